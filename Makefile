@@ -20,10 +20,10 @@ WORKERS := -n logical --maxprocesses 8 --dist worksteal
 BUDGET := 30
 # Failures are shown, and written to a file, as they come: an interrupted run leaves them.
 test: $(VENV)/.ready
-	$(BIN)/python -m pytest -m "not slow" $(WORKERS) --budget $(BUDGET) --failures out/failures.txt
+	$(BIN)/python -m pytest -m "not slow" $(WORKERS) --budget $(BUDGET) --failures=out/failures.txt
 
 test-slow: $(VENV)/.ready
-	$(BIN)/python -m pytest -m slow --timeout 3600 $(WORKERS) --failures out/failures-slow.txt
+	$(BIN)/python -m pytest -m slow --timeout 3600 $(WORKERS) --failures=out/failures-slow.txt
 
 # The live view in a real browser. Chromium is the system's; where it is missing, root gets it on Debian, and others are told.
 test-browser: $(VENV)/.ready

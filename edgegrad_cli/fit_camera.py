@@ -19,7 +19,11 @@ def add(commands: Any) -> None:
     parser.add_argument("--no-focal", action="store_true", help="keep the focal length")
     parser.add_argument("--principal", action="store_true", help="also find the principal point")
     parser.add_argument(
-        "--distortion", type=number, default=0, metavar="N", help="also find so many coefficients (4, 5 or 8)"
+        "--distortion",
+        type=number,
+        default=0,
+        metavar="N",
+        help="also find so many coefficients, up to 8 (a fisheye: 4)",
     )
     parser.add_argument(
         "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
@@ -59,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}")
         K = fit.camera.K.tolist()
         print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
+        if fit.uncertainty is not None:
+            print(f"standard deviation: {fit.uncertainty.words}", flush=True)
         save_camera(args.out / "camera.json", fit.camera)
         names = ["camera.json", fit.write_history(args.out), *write_outputs(args.out, fit.search), CHECKPOINT]
         print(f"wrote {', '.join(names)} in {args.out}")

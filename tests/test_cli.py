@@ -464,7 +464,8 @@ def test_fit_camera(files, capsys, monkeypatch):
     assert run(*said, "--no-focal", "--out", out) == 0
     found, true = eg.load_camera(out / "camera.json"), camera(48)
     torch.testing.assert_close(found.world_to_camera.double(), true.world_to_camera, atol=0.05, rtol=0)
-    assert "focal length" in capsys.readouterr().out
+    said_of = capsys.readouterr().out
+    assert "focal length" in said_of and "standard deviation: ±" in said_of
     losses = [record["loss"] for record in json.loads((out / "history.json").read_text())]
     assert losses[-1] == json.loads((out / "pose.json").read_text())["loss"]
     assert run(*said, "--no-focal", "--out", out, "--resume") == 0  # nothing left to do

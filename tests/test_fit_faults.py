@@ -98,7 +98,7 @@ def test_a_killed_fit_leaves_the_best_pose_so_far(files, kills, monkeypatch):
     for kill in range(kills):
         out = f"out{kill}"
         run = Forked(lambda out=out: cli.main(arguments(files, out)))
-        steps = chance.randint(0, 60) if kill else 0  # of about 80
+        steps = chance.randint(0, 40) if kill else 0  # of about 60
         told = [json.loads(run.out.readline()) for _ in range(steps)]
         # From the next step's beginning to its end; the first step comes after reading the files.
         time.sleep(chance.uniform(0.0, 0.02 if steps else 0.2))

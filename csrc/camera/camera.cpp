@@ -15,8 +15,8 @@ namespace {
 
 constexpr double margin = 1;  // px, by which a filter may reach over the border of the image
 
-// What is visible through the lenses that were asked for last: it depends on a camera's size, K and coefficients alone,
-// and takes as long to find out as a small image. Each takes about 10 KiB.
+// This cache keeps what is visible through the lenses of recent calls. That depends on a camera's size, K and
+// coefficients alone, and finding it takes as long as a small image. Each entry takes about 10 KiB.
 class LensViews {
    public:
     using Key = std::array<uint64_t, 9 + most_coefficients>;

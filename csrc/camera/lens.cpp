@@ -165,7 +165,7 @@ std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m
 
 namespace {
 
-// By the table of a radial lens, if it holds all of the points.
+// Returns false unless the lens is radial and its table holds all of the points.
 bool straighten_by_table(const AnyLens& lens, const LensDisc& disc, int k, double* x, double* y) {
     if (!disc.inverse || k > Points::size || !with_radial_lens(lens, [](const auto& l) { return l.is_radial(); }))
         return false;

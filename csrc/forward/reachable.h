@@ -52,7 +52,7 @@ class ReachablePixels {
     int width_;
     double margin_;
     Bounds bounds_;
-    // Of a lens: what the octagon's image spans in each row, px; empty for a pinhole.
+    // Behind a lens, each row has the span of the octagon's image, px. A pinhole has no spans.
     struct Span {
         double from = infinite, to = -infinite;
     };

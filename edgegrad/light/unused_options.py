@@ -34,5 +34,5 @@ def why_unused(name: str, scene: Scene, with_shader: bool) -> str:
     if name == "check_shader" and not with_shader:
         return "there is no shader"
     if name == "creases" and not with_shader and not scene.is_shaded:
-        return "colours and textures tell by themselves at which edges they jump"
+        return "colours and textures show by themselves at which edges they jump"
     return ""

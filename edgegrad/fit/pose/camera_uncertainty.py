@@ -35,6 +35,7 @@ class CameraUncertainty(Uncertainty):
     distortion: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     vague: tuple[str, ...] = ()  # numbers of the lens that are not known, in words
     at_lens: Tensor | None = None  # (6, 6), the covariance with the lens as it was found
+    names: tuple[str, ...] = ()  # of the coefficients of distortion
 
     @property
     def unknown(self) -> str:
@@ -44,6 +45,15 @@ class CameraUncertainty(Uncertainty):
         assert self.at_lens is not None
         pose = Uncertainty(self.at_lens, self.size, self.free, most=self.most).unknown
         return ", ".join([pose, *self.vague] if pose else self.vague)
+
+    @property
+    def words(self) -> str:
+        """The standard deviations of the pose, and of each number of the lens that was sought."""
+        parts = [super().words]
+        if self.principal.any():
+            parts.append("principal point ±{:.2g}, ±{:.2g} px".format(*self.principal.tolist()))
+        parts += [f"{name} ±{value:.2g}" for name, value in zip(self.names, self.distortion.tolist(), strict=True)]
+        return ", ".join(parts)
 
     @staticmethod
     def of_entries(source: Source, pose: Pose, covariance: Tensor) -> CameraUncertainty:
@@ -65,7 +75,13 @@ class CameraUncertainty(Uncertainty):
             ALONE_DEGREES if task.colourless else DEGREES, camera.size[1] * torch.tensor(principal, dtype=torch.float64),
             torch.tensor([deviations[entry] for entry in free if entry >= BEND], dtype=torch.float64),
             tuple(vague(camera, deviations)), own @ covariance[of_pose][:, of_pose] @ own.T,
+            tuple(coefficient(camera, entry) for entry in free if entry >= BEND),
         )  # fmt: skip
+
+
+def coefficient(camera: Camera, entry: int) -> str:
+    """Return the name of a coefficient of distortion, by the entry of a step that moves it."""
+    return f"k{entry - BEND + 1}" if camera.projection == "fisheye" else COEFFICIENTS[entry - BEND]
 
 
 def vague(camera: Camera, deviations: dict[int, float]) -> list[str]:
@@ -86,8 +102,7 @@ def vague(camera: Camera, deviations: dict[int, float]) -> list[str]:
                 f"principal point known to ±{deviation * camera.size[1]:.2g} pixels in {'xy'[entry - PRINCIPAL]} only"
             )
         else:
-            name = f"k{entry - BEND + 1}" if camera.projection == "fisheye" else COEFFICIENTS[entry - BEND]
-            found.append(f"{name} known to ±{deviation:.2g} only{corner}")
+            found.append(f"{coefficient(camera, entry)} known to ±{deviation:.2g} only{corner}")
     return found
 
 

@@ -180,7 +180,7 @@ def fit_camera(
     principal point against a rotation of the camera. `uncertainty` has the standard deviation of each number. A fit is not
     `converged` where a number of the lens is hardly known, and `reason` names it: one whose deviation moves a corner of the image
     by more than 3 % of its distance from the principal point, or about which a guess says as much. Several pictures from
-    different sides tell more: see calibrate(). Raises TypeError or ValueError that names the argument.
+    different sides say more: see calibrate(). Raises TypeError or ValueError that names the argument.
     """
     several = isinstance(camera, (list, tuple))
     given = [with_coefficients("camera", one, distortion) for one in (camera if several else [camera])]

@@ -75,7 +75,7 @@ def fit_pose(
 
     mesh        what the picture shows, with its colours; the meshes of a Scene move together
     target      (H, W, C) linear radiance in any unit, as read_image gives it, with the mesh's channels; or a list of pictures.
-                The object's gain in each of them is found beside the pose, and so is that of a background that is given
+                The object's gain in each of them is found together with the pose, and so is that of a background that is given
     camera      the camera of the picture, of size (H, W), or a list of them; with fit_focal, its focal length is where the fit
                 starts
     mask        (H, W) or (H, W, 1), 1 on the object and 0 elsewhere, as read_mask gives it. Then the colours inside the mask
