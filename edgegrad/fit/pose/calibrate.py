@@ -124,11 +124,11 @@ class Calibration:
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Writes all of it to a folder, which is made where it is missing, and gives the files' names:
 
-        calibration.json  focal length, principal point and distortion with their standard deviations, those of the poses, loss
-                          and reason
-        history.json      loss, gradient norms and cameras of each step
-        camera-0.json …   the cameras, as load_camera reads them
-        fit.png           plot(), loss.png: plot_history(); not with figures=False
+        - calibration.json: focal length, principal point and distortion with their standard deviations, those of the poses, loss
+          and reason
+        - history.json: loss, gradient norms and cameras of each step
+        - camera-0.json and so on: the cameras, as load_camera reads them
+        - fit.png and loss.png: plot() and plot_history(); not with figures=False
 
         Each file is written whole or not at all. Raises OSError, or at last ImportError when matplotlib is missing.
         """

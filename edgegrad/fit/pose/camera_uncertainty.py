@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -33,9 +34,9 @@ class CameraUncertainty(Uncertainty):
 
     principal: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     distortion: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
-    vague: tuple[str, ...] = ()  # numbers of the lens that are not known, in words
+    vague: Sequence[str] = ()  # numbers of the lens that are not known, in words
     at_lens: Tensor | None = None  # (6, 6), the covariance with the lens as it was found
-    names: tuple[str, ...] = ()  # of the coefficients of distortion
+    names: Sequence[str] = ()  # of the coefficients of distortion
 
     @property
     def unknown(self) -> str:
