@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import Calibration, calibrate, fit_camera
+from edgegrad.fit.ending import Ending
 from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
 from edgegrad.fit.pose.evidence import Colours, noise_of
 from edgegrad.fit.pose.given import Names
@@ -182,6 +184,16 @@ def test_a_lens_from_several_pictures(tmp_path) -> None:
     deviation = fit.uncertainty.focal * float(fit.camera.K[0, 0])
     assert said["standard_deviations"]["focal"] == pytest.approx(deviation)
     torch.testing.assert_close(eg.load_camera(tmp_path / "camera-1.json").K.double(), fit.cameras[1].K)
+
+
+def test_a_calibration_without_rest_names_what_is_not_known() -> None:
+    """No more steps can be had, so numbers that the pictures hardly tell are the reason."""
+    zeros = torch.zeros(2, dtype=torch.float64)
+    known = CameraUncertainty(
+        torch.eye(6).double(), 1.0, torch.empty(0, 3).double(), 0.0, 5.0, zeros, zeros, ("k2 known to ±1 only",)
+    )
+    ended = Calibration([SimpleNamespace(uncertainty=known)], Ending.STEPS, 0.0, [])  # type: ignore[list-item]
+    assert ended.reason == "not known: k2 known to ±1 only" and not ended.converged
 
 
 @pytest.mark.slow

@@ -271,6 +271,7 @@ def test_a_bare_matrix_is_a_pose(tmp_path):
         # 5.6 mm at 400 pixels a mm of a sensor of 240 pixels, of which the file has a quarter.
         ({0x920A: IFDRational(56, 10), 0xA20E: IFDRational(400), 0xA210: 4, 0xA002: 240}, 5.6 * 400.0 / 4.0),
         ({0x920A: IFDRational(56, 10)}, None),
+        ({0xA405: 65535}, None),  # not known
     ],
 )
 def test_the_focal_length_of_a_photograph(tags, pixels, tmp_path):

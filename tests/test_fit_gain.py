@@ -36,6 +36,16 @@ def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> N
     assert errors(expected)[0] < 0.1 and fit.loss == pytest.approx(expected.loss, rel=0.3)
 
 
+def test_a_broken_pixel_does_not_hold_a_fit() -> None:
+    """The range of the pictures, which the width of the robust loss follows, is that of what is not brighter than white."""
+    view = camera(48)
+    image = picture(view)
+    image[3, 3] = 1e5
+    fit = fit_pose(bracket(), image, view, init=START, background=BACKGROUND, progress=False)
+    off = errors(fit)
+    assert off[0] < 0.2 and off[1] < 0.2 and fit.converged, off
+
+
 @pytest.mark.parametrize("gain", [0.1, pytest.param(16.0, marks=pytest.mark.slow)])
 def test_a_dim_picture_before_clutter(gain: float) -> None:
     view = camera(48)

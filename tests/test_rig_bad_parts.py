@@ -165,6 +165,15 @@ def test_channels_that_cannot_be_read_are_left_out(case: str, tmp_path) -> None:
     check(sample, rig, rig.posed(**rig.animation("bend").at(0.7)), 0, 0.7)
 
 
+def test_a_channel_of_a_node_that_is_not_there_is_named(tmp_path) -> None:
+    def change(s: Sample) -> None:
+        s.animation("b", (2, "translation", [0.0, 0.5], np.zeros((2, 3)), "LINEAR"))
+        s.tree["animations"][-1]["channels"][0]["target"]["node"] = 99
+
+    rig = load(spoilt(change), tmp_path, r"translation of node 99 in animation 'b' \(left out: there is no such node")
+    assert rig.animation("b").channels == ()
+
+
 def test_names_differ(tmp_path) -> None:
     """Of nodes, morph targets and animations, also where one is called as another becomes."""
     sample = simple_morph()

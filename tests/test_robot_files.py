@@ -242,6 +242,11 @@ REFUSED = {
     "axis of two numbers": (
         (LINKS, joint("j", "a", "b"), joint("k", "b", "c", "continuous", '<axis xyz="0 1"/>')), "joint 'k': expected an axis"
     ),
+    "a scale of two numbers": (
+        (mesh_link("a", "uv.obj", ' scale="1 1"'),), r"link 'a': expected a mesh scale of 3 .* got \[1.0, 1.0\]"
+    ),
+    "a scale of zero": ((mesh_link("a", "uv.obj", ' scale="0 1 1"'),), "link 'a': expected a mesh scale of 3 finite numbers"),
+    "a scale that is no number": ((mesh_link("a", "uv.obj", ' scale="nan 1 1"'),), "link 'a': expected a mesh scale of 3"),
     "links of one name": ((LINKS, '<link name="c"/>', joint("j", "a", "b")), "link 'c': expected each link once"),
     "joints of one name": ((LINKS, joint("j", "a", "b"), joint("j", "b", "c")), "joint 'j': expected each joint once"),
 }  # fmt: skip
@@ -250,6 +255,7 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_no_robot_is_named(case: str, tmp_path) -> None:
     parts, message = REFUSED[case]
+    write_obj(tmp_path / "uv.obj")
     with pytest.raises(ValueError, match=rf"r\.urdf: {message}"):
         eg.load_robot(robot(tmp_path, *parts))
 

@@ -9,6 +9,7 @@ from ..optional import require
 from .paths import PathLike
 
 FILM = math.hypot(36.0, 24.0)  # mm, the diagonal of 35 mm film, which equivalent focal lengths refer to
+LONGEST = 10_000.0  # mm, equivalent for 35 mm film: no lens of a camera is longer, and 65535 stands for an unknown one
 UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, of EXIF's FocalPlaneResolutionUnit
 
 
@@ -36,7 +37,8 @@ def read_focal(path: PathLike) -> FocalLength | None:
         value = spec.getattribute(name)
         return float(value) if isinstance(value, (int, float)) and value > 0.0 else 0.0
 
-    if film := number("Exif:FocalLengthIn35mmFilm"):
+    film = number("Exif:FocalLengthIn35mmFilm")
+    if 0.0 < film < LONGEST:
         pixels = film / FILM * math.hypot(spec.width, spec.height)
         return FocalLength(pixels, f"{film:g} mm, equivalent for 35 mm film")
     length, resolution = number("Exif:FocalLength"), number("Exif:FocalPlaneXResolution")
@@ -44,4 +46,7 @@ def read_focal(path: PathLike) -> FocalLength | None:
         return None
     taken = number("Exif:PixelXDimension") or spec.width
     unit = UNITS.get(int(number("Exif:FocalPlaneResolutionUnit")), UNITS[2])
-    return FocalLength(length * resolution / unit * spec.width / taken, f"{length:g} mm, and the sensor's resolution")
+    pixels = length * resolution / unit * spec.width / taken
+    if not pixels * FILM < LONGEST * math.hypot(spec.width, spec.height):
+        return None
+    return FocalLength(pixels, f"{length:g} mm, and the sensor's resolution")

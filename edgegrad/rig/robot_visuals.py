@@ -41,7 +41,15 @@ class Visuals:
         matrix = np.eye(4) if visual.origin is None else np.asarray(visual.origin, np.float64)
         if geometry.mesh is not None:
             parts = self._read(link, geometry.mesh.filename)
-            scale = np.ones(3) if geometry.mesh.scale is None else np.broadcast_to(geometry.mesh.scale, 3)
+            scale = (
+                np.ones(1) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, np.float64).reshape(-1)
+            )
+            if len(scale) not in (1, 3) or not np.isfinite(scale).all() or not scale.all():
+                raise ValueError(
+                    f"{self.file}: link {link!r}: expected a mesh scale of 3 finite numbers other than 0, got {scale.tolist()}; "
+                    "repair it"
+                )
+            scale = np.broadcast_to(scale, 3)
             matrix = matrix @ np.diag([*scale, 1.0])
         else:
             parts = [_shape(geometry)]

@@ -263,6 +263,10 @@ def _animations(
                     channels.append(_channel(arrays, tree, animation, channel, places, what, source))
                 except Fault as fault:
                     source.unsupported.note(what, f"left out: {fault}")
+            elif node is not None and not 0 <= node < len(tree.get("nodes", [])):
+                source.unsupported.note(
+                    f"{target['path']} of node {node} in animation {name[:60]!r}", "left out: there is no such node"
+                )
     return list(found.items())
 
 

@@ -25,7 +25,7 @@ from ...files.paths import PathLike, replacing
 from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
-from ..ending import Ending, reason_of
+from ..ending import Ending
 from ..history import Record, number_or_none, plain_history
 from ..views import check_image
 from .adjust import Adjusted, adjusted, poses_of
@@ -104,7 +104,12 @@ class Calibration:
         """In words: "converged", or what kept the fit from that: "images[2]: edges not explained: …", "not known: …" with
         numbers that the pictures hardly show, "steps ran out: …", "interrupted"."""
         if self.ending is not Ending.FLAT:
-            return reason_of(self.ending, 1.0)
+            known = self.uncertainty
+            if self.ending is Ending.STEPS and known is not None and known.vague:
+                return f"not known: {', '.join(known.vague)}"
+            return (
+                "steps ran out: what is sought has not come to rest" if self.ending is Ending.STEPS else "interrupted"
+            )
         for k, fit in enumerate(self.fits):
             if not fit.converged:
                 of_lens = fit.reason.startswith("not known") and fit.uncertainty is not None and fit.uncertainty.vague

@@ -171,7 +171,8 @@ class PoseTask:
             raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
         free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * lens.scale + [ZOOM] * lens.focal
         free += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(BEND, BEND + lens.distortion))
-        seen = torch.cat([shot.target.flatten(0, 1) for shot in shots])
+        # What is brighter than white, as a lamp or a broken pixel, says nothing of the range of the others.
+        seen = torch.cat([shot.target.flatten(0, 1) for shot in shots]).clamp(max=1.0)
         colours = (
             seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
         )  # a mask's range says nothing of theirs

@@ -57,6 +57,7 @@ class PhotoSearch(Ways):
         # Before an even background colours are compared as they are first.
         self.colours_first = not task.clutter and "alpha" not in task.aovs and all(depth is None for depth in depths)
         self.further = further
+        self._judged_poses: list[Pose] = []  # where the first descent began and ended
         self.alike: list[Pose] = []  # others, which the pictures hardly tell from the answer
 
     def run(self) -> None:
@@ -112,6 +113,7 @@ class PhotoSearch(Ways):
         stays = found.short and len(distinct([found.pose, self.start], 2, APART)) == 1
         start = self._judge(self.start, stays)
         best = max(found, start, key=lambda end: end.explained)
+        self._judged_poses = [found.pose, start.pose]
         if not self.colours_first:
             self._take(best)
         if self.further and best.explained < self.enough:
@@ -320,9 +322,13 @@ class PhotoSearch(Ways):
         return found
 
     def _as_they_are(self, pose: Pose) -> bool:
-        """Whether the light leaves the mesh's colours as they are."""
-        (most,) = self.journal.numbers(lambda: [self._change(pose)])
-        return most < AS_THEY_ARE
+        """Return whether the light leaves the mesh's colours as they are.
+
+        That is so of the pictures, not of a pose. At a wrong pose a light is found that makes up for a part of the error, so the
+        least change counts: at this pose, and where the first descent began and ended."""
+        poses = [pose, *self._judged_poses]
+        (least,) = self.journal.numbers(lambda: [min(self._change(one) for one in poses)])
+        return least < AS_THEY_ARE
 
     def _change(self, pose: Pose) -> float:
         """How far colours in the light are from those of the mesh, in parts of these, of all pictures the farthest."""
