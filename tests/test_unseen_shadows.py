@@ -28,7 +28,7 @@ def bright_spot() -> Tensor:
 def lights_of(kind: str, theta: Tensor) -> tuple[list[eg.Mesh], list[Any]]:
     """Meshes that emit, and other lights."""
     # So that what a point light gives the floor stays nearly the same, and the shadow's border is all that changes.
-    shift = theta * (vector(0.44, 0.3, 0.0) if kind == "point" else vector(0.5, 0.0, 0.2))
+    shift = theta * (vector(-0.2, 0.5, 0.0) if kind == "point" else vector(0.5, 0.0, 0.2))
     place, towards = vector(*PLACE) + shift, vector(-3.0, 1.3, 0.2) + shift
     if kind == "lamp":
         half, up = vector(0, 0, 0.25), vector(0.1, 0.2, 0)
