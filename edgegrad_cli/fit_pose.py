@@ -154,7 +154,7 @@ def _print_fit(fit: PoseFit, focal: bool) -> None:
     lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
     if fit.uncertainty is not None:
         lines.append(f"standard deviation: {fit.uncertainty.words}")
-    if abs(fit.scale - 1.0) > 0.0:
+    if fit.scale != 1.0:
         lines.append(f"scale: {fit.scale:.6g}")
     if focal:
         lines.append(f"focal length: {float(fit.camera.K[0, 0]):.6g} px")

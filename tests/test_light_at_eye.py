@@ -110,13 +110,14 @@ def gradients(case: Case, seeds: int, **options: object) -> list[float]:
 
 
 def check(case: Case, seeds: int = 4, samples: int = 4_000) -> None:
-    """The gradient with shadows is that without, which has the same samples at silhouettes, within 2 % and chance."""
+    """The gradient with shadows is that without, which has the same samples at silhouettes and no shadow boundaries. The slack of
+    1.5 % is for offsets of 1e-4; with chance it stays below 4.5 %, so that a gradient 5 % off fails."""
     found = gradients(case, seeds, edge_samples=samples)
     right = gradients(case, seeds, edge_samples=samples, shadows=False)
     size = abs(estimate(right).mean)
     off = estimate([a - b for a, b in zip(found, right, strict=True)])
     assert 4 * off.error < 0.03 * size, f"too noisy to tell 5 %: {off} of {size}"
-    assert abs(off.mean) < 0.02 * size + 4 * off.error, f"off by {off}, right: {size}"
+    assert abs(off.mean) < 0.015 * size + 4 * off.error, f"off by {off}, right: {size}"
 
 
 LIGHTS = ("point", "spot", "sun", "area")
