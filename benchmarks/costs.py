@@ -9,15 +9,15 @@ from functools import cache, partial
 from typing import Any
 
 import torch
-from common import Kernel, Step, single, sphere
-from table import Bench, Row, median_row, milliseconds, ratio_row, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.library import core
-from edgegrad.report import build
-from edgegrad.report.scenes import cube, front_camera, smooth_adjoint, smooth_colors
-from edgegrad.report.scenes import sphere as icosphere
+
+from .common import Kernel, Step, single, sphere
+from .scenes import build, cube, front_camera, smooth_adjoint, smooth_colors
+from .scenes import sphere as icosphere
+from .table import Bench, Row, median_row, milliseconds, ratio_row, seconds_of
 
 
 @cache

@@ -7,15 +7,15 @@ import statistics
 from pathlib import Path
 
 import torch
-from common import Converged, Kernel, single, sphere
-from table import Bench, Row, median_row, milliseconds, quartiles, ratio_row
 
 import edgegrad as eg
 from edgegrad.library import core
-from edgegrad.report import build
-from edgegrad.report.error_time.methods import default_samples, differentiate
-from edgegrad.report.scenes import ReportScene
-from edgegrad.report.scenes import sphere as icosphere
+
+from .common import Converged, Kernel, single, sphere
+from .error_time.methods import default_samples, differentiate
+from .scenes import ReportScene, build
+from .scenes import sphere as icosphere
+from .table import Bench, Row, median_row, milliseconds, quartiles, ratio_row
 
 CONVERGED = Path(__file__).resolve().parents[1] / "out" / "converged"
 

@@ -9,13 +9,14 @@ from functools import cache
 
 import numpy as np
 import torch
-from common import Kernel, Step, sphere
-from table import Bench, Row, Skipped, milliseconds, quartiles
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.library import core
-from edgegrad.report.error_time import mitsuba
+
+from .common import Kernel, Step, sphere
+from .error_time import mitsuba
+from .table import Bench, Row, Skipped, milliseconds, quartiles
 
 Run = Callable[[float, int], tuple[Tensor, float]]  # (budget, seed) → gradient (V, 3), seconds
 FACTORS = tuple(2.0**k for k in range(-6, 7))  # times edgegrad's default samples

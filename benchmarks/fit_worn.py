@@ -1,21 +1,17 @@
 """fit_pose by colours in pictures that a lens, a file or a cover has changed: steps, processor time, and how far off it ends.
 
-OMP_NUM_THREADS=1 python benchmarks/fit_worn.py
+OMP_NUM_THREADS=1 python -m benchmarks.fit_worn
 """
 
 from __future__ import annotations
 
-import sys
 import time
-from pathlib import Path
 
 import torch
-
-from edgegrad.fit import fit_pose
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from test_fit import BACKGROUND, START, bracket, camera, errors, picture
 from test_fit_robust import blurred, compressed, covered
+
+from edgegrad.fit import fit_pose
 
 
 def main() -> None:

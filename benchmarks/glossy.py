@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from table import Bench, Row, milliseconds, quartiles, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report.error_time import mitsuba
-from edgegrad.report.scenes import sphere
+
+from .error_time import mitsuba
+from .scenes import sphere
+from .table import Bench, Row, milliseconds, quartiles, seconds_of
 
 SIZE = 96
 LAMPS = ((14, 40, 4, 60.0), (20, 90, 3, 120.0), (30, 64, 5, 40.0))  # row, column, size and radiance

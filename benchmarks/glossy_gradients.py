@@ -15,14 +15,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from glossy import SIZE, sky
-from table import Bench, Row, milliseconds
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
-from edgegrad.report.error_time import mitsuba
-from edgegrad.report.scenes import sphere
+
+from .error_time import mitsuba
+from .glossy import SIZE, sky
+from .scenes import sphere
+from .table import Bench, Row, milliseconds
 
 Parameters = dict[str, Tensor]
 # What tells the other image from this one.

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Kernel
-from table import Bench, Row, milliseconds, ratio_row, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
@@ -19,9 +17,11 @@ from edgegrad.kernel.request import make_request
 from edgegrad.library import core
 from edgegrad.light.radiance import Lighting
 from edgegrad.points.frame import Frame
-from edgegrad.report import build
-from edgegrad.report.scenes import ReportScene
 from edgegrad.shader import Effort, _Image
+
+from .common import Kernel
+from .scenes import ReportScene, build
+from .table import Bench, Row, milliseconds, ratio_row, seconds_of
 
 # Samples on the borders of shadows.
 COUNTS = {

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from table import Bench, Row, median_row, milliseconds, ratio_row
+from .table import Bench, Row, median_row, milliseconds, ratio_row
 
 
 def memory(bench: Bench) -> list[Row]:
@@ -34,8 +34,9 @@ def start(bench: Bench) -> list[Row]:
 
 def fresh(*arguments: str) -> dict[str, float]:
     """What fresh.py measures in a process of its own."""
-    command = [sys.executable, str(Path(__file__).with_name("fresh.py")), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "benchmarks.fresh", *arguments]
+    root = Path(__file__).parents[1]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
     return json.loads(done.stdout)

@@ -1,6 +1,6 @@
 """The operators of edgegrad.raster beside render(spp=1), and render_batch: processor time of a step, forward and backward.
 
-python benchmarks/raster.py [--rounds 5]
+python -m benchmarks.raster [--rounds 5]
 
 The scene is a textured sphere of 20,480 faces, seen by 8 cameras at 512², with gradients of vertices and texture. All take
 turns. render_batch has 32 spheres of 1,280 faces at 64²: plain ones take one thread each, beside the calling one, lit ones come
@@ -27,7 +27,8 @@ from torch import Tensor
 
 import edgegrad as eg
 import edgegrad.raster as dr
-from edgegrad.report.scenes import sphere
+
+from .scenes import sphere
 
 BATCH, SIZE = 8, 512
 

@@ -1,6 +1,6 @@
 """How fast edgegrad is, and what it is compared with, against targets: one table.
 
-Run:  python benchmarks/speed.py [--only NAME …] [--quick] [--out FILE.json]
+Run:  python -m benchmarks.speed [--only NAME …] [--quick] [--out FILE.json]
 
 A ratio is taken in one run: its two sides alternate, so that a noisy machine slows both, and what is printed is the median
 over the pairs and their quartiles. "At equal error" is the error of the per-vertex gradient relative to the whole gradient,
@@ -21,20 +21,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from bounces import bounced_gradients, bounces
-from costs import aovs, backward, bits, forward, large, lenses, small, sparse, textures, threads, update
-from defaults import deep, flat_colors, kernel_hash, noise, tangled
-from equal_error import boundary, interior, step
-from glossy import glossy
-from glossy_gradients import glossy_gradients
-from light import light
-from material_grid import material_grid
-from processes import memory, order, start
-from table import HEAD, Bench, Row, Skipped, line
 from tqdm import tqdm
 
 import edgegrad as eg
-from edgegrad.report.error_time import mitsuba
+
+from .bounces import bounced_gradients, bounces
+from .costs import aovs, backward, bits, forward, large, lenses, small, sparse, textures, threads, update
+from .defaults import deep, flat_colors, kernel_hash, noise, tangled
+from .equal_error import boundary, interior, step
+from .error_time import mitsuba
+from .glossy import glossy
+from .glossy_gradients import glossy_gradients
+from .light import light
+from .material_grid import material_grid
+from .processes import memory, order, start
+from .table import HEAD, Bench, Row, Skipped, line
 
 ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "forward": forward,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from edgegrad.report.error_time.methods import default_samples
-from edgegrad.report.scenes import (
+from benchmarks.error_time.methods import default_samples
+from benchmarks.scenes import (
     cube,
     front_camera,
     occluded_triangle,
@@ -13,7 +13,7 @@ from edgegrad.report.scenes import (
     smooth_colors,
     soup,
 )
-from edgegrad.report.scenes import sphere as icosphere
+from benchmarks.scenes import sphere as icosphere
 
 __all__ = [
     "cube",

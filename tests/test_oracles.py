@@ -1,5 +1,5 @@
 """The oracles checked without the kernel: exact pixel integrals against analytic ones, their gradient against finite
-differences, and the sampled twin (edgegrad.reference) against both."""
+differences, and the sampled twin (oracles.reference) against both."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 import pytest
 import torch
 from combinations import diagonal
+from oracles import reference
+from oracles.exact import exact_image, gauss_triangle
 from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangle, random_slivers
 from torch import Tensor
 
-from edgegrad import reference
 from edgegrad.camera.camera import Camera
-from edgegrad.report.exact import exact_image, gauss_triangle
 from edgegrad.scene.mesh import PLAIN, Mesh
 from edgegrad.scene.scene import Scene
 

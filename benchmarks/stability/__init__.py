@@ -1,0 +1,1 @@
+"""The error of image and gradient in extreme cases."""
