@@ -19,8 +19,7 @@ from edgegrad.library import core
 
 from .error_time.methods import differentiate
 from .error_time.references import standard_error
-from .scenes import ReportScene, smooth_adjoint
-from .scenes import sphere as icosphere
+from .scenes import ReportScene, icosphere, smooth_adjoint
 
 
 def sphere(size: int | tuple[int, int], subdivisions: int = 6) -> tuple[eg.Mesh, eg.Camera, Tensor]:

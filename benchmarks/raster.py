@@ -28,14 +28,14 @@ from torch import Tensor
 import edgegrad as eg
 import edgegrad.raster as dr
 
-from .scenes import sphere
+from .scenes import icosphere
 
 BATCH, SIZE = 8, 512
 
 
 class Step:
     def __init__(self) -> None:
-        mesh = sphere(5)
+        mesh = icosphere(5)
         self.verts, self.faces = mesh.verts.float(), mesh.faces
         self.uvs = (self.verts[:, :2] + 1) / 2
         self.texture, self.adjoint = torch.rand(512, 512, 3), torch.rand(BATCH, SIZE, SIZE, 3)
@@ -75,7 +75,7 @@ IMAGES = 32
 
 def batch(lit: bool) -> Callable[[], None]:
     """A step of render_batch() over meshes that share vertices."""
-    mesh = sphere(3)
+    mesh = icosphere(3)
     camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (64, 64))
     lights = [eg.DirectionalLight(torch.tensor([0.0, -0.3, -1.0]))] if lit else []
     material = eg.Material() if lit else None

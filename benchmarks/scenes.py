@@ -145,7 +145,7 @@ def cube(half: float = 0.6) -> Mesh:
     return Mesh(verts, torch.tensor(faces), colors=smooth_colors(verts))
 
 
-def sphere(subdivisions: int = 3) -> Mesh:
+def icosphere(subdivisions: int = 3) -> Mesh:
     """Unit sphere of 20 · 4^subdivisions faces (3: 1,280; 6: 81,920), watertight, outward, with smooth colours: an icosphere."""
     phi = (1.0 + math.sqrt(5.0)) / 2.0
     # Corners (0, ±1, ±φ) and its rotations of coordinates: three rectangles, one in each plane.
@@ -234,7 +234,7 @@ def _triangle(size: int) -> Built:
 
 
 def _sphere(size: int, subdivisions: int = 6) -> Built:
-    mesh = sphere(subdivisions)
+    mesh = icosphere(subdivisions)
     camera = Camera.look_at((0.9, 0.7, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (size, size))
     title = f"sphere of {len(mesh.faces):,} faces, smooth colours"
     return title, Scene([mesh], background()), camera
@@ -312,7 +312,7 @@ def _million(size: int) -> Built:
 def _lit(size: int, light: Light | Mesh, title: str, subdivisions: int = 6) -> Built:
     """A black ellipsoid and its shadow on a plane. The gradient is that of the ellipsoid: that of the plane's corners, which all
     of the image moves, would hide it. Were it lit, each edge of it would be a crease, which Mitsuba does not sample."""
-    ball = sphere(subdivisions)
+    ball = icosphere(subdivisions)
     look = Material(base_color=torch.tensor([0.8, 0.6, 0.4], dtype=torch.float64))
     size_of, at = torch.tensor(
         [[0.5, 0.3, 0.4], [0.0, 0.0, 1.0]], dtype=torch.float64
@@ -344,7 +344,7 @@ def _lit_sky(size: int, subdivisions: int = 6) -> Built:
 
 def _room(size: int, light: Mesh, at: tuple[float, float, float], title: str, subdivisions: int = 3) -> Built:
     """A black ellipsoid in a room with coloured walls, open towards −y. As in `_lit`, its edges are no creases."""
-    ball, (x, y, z) = sphere(subdivisions), at
+    ball, (x, y, z) = icosphere(subdivisions), at
     size_of, centre = torch.tensor([[0.45, 0.25, 0.35], [x, y, z]], dtype=torch.float64)
     meshes = [Mesh(ball.verts * size_of + centre, ball.faces, colors=torch.zeros_like(ball.verts))]
     white, red, green = (0.75, 0.75, 0.75), (0.7, 0.15, 0.1), (0.15, 0.6, 0.2)

@@ -24,8 +24,7 @@ from tqdm import tqdm
 import edgegrad as eg
 
 from .common import sphere
-from .scenes import build, front_camera, smooth_adjoint
-from .scenes import sphere as icosphere
+from .scenes import build, front_camera, icosphere, smooth_adjoint
 
 F64 = torch.float64
 

@@ -13,21 +13,18 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
-
-import edgegrad as eg
 
 from .bounces import bounced_gradients, bounces
 from .costs import aovs, backward, bits, forward, large, lenses, small, sparse, textures, threads, update
-from .defaults import deep, flat_colors, kernel_hash, noise, tangled
+from .defaults import deep, flat_colors, noise, tangled
+from .document import machine
 from .equal_error import boundary, interior, step
 from .error_time import mitsuba
 from .glossy import glossy
@@ -73,11 +70,8 @@ GROUPS = {"safe": ("deep", "tangled", "flat-colors", "noise")}
 def settings(quick: bool) -> dict[str, Any]:
     """Where and of what this was measured."""
     return {
-        "date": time.strftime("%Y-%m-%d %H:%M:%S"), "quick": quick, "threads": torch.get_num_threads(),
-        "cores": os.cpu_count(), "load": os.getloadavg()[0], "system": platform.platform(),
-        "python": platform.python_version(), "torch": torch.__version__,
-        "edgegrad": eg.__version__, "mitsuba": mitsuba.available(),
-        "kernel": kernel_hash(),
+        "date": time.strftime("%Y-%m-%d %H:%M:%S"), "quick": quick, "load": os.getloadavg()[0],
+        "mitsuba": mitsuba.available(), **machine(),
     }  # fmt: skip
 
 

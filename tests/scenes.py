@@ -6,6 +6,7 @@ from benchmarks.error_time.methods import default_samples
 from benchmarks.scenes import (
     cube,
     front_camera,
+    icosphere,
     occluded_triangle,
     one_triangle,
     random_slivers,
@@ -13,7 +14,6 @@ from benchmarks.scenes import (
     smooth_colors,
     soup,
 )
-from benchmarks.scenes import sphere as icosphere
 
 __all__ = [
     "cube",

@@ -4,7 +4,7 @@ differences, and the sampled twin (oracles.reference) against both."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -20,15 +20,6 @@ from edgegrad.scene.scene import Scene
 
 PROJECTIONS = ("perspective", "orthographic")
 KINDS = ("plain", "colors", "face_colors", "corner_colors", "texture")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """The oracles are many small operations; on a busy machine, waiting for a second thread gains nothing."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def pixel_camera(height: int, width: int) -> Camera:

@@ -21,8 +21,8 @@ from edgegrad.render import render
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ..finer import finer_image
 from ..scenes import ReportScene
+from ..supersampling import supersampled
 from . import mitsuba
 
 VERSION = importlib.metadata.version("edgegrad")
@@ -31,6 +31,7 @@ FORWARD_SPP = 16  # of the image in a whole step; the gradient does not depend o
 STEP_PIXELS = 0.5
 FACTORS = (1 / 16, 1 / 4, 1, 4, 16, 64)  # times edgegrad's default samples
 SPP = (1, 4, 16, 64, 256)
+METRICS = ("vertex", "translation", "rotation")
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ class FiniteDifferences:
             scene = self._scene.moved(verts)
             times = round(spp**0.5) if scene.is_lit else 1
             options = {"spp": round(spp / times**2), "seed": seed, "bounces": self._scene.bounces}
-            image = finer_image(scene, self._scene.camera, times, **options)
+            image = supersampled(scene, self._scene.camera, times, **options)
         return float((image * self._scene.adjoint.double()).sum())
 
     def _turned(self, vector: Tensor) -> Tensor:

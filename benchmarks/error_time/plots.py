@@ -12,9 +12,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from edgegrad.files.paths import replacing
 
-from ..document import FAINT, GRID, INK, METRICS, Document, duration, percent
+from ..document import FAINT, INK, Document, duration, machine_in_words, percent, style
 from ..scenes import SCENES
-from .methods import FORWARD_SPP
+from .methods import FORWARD_SPP, METRICS
 from .references import disagrees
 
 # Colours of Okabe and Ito, which the colour-blind tell apart. (label, colour, width of the line, marker)
@@ -84,12 +84,8 @@ def _scenes(document: Document) -> list[str]:
 def _panel(axes: Axes, document: Document, scene: str, metric: str) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.grid(True, which="major", color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.tick_params(which="both", labelsize=8, color=FAINT, labelcolor=INK, labelleft=True)
-    axes.tick_params(which="minor", length=0)
+    style(axes)
+    axes.tick_params(labelleft=True)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda seconds, _: duration(seconds)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda error, _: percent(error)))
     for axis in (axes.xaxis, axes.yaxis):
@@ -177,8 +173,7 @@ Mitsuba of a whole step (update after the vertices moved, image at {FORWARD_SPP}
 compilation, which is given apart; for interior and boundary of the backward pass alone, and their errors are relative to
 the whole gradient; for finite differences of 12 images (6 a vertex).
 
-{now["threads"]} threads of {now["processor"]}, {now["cores"]} cores; edgegrad {now["edgegrad"]} (kernel {now["kernel"]}), \
-torch {now["torch"]}, embreex {now["embreex"]}, Python {now["python"]}, {now["system"]}.
+{machine_in_words(now)}.
 """
     for name in _scenes(document):
         text += _section(document, name)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from oracles.exact import exact_image
+from oracles.exact import exact_image, one_thread
 from torch import Tensor
 
 from edgegrad.files.paths import replacing
@@ -120,13 +120,8 @@ def exact(scene: ReportScene) -> Reference:
             return torch.zeros_like(verts)
         return torch.autograd.grad((image * scene.adjoint.double()).sum(), verts, materialize_grads=True)[0]
 
-    # Many small operations: waiting for other threads gains nothing.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         whole, interior = gradient(True), gradient(False)
-    finally:
-        torch.set_num_threads(threads)
     return Reference("exact pixel integrals", interior, whole - interior)
 
 

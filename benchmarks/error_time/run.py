@@ -22,9 +22,9 @@ from edgegrad.check import check_positive, check_positive_int
 from edgegrad.files.paths import replacing
 from edgegrad.profile import profile
 
-from ..document import METRICS, Document, duration, percent, settings
+from ..document import Document, duration, machine, percent
 from ..scenes import SCENES, ReportScene, build
-from .methods import METHODS, Method, missing
+from .methods import METHODS, METRICS, Method, missing
 from .references import BOUNCED, LIT, QUICK, Effort, Reference, disagrees, reference
 
 NAME = "error-time"
@@ -98,7 +98,7 @@ class _Run:
         self.out, self.size, self.seeds, self.limit, self.quick = out, size, seeds, limit, quick
         self.bar: tqdm | None = None
         self.file = out / f"{NAME}.json"
-        self.document = self._resume(settings(size, seeds, quick))
+        self.document = self._resume({"size": size, "seeds": list(range(seeds)), "quick": quick, **machine()})
 
     def say(self, text: str) -> None:
         tqdm.write(text)

@@ -15,7 +15,7 @@ from edgegrad.render import render
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ..scenes import background, front_camera, smooth_colors, sphere
+from ..scenes import background, front_camera, icosphere, smooth_colors
 
 F64 = torch.float64
 STEPS = 500
@@ -42,7 +42,7 @@ def summary(name: str, losses: list[float], error: tuple[str, float, float]) -> 
 
 def camera_fit(steps: int = STEPS, say: Say = lambda text: None) -> dict[str, Any]:
     """The distance is off by half and the focal length too, so that the size in the image is right: Adam on both logarithms."""
-    camera, scene = front_camera(48), Scene([sphere(3)], background())
+    camera, scene = front_camera(48), Scene([icosphere(3)], background())
 
     def view(distance: Tensor, focal: Tensor) -> Camera:
         M, K = camera.world_to_camera, camera.K
@@ -73,7 +73,7 @@ def vertex_fit(steps: int = STEPS, preconditioned: bool = False, say: Say = lamb
     Preconditioned: Adam, with one scale for all, on u = (I + λ L) v (Nicolet, Jacobson and Jakob, Large Steps in Inverse
     Rendering of Geometry, 2021), solved by cholespy.
     """
-    ball = sphere(5)
+    ball = icosphere(5)
     bumps = 1.0 + 0.12 * torch.sin(
         4.0 * ball.verts @ torch.tensor([[1.0, 0.3], [0.2, -1.1], [0.7, 0.9]], dtype=F64)
     ).sum(1)

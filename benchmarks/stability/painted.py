@@ -14,7 +14,7 @@ from edgegrad.points.hits import Hits
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ..scenes import background, sphere
+from ..scenes import background, icosphere
 from .cases.case import Problem, everything
 
 F64 = torch.float64
@@ -22,7 +22,7 @@ F64 = torch.float64
 
 def shaded_sphere(camera: Camera) -> Problem:
     """Colours of vertices by a shader."""
-    mesh = sphere(2)
+    mesh = icosphere(2)
     colors = mesh.colors
     assert colors is not None
     problem = everything(Scene([mesh], background()), camera, colors=False)

@@ -12,9 +12,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from edgegrad.files.paths import replacing
 
-from ..document import FAINT, GRID, INK, Document, percent
-from .cases.measure import LIMIT, NOISE, NOISY, RAISED, RIGHT, TOLERANCE, WRONG
-from .rows import NAME, gradient
+from ..document import FAINT, INK, Document, machine_in_words, percent, style
+from . import NAME
+from .cases.measure import LIMIT, NOISE, NOISY, RAISED, RIGHT, TOLERANCE, WRONG, worst_part
 
 COLORS = {RIGHT: "#0072B2", LIMIT: "#E69F00", WRONG: "#D55E00", NOISY: "#CC79A7", RAISED: "#6e6e6e"}
 FLOOR = 1e-5  # smaller errors are drawn there
@@ -77,15 +77,14 @@ def _column(axes: Axes, groups: dict[str, list[dict[str, Any]]], length: int) ->
     axes.set_xscale("log")
     axes.set_xlim(0.7 * FLOOR, 10.0)
     axes.set_ylim(length - 0.5, -0.8)
-    axes.grid(True, axis="x", which="major", color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right", "left"]].set_visible(False)
-    axes.spines["bottom"].set_color(FAINT)
+    style(axes)
+    axes.grid(False, axis="y")
+    axes.spines["left"].set_visible(False)
     axes.axvline(TOLERANCE, color=FAINT, linewidth=1.0)
     axes.xaxis.set_major_locator(LogLocator(10.0, numticks=9))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda error, _: percent(error)))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.tick_params(which="both", labelsize=8, color=FAINT, labelcolor=INK, length=0)
+    axes.tick_params(length=0)
     axes.set_xlabel("relative error of the gradient", color=INK, fontsize=8.5)
     ticks, labels, y = [], [], 0
     for group, rows in groups.items():
@@ -97,7 +96,7 @@ def _column(axes: Axes, groups: dict[str, list[dict[str, Any]]], length: int) ->
             y += 1
             ticks.append(y)
             labels.append(row["name"])
-            _, part = gradient(row)
+            _, part = worst_part(row)
             error, noise, color = part["error"], part["noise"], COLORS[row["verdict"]]
             low, high = (min(max(x, FLOOR), 9.0) for x in (error - noise, error + noise))
             axes.plot([low, high], [y, y], color=color, linewidth=1.4, solid_capstyle="butt")
@@ -119,11 +118,7 @@ def spacings(found: dict[str, Any]) -> Figure:
         axes.plot(x, y, line, color=STEPS[painted], linewidth=1.4, marker="o", markersize=3.5, label=name)
     axes.set_xscale("log", base=2)
     axes.set_yscale("log")
-    axes.grid(True, which="major", color=GRID, linewidth=0.8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.tick_params(which="both", labelsize=8, color=FAINT, labelcolor=INK)
-    axes.tick_params(which="minor", length=0)
+    style(axes)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda spacing, _: f"{spacing:g}"))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda error, _: percent(error)))
     axes.set_xlabel("spacing of lines, px (1 is the default)", color=INK, fontsize=8.5)
@@ -149,11 +144,7 @@ def losses(fits: list[dict[str, Any]]) -> Figure:
             fontsize=8, va="center", annotation_clip=False,
         )  # fmt: skip
     axes.set_yscale("log")
-    axes.grid(True, which="major", color=GRID, linewidth=0.8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.tick_params(which="both", labelsize=8, color=FAINT, labelcolor=INK)
-    axes.tick_params(which="minor", length=0)
+    style(axes)
     axes.set_xlabel("step", color=INK, fontsize=8.5)
     axes.set_ylabel("mean squared difference", color=INK, fontsize=8.5)
     figure.text(0.012, 0.94, "Ill-conditioned fits", fontsize=13, color=INK)
@@ -181,8 +172,7 @@ background. Where a reference is zero, errors are relative to the norm of the ad
 *right*: within four standard errors and {percent(TOLERANCE)}, with a standard error below {percent(NOISE)}.
 *limit*: not right, of known cause and size; see below. *too noisy to tell* and *wrong* do not pass.
 
-{now["threads"]} threads of {now["processor"]}, {now["cores"]} cores; edgegrad {now["edgegrad"]} (kernel {now["kernel"]}), \
-torch {now["torch"]}, embreex {now["embreex"]}, Python {now["python"]}, {now["system"]}; {document.get("seconds", 0.0):.0f} s.
+{machine_in_words(now)}; {document.get("seconds", 0.0):.0f} s.
 """]  # fmt: skip
     for group in dict.fromkeys(row["group"] for row in rows):
         lines += [
@@ -207,7 +197,7 @@ def _entry(entry: dict[str, float]) -> str:
 def _row(row: dict[str, Any]) -> str:
     if "raised" in row:
         return f"| {row['name']} | {row['extreme']} | | | | | error raised: {row['raised']} |"
-    name, part = gradient(row)
+    name, part = worst_part(row)
     reference = row["reference"]
     if row["steps"]:
         reference += ", steps " + ", ".join(f"{step:g}" for step in dict.fromkeys(row["steps"].values()))
@@ -219,7 +209,7 @@ def _row(row: dict[str, Any]) -> str:
 def _limit(row: dict[str, Any]) -> str:
     if row["verdict"] == RIGHT:
         return f"- {row['name']}: {row['limit']}. Not seen in this run."
-    name, part = gradient(row)
+    name, part = worst_part(row)
     return (
         f"- {row['name']}: {row['limit']}. {percent(part['error'])} of {name}, image {percent(row['image']['error'])}."
     )

@@ -17,11 +17,10 @@ from tqdm import tqdm
 
 from edgegrad.files.paths import replacing
 
-from ..document import Document, percent, settings
-from . import fits, statistics, steps
+from ..document import Document, machine, percent
+from . import NAME, fits, statistics, steps
 from .cases import CASES
-from .cases.measure import NOISY, QUICK, WRONG, Effort, measure
-from .rows import NAME, gradient
+from .cases.measure import NOISY, QUICK, WRONG, Effort, measure, worst_part
 
 SECTIONS = {"statistics": statistics.measure, "steps": steps.measure, "fits": fits.measure}
 NEEDS = {"statistics": ["scipy"], "fits": ["cholespy"]}
@@ -37,9 +36,7 @@ def stability(out: Path, cases: Sequence[str] | None = None, *, quick: bool = Fa
     """
     chosen, sections = _chosen(cases)
     begin = time.perf_counter()
-    document: Document = {"settings": settings(0, 0, quick), "cases": [], "sections": {}}
-    for key in ("size", "seeds"):
-        del document["settings"][key]
+    document: Document = {"settings": {"quick": quick, **machine()}, "cases": [], "sections": {}}
     for name, packages in NEEDS.items():
         if name in sections and (lack := [p for p in packages if importlib.util.find_spec(p) is None]):
             text = f"{name} needs {' and '.join(lack)}; install with: pip install 'edgegrad[fit]'"
@@ -114,7 +111,7 @@ def _plain(value: Any) -> Any:
 def in_a_line(row: dict[str, Any]) -> str:
     if "raised" in row:
         return f"{row['name']:26s} {row['verdict']}: {row['raised']}"
-    image, (name, part) = row["image"], gradient(row)
+    image, (name, part) = row["image"], worst_part(row)
     return (
         f"{row['name']:26s} image {percent(image['error']):>9s} ± {percent(image['noise']):9s} "
         f"gradient {percent(part['error']):>9s} ± {percent(part['noise']):9s} ({name})  {row['verdict']}"

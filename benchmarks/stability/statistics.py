@@ -12,6 +12,7 @@ from oracles.exact import exact_image
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
+from edgegrad.camera.poses import rotation
 from edgegrad.optional import require
 from edgegrad.render import render
 from edgegrad.scene.mesh import Mesh
@@ -21,14 +22,14 @@ from ..scenes import (
     background,
     cube,
     front_camera,
+    icosphere,
     occluded_triangle,
     one_triangle,
     random_slivers,
     smooth_colors,
-    sphere,
 )
 from .cases import CASES
-from .cases.case import Problem, everything, rotation
+from .cases.case import Problem, everything
 from .cases.glossy import GLOSSY
 from .cases.light import LIT
 from .cases.measure import Effort, Running, differences, exact, sample
@@ -60,7 +61,7 @@ def scenes() -> dict[str, Callable[[], Problem]]:
         "one triangle": lambda: everything(one_triangle(), camera),
         "occluded triangle": lambda: everything(occluded_triangle(), camera),
         "40 slivers": lambda: everything(Scene([random_slivers(40, 1, camera)], background()), camera),
-        "sphere": lambda: everything(Scene([sphere(2)], background()), camera),
+        "sphere": lambda: everything(Scene([icosphere(2)], background()), camera),
         **{name: CASES[name].build for name in chosen},
         **{name: partial(build, camera) for name, build in PAINTED.items()},
     }
@@ -181,7 +182,7 @@ def _grid(n: int, size: float) -> Mesh:
 def tail_scenes() -> dict[str, tuple[Scene, Camera]]:
     front = front_camera(48)
     plane = CASES["camera-plane"].build()
-    speck = sphere(5).transformed(scale=0.25)
+    speck = icosphere(5).transformed(scale=0.25)
     box = cube(0.6).transformed(rotation(torch.tensor([0.3, 0.4, 0.1], dtype=F64)))
     return {
         "one large triangle": (one_triangle(), front),

@@ -10,7 +10,7 @@ Which polygons there are is combinatorics, decided here without derivatives; eac
 two lines (edges of faces, borders of cells), so its position is computed once more from the scene, with derivatives. That
 one expression holds both terms of the gradient: radiance that changes at a point, and polygons whose sides move.
 
-It is right for faces that do not pass through each other (crossing.py cuts others apart), in front of a perspective camera,
+It is right for faces that do not pass through each other (cut_apart.py cuts others apart), in front of a perspective camera,
 in general position. Edges and vertices that faces share are recognised, also when each face has its own copies. But where an
 edge lies on a cell's border the image is right and has no two-sided derivative, and where edges of two occluders that share no
 vertex lie on one line before a third face, the derivative may be that of the wrong edge.
@@ -20,6 +20,8 @@ Textures are cut into the cells in which they are bilinear, whose lines are stra
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +35,17 @@ from edgegrad.scene.scene import Scene
 # Pixels. A point this close to a line counts as on it: above the rounding of coordinates (1e-14), far below anything
 # that matters to an area.
 ON_LINE = 1e-12
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread: exact integrals are many small operations, where waiting for others gains nothing."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def exact_image(scene: Scene, camera: Camera, order: int = 5, visibility: bool = True, filter: str = "box") -> Tensor:
@@ -194,7 +207,7 @@ def _texel_lines(scene: Scene, view: View) -> tuple[Tensor, Tensor]:
 def _radiance(scene: Scene, face: Tensor, b: Tensor) -> Tensor:
     """Radiance (T, G, C) at the barycentrics b (T, G, 3) in the faces (T,); the points of one row lie between the same texels."""
     C = scene.channels
-    corners = torch.cat([_corner_colors(mesh, C) for mesh in scene.meshes])
+    corners = torch.cat([corner_colors(mesh, C) for mesh in scene.meshes])
     radiance = torch.einsum("tgi,tic->tgc", b, corners[face])
     first = 0
     for mesh in scene.meshes:
@@ -214,8 +227,8 @@ def _radiance(scene: Scene, face: Tensor, b: Tensor) -> Tensor:
     return radiance
 
 
-def _corner_colors(mesh: Mesh, channels: int) -> Tensor:
-    """(F, 3, C), whatever kind of colours the mesh has; zero for a texture."""
+def corner_colors(mesh: Mesh, channels: int) -> Tensor:
+    """Return colours (F, 3, C) at the corners of faces, whatever kind the mesh has; zero for a texture."""
     if mesh.texture is not None:
         return torch.zeros((len(mesh.faces), 3, channels), dtype=torch.float64)
     if mesh.colors is not None:

@@ -20,14 +20,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from edgegrad.camera.camera import Camera
+from edgegrad.camera.poses import rotation
 from edgegrad.scene.lights import DirectionalLight, PointLight
 from edgegrad.scene.material import Material
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ...scenes import cube, sphere
+from ...scenes import cube, icosphere
 from .camera import vector
-from .case import F64, Group, Parts, Problem, View, rotation
+from .case import F64, Group, Parts, Problem, View
 
 group = Group("bounces")
 
@@ -204,7 +205,7 @@ def mirror(roughness: float) -> Problem:
 @group.add("integrating-sphere", "a lamp inside of a closed ball of albedo 0.9, 8 bounces", seeds=32)
 def inside() -> Problem:
     """What a ball scatters once comes back evenly: after k bounces the irradiance is ρᵏ times the mean of the first."""
-    bounces, ball, camera = 8, sphere(4), view(vector(0.2, -0.1, 0.0), vector(-1.0, 0.3, 0.2), 60.0, 8)
+    bounces, ball, camera = 8, icosphere(4), view(vector(0.2, -0.1, 0.0), vector(-1.0, 0.3, 0.2), 60.0, 8)
     parts = {
         "lamp": vector(0.3, 0.1, 0.2), "brightness": vector(3.0), "albedo": vector(0.9, 0.8, 0.5),
         "radius": torch.ones(1, dtype=F64),
@@ -253,7 +254,7 @@ def cancelling(bounces: int) -> Problem:
 
 def _furnace(parts: Parts, bounces: int, **fields: Any) -> Problem:
     """Seen as one pixel."""
-    room, block = sphere(1).transformed(scale=1.5), cube(0.3)
+    room, block = icosphere(1).transformed(scale=1.5), cube(0.3)
     camera = view(vector(0.6, -0.3, 0.5), vector(1.4, 0.0, 0.4), 60.0, 1)
 
     def make(parts: Parts) -> View:
@@ -330,7 +331,7 @@ def standing() -> Problem:
     seeds=8,
 )
 def million(subdivisions: int) -> Problem:
-    ball = sphere(subdivisions)
+    ball = icosphere(subdivisions)
     sends = [[2.0, -2.3, -3.3], [2.0, 2.3, -3.3], [2.0, 2.3, 2.3], [2.0, -2.3, 2.3]]
     gets = [[-2.0, -0.6, -0.6], [-2.0, -0.6, 0.6], [-2.0, 0.6, 0.6], [-2.0, 0.6, -0.6]]
     camera = view(vector(-1.2, 0.0, 0.05), vector(-2.0, 0.0, 0.0), 60.0, 8)

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
+from edgegrad.camera.poses import rotation
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ...scenes import background, cube, front_camera, smooth_colors, sphere
-from .case import F64, Group, Problem, everything, rigid, rotation
+from ...scenes import background, cube, front_camera, icosphere, smooth_colors
+from .case import F64, Group, Problem, everything, rigid
 from .scale import tilted_cube
 
 group = Group("camera")
@@ -75,7 +76,7 @@ def _principal(K: Tensor, point: Tensor) -> Tensor:
 @group.add("inside", "inside a mesh with a colour for each face", True)
 @group.add("inside-smooth", "inside a mesh with smooth colours: no curve at all", False)
 def inside(creases: bool) -> Problem:
-    mesh = sphere(1)
+    mesh = icosphere(1)
     camera = Camera.look_at(vector(0.3, -0.2, 0.1), vector(-0.5, 0.4, -1.0), vector(0.1, 1.0, 0.0), 70.0, (48, 48))
     return everything(Scene([flat(mesh) if creases else mesh], background()), camera)
 

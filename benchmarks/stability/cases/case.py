@@ -8,12 +8,13 @@ from itertools import pairwise
 from typing import Any
 
 import torch
-from oracles.exact import exact_image
+from oracles.exact import corner_colors, exact_image
 from oracles.reference import render as twin
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
-from edgegrad.scene.mesh import PLAIN, Mesh
+from edgegrad.camera.poses import rotation
+from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
 from ...scenes import smooth_adjoint
@@ -34,7 +35,7 @@ class Problem:
     image      (scene, camera) ↦ the image without sampling, where there are finite differences
     equal      parts ↦ (scene, camera) with the same image, of which they are taken; `make` when None
     steps      of those, one for each part
-    finer      so many times as many pixels each way, of which they take the mean (report/finer.py)
+    finer      so many times as many pixels each way, of which they take the mean (supersampling.py)
     zero       of the adjoint's norm: what a reference may be by rounding that is zero
     reference  in words
     """
@@ -218,14 +219,6 @@ def _problem(
     return Problem(parts, make, exact, **fields)
 
 
-def rotation(vector: Tensor) -> Tensor:
-    """Rotation matrix (3, 3) of a rotation vector (3,), in radians."""
-    x, y, z = vector
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return torch.linalg.matrix_exp(cross)
-
-
 # -- for the exact integrals ------------------------------------------------------------------------------------------
 
 
@@ -251,16 +244,8 @@ def in_view(scene: Scene, camera: Camera) -> Scene:
 
 def _clip(mesh: Mesh, planes: Tensor, channels: int) -> Mesh | None:
     faces = mesh.faces.long()
-    if mesh.face_colors is not None:
-        colors = mesh.face_colors.double()[:, None].expand(-1, 3, -1)
-    elif mesh.colors is not None:
-        colors = mesh.colors.double()[faces]
-    elif mesh.corner_colors is not None:
-        colors = mesh.corner_colors.double()
-    else:
-        colors = torch.full((len(faces), 3, channels), PLAIN, dtype=F64)
     triangles = []
-    for corners, values in zip(mesh.verts.double()[faces], colors, strict=True):
+    for corners, values in zip(mesh.verts.double()[faces], corner_colors(mesh, channels), strict=True):
         polygon = list(torch.cat([corners, values], 1))
         for plane in planes:
             polygon = _halve(polygon, plane)

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
+from edgegrad.camera.poses import rotation
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ...scenes import background, cube, front_camera, smooth_colors, sphere
+from ...scenes import background, cube, front_camera, icosphere, smooth_colors
 from .camera import flat, upright, vector
-from .case import F64, Group, Problem, everything, rigid, rotation
+from .case import F64, Group, Problem, everything, rigid
 from .scale import tilted_cube
 
 group = Group("coincident")
@@ -82,7 +83,7 @@ def copies(count: int = 2, dtype: torch.dtype = F64) -> Problem:
 
 @group.add("copies-sphere", "two spheres of 1,280 faces in the same place")
 def copies_sphere() -> Problem:
-    scene = Scene([sphere(3).transformed(scale=0.9)], background())
+    scene = Scene([icosphere(3).transformed(scale=0.9)], background())
     return everything(scene, CAMERA, shown=lambda scene: scene.replace(meshes=[*scene.meshes] * 2))
 
 

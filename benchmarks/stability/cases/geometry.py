@@ -6,16 +6,17 @@ import math
 from typing import Any, Literal
 
 import torch
+from oracles.cut_apart import cut_apart
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
+from edgegrad.camera.poses import rotation
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ...scenes import background, cube, front_camera, smooth_colors, soup, sphere, unproject
-from ..crossing import cut_apart
+from ...scenes import background, cube, front_camera, icosphere, smooth_colors, soup, unproject
 from .camera import flat, vector
-from .case import F64, Group, Parts, Problem, everything, rotation
+from .case import F64, Group, Parts, Problem, everything
 from .scale import tilted_cube
 
 group = Group("geometry")
@@ -113,12 +114,12 @@ def triangle_soup(dtype: torch.dtype) -> Problem:
     def shown(scene: Scene) -> Scene:
         return scene.replace(meshes=[soup(scene.meshes[0])])
 
-    return everything(Scene([sphere(2).transformed(scale=0.9)], background()).to(dtype), CAMERA, shown=shown)
+    return everything(Scene([icosphere(2).transformed(scale=0.9)], background()).to(dtype), CAMERA, shown=shown)
 
 
 @group.add("open-border", "open borders: half a sphere and single triangles cut out of it")
 def open_border() -> Problem:
-    ball = sphere(2).transformed(scale=0.9)
+    ball = icosphere(2).transformed(scale=0.9)
     middles = ball.verts[ball.faces.long()].mean(1)
     kept = (middles @ vector(0.5, 0.6, -0.4) < 0.1) & (torch.arange(len(middles)) % 9 != 0)
     return everything(Scene([ball.replace(faces=ball.faces[kept])], background()), CAMERA)
@@ -136,7 +137,7 @@ def huge_triangle() -> Problem:
 @group.add("million-in-a-pixel", "a sphere of 1.3 M faces inside one pixel", slow=True)
 def million_in_a_pixel() -> Problem:
     """Of one colour; a sphere is seen as an ellipse, whose area is known."""
-    ball = sphere(8)
+    ball = icosphere(8)
     size, focal = (5, 5), 40.0
     camera = front_camera(48).replace(
         K=torch.tensor([[focal, 0.0, 2.5], [0.0, focal, 2.5], [0.0, 0.0, 1.0]], dtype=F64), size=size
@@ -223,7 +224,7 @@ def through_each_other(projection: Literal["perspective", "orthographic"] = "per
 
 @group.add("spikes", "a sphere of 1,280 faces whose vertices are moved in and out by normal noise of 10 %")
 def spikes() -> Problem:
-    ball = sphere(3).transformed(scale=0.9)
+    ball = icosphere(3).transformed(scale=0.9)
     verts = ball.verts * (1.0 + 0.1 * _noise(len(ball.verts))[:, :1])
     return everything(Scene([ball.replace(verts=verts)], background()), CAMERA)
 
@@ -235,7 +236,7 @@ def spikes() -> Problem:
 )
 def tangled() -> Problem:
     """As the first steps of a plain shape fit leave it. Moved as a whole; against finite differences."""
-    ball = sphere(3).transformed(scale=0.9)
+    ball = icosphere(3).transformed(scale=0.9)
     verts = ball.verts + 0.09 * _noise(len(ball.verts))
     ball = ball.replace(colors=torch.rand(len(verts), 3, generator=torch.Generator().manual_seed(0), dtype=F64))
     parts = {"shift": torch.zeros(3, dtype=F64), "growth": torch.zeros(1, dtype=F64)}

@@ -17,7 +17,7 @@ from edgegrad.scene.material import Material, Texture, vertex_normals
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ...scenes import sphere
+from ...scenes import icosphere
 from .camera import ORIGIN, vector
 from .case import F64, Parts, Problem, View
 from .light import LAMP, Lamp, adjoint, panel, stage, torus, view
@@ -49,7 +49,7 @@ def sky(lamps: bool) -> Lamp:
 
 def bulb(at: Tensor, level: Tensor) -> Mesh:
     """A sphere that emits."""
-    shape = sphere(1)
+    shape = icosphere(1)
     return Mesh(shape.verts, shape.faces, material=Material(base_color=0.0, emission=12.0 * level)).transformed(
         scale=0.3, t=at
     )
@@ -81,7 +81,7 @@ def staged(lamp: Lamp, roughness: float, metallic: float, **fields: Any) -> Prob
 
 def ball(lamp: Lamp, roughness: float, metallic: float) -> Problem:
     """A ball over a plane, whose normals move too."""
-    shape = sphere(2).transformed(scale=0.5).transformed(t=vector(0.0, 0.0, 0.8))
+    shape = icosphere(2).transformed(scale=0.5).transformed(t=vector(0.0, 0.0, 0.8))
     shape = Mesh(shape.verts, shape.faces, normals=vertex_normals(shape.verts, shape.faces))
     problem = staged(lamp, roughness, metallic, caster=shape)
     made = problem.make

@@ -7,19 +7,20 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from oracles.lit_image import lit_image
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
+from edgegrad.camera.poses import rotation
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import AreaLight, DirectionalLight, Light, PointLight, SpotLight
 from edgegrad.scene.material import Material, vertex_normals
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ...scenes import cube, sphere
-from ..lit_twin import lit_image
+from ...scenes import cube, icosphere
 from .camera import ORIGIN, vector
-from .case import F64, Group, Parts, Problem, View, rotation
+from .case import F64, Group, Parts, Problem, View
 
 group = Group("light")
 
@@ -247,7 +248,7 @@ def rough(roughness: float, metallic: float) -> Problem:
 
 @group.add("opposed", "interpolated normals that oppose the faces of a sphere", more=4)
 def opposed() -> Problem:
-    ball = sphere(2).transformed(scale=0.4).transformed(t=vector(0.0, 0.0, 0.8))
+    ball = icosphere(2).transformed(scale=0.4).transformed(t=vector(0.0, 0.0, 0.8))
     ball = Mesh(ball.verts, ball.faces)
     return stage(point(), caster=ball.replace(normals=-vertex_normals(ball.verts, ball.faces)))
 
@@ -279,7 +280,7 @@ def standing(lamp: Lamp) -> Problem:
 
 @group.add("lit-touching", "a sphere that touches the plane in a vertex", more=4)
 def touching() -> Problem:
-    ball = sphere(2)
+    ball = icosphere(2)
     ball = Mesh(ball.verts, ball.faces).transformed(scale=0.45)
     ball = ball.transformed(t=vector(0.0, 0.0, -float(ball.verts[:, 2].min())))
     return stage(point(), caster=ball, moves=STANDING, options=MANY_EDGES)

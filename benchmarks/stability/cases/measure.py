@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
+from oracles.exact import one_thread
 from torch import Tensor
 
 from edgegrad.render import render
 
-from ...finer import finer_image
+from ...supersampling import supersampled
 from .case import Case, Parts, Problem
 
 TOLERANCE = 0.02  # what may be missing, beyond four standard errors
@@ -136,6 +137,11 @@ def verdict(row: dict[str, Any], case: Case) -> tuple[str, str]:
     return RIGHT, worst
 
 
+def worst_part(row: dict[str, Any]) -> tuple[str, dict[str, float]]:
+    """Return the part of the gradient with the largest error, and its errors."""
+    return max(row["parts"].items(), key=lambda item: item[1]["error"])
+
+
 def sample(problem: Problem, seed: int, **options: Any) -> tuple[Tensor, Parts]:
     """Image and gradient from one seed."""
     leaves = {name: value.detach().clone().requires_grad_() for name, value in problem.parts.items()}
@@ -155,14 +161,10 @@ def reference(problem: Problem, effort: Effort) -> tuple[Tensor, dict[str, Estim
 
 def exact(problem: Problem, integrals: Callable[[Parts], Tensor]) -> tuple[Tensor, Parts]:
     leaves = {name: value.detach().double().requires_grad_() for name, value in problem.parts.items()}
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # many small operations: waiting for other threads gains nothing
-    try:
+    with one_thread():
         image = integrals(leaves)
         loss = (image * problem.cotangent(image)).sum()
         grads = torch.autograd.grad(loss, list(leaves.values()), materialize_grads=True)
-    finally:
-        torch.set_num_threads(threads)
     return image.detach(), dict(zip(leaves, grads, strict=True))
 
 
@@ -193,7 +195,7 @@ def differences(problem: Problem, adjoint: Tensor, name: str, scale: float, effo
 
     def loss(value: Tensor, seed: int) -> float:
         scene, camera = make({**problem.parts, name: value})
-        return float((finer_image(scene, camera, finer, spp=spp, seed=seed, bounces=bounces) * adjoint).sum())
+        return float((supersampled(scene, camera, finer, spp=spp, seed=seed, bounces=bounces) * adjoint).sum())
 
     run = Running()
     with torch.no_grad():

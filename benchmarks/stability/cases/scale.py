@@ -9,11 +9,12 @@ from oracles.exact import exact_image
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
+from edgegrad.camera.poses import rotation
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
-from ...scenes import background, cube, front_camera, smooth_colors, sphere
-from .case import F64, Group, Parts, Problem, View, camera_parts, everything, in_view, rotation
+from ...scenes import background, cube, front_camera, icosphere, smooth_colors
+from .case import F64, Group, Parts, Problem, View, camera_parts, everything, in_view
 
 group = Group("scale and place")
 
@@ -122,8 +123,8 @@ FLOAT_FRAME = "both share one frame of floats, which are too coarse for either"
     slow=True,
 )
 def two_details(distance: float) -> Problem:
-    near = sphere(4).transformed(scale=0.7)
-    other = sphere(4).transformed(t=distance * torch.tensor([0.94, 0.19, -0.28], dtype=F64))  # out of view
+    near = icosphere(4).transformed(scale=0.7)
+    other = icosphere(4).transformed(t=distance * torch.tensor([0.94, 0.19, -0.28], dtype=F64))  # out of view
     return everything(
         Scene([near, other], background()), front_camera(48), camera_too=False,
         equal=lambda scene: scene.replace(meshes=scene.meshes[:1]),

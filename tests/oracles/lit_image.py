@@ -12,7 +12,6 @@ import math
 from typing import NamedTuple
 
 import torch
-from oracles.reference import closest_faces
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -21,6 +20,8 @@ from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
+
+from .reference import closest_faces
 
 F64 = torch.float64
 BLOCK = 1 << 14  # points whose shadow rays are tested against all faces at once

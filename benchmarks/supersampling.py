@@ -1,5 +1,7 @@
-"""Images as means of finer ones: a face in the light is shaded about once for 16 samples of a pixel, of many small pixels each
-in a place of its own."""
+"""Images as means of finer ones.
+
+A lit face is shaded about once for the 16 samples of a pixel. Of many small pixels, each is shaded at a point of its own.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from edgegrad.render import render
 from edgegrad.scene.scene import Scene
 
 
-def finer_image(scene: Scene, camera: Camera, times: int, **options: Any) -> Tensor:
-    """(H, W, C) float64: the mean over times × times pixels for each, of the other arguments of render()."""
+def supersampled(scene: Scene, camera: Camera, times: int, **options: Any) -> Tensor:
+    """Return the image (H, W, C), float64, as means over times × times pixels of a finer one. `options` go to render()."""
     (H, W), scale = camera.size, camera.K.new_tensor([[times], [times], [1.0]])
     fine = camera.replace(K=camera.K * scale, size=(times * H, times * W))
     return render(scene, fine, **options).double().reshape(H, times, W, times, -1).mean((1, 3))

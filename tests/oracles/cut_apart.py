@@ -9,11 +9,12 @@ one pierces the other.
 from __future__ import annotations
 
 import torch
-from oracles.exact import _corner_colors
 from torch import Tensor
 
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
+
+from .exact import corner_colors
 
 Corner = tuple[Tensor, Tensor]  # position and colour
 
@@ -22,7 +23,7 @@ def cut_apart(scene: Scene) -> Scene:
     """The same surfaces as a soup of triangles with colours of corners. Meshes must not have textures."""
     assert all(mesh.texture is None for mesh in scene.meshes), "cut_apart: meshes must not have textures"
     corners = torch.cat([mesh.verts.double()[mesh.faces.long()] for mesh in scene.meshes])
-    colors = torch.cat([_corner_colors(mesh, scene.channels) for mesh in scene.meshes])
+    colors = torch.cat([corner_colors(mesh, scene.channels) for mesh in scene.meshes])
     crossing = faces_that_cross(corners.detach())
     pieces = []
     for f in range(len(corners)):
