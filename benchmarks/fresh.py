@@ -91,6 +91,7 @@ def memory(height: int = 1080, width: int = 1920, spp: int = 64) -> dict[str, fl
     # Code, threads and what torch keeps of a first backward pass are not this image's.
     tiny = single(cube())
     eg.render(tiny.replace(verts=tiny.verts.requires_grad_()), front_camera(16)).sum().backward()
+    assert mesh.colors is not None
     verts, colors = mesh.verts.clone().requires_grad_(), mesh.colors.clone().requires_grad_()
     mesh = mesh.replace(verts=verts, colors=colors)
     if hasattr(libc := ctypes.CDLL(None), "malloc_trim"):

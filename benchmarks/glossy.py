@@ -15,7 +15,7 @@ from torch import Tensor
 
 import edgegrad as eg
 
-from .error_time import mitsuba
+from . import mitsuba
 from .scenes import icosphere
 from .table import Bench, Row, median_time, quartiles, seconds_of
 
@@ -51,17 +51,11 @@ class MitsubaImages:
     """The same by Mitsuba's `direct`: a draw of the light and one of the material for each of 64 samples a pixel."""
 
     def __init__(self, mi: Any, kind: str, roughness: float) -> None:
-        turn = mi.ScalarTransform4f
-        to_world = turn().look_at([0, 0.3, 3.2], [0, 0, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         metal = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
-        image = mi.Bitmap(mitsuba.sky_image(sky(kind)).numpy())
-        sky_ = {"type": "envmap", "bitmap": image, "to_world": turn().rotate([0, 1, 0], 180)}
-        sensor = {"type": "perspective", "fov": 40, "fov_axis": "y", "to_world": to_world, "film": film}
         parts = {
             "integrator": {"type": "direct"},
-            "sensor": sensor,
-            "sky": sky_,
+            "sensor": mitsuba.sensor(mi, (0, 0.3, 3.2), (0, 0, 0), 40, (SIZE, SIZE)),
+            "sky": mitsuba.sky(mi, sky(kind)),
             "ball": {"type": "sphere", "bsdf": metal},
         }
         self.mi, self.scene = mi, mi.load_dict({"type": "scene", **parts})
@@ -108,8 +102,6 @@ class MitsubaLampImages:
 
     def __init__(self, mi: Any, kind: str, roughness: float) -> None:
         turn = mi.ScalarTransform4f
-        to_world = turn().look_at([0, 1.6, 3.6], [0, 0.35, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         metal = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
         if kind in QUADS:
             centre, u, v, radiance = QUADS[kind]
@@ -124,7 +116,7 @@ class MitsubaLampImages:
         lamp["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
         parts = {
             "integrator": {"type": "direct"},
-            "sensor": {"type": "perspective", "fov": 36, "fov_axis": "y", "to_world": to_world, "film": film},
+            "sensor": mitsuba.sensor(mi, (0, 1.6, 3.6), (0, 0.35, 0), 36, (SIZE, SIZE)),
             "ball": {"type": "sphere", "center": list(BALL[0]), "radius": BALL[1], "bsdf": metal},
             "floor": {"type": "rectangle", "to_world": turn().rotate([1, 0, 0], -90).scale(FLOOR), "bsdf": dict(metal)},
             "lamp": lamp,

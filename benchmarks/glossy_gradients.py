@@ -11,7 +11,6 @@ import math
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +19,8 @@ from torch.nn.functional import normalize
 
 import edgegrad as eg
 
+from . import mitsuba
 from .document import duration
-from .error_time import mitsuba
 from .glossy import SIZE, sky
 from .scenes import icosphere
 from .table import Bench, Row
@@ -125,64 +124,6 @@ KEYS = {
 }  # fmt: skip
 
 
-def gltf_material(mi: Any, dr: Any, given: Parameters) -> Any:
-    """edgegrad's Material as a plugin of Mitsuba, whose `principled` mixes a metal and a dielectric, not their reflectances: at
-    metallic 0.8 that is a tenth brighter, and its derivative by metallic near zero. Directions are drawn by visible normals
-    in a share (1 + metallic) / 2 of all, else by the cosine."""
-
-    class Gltf(mi.BSDF):
-        def __init__(self, props: Any) -> None:
-            mi.BSDF.__init__(self, props)
-            self.base_color = mi.Color3f(*given["base color"].tolist())
-            self.metallic, self.roughness = mi.Float(float(given["metallic"])), mi.Float(float(given["roughness"]))
-            self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
-            self.m_flags = self.m_components[0]
-
-        def traverse(self, callback: Any) -> None:
-            for name in ("base_color", "metallic", "roughness"):
-                callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
-
-        def lobe(self) -> tuple[Any, Any]:
-            alpha = dr.detach(dr.square(self.roughness))
-            return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha), dr.detach(0.5 + 0.5 * self.metallic)
-
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
-            lobe, share = self.lobe()
-            half, _ = lobe.sample(si.wi, sample2)
-            out = dr.select(sample1 < share, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
-            found = dr.zeros(mi.BSDFSample3f)
-            found.wo, found.eta, found.pdf = out, 1.0, self.pdf(ctx, si, out, active)
-            found.sampled_type, found.sampled_component = mi.UInt32(+mi.BSDFFlags.GlossyReflection), 0
-            some = active & (found.pdf > 0)
-            return found, dr.select(some, self.eval(ctx, si, out, active) / found.pdf, 0.0)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            nv, nl = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-            half = dr.normalize(si.wi + wo)
-            a2 = dr.square(dr.square(self.roughness))
-            density = a2 / (dr.pi * dr.square(dr.square(half.z) * (a2 - 1.0) + 1.0))
-            masked = nl * dr.sqrt(a2 + (1.0 - a2) * nv * nv) + nv * dr.sqrt(a2 + (1.0 - a2) * nl * nl)
-            f0 = 0.04 + (self.base_color - 0.04) * self.metallic
-            fresnel = f0 + (1.0 - f0) * (1.0 - dr.dot(si.wi, half)) ** 5
-            f = (1.0 - fresnel) * self.base_color * (1.0 - self.metallic) / dr.pi + fresnel * density * 0.5 / masked
-            return dr.select(active & (nv > 0) & (nl > 0), f * nl, 0.0)
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            nv, nl = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-            half = dr.normalize(si.wi + wo)
-            lobe, share = self.lobe()
-            density = share * lobe.pdf(si.wi, half) / (4.0 * dr.dot(wo, half)) + (1.0 - share) * nl / dr.pi
-            return dr.select(active & (nv > 0) & (nl > 0), density, 0.0)
-
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-        def to_string(self) -> str:
-            return "Gltf[]"
-
-    return Gltf(mi.Properties())
-
-
 class MitsubaGradients:
     """The same ball by Mitsuba. Its `prb` differentiates at points that are drawn by the light and by the material, and does not
     differentiate how these are drawn; for what moves silhouettes `prb_projective`. Loss and camera are edgegrad's."""
@@ -194,14 +135,11 @@ class MitsubaGradients:
         dr.set_thread_count(torch.get_num_threads())
         (mesh,), (light,) = scene.meshes, scene.lights
         assert isinstance(light, eg.Environment) and mesh.normals is not None
-        turn = mi.ScalarTransform4f
-        sensor = {
-            "type": "perspective", "fov": 40, "fov_axis": "y",
-            "to_world": turn().look_at([0, 0.3, 3.2], [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
-        }  # fmt: skip
+        mitsuba.register(mi, dr)
         props = mi.Properties()
-        props["bsdf"] = gltf_material(mi, dr, given)
+        props["bsdf"] = mi.load_dict(
+            mitsuba.bsdf(given["base color"].tolist(), float(given["metallic"]), float(given["roughness"]))
+        )
         ball = mi.Mesh("ball", len(mesh.verts), len(mesh.faces), props, has_vertex_normals=True)
         shape = mi.traverse(ball)
         shape["vertex_positions"] = mi.Float(mesh.verts.numpy().ravel())
@@ -209,8 +147,8 @@ class MitsubaGradients:
         shape["faces"] = mi.UInt32(mesh.faces.numpy().astype(np.uint32).ravel())
         shape.update()
         self.radiance = light.radiance
-        bitmap = mi.Bitmap(mitsuba.sky_image(light.radiance).numpy())
-        sky_ = {"type": "envmap", "bitmap": bitmap, "to_world": turn().rotate([0, 1, 0], 180)}
+        sensor = mitsuba.sensor(mi, (0, 0.3, 3.2), (0, 0, 0), 40, (SIZE, SIZE))
+        sky_ = mitsuba.sky(mi, light.radiance)
         self.scene = mi.load_dict({"type": "scene", "sensor": sensor, "sky": sky_, "ball": ball})
         self.integrators = {name: mi.load_dict({"type": name, "max_depth": 2}) for name in ("prb", "prb_projective")}
         self.params = mi.traverse(self.scene)

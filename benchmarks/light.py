@@ -29,12 +29,12 @@ COUNTS = {
 }
 CONVERGED = 1 << 20
 WANTED = {"point": 3.0, "area": 3.0, "sky": 5.0}  # errors, in percent
-OVER_IMAGE: dict[str, dict[str, float]] = {
+OVER_IMAGE: dict[str, dict[str, Any]] = {
     "point": {"must": 0.5, "aim": 0.2},
     "area": {"must": 5, "aim": 2},
     "sky": {"aim": 10},
 }
-SLOPES: dict[str, dict[str, float]] = {"point": {"must": -0.9, "aim": -1}, "area": {"must": -0.6, "aim": -0.75}}
+SLOPES: dict[str, dict[str, Any]] = {"point": {"must": -0.9, "aim": -1}, "area": {"must": -0.6, "aim": -0.75}}
 
 
 def light(bench: Bench) -> list[Row]:
@@ -135,7 +135,8 @@ def borders(bench: Bench, lamp: str) -> list[Row]:
             eg.render(scene.scene, scene.camera)
 
     n = bench.repeats(9)
-    image(), border_gradient(scene, 256, 0)
+    image()
+    border_gradient(scene, 256, 0)
     ahead = statistics.median(seconds_of(image) for _ in range(n))
     errors, seconds = [], []
     counts = COUNTS[lamp][:-1] if bench.quick else COUNTS[lamp]

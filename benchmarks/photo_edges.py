@@ -63,7 +63,7 @@ def across(picture: Tensor, alpha: Tensor, reach: float) -> Profile:
     image = linear_to_srgb(picture.clamp(0.0, 1.0)).double().numpy()
     squares = np.zeros_like(x)
     for channel in np.moveaxis(image, -1, 0):
-        slopes = [ndimage.gaussian_filter(channel, SIGMA, order=order) for order in ((0, 1), (1, 0))]
+        slopes = [ndimage.gaussian_filter(channel, SIGMA, order=order) for order in ((0, 1), (1, 0))]  # type: ignore[arg-type]
         read = [ndimage.map_coordinates(slope, [y, x], order=1, mode="nearest") for slope in slopes]
         squares += (read[0] * normals[:, None, 0] + read[1] * normals[:, None, 1]) ** 2
     return Profile(points, normals, along, np.sqrt(squares))
@@ -126,13 +126,13 @@ def _line(points: np.ndarray) -> np.ndarray:
 def _ransac(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
     """The line that most of the points are on, and how many they are, of `count`."""
     rng = np.random.default_rng(0)
-    best = np.zeros(len(points), bool)
+    line, best = np.full(3, np.nan), np.zeros(len(points), bool)
     for _ in range(LINES if len(points) > 1 else 0):
-        line = _line(points[rng.choice(len(points), 2, replace=False)])
-        on = np.abs(points @ line[:2] + line[2]) < ON_LINE
+        tried = _line(points[rng.choice(len(points), 2, replace=False)])
+        on = np.abs(points @ tried[:2] + tried[2]) < ON_LINE
         best = on if on.sum() > best.sum() else best
     if best.sum() < 5:
-        return np.full(3, np.nan), 0.0
+        return line, 0.0
     for _ in range(5):
         line = _line(points[best])
         best = np.abs(points @ line[:2] + line[2]) < ON_LINE

@@ -113,7 +113,9 @@ def textured(mesh: Path, texture: Path) -> eg.Mesh:
 
 def _integers(path: Path) -> Tensor:
     """(H, W) of 16 bits, as they are in the file."""
-    return torch.from_numpy(oiio.ImageBuf(str(path)).get_pixels(oiio.UINT16)[..., 0].astype(np.float32))
+    pixels = oiio.ImageBuf(str(path)).get_pixels(oiio.UINT16)
+    assert pixels is not None
+    return torch.from_numpy(pixels[..., 0].astype(np.float32))
 
 
 def _placed(R: Any, t: Any) -> Placed:

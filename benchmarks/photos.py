@@ -418,7 +418,7 @@ def main() -> None:
     done: list[Part] = []
     for name in parts:
         print(name, flush=True)
-        found = [MADE[name](run, name)] if name in MADE else REAL[name](run, given.folder)
+        found = [MADE[name](run, name)] if name in MADE else REAL[name](run, given.folder)  # type: ignore[arg-type]
         for part in found:
             done.append(part)
             if given.json is not None:

@@ -44,7 +44,8 @@ class Photo:
     known: Tensor  # (H, W), 0 where the mask may be a shadow's
 
     def resized(self, factor: float) -> Photo:
-        size = tuple(round(n * factor) for n in self.camera.size)
+        H, W = self.camera.size
+        size = round(H * factor), round(W * factor)
 
         def smaller(x: Tensor) -> Tensor:
             x = x.reshape(*x.shape[:2], -1).movedim(-1, 0)[None]
@@ -78,7 +79,7 @@ def _closed(mask: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _largest(mask: np.ndarray) -> np.ndarray:
-    label, count = ndimage.label(mask)
+    label, count = ndimage.label(mask)  # type: ignore[misc]
     return label == 1 + np.argmax(ndimage.sum(mask, label, range(1, count + 1)))
 
 

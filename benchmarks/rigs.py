@@ -70,7 +70,7 @@ def in_light(mesh: eg.Mesh, lights: list[Any]) -> eg.Scene:
     assert mesh.colors is not None
     normals = eg.vertex_normals(mesh.verts, mesh.faces)
     material = eg.Material(base_color=mesh.colors)
-    return eg.Scene(mesh.replace(colors=None, normals=normals, material=material), lights=lights)
+    return eg.Scene([mesh.replace(colors=None, normals=normals, material=material)], lights=lights)
 
 
 def harmonic(posed: eg.Mesh, light: Tensor) -> eg.Scene:
@@ -156,7 +156,7 @@ TURNED = [
 
 def model() -> tuple[eg.Rig, Any]:
     """anny, of which these bones turn."""
-    import anny
+    import anny  # type: ignore[import-not-found]
     import roma
 
     given = anny.Anny(skinning_method="lbs")
@@ -170,7 +170,9 @@ def model() -> tuple[eg.Rig, Any]:
         return given(poses, phenotype)["vertices"]
 
     controls = {"rotations": eg.Control(torch.zeros(len(TURNED), 3), names=tuple(TURNED), rotates=True)}
-    controls |= {name: eg.Control(torch.tensor(0.5), 0.0, 1.0) for name in given.phenotype_labels}
+    controls |= {
+        name: eg.Control(torch.tensor(0.5), torch.tensor(0.0), torch.tensor(1.0)) for name in given.phenotype_labels
+    }
     return eg.Rig.from_function(function, given.get_triangular_faces(), controls, batched=True), given
 
 
@@ -194,12 +196,15 @@ def model_bodies(count: int, first: int, size: int, degrees: float = 20.0) -> No
         )
         truth = {n: 0.2 + 0.6 * torch.rand((), generator=g, dtype=F64) for n in rig.controls if n != "rotations"}
         with torch.no_grad():
-            posed = rig.posed(turns, **truth)
+            posed = rig.posed(turns, **truth)  # type: ignore[arg-type]
+        assert isinstance(posed, eg.Mesh)
         tall = float(posed.verts[:, 2].max() - posed.verts[:, 2].min())
         began = time.process_time()
         fit = fit_rig(rig, cameras, masks=masks_of(posed, cameras), seed=seed, progress=False)
         seconds.append(time.process_time() - began)
-        error = (fit.posed().verts - posed.verts).norm(dim=1)
+        found = fit.posed()
+        assert isinstance(found, eg.Mesh)
+        error = (found.verts - posed.verts).norm(dim=1)
         off.append(float(error.mean()) / tall)
         print(
             f"body {seed}: vertices {off[-1]:.2%} of the height in the mean, {float(error.max()) / tall:.2%} at most; "

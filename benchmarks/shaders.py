@@ -16,6 +16,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -114,9 +116,8 @@ def peak(gradient: bool) -> None:
 def memory() -> None:
     print("| 1920 × 1080, 16 samples a pixel, network 3 × 64 | MB |\n|---|---|")
     for gradient in (False, True):
-        found = subprocess.run(
-            [sys.executable, __file__, "--peak", str(int(gradient))], capture_output=True, check=True
-        )
+        command = [sys.executable, "-m", "benchmarks.shaders", "--peak", str(int(gradient))]
+        found = subprocess.run(command, capture_output=True, check=True, cwd=Path(__file__).parents[1])
         print(f"| {'image and gradient' if gradient else 'image'} | {float(found.stdout):.0f} |")
 
 
@@ -154,7 +155,7 @@ def mipmaps(seeds: int = 16, converged: int = 32) -> None:
     print("| error of the gradient at 24 px of 256² texels | vertices | texels |\n|---|---|---|")
     for filter in ("linear", "mipmap"):
 
-        def gradient(seed: int, filter: str = filter, **samples: int) -> tuple[Tensor, ...]:
+        def gradient(seed: int, filter: str = filter, **samples: Any) -> tuple[Tensor, ...]:
             assert quad.texture is not None
             verts, texture = quad.verts.clone().requires_grad_(), quad.texture.clone().requires_grad_()
             mesh = quad.replace(verts=verts, texture=texture, filter=filter)
@@ -174,7 +175,7 @@ def mipmaps(seeds: int = 16, converged: int = 32) -> None:
 PARTS = {"time": times, "memory": memory, "noise": noise, "mipmaps": mipmaps}
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--peak", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()

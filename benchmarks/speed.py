@@ -21,12 +21,12 @@ from typing import Any
 
 from tqdm import tqdm
 
+from . import mitsuba
 from .bounces import bounced_gradients, bounces
 from .costs import aovs, backward, bits, forward, large, lenses, small, sparse, textures, threads, update
 from .defaults import deep, flat_colors, noise, tangled
 from .document import machine
 from .equal_error import boundary, interior, step
-from .error_time import mitsuba
 from .glossy import glossy
 from .glossy_gradients import glossy_gradients
 from .light import light

@@ -21,9 +21,9 @@ from edgegrad.render import render
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
+from .. import mitsuba
 from ..scenes import ReportScene
 from ..supersampling import supersampled
-from . import mitsuba
 
 VERSION = importlib.metadata.version("edgegrad")
 FORWARD_SPP = 16  # of the image in a whole step; the gradient does not depend on it, as the loss is linear

@@ -1,7 +1,7 @@
-"""Mitsuba 3 as a peer of the report: the gradient of an edgegrad scene by its projective-sampling integrators.
+"""Mitsuba 3 as a peer: its module, lights and materials as edgegrad has them, and gradients by projective sampling.
 
-Unlit radiance becomes an emitter on both sides of a mesh, the background a constant one; both integrators stop at the
-first hit.
+In `Mitsuba`, unlit radiance becomes an emitter on both sides of a mesh, and the background a constant one. Both integrators stop
+at the first hit.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,14 @@ import torch
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
+from edgegrad.light.bsdf import DIELECTRIC, LEAST_ALPHA
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import PointLight
 from edgegrad.scene.material import Material, Texture
 from edgegrad.scene.mesh import PLAIN, Mesh
 from edgegrad.scene.scene import Scene
 
+BSDF = "metallic_roughness"  # the plugin of edgegrad's materials
 INTEGRATORS = ("direct_projective", "prb_projective")
 VARIANT = "llvm_ad_rgb"
 LLVM = 16  # the oldest that is let through: 15 aborts the whole process on prb_projective ("Cannot select: fminimum")
@@ -65,6 +68,120 @@ def sky_image(radiance: Tensor) -> Tensor:
     poles_and_between = torch.cat([radiance[:1], between, radiance[-1:]])
     rows = torch.stack([poles_and_between[:-1], radiance], 1).flatten(0, 1)
     return torch.cat([rows, poles_and_between[-1:]])
+
+
+def sky(mi: Any, radiance: Tensor) -> dict[str, Any]:
+    """Return an `envmap` of the image (h, w, C) of an environment, turned by half a turn to edgegrad's axes."""
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 180)
+    return {"type": "envmap", "bitmap": mi.Bitmap(sky_image(radiance).float().numpy()), "to_world": turned}
+
+
+def sensor(
+    mi: Any, eye: tuple[float, ...], target: tuple[float, ...], fov_y: float, size: tuple[int, int]
+) -> dict[str, Any]:
+    """Return the camera of Camera.look_at with y up; `size` is (height, width), `fov_y` in degrees."""
+    film = {"type": "hdrfilm", "width": size[1], "height": size[0], "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f().look_at(list(eye), list(target), [0, 1, 0])
+    return {"type": "perspective", "fov": fov_y, "fov_axis": "y", "to_world": to_world, "film": film}
+
+
+def bsdf_class(mi: Any, dr: Any) -> type:
+    """Return edgegrad's Material as a plugin, for any variant of Mitsuba.
+
+    It is glTF's model (appendix B) with correlated masking (Heitz 2014, eq. 99), or Lambert's where `roughness` is negative,
+    under an optional normal map with the shadow terminator of Chiang, Li and Burley (2019). Mitsuba's `principled` mixes a
+    metal and a dielectric, not their reflectances: at metallic 0.8 that is a tenth brighter. Directions are drawn by the
+    visible normals in a share (1 + metallic) / 2, else by the cosine; how they are drawn is not differentiated.
+    """
+
+    class MetallicRoughness(mi.BSDF):
+        def __init__(self, props: Any) -> None:
+            mi.BSDF.__init__(self, props)
+            self.base_color = mi.Color3f(*(props[f"base_color{c}"] for c in range(3)))
+            self.metallic, self.roughness = mi.Float(props["metallic"]), mi.Float(props["roughness"])
+            self.glossy, self.two_sided, self.map = props["roughness"] >= 0, props["two_sided"], None
+            if "normal_map" in props:
+                self.map = props["normal_map"]
+            self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
+            self.m_flags = self.m_components[0]
+
+        def traverse(self, callback: Any) -> None:
+            for name in ("base_color", "metallic", "roughness"):
+                callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+
+        def _alpha(self) -> Any:
+            return dr.maximum(dr.square(self.roughness), LEAST_ALPHA)
+
+        def _lobe(self) -> tuple[Any, Any]:
+            """Return the distribution of visible normals and the share of samples drawn by it."""
+            alpha, share = dr.detach(self._alpha()), dr.detach(0.5 + 0.5 * self.metallic)
+            return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha), share
+
+        def _frame(self, si: Any, active: Any) -> tuple[Any, Any]:
+            """Return the sign of the visible side, and the frame of the mapped normal there, on the front."""
+            side = dr.select(si.wi.z > 0, mi.Float(1), mi.Float(-1))
+            if self.map is None:
+                return side, mi.Frame3f(mi.Normal3f(0, 0, 1))
+            return side, mi.Frame3f(dr.normalize(mi.Normal3f(2 * self.map.eval_3(si, active) - 1)))
+
+        def sample(self, ctx: Any, si: Any, one: Any, two: Any, active: Any = True) -> Any:
+            side, frame = self._frame(si, active)
+            l = mi.warp.square_to_cosine_hemisphere(two)
+            if self.glossy:
+                lobe, share = self._lobe()
+                v = frame.to_local(side * si.wi)
+                h, _ = lobe.sample(v, two)
+                l = dr.select(one < share, mi.reflect(v, h), l)
+            sample = dr.zeros(mi.BSDFSample3f)
+            sample.wo, sample.eta = side * frame.to_world(l), 1.0
+            value, sample.pdf = self.eval_pdf(ctx, si, sample.wo, active)
+            sample.sampled_type, sample.sampled_component = mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(0)
+            return sample, dr.select(sample.pdf > 0, value / dr.select(sample.pdf > 0, sample.pdf, 1.0), 0.0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            side, frame = self._frame(si, active)
+            gv, gl = side * si.wi.z, side * wo.z  # by the normal of the face
+            v, l = frame.to_local(side * si.wi), frame.to_local(side * wo)
+            nl = l.z
+            above = active & (gl > 0) & (nl > 0) & (gv > 0)
+            above &= mi.Mask(True) if self.two_sided else si.wi.z > 0
+            f, pdf = self.base_color / math.pi, nl / math.pi
+            if self.glossy:
+                lobe, share = self._lobe()
+                h = dr.normalize(v + l)
+                a2, vh, nv = dr.square(self._alpha()), dr.dot(v, h), dr.maximum(v.z, 0)
+                D = a2 / (math.pi * dr.square(h.x * h.x + h.y * h.y + a2 * h.z * h.z))
+                masking = 0.5 / (nl * dr.sqrt(a2 + (1 - a2) * nv * nv) + nv * dr.sqrt(a2 + (1 - a2) * nl * nl))
+                f0 = DIELECTRIC + (self.base_color - DIELECTRIC) * self.metallic
+                fresnel = f0 + (1 - f0) * (1 - vh) ** 5
+                f = (1 - fresnel) * self.base_color * (1 - self.metallic) / math.pi + fresnel * D * masking
+                pdf = (1 - share) * pdf + share * lobe.pdf(v, h) / (4 * vh)
+            if self.map is not None:
+                G = dr.clip(gl / (dr.maximum(frame.n.z, 1e-6) * dr.maximum(nl, 1e-12)), 0, 1)
+                f = f * (G + G * G - G * G * G)
+            return dr.select(above, f * nl, mi.Color3f(0.0)), dr.select(above, pdf, 0.0)
+
+        def to_string(self) -> str:
+            return "MetallicRoughness[]"
+
+    return MetallicRoughness
+
+
+def bsdf(base_color: Sequence[float], metallic: float, roughness: float, two_sided: bool = False) -> dict[str, Any]:
+    """Return the description of a material by the plugin BSDF, which `register` makes known."""
+    colors = {f"base_color{c}": float(value) for c, value in enumerate(base_color)}
+    return {"type": BSDF, "metallic": metallic, "roughness": roughness, "two_sided": two_sided, **colors}
+
+
+def register(mi: Any, dr: Any) -> None:
+    """Make the plugin BSDF known to the present variant."""
+    mi.register_bsdf(BSDF, bsdf_class(mi, dr))
 
 
 class Mitsuba:
