@@ -65,8 +65,11 @@ def default_step(
     over_image: dict[str, Any] | None = None,
     milliseconds: dict[str, Any] | None = None,
 ) -> list[Row]:
-    """A step at default settings as a user writes it, after the vertices moved: the backward pass beside the image of 16 samples
-    a pixel, and the error of the per-vertex gradient. Each is a row; those that have a target say so."""
+    """Measure a step with default settings, after the vertices moved.
+
+    The rows are the backward pass relative to the image of 16 samples a pixel, its time, and the error of the gradient of
+    vertices. `error`, `over_image` and `milliseconds` are their targets.
+    """
     bench.bar.set_postfix_str("converged gradient")
     correct = Converged(scene, CONVERGED, kernel_hash())
     elsewhere = scene.moved((scene.verts * 1.001).float())

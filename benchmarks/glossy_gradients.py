@@ -1,4 +1,4 @@
-"""How noisy gradients of glossy surfaces are, by default samples.
+"""Noise in gradients of glossy surfaces with default samples.
 
 The loss is the squared difference to the image of a scene that one parameter tells from this one, without its noise: the gradient
 is that of an image times a fixed residual. Printed is the standard deviation of the gradient over its size, as vectors, in
@@ -37,7 +37,7 @@ UVS = 0.01 * torch.tensor([1.0, 0.7])
 
 
 def ball(kind: str, roughness: float) -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
-    """Of a metal that is not quite one. Normals and vertices have a common shift, texels of the sky a factor for 8 × 8."""
+    """Return a ball of metallic 0.8. One shift moves all normals, one all vertices; a factor scales 8 × 8 texels of the sky."""
     given = {
         "roughness": torch.tensor(roughness),
         "metallic": torch.tensor(0.8),
@@ -58,7 +58,7 @@ def ball(kind: str, roughness: float) -> tuple[Parameters, Callable[[Parameters]
 
 
 def sheet() -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
-    """A metal sheet with a wavy normal map under a point light, by the texture coordinates of its 81 vertices."""
+    """Return a metal sheet with a wavy normal map under a point light; its texture coordinates are the parameters."""
     line = torch.linspace(-1, 1, 9)
     y, x = torch.meshgrid(line, line, indexing="ij")
     i = torch.arange(81).reshape(9, 9)
@@ -82,7 +82,7 @@ def sheet() -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
 def residuals(
     given: Parameters, scene: Callable[[Parameters], eg.Scene], changes: Parameters, camera: eg.Camera
 ) -> dict[str, Tensor]:
-    """The derivative of each loss by the image, (H, W, 3)."""
+    """Return the derivative of each loss with respect to the image, (H, W, 3)."""
 
     def clean(p: Parameters) -> Tensor:
         with torch.no_grad():
@@ -94,8 +94,7 @@ def residuals(
 def noise(
     given: Parameters, scene: Callable[[Parameters], eg.Scene], changes: Parameters, camera: eg.Camera, seeds: int
 ) -> dict[str, float]:
-    """Of the gradient by each parameter, all taken at once, in percent."""
-
+    """Return the noise of the gradient with respect to each parameter, in percent."""
     residual = residuals(given, scene, changes, camera)
     found: dict[str, list[Tensor]] = {name: [] for name in changes}
     for seed in range(seeds):
@@ -108,12 +107,12 @@ def noise(
 
 
 def _relative(g: Tensor) -> float:
-    """In percent."""
+    """Return the deviation relative to the size of the mean, in percent."""
     return 100 * float(g.var(0).sum().sqrt()) / _size(g)
 
 
 def _size(g: Tensor) -> float:
-    """Of the mean, whose square has its own noise in it, which is taken off."""
+    """Return the size of the mean; the noise in its square is subtracted."""
     return float((g.mean(0).square().sum() - g.var(0).sum() / len(g)).clamp(min=1e-30).sqrt())
 
 
@@ -125,8 +124,11 @@ KEYS = {
 
 
 class MitsubaGradients:
-    """The same ball by Mitsuba. Its `prb` differentiates at points that are drawn by the light and by the material, and does not
-    differentiate how these are drawn; for what moves silhouettes `prb_projective`. Loss and camera are edgegrad's."""
+    """Mitsuba's gradients of the same ball, loss and camera.
+
+    `prb` differentiates at samples of the light and of the BSDF, and not how these are drawn. `prb_projective` is used for what
+    moves silhouettes.
+    """
 
     PRIMAL = 16  # samples a pixel of the image, edgegrad's default
 
@@ -156,7 +158,7 @@ class MitsubaGradients:
         self.residual = {name: mi.TensorXf(r.numpy()) for name, r in residual.items()}
 
     def __call__(self, name: str, spp: int, seed: int) -> Tensor:
-        """By one parameter."""
+        """Return the gradient with respect to one parameter."""
         mi, dr, key = self.mi, self.dr, KEYS[name]
         given = type(self.values[name])(self.values[name])
         dr.enable_grad(given)
@@ -178,18 +180,22 @@ class MitsubaGradients:
         return self.by_blocks(found[..., :3]) if name == "texels" else found.flatten()
 
     def by_blocks(self, by_data: Tensor) -> Tensor:
-        """What is by texels of Mitsuba's image of the sky, before whose first column the last one stands and behind the last one
-        the first, by factors of ours."""
+        """Return the gradient with respect to factors of our sky from that of Mitsuba's texels.
+
+        Mitsuba's image repeats its last column before the first one, and its first after the last one.
+        """
         factor = torch.ones((8, 16, 3), dtype=torch.float64, requires_grad=True)
         image = mitsuba.sky_image(self.radiance * factor.repeat_interleave(8, 0).repeat_interleave(8, 1))
         data = torch.cat([image[:, -1:], image, image[:, :1]], 1)
         return torch.autograd.grad((data * by_data).sum(), factor)[0].flatten()
 
 
-def beside_mitsuba(bench: Bench, kind: str, roughness: float, camera: eg.Camera) -> list[Row]:
-    """How many times longer Mitsuba takes to the error that a gradient by default samples has, in processor time. Both sides
-    are unbiased, so that errors are deviations: Mitsuba's fall with the root of its samples, whose number follows from all that
-    were measured; its time is interpolated, and no less than that of the fewest. Both errors are over the size of edgegrad's."""
+def against_mitsuba(bench: Bench, kind: str, roughness: float, camera: eg.Camera) -> list[Row]:
+    """Measure how much longer Mitsuba takes to the error of a gradient with default samples, in processor time.
+
+    Both sides are unbiased, so errors are deviations, relative to the size of edgegrad's gradient. Mitsuba's fall with the root
+    of its samples, whose number follows from all that were measured. Its time is interpolated, and at least that of the fewest.
+    """
     given, scene = ball(kind, roughness)
     residual = residuals(given, scene, CHANGES, camera)
     theirs, seeds = MitsubaGradients(scene(given), given, residual), bench.repeats(24)
@@ -236,10 +242,10 @@ def _measured(gradient: Callable[[int], Tensor], seeds: int) -> tuple[Tensor, fl
 def glossy_gradients(bench: Bench) -> list[Row]:
     camera = eg.Camera.look_at((0.0, 0.3, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (SIZE, SIZE))
     rows, seeds = [], bench.repeats(24)
-    for kind in ("even", "lamps"):
+    for kind in ("even", "lights"):
         for roughness in (0.5, 0.2, 0.1, 0.05):
             found = noise(*ball(kind, roughness), CHANGES, camera, seeds)
-            sky_ = "smooth sky" if kind == "even" else "sky with lamps"
+            sky_ = "smooth sky" if kind == "even" else "sky with small lights"
             rows += [
                 Row(
                     f"a metal ball, {sky_}, roughness {roughness}: gradient by {name}",
@@ -254,6 +260,6 @@ def glossy_gradients(bench: Bench) -> list[Row]:
     value = noise(*sheet(), {"uvs": UVS}, above, seeds)["uvs"]
     rows.append(Row("a normal-mapped sheet: gradient by texture coordinates", value, unit=" %", must=40.0, aim=20.0))
     if mitsuba.available():
-        for kind, roughness in (("even", 0.5), ("even", 0.2), ("lamps", 0.5), ("lamps", 0.2)):
-            rows += beside_mitsuba(bench, kind, roughness, camera)
+        for kind, roughness in (("even", 0.5), ("even", 0.2), ("lights", 0.5), ("lights", 0.2)):
+            rows += against_mitsuba(bench, kind, roughness, camera)
     return rows

@@ -36,7 +36,7 @@ CHANCE = 0.01  # of a false alarm in a run, by Holm
 
 
 def sky() -> Tensor:
-    """Brighter above, with three lamps."""
+    """Return a sky, brighter above, with three small lights."""
     image = torch.linspace(1.0, 0.2, 32)[:, None, None].repeat(1, 64, 3)
     for row, column, radiance in ((7, 12, 15.0), (10, 44, 25.0), (16, 30, 8.0)):
         image[row : row + 3, column : column + 3] = radiance
@@ -44,7 +44,7 @@ def sky() -> Tensor:
 
 
 def places() -> list[tuple[float, float, float, float]]:
-    """Of each ball: x and y of its centre, metallic, roughness."""
+    """Return x and y of the centre, metallic and roughness of each ball."""
     rows, columns = len(METALLIC), len(ROUGHNESS)
     return [
         (2.4 * (j - (columns - 1) / 2), 2.4 * ((rows - 1) / 2 - i), METALLIC[i], ROUGHNESS[j])
@@ -74,7 +74,7 @@ def ours(seed: int) -> Tensor:
 
 
 class Mitsuba:
-    """Where LLVM is found, by that, and else point by point."""
+    """Mitsuba's images, by LLVM where it is found, else by its scalar variant."""
 
     def __init__(self) -> None:
         try:
@@ -100,7 +100,7 @@ class Mitsuba:
 
 
 def balls(images: Tensor) -> Tensor:
-    """(n, balls, 3): means over the inner two thirds of each ball, where both shapes are the same."""
+    """Return means (n, balls, 3) over the inner part of each ball, where both shapes are the same."""
     n = len(images)
     tiles = images.reshape(n, len(METALLIC), TILE, len(ROUGHNESS), TILE, 3).movedim(2, 3)
     tiles = tiles.reshape(n, -1, TILE, TILE, 3).double()
@@ -110,7 +110,7 @@ def balls(images: Tensor) -> Tensor:
 
 
 def compared(seeds: int) -> tuple[Row, Tensor]:
-    """How many of the balls' colours are not those of Mitsuba, and both images."""
+    """Count the colours of balls that differ from Mitsuba's, and return that row and both images."""
     theirs = Mitsuba()
     found = [torch.stack([render(seed) for seed in tqdm(range(seeds))]) for render in (ours, theirs)]
     a, b = (balls(images) for images in found)

@@ -33,7 +33,7 @@ SPLIT = 8  # interior samples for each boundary sample: one of the latter costs 
 
 
 def available() -> str | None:
-    """Mitsuba's version, or None where it is not installed or finds no LLVM."""
+    """Return Mitsuba's version, or None where it is not installed or finds no LLVM."""
     try:
         return load()[0].__version__
     except (ImportError, RuntimeError):
@@ -41,7 +41,7 @@ def available() -> str | None:
 
 
 def load() -> tuple[Any, Any]:
-    """The modules mitsuba and drjit, in the variant that runs on the CPU with derivatives."""
+    """Return the modules mitsuba and drjit, in the variant that runs on the CPU with derivatives."""
     try:
         mi, dr = importlib.import_module("mitsuba"), importlib.import_module("drjit")
     except ImportError as error:
@@ -61,9 +61,12 @@ def load() -> tuple[Any, Any]:
 
 
 def sky_image(radiance: Tensor) -> Tensor:
-    """(2 h + 1, w, C): an environment's image (h, w, C) as Mitsuba's `envmap` takes it. That has the first and the last row at
-    the poles and all others evenly between, where edgegrad has the centres of texels half a row off the poles: an image taken as
-    it is would be stretched by h / (h − 1). Every second row is one of the image, and both interpolate alike."""
+    """Return the image (h, w, C) of an environment as Mitsuba's `envmap` takes it, (2 h + 1, w, C).
+
+    Mitsuba has the first and the last row at the poles and all others evenly between; edgegrad has the centres of texels half a row
+    off the poles. An unchanged image would be stretched by h / (h − 1). Here every second row is one of the image, and both
+    interpolate alike.
+    """
     between = (radiance[1:] + radiance[:-1]) / 2
     poles_and_between = torch.cat([radiance[:1], between, radiance[-1:]])
     rows = torch.stack([poles_and_between[:-1], radiance], 1).flatten(0, 1)
@@ -301,7 +304,7 @@ class Mitsuba:
 
 
 def _resized(scene: Scene, camera: Camera) -> tuple[Scene, Camera, float]:
-    """The same view of the scene around the origin with the radius RADIUS, and how many times as large it is."""
+    """Return the same view of the scene, centred and scaled to the radius RADIUS, and the scale."""
     meshes = [mesh.replace(verts=mesh.verts.detach().cpu().double()) for mesh in scene.meshes]
     verts = torch.cat([mesh.verts for mesh in meshes])
     center = verts.mean(0)
@@ -347,7 +350,7 @@ def _rgb(color: Tensor) -> dict[str, Any]:
 
 
 def _lights(mi: Any, scene: Scene, background: Tensor, scale: float) -> dict[str, Any]:
-    """Beside meshes that emit. A black background is none, so that no samples of lights go there."""
+    """Return lights other than emissive meshes. A black background is left out, so that no light samples go there."""
     found: dict[str, Any] = {}
     for i, light in enumerate(scene.lights):
         if isinstance(light, PointLight):
@@ -373,7 +376,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _by_vertex(verts: int, faces: Tensor, corners: Tensor) -> Tensor | None:
-    """Values of corners (F, 3, n) as values of vertices (V, n), or None where the corners of a vertex differ."""
+    """Return values of corners (F, 3, n) as values of vertices (V, n), or None where the corners of a vertex differ."""
     values = corners.new_zeros((verts, corners.shape[-1]))
     values[faces] = corners
     return values if torch.equal(values[faces], corners) else None
@@ -422,7 +425,7 @@ def _shape(mi: Any, dr: Any, mesh: Mesh, name: str, lit: bool) -> Any:
 
 
 def _material(mi: Any, props: Any, mesh: Mesh) -> None:
-    """A Lambertian constant that both sides show, light from the front of a surface that scatters nothing, or black."""
+    """Set a two-sided Lambertian constant, emission from the front of a black surface, or black."""
     material = Material(base_color=0.0) if mesh.material is None else mesh.material
     given = [
         1.0 if material.base_color is None else material.base_color,
@@ -454,7 +457,7 @@ def _filled(mi: Any, props: Any, name: str, verts: Tensor, faces: Tensor, uvs: T
 
 
 def _two_sided(mi: Any, dr: Any, radiance: Any) -> Any:
-    """An emitter that shines on both sides: Mitsuba's "area" is black from behind, which open meshes show."""
+    """Return an emitter that shines on both sides: Mitsuba's "area" is black from behind, which open meshes show."""
 
     class TwoSided(mi.Emitter):
         def __init__(self, props: Any) -> None:
@@ -482,7 +485,7 @@ def _two_sided(mi: Any, dr: Any, radiance: Any) -> Any:
 
 
 def _seamed(mi: Any, bitmap: Any) -> Any:
-    """A texture whose coordinates belong to corners, as attributes face_u and face_v of the mesh."""
+    """Return a texture whose coordinates belong to corners, as attributes face_u and face_v of the mesh."""
 
     class Seamed(mi.Texture):
         def __init__(self, props: Any) -> None:

@@ -44,7 +44,7 @@ def harmonics(n: Tensor) -> Tensor:
 
 
 def steps_of_time() -> dict[str, Callable[[int], None]]:
-    """One step each: the kernel's own colours and texture, and shaders."""
+    """Return one step each of the kernel's own colours and texture, and of shaders."""
     mesh, camera, _ = sphere(256)
     adjoint = smooth_adjoint(256, 256, 3).float()
     texture = torch.rand((256, 256, 3), generator=torch.Generator().manual_seed(0)).requires_grad_()
@@ -100,7 +100,7 @@ def times(repeats: int = 9) -> None:
 
 
 def peak(gradient: bool) -> None:
-    """Prints what this process needs above its start, MB."""
+    """Print the memory that this process needs above its start, in MB."""
     mesh, camera, _ = sphere((1080, 1920))
     net, verts = network(), mesh.verts.clone().requires_grad_(gradient)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -122,7 +122,7 @@ def memory() -> None:
 
 
 def noise(seeds: int = 64) -> None:
-    """Of an image whose faces are shaded once in a pixel, beside one whose samples all are: the pixels of one 4 × 4 as fine."""
+    """Print the noise of images whose faces are shaded once a pixel, and of ones shaded at every sample (4 × 4 as fine)."""
     camera, fine = front_camera(64), 4
     finer = camera.replace(K=torch.cat([fine * camera.K[:2], camera.K[2:]]), size=(64 * fine, 64 * fine))
     texture = torch.rand((64, 64, 3), generator=torch.Generator().manual_seed(0), dtype=F64)
@@ -149,7 +149,7 @@ def noise(seeds: int = 64) -> None:
 
 
 def mipmaps(seeds: int = 16, converged: int = 32) -> None:
-    """The gradient of a texture much finer than the pixels, at default samples, against a converged one of the same filter."""
+    """Print the error of gradients of a texture much finer than the pixels, with default samples, by filter."""
     scene = build("quad", 24)
     (quad,) = scene.scene.meshes
     print("| error of the gradient at 24 px of 256² texels | vertices | texels |\n|---|---|---|")

@@ -68,7 +68,7 @@ GROUPS = {"safe": ("deep", "tangled", "flat-colors", "noise")}
 
 
 def settings(quick: bool) -> dict[str, Any]:
-    """Where and of what this was measured."""
+    """Return when, where and of which versions this was measured."""
     return {
         "date": time.strftime("%Y-%m-%d %H:%M:%S"), "quick": quick, "load": os.getloadavg()[0],
         "mitsuba": mitsuba.available(), **machine(),
