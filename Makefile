@@ -46,7 +46,7 @@ mutants: $(VENV)/.ready
 SANITIZE := build/sanitize
 # Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick; without tests marked
 # `unwatched`.
-WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows rim wide_fisheye aovs lit_kernel glossy_light derivative_points shadow_rims bounce_borders forward_mode samples messages raster raster_texture raster_antialias
+WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows lens_boundary wide_fisheye aovs lit_kernel glossy_light derivative_points shadow_alpha_edges secondary_edges forward_mode samples messages raster raster_texture raster_antialias
 WATCHED_TESTS := $(WATCHED:%=tests/test_%.py)
 CHOSEN := not slow and not unwatched
 # Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for

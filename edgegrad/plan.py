@@ -15,11 +15,11 @@ from .kernel import memory as memory
 from .kernel.counts import COUNTS, table
 from .kernel.derivatives import moves
 from .kernel.flat import Flat
-from .kernel.operators import Hits, backward_kernel, image_room, pass_size
+from .kernel.operators import Hits, backward_kernel, image_memory, pass_size
 from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
 from .library import core
+from .light.antithetic import MOST_SETS, SETS
 from .light.bounces import check_bounces
-from .light.companions import FOURS, MOST_FOURS
 from .light.radiance import LIGHTING, Lighting
 from .light.resampled import how_drawn
 from .light.unused_options import warn_of_unused
@@ -143,7 +143,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     inside = sum(lighting.in_gradient(scene, light) for light in scene.casting)
     more = (
         f"; for the gradient inside faces {inside}, in fours of which what derivatives have of both signs cancels, and up to "
-        f"{MOST_FOURS // FOURS} times as many where faces are seen from aside"
+        f"{MOST_SETS // SETS} times as many where faces are seen from aside"
         if inside > lights
         else ""
     )
@@ -167,7 +167,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     terms["unseen shadow edges"] = _unseen_shadow_edges(scene, request, lighting)
     terms["bounce edges"] = _bounce_edges(scene, request, lighting)
     terms["surface borders"] = _surface_borders(scene, request, lighting)
-    terms["texels of lamps"] = _texels_of_lamps(scene, lighting)
+    terms["texels of lamps"] = _texels_of_lights(scene, lighting)
     return terms
 
 
@@ -185,7 +185,7 @@ def _bounces(scene: Scene, points: int, beside: int, lighting: Lighting) -> Term
     )
 
 
-def _texels_of_lamps(scene: Scene, lighting: Lighting) -> Term:
+def _texels_of_lights(scene: Scene, lighting: Lighting) -> Term:
     lamps = [light for light in scene.casting if isinstance(light, MeshLight) and light.has_borders]
     moving = sum(moves(light.coordinates) for light in lamps)
     if not moving:
@@ -274,7 +274,7 @@ def _cuts_that_move(scene: Scene, request: Request) -> bool:
 
 def _most_bounce_samples(request: Request) -> int:
     each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
-    return each if each >= 0 else core.most_bounce_samples(*size, request.image.spp)
+    return each if each >= 0 else core.most_secondary_edge_samples(*size, request.image.spp)
 
 
 def _cuts(scene: Scene) -> bool:
@@ -290,7 +290,7 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
     needs = core.image_bytes(pass_size(request), B)
     copied = _bytes_of_copies(scene, request.scene)
     cameras = "" if B == 1 else f", {B} cameras"
-    textures, cut_outs = len(request.scene.textures), len(request.scene.cut_outs)
+    textures, alpha_masks = len(request.scene.textures), len(request.scene.alpha_masks)
     return {
         "scene": Term(
             copied > 0,
@@ -306,7 +306,7 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
         # Their memory is the user's own, or counted with the scene.
         "textures": Term(textures > 0, f"{textures} to look up" if textures else "no mesh has one"),
         "cut-outs": Term(
-            cut_outs > 0, "rays pass through where alpha is below its cutoff" if cut_outs else "no mesh has alpha"
+            alpha_masks > 0, "rays pass through where alpha is below its cutoff" if alpha_masks else "no mesh has alpha"
         ),
         "kept for backward": Term(
             any_gradient,
@@ -322,7 +322,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     moves = any(name in wanted for name in MOVING)
 
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
-    with image_room(request):
+    with image_memory(request):
         ones = flat.colors.new_ones((B, camera.height, camera.width, request.channels))
     hits = Hits(
         ones[..., 0].contiguous(),
@@ -332,8 +332,9 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     )
     _, profiles = backward_kernel(ones, hits, request, wanted, dry=True, lit=lit)
     counts = {name: int(sum(profile[name] for profile in profiles)) for name in COUNTS}
-    surface, edge, silhouettes, creases, intersections, rim = (
-        counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "rim")
+    surface, edge, silhouettes, creases, intersections, lens_boundary = (
+        counts[name]
+        for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "lens_boundary")
     )
     needs = core.gradient_bytes(
         pass_size(request), motion=work.motion, boundary=work.boundary, steps=work.steps, wanted=list(wanted),
@@ -347,7 +348,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     # Why the terms are off, "" where nothing keeps them from running.
     still = "" if moves else "neither verts nor the camera require a gradient"
     no_boundary = still or ("" if request.gradient.visibility else "visibility=False")
-    no_rim = "" if {"K", "distortion"} & set(wanted) else "neither K nor distortion requires a gradient"
+    no_lens_boundary = "" if {"K", "distortion"} & set(wanted) else "neither K nor distortion requires a gradient"
     no_interior = ""
     if not (work.motion or work.appearance):
         no_interior = "each face has one radiance, wherever it moves" if moves else "nothing asks for it"
@@ -396,11 +397,15 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
             no_boundary or (f"{intersections:,} in view" if intersections else "none in view"),
             bytes=bytes_of("intersections"),
         ),
-        "rim": Term(
-            rim > 0,
+        "lens boundary": Term(
+            lens_boundary > 0,
             no_boundary
-            or no_rim
-            or (f"where the lens folds or ends, {rim:,} px in view" if rim else "no lens ends in view"),
+            or no_lens_boundary
+            or (
+                f"where the lens folds or ends, {lens_boundary:,} px in view"
+                if lens_boundary
+                else "no lens ends in view"
+            ),
         ),
     }
     lines = counts["step_lines"]

@@ -1,6 +1,6 @@
-"""Borders of what surfaces of paths of light see of one another (csrc/secondary/edge_line_source.h): an edge, or the rim of a
-cut-out, on the line between a point that sends light and one that receives it. And curves at which surfaces of paths begin to
-send light (csrc/secondary/surface_edges.cpp): where faces pass through each other, and rims of cut-outs as textures move.
+"""Secondary edges, seen from points of paths of light (csrc/secondary/edge_line_source.h): an edge, or an alpha edge,
+on the line between a point that sends light and one that receives it. And curves at which surfaces of paths begin
+to send light (csrc/secondary/surface_edges.cpp): where faces pass through each other, and alpha edges as textures move.
 
 Where the camera sees the point that receives, the first are curves in the image. From where it need not, light is followed on to
 the camera, by so many steps more:
@@ -28,28 +28,30 @@ from .at_points import Options
 AT_ONCE = 1 << 17  # samples whose light is followed together
 
 
-def bounce_edges(frame: Frame, options: Options) -> list[Term]:
+def secondary_edges(frame: Frame, options: Options) -> list[Term]:
     """What samples on these borders give to the image."""
     surfaces = frame.surfaces
     flat = surfaces.casters
-    rims = bool(len(flat.cut_outs)) and moves(flat.alphas, flat.uvs)
-    on_surfaces = moves(surfaces.verts) or rims  # as the camera moves these stay
+    alpha_edges = bool(len(flat.alpha_masks)) and moves(flat.alphas, flat.uvs)
+    on_surfaces = moves(surfaces.verts) or alpha_edges  # as the camera moves these stay
     if not (on_surfaces or moves(frame.view.world_to_camera, frame.intrinsics)):
         return []
     terms = _seen(frame, options)
     if on_surfaces:
         for further in range(1, options.bounces - 1):
-            terms += _passed_on(frame, in_kernel.bounce_samples(frame, options, further), "bounce edges", further)
+            terms += _passed_on(
+                frame, in_kernel.secondary_edge_samples(frame, options, further), "bounce edges", further
+            )
     crossings = moves(surfaces.verts) and has_intersections(frame.request.scene)
-    if crossings or rims:
+    if crossings or alpha_edges:
         for further in range(options.bounces - 1):
-            found = in_kernel.surface_border_samples(frame, options, further, crossings, rims)
+            found = in_kernel.surface_edge_samples(frame, options, further, crossings, alpha_edges)
             terms += _passed_on(frame, found, "surface borders", further)
     return terms
 
 
 def world_velocity(frame: Frame, records: CurveRecords) -> list[tuple[Form, Tensor]]:
-    """How F of samples that have no place in the image moves, by vertices in the world and by the textures of cut-outs."""
+    """How F of samples that have no place in the image moves, by vertices in the world and by the textures of alpha."""
     flat = frame.surfaces.casters
     return [
         (Form(records.row_of, records.vertex, records.by_q), frame.surfaces.verts),
@@ -59,7 +61,7 @@ def world_velocity(frame: Frame, records: CurveRecords) -> list[tuple[Form, Tens
 
 
 def _seen(frame: Frame, options: Options) -> list[Term]:
-    records, jump, _ = in_kernel.bounce_samples(frame, options, 0)
+    records, jump, _ = in_kernel.secondary_edge_samples(frame, options, 0)
     if not len(records.x):
         return []
     samples = EdgeSamples(frame, records)

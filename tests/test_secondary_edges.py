@@ -10,11 +10,11 @@ import pytest
 import torch
 from bounce_scenes import QUAD
 from strip_oracle import Strip, border, sent_from_line
-from test_bounce_edges import LOOKS, alone, weights_of
+from test_secondary_edge_points import LOOKS, alone, weights_of
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.light import bounce_edges
+from edgegrad.light import secondary_edges
 
 F64 = torch.float64
 Leaves = dict[str, Tensor]
@@ -166,7 +166,7 @@ def test_whole_borders(make: Callable[[tuple[str, str]], Border], looks: tuple[s
 @pytest.mark.parametrize("looks", [("glossy", "lambert"), ("lambert", "glossy")], ids="-".join)
 def test_line_through_the_sender(looks: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the blade passes through the sender, without its edges."""
-    monkeypatch.setattr(bounce_edges, "_seen", lambda *_: [])
+    monkeypatch.setattr(secondary_edges, "_seen", lambda *_: [])
     check(blade_through_sender(looks, WIDE), looks, 400_000, side=1)
 
 

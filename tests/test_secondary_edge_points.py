@@ -13,7 +13,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad import shader
-from edgegrad.light import bounce_edges, in_kernel
+from edgegrad.light import in_kernel, secondary_edges
 from edgegrad.light.at_points import Options
 from edgegrad.points.frame import Frame
 from edgegrad.points.splat import Term
@@ -106,10 +106,10 @@ def test_light_that_is_followed_to_the_camera(looks: tuple[str, str], monkeypatc
     monkeypatch.setattr(in_kernel, "towards_camera", lambda frame, arrivals, _: follow(frame, arrivals, (0, 0)))
 
     def passed_on(frame: Frame, options: Options) -> list[Term]:
-        found = in_kernel.bounce_samples(frame, options._replace(bounces=3), 1)
-        return bounce_edges._passed_on(frame, found, "bounce edges", 1)
+        found = in_kernel.secondary_edge_samples(frame, options._replace(bounces=3), 1)
+        return secondary_edges._passed_on(frame, found, "bounce edges", 1)
 
-    monkeypatch.setattr(bounce_edges, "_seen", passed_on)
+    monkeypatch.setattr(secondary_edges, "_seen", passed_on)
     exact, weights = leaves_of(Strip.standard()), weights_of(Strip.standard())
     value = border(exact, LOOKS[looks[0]], LOOKS[looks[1]], weights)
     found = gradients(Strip.standard(), looks, weights, 400_000)

@@ -1,4 +1,4 @@
-"""Directions in fours, in which what the derivatives of a glossy lobe have of both signs cancels (csrc/shading/lit/antithetic.h,
+"""Directions in sets, in which what the derivatives of a glossy lobe have of both signs cancels (csrc/shading/lit/antithetic.h,
 which names the sources)."""
 
 from __future__ import annotations
@@ -9,21 +9,21 @@ from torch.nn.functional import normalize
 
 from .bsdf import dot
 
-COMPANIONS = 4  # with the direction itself
-FOURS = 2  # for one sample of a light
-MOST_FOURS = 8  # the same where the face is seen from aside and its normal differs from the shading normal
+SET_SIZE = 4  # with the direction itself
+SETS = 2  # for one sample of a light
+MOST_SETS = 8  # the same where the face is seen from aside and its normal differs from the shading normal
 ASIDE, PART = 0.2, 0.1  # the cosine, and the share of it that the normals differ by
 LEAST_TANGENT2 = 1e-24  # below it a normal has no azimuth in doubles
 
 
 def seen_aside(v: Tensor, n: Tensor, g: Tensor) -> Tensor:
     """(N,) bool, of unit directions (N, 3) to the viewer, shading normals and normals of faces: where faces are seen from aside
-    and both normals differ by a part of that angle (fours_of() in csrc/shading/lit/derivative_points.h says why)."""
+    and both normals differ by a part of that angle (sets_of() in csrc/shading/lit/derivative_points.h says why)."""
     nv, apart = dot(n, v).clamp(min=0)[:, 0], torch.linalg.cross(g, n)
     return (nv < ASIDE) & (dot(apart, apart)[:, 0] > (PART * nv) ** 2)
 
 
-def companions(v: Tensor, n: Tensor, alpha: Tensor, l: Tensor) -> tuple[Tensor, Tensor]:
+def antithetic_set(v: Tensor, n: Tensor, alpha: Tensor, l: Tensor) -> tuple[Tensor, Tensor]:
     """(N, 4, 3) directions and (N, 4) their solid angles over that of the normal of the first, of unit directions (N, 3) to the
     viewer, of the normal and to the light, and α (N, 1).
 

@@ -18,8 +18,8 @@ import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.light import by_material, in_kernel
 from edgegrad.light.bsdf import Scattering
-from edgegrad.light.lamp_trees import MeshTowards, tree_of
 from edgegrad.light.lobes import Lobes
+from edgegrad.light.mesh_light_sampling import MeshTowards, tree_of
 from edgegrad.light.resampled import Glossy, resampled
 from edgegrad.points.frame import Frame
 from edgegrad.points.sobol import sobol_parts

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
-from edgegrad.light import in_kernel, sliding
+from edgegrad.light import in_kernel, near_field
 from edgegrad.points.frame import Frame
 from edgegrad.points.records import barycentrics
 
@@ -54,7 +54,7 @@ def test_without_differences_noise_has_no_bound(monkeypatch: pytest.MonkeyPatch)
         return estimate(found).error
 
     quiet = noise()
-    monkeypatch.setattr(sliding, "RADIUS", 0.0)
+    monkeypatch.setattr(near_field, "RADIUS", 0.0)
     assert noise() > 5 * quiet
 
 

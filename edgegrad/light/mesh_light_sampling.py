@@ -1,5 +1,5 @@
 """Meshes that emit as surfaces meet them: which of their faces lie in a direction, and what hides them
-(csrc/shading/lit/mesh_light_sampling.h, lamp_tree.h)."""
+(csrc/shading/lit/mesh_light_sampling.h, mesh_light_sampling.h)."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from ..scene.rows import unit
 from .bsdf import dot
 from .lobes import Lobes, axes_around
 
-LEAST_LAMP = 0.25  # solid angle over that of a lobe, below which nothing is drawn by the lobe
-LEAST_ROUND = 1.0  # the same of round lamps
+LEAST_EMITTER = 0.25  # solid angle over that of a lobe, below which nothing is drawn by the lobe
+LEAST_ROUND = 1.0  # the same of round lights
 FARTHEST_LOBE = 4.0  # between them, in half angles of the lobe
-SMALLEST_LAMP = 0.1  # solid angle over that of a lobe, below which points of a flat lamp are alike
+SMALLEST_EMITTER = 0.1  # solid angle over that of a lobe, below which points of a flat light are interchangeable
 
 _trees: WeakKeyDictionary[MeshLight, Any] = WeakKeyDictionary()
 
 
 def tree_of(light: MeshLight) -> Any:
     """The kernel's tree of the faces; None where there are too many of them."""
-    if len(light.mesh.faces) > core.MOST_LAMP_FACES:
+    if len(light.mesh.faces) > core.MOST_EMISSIVE_FACES:
         return None
     if light not in _trees:
         verts, faces = values_of(light.mesh.verts.detach().double(), light.mesh.faces)
-        _trees[light] = core.LampTree(np.ascontiguousarray(verts), faces.astype(np.int32))
+        _trees[light] = core.EmissiveFaceTree(np.ascontiguousarray(verts), faces.astype(np.int32))
     return _trees[light]
 
 
@@ -45,11 +45,11 @@ def hides(light: MeshLight) -> bool:
 
 
 class MeshTowards(NamedTuple):
-    """A lamp as N points of surfaces meet it, without derivatives, in float64."""
+    """A light as N points of surfaces meet it, without derivatives, in float64."""
 
     light: MeshLight
     position: Tensor  # (N, 3)
-    own: Tensor  # (N,) the points' faces, as the lamp's mesh counts its own
+    own: Tensor  # (N,) the points' faces, as the light's mesh counts its own
     contact: Tensor  # (N,) distance within which nothing hides it
 
     @classmethod
@@ -65,7 +65,7 @@ class MeshTowards(NamedTuple):
         return MeshTowards(self.light, *(part.repeat_interleave(times, 0) for part in self[1:]))
 
     def _ball(self) -> tuple[Tensor, Tensor]:
-        """(N, 1) the sine of half the angle of a ball around the lamp, 1 inside of it; (N, 3) the direction to its middle."""
+        """(N, 1) the sine of half the angle of a ball around the light, 1 inside of it; (N, 3) the direction to its middle."""
         *center, radius, _ = tree_of(self.light).ball
         to = self.position.new_tensor(center) - self.position
         distance = to.norm(dim=1, keepdim=True)
@@ -97,10 +97,10 @@ class MeshTowards(NamedTuple):
         sine, _ = self._ball()
         return points._replace(density=self.solid_angles(points) / self._solid_angle(sine)[:, 0])
 
-    def are_alike(self, lobes: Lobes) -> Tensor:
-        """(N,) bool: whether points that the light draws are so much alike that one is as good as another."""
+    def interchangeable(self, lobes: Lobes) -> Tensor:
+        """(N,) bool: whether points that the light draws are interchangeable."""
         sine, _ = self._ball()
-        small = (self._solid_angle(sine) < SMALLEST_LAMP * lobes.solid_angle())[:, 0] & tree_of(self.light).is_flat
+        small = (self._solid_angle(sine) < SMALLEST_EMITTER * lobes.solid_angle())[:, 0] & tree_of(self.light).is_flat
         return small | self.is_drawn_by_ball(lobes)
 
     def is_drawn_by(self, lobes: Lobes) -> Tensor:
@@ -109,16 +109,16 @@ class MeshTowards(NamedTuple):
         wide = lobes.solid_angle()
         half = torch.acos(1 - wide / (2 * math.pi))
         near = torch.acos(dot(lobes.mirrored(), middle).clamp(-1, 1)) < torch.asin(sine) + FARTHEST_LOBE * half
-        least = torch.where(self._is_round(), LEAST_ROUND, LEAST_LAMP)
+        least = torch.where(self._is_round(), LEAST_ROUND, LEAST_EMITTER)
         some = (self._solid_angle(sine) >= least * wide) & ((sine >= 1) | near)
         return some[:, 0] & lobes.narrow
 
     def directions(self, place: Tensor) -> Tensor:
-        """(N, 3) unit directions to places on the lamp."""
+        """(N, 3) unit directions to places on the light."""
         return unit(place.detach() - self.position)
 
     def solid_angles(self, points: LightPoints) -> Tensor:
-        """(N,): |dl/dq| of points, zero where the lamp hides them or shows nothing."""
+        """(N,): |dl/dq| of points, zero where the light hides them or shows nothing."""
         weights = self.light._weights(points)
         found = self.light.facing(points.index, weights, self.position)[:, 0]
         away = self.position - self.light.place(points).detach()
@@ -173,6 +173,6 @@ def _one_minus_cosine(sine: Tensor) -> Tensor:
 
 
 def least_brightness(light: MeshLight) -> float:
-    """What is added to how bright a lamp is, so that what is dark has a gradient too."""
+    """What is added to how bright a light is, so that what is dark has a gradient too."""
     mean = float(light.mean_emission)
     return EVEN * mean if mean > 0 else 1.0

@@ -2,7 +2,7 @@
 
 At a fixed place x of the image, vertices and camera move the barycentrics b of what is seen: it slides by δξ = (∂b/∂x)⁻¹ δb, px.
 With the further points of its path held on their faces, the derivative of light by δξ grows as one over the distance to them, and
-beside corners of a room its variance is infinite. But along an axis of the image the mean of a derivative is a difference,
+near corners of a room its variance is infinite. But along an axis of the image the mean of a derivative is a difference,
 
     ∫ ∂L/∂x_a dx_a = L(r) − L(l)
 
@@ -56,7 +56,7 @@ def radius(frame: Frame) -> float:
     return near if math.isfinite(near) else 0.0
 
 
-class Nearby(NamedTuple):
+class NearField(NamedTuple):
     """Light from nearby that comes to hits inside faces."""
 
     frame: Frame

@@ -3,8 +3,8 @@ by way of such surfaces changes as the borders move on them.
 
     δI = Σ_k k(x_k − c) B_k δF        over samples
 
-of a border F = 0 (csrc/secondary/indirect_shadows.cpp), with the light B_k that comes from the surface there to the place x_k of the
-image, by so many steps more (csrc/shading/lit/light_tracing.h).
+of a border F = 0 (csrc/secondary/indirect_shadows.cpp), with the light B_k that comes from the surface there to the place x_k of
+the image, by so many more steps (csrc/shading/lit/light_tracing.h).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from ..points.records import CurveRecords
 from ..points.shadows import ShadowLight
 from ..points.splat import Term
 from . import in_kernel
-from .bounce_edges import world_velocity
 from .bsdf import dot
+from .secondary_edges import world_velocity
 
 AT_ONCE = 1 << 17  # samples whose light is followed together
 
 
-def unseen_shadows(frame: Frame, bounces: int, watch: Watch) -> list[Term]:
+def indirect_shadows(frame: Frame, bounces: int, watch: Watch) -> list[Term]:
     """What samples on these borders give to the image, by light that is scattered `bounces` times at most."""
     request, surfaces, sampler = frame.request, frame.surfaces, frame.sampler
     count = request.gradient.edge_samples
@@ -36,14 +36,14 @@ def unseen_shadows(frame: Frame, bounces: int, watch: Watch) -> list[Term]:
         count = core.most_shadow_samples(frame.width, frame.height, request.image.spp)
     flat = surfaces.casters
     # As the camera moves these borders stay.
-    moving = moves(surfaces.verts) or (bool(len(flat.cut_outs)) and moves(flat.alphas, flat.uvs))
+    moving = moves(surfaces.verts) or (bool(len(flat.alpha_masks)) and moves(flat.alphas, flat.uvs))
     terms: list[Term] = []
     for index, casting in enumerate(surfaces.scene.casting):
         if moving or ShadowLight.moves(casting):
             seed = derived_seed(sampler.grad_seed, index + 2)
             light = ShadowLight.of(surfaces, index, seed)
             records = sampler.shadow_samples(light.parts, seed, count, False, one=True, seen=False)
-            watch.count("unseen_shadow_samples", len(records.x))
+            watch.count("indirect_shadow_samples", len(records.x))
             terms += _of_light(frame, light, records, bounces)
     return terms
 
