@@ -1,5 +1,4 @@
-"""The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-rig, fit-texture, fit-camera, track, render, bop, demo, report,
-doctor.
+"""The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-rig, fit-texture, fit-camera, track, render, bop, demo, doctor.
 
 It lies beside the library rather than in it, for importing any part of that imports torch, which takes seconds: help and
 faults of arguments are said before. Each command imports what it uses when it runs.
@@ -14,7 +13,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_rig, fit_shape, fit_texture, render, report, track
+from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_rig, fit_shape, fit_texture, render, track
 from .arguments import Parser
 
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, as shells have it
@@ -76,7 +75,6 @@ def parser() -> Parser:
         render,
         bop,
         demo,
-        report,
         doctor,
     ):
         module.add(commands)
