@@ -19,7 +19,7 @@ INK, BLUE, GREY = "#222222", "#1f6fb2", "#b9bec6"
 def imports() -> dict[str, set[str]]:
     """Of each package or module in edgegrad, those that it imports."""
     graph = grimp.build_graph("edgegrad", cache_dir=None)
-    left_out = {f"edgegrad.{name}" for name in (*FACADES, "_core")}
+    left_out = {f"edgegrad.{name}" for name in (*FACADES, "_core", "__main__")}
     children = sorted(graph.find_children("edgegrad") - left_out)
     return {
         name.removeprefix("edgegrad."): {

@@ -59,9 +59,8 @@ def _error_time(args: argparse.Namespace) -> int:
     """Relative error of the gradient (per vertex, and of whole-object translation and rotation) against wall time, for a
     sweep of samples: edgegrad, finite differences, and every other renderer that is installed. Ctrl-C keeps what is
     measured; the same command goes on from there."""
-    from edgegrad.optional import require
-    from edgegrad.report.error_time.run import error_time
-
+    from ..optional import require
+    from ..report.error_time.run import error_time
     from . import INTERRUPTED
 
     require("matplotlib", "edgegrad[report]", "edgegrad report")  # before the measurements rather than after them
@@ -81,9 +80,8 @@ def _stability(args: argparse.Namespace) -> int:
     """Error of image and gradient in extreme cases against independent references: scale, cameras, geometry, what coincides,
     stiff scenes; whether the gradient is unbiased, steps within faces, and ill-conditioned fits. Ctrl-C keeps what is measured.
     The exit code is 1 if a case is wrong."""
-    from edgegrad.optional import require
-    from edgegrad.report.stability.run import failures, stability
-
+    from ..optional import require
+    from ..report.stability.run import failures, stability
     from . import INTERRUPTED
 
     require("matplotlib", "edgegrad[report]", "edgegrad report")  # before the measurements rather than after them
