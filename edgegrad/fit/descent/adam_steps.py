@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,10 +12,7 @@ from torch import Tensor
 from ..history import Record
 from ..options import Options, Parameter
 from .adam import Adam
-from .loop import Way, is_finite
-
-if TYPE_CHECKING:
-    from .objective import Objective
+from .loop import Loss, Way, is_finite
 
 CUT, CUTS = 0.3, 3  # learning rates fall by this factor when steps lead no further; so often before the fit ends
 SMOOTH = 0.9  # on the way the best values are those of the least loss, averaged over some ten steps for its noise
@@ -23,7 +20,7 @@ WARM = 10  # steps of few views until their losses are averaged enough to be com
 _PLAIN = ("cuts", "since", "smooth", "least", "total")
 
 
-class AdamSteps(Way):
+class AdamSteps(Way[Loss]):
     """A way down by Adam. About a minimum the steps go to and fro: the values found are the mean over those after the last fall
     of the rates."""
 
@@ -35,7 +32,7 @@ class AdamSteps(Way):
         self.smooth, self.least = 0.0, math.inf
         self.total: dict[str, Tensor] = {}  # of the values since the last cut
 
-    def advance(self, objective: Objective) -> Record:
+    def advance(self, objective: Loss) -> Record:
         if self.renew(objective, self.values):
             self.least = math.inf
         loss = objective(self.values, self.step)

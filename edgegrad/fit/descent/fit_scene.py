@@ -117,7 +117,7 @@ def options_of(options: Mapping[str, Any]) -> Options:
     return Options(**options)
 
 
-def way_of(parameters: Mapping[str, Parameter], options: Options) -> Way:
+def way_of(parameters: Mapping[str, Parameter], options: Options) -> Way[Objective]:
     """By the method of the options. Raises ValueError where it does not serve."""
     return {"adam": AdamSteps, "gauss-newton": GaussNewtonSteps}[options.method](parameters, options)
 

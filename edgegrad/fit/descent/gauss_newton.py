@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,9 +21,7 @@ from ..losses import REGION
 from ..options import Options, Parameter
 from .curvature import MOST, check_pointwise, curvature
 from .loop import Way, is_finite
-
-if TYPE_CHECKING:
-    from .objective import Objective
+from .objective import Objective
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 0.03, 1e-4, 1e4  # λ
 FAR_DAMPING = (
@@ -38,7 +36,7 @@ RAISED = 2.0  # factor of λ at the first step that is taken back; twice as much
 _PLAIN = ("losses", "noise", "damping", "raised", "promised", "settled", "accepted", "places", "here", "slope", "H")
 
 
-class GaussNewtonSteps(Way):
+class GaussNewtonSteps(Way[Objective]):
     """A way down by Gauss-Newton. All in units of the learning rates."""
 
     def __init__(self, parameters: Mapping[str, Parameter], options: Options) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,11 +20,27 @@ from ..history import Record
 from ..options import Options, Parameter
 from .falls import Falls
 
-if TYPE_CHECKING:
-    from .objective import Objective
-
 SMALL = 64  # values of up to so many numbers are kept for each step
 _PLAIN = ("best", "step", "seconds", "flat", "renewed")
+
+
+class Loss(Protocol):
+    """The objective of a descent, as the loop needs it."""
+
+    def __call__(self, tensors: Mapping[str, Tensor], step: int) -> Tensor:
+        """The loss of the tensors, with the samples of a step."""
+        ...
+
+    def renews(self, step: int) -> bool:
+        """Whether a step begins with renew()."""
+        ...
+
+    def renew(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """What the loss holds fixed between steps is what it is at these values."""
+        ...
+
+
+LossT = TypeVar("LossT", bound=Loss, contravariant=True)
 
 
 class Descent(NamedTuple):
@@ -36,7 +52,7 @@ class Descent(NamedTuple):
     ending: Ending
 
 
-class Way:
+class Way(Generic[LossT]):
     """The state of a descent: where it is, what was best, and whether the steps still lead down."""
 
     def __init__(self, parameters: Mapping[str, Parameter], options: Options, apart: bool = True) -> None:
@@ -48,11 +64,11 @@ class Way:
         self.falls = Falls(self.values, apart)
         self.renewed: tuple[int, dict[str, Tensor]] | None = None  # step and values of the objective's last renewal
 
-    def advance(self, objective: Objective) -> Record:
+    def advance(self, objective: LossT) -> Record:
         """One step, with the record of the point where it began."""
         raise NotImplementedError
 
-    def renew(self, objective: Objective, values: Mapping[str, Tensor]) -> bool:
+    def renew(self, objective: LossT, values: Mapping[str, Tensor]) -> bool:
         """What the objective holds fixed between steps, where it is time to; False where losses stay comparable."""
         if not objective.renews(self.step):
             return False
@@ -117,8 +133,8 @@ def is_finite(record: Record) -> bool:
 
 
 def descend(
-    way: Way,
-    objective: Objective,
+    way: Way[LossT],
+    objective: LossT,
     save: Callable[[dict[str, Any]], None],
     saved: dict[str, Any] | None = None,
     title: str = "fit",

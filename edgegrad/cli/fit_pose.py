@@ -36,7 +36,7 @@ from .inputs import (
 )
 
 if TYPE_CHECKING:
-    from edgegrad.fit import PoseFit
+    from ..fit import PoseFit
 
 
 def add(commands: Any) -> None:
@@ -95,8 +95,7 @@ def _starts(text: str) -> int | str:
 def run(args: argparse.Namespace) -> int:
     """Finds rotation and translation of a mesh in a picture, from a start within about 30° and 15 % of the mesh's size.
     Ctrl-C keeps the best pose so far, and --resume goes on from there."""
-    from edgegrad.fit import fit_pose
-
+    from ..fit import fit_pose
     from . import INTERRUPTED
 
     if args.label is not None and args.mask is None:

@@ -11,7 +11,7 @@ from .arguments import add_depth, add_view, count, longer_side, number
 from .inputs import assume_fov, check_size, read_depth, read_labels, read_picture, read_pose, read_view, seen_by
 
 if TYPE_CHECKING:
-    from edgegrad.fit import PoseFit
+    from ..fit import PoseFit
 
 
 def add(commands: Any) -> None:
@@ -45,9 +45,8 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Finds the poses of several meshes in a photograph, in which they may cover one another, from starts within about 15° and
     5 % of their sizes. Ctrl-C keeps the best poses so far."""
-    from edgegrad import Scene, load_scene
-    from edgegrad.fit import fit_poses
-
+    from .. import Scene, load_scene
+    from ..fit import fit_poses
     from . import INTERRUPTED
 
     if args.init and len(args.init) != len(args.mesh):

@@ -10,7 +10,7 @@ from .arguments import count, number
 from .outputs import make_folder, write_outputs
 
 if TYPE_CHECKING:
-    from edgegrad.demo import Run
+    from ..demo import Run
 
 
 def add(commands: Any) -> None:
@@ -23,8 +23,7 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Finds an airliner in pictures that are rendered at known poses, each from a start up to 20° and 15 % of its size away."""
-    from edgegrad import demo  # imports pyvista when it runs
-
+    from .. import demo  # imports pyvista when it runs
     from . import INTERRUPTED
 
     mesh, background = demo.airliner(), demo.earth()

@@ -42,9 +42,8 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Finds pose and focal length of the camera that took a picture of a mesh, from a start within about 30° and 15 % of the
     mesh's size. Ctrl-C keeps the best so far, and --resume goes on from there."""
-    from edgegrad import save_camera
-    from edgegrad.fit import fit_camera
-
+    from .. import save_camera
+    from ..fit import fit_camera
     from . import INTERRUPTED
 
     scene = read_scene(args)

@@ -16,13 +16,13 @@ FOV = 40.0  # degrees, the vertical field of view where nothing is said of it
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from edgegrad import Camera, Mesh, Scene
-    from edgegrad.fit import Pose
+    from .. import Camera, Mesh, Scene
+    from ..fit import Pose
 
 
 def read_scene(args: argparse.Namespace) -> Scene:
     """The mesh file, with --texture and --no-materials. Raises what load_scene raises, in words of the command line."""
-    from edgegrad import Scene, load_scene
+    from .. import Scene, load_scene
 
     if args.texture is not None:
         return Scene([read_mesh(args)])
@@ -32,7 +32,7 @@ def read_scene(args: argparse.Namespace) -> Scene:
 
 def read_mesh(args: argparse.Namespace) -> Mesh:
     """The mesh file as one mesh; see read_scene."""
-    from edgegrad import load_mesh
+    from .. import load_mesh
 
     with _in_words_of_the_shell():
         return load_mesh(args.mesh, args.texture, materials=not args.no_materials)
@@ -51,7 +51,7 @@ def _in_words_of_the_shell() -> Iterator[None]:
 
 def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
     """(H, W, 3), and (H, W) from its alpha where that says anything."""
-    from edgegrad import read_image
+    from .. import read_image
 
     image = read_image(path, channels=4)
     alpha = image[..., 3]
@@ -61,10 +61,10 @@ def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
 def seen_by(camera: Path | None, image: Path) -> Path:
     """The image as the camera of a file speaks of it: upright, for so commands read pictures whose cameras they write; or as it
     is stored, where that alone is in proportion to the camera. Tells which, where the EXIF orientation leaves it open."""
-    from edgegrad import load_camera
-    from edgegrad.files.formats.views import resized
-    from edgegrad.files.image import read_orientation, read_size
-    from edgegrad.files.paths import StoredPath
+    from .. import load_camera
+    from ..files.formats.views import resized
+    from ..files.image import read_orientation, read_size
+    from ..files.paths import StoredPath
 
     if camera is None or camera.suffix.lower() != ".json" or (orientation := read_orientation(image)) == 1:
         return image
@@ -81,7 +81,7 @@ def seen_by(camera: Path | None, image: Path) -> Path:
 
 def read_coverage(path: Path, label: int | None = None) -> Tensor:
     """(H, W) as edgegrad.read_mask reads it. Raises what that raises, in words of the command line."""
-    from edgegrad import read_mask
+    from .. import read_mask
 
     with _in_words_of_the_shell():
         return read_mask(path, label)
@@ -89,7 +89,7 @@ def read_coverage(path: Path, label: int | None = None) -> Tensor:
 
 def read_labels(path: Path, count: int) -> list[Tensor]:
     """Of each of so many meshes (H, W), where an image of labels has its number, from 1. Raises what read_mask raises."""
-    from edgegrad import read_mask
+    from .. import read_mask
 
     found = []
     for number in range(1, count + 1):
@@ -103,7 +103,7 @@ def read_labels(path: Path, count: int) -> list[Tensor]:
 
 def read_weight(path: Path) -> Tensor:
     """(H, W), how much a pixel counts. Raises what edgegrad.read_mask raises."""
-    from edgegrad.files.mask import read_weight
+    from ..files.mask import read_weight
 
     return read_weight(path)
 
@@ -111,7 +111,7 @@ def read_weight(path: Path) -> Tensor:
 def read_depth(args: argparse.Namespace, picture: Tensor) -> Tensor | None:
     """(H, W) of --depth and --depth-scale, for a picture (H, W, 3). Raises what edgegrad.read_depth raises, in words of the
     command line."""
-    from edgegrad import read_depth
+    from .. import read_depth
 
     if args.depth is None:
         if args.depth_scale is not None:
@@ -143,7 +143,7 @@ def read_background(text: str | None, picture: Tensor) -> Tensor | None:
     """A colour (3,) from #rrggbb, or an image (H, W, 3)."""
     import torch
 
-    from edgegrad.files.image import read_image, srgb_to_linear
+    from ..files.image import read_image, srgb_to_linear
 
     if text is None:
         return None
@@ -172,9 +172,9 @@ def read_pose(path: Path) -> Pose:
     """From what fit-pose or track writes, or mesh to world 4 × 4 by rows: JSON, text or .npy. Raises ValueError or OSError."""
     import numpy as np
 
-    from edgegrad.files.paths import check_readable
-    from edgegrad.fit.pose.pose import pose_from_matrix
-    from edgegrad.fit.pose.result import pose_from_json
+    from ..files.paths import check_readable
+    from ..fit.pose.pose import pose_from_matrix
+    from ..fit.pose.result import pose_from_json
 
     try:
         file = check_readable(path, (".json", ".txt", ".npy"))
@@ -192,9 +192,9 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
     """From --camera; else from the pose file, unless a view is described; else one that frames the mesh."""
     import torch
 
-    from edgegrad import load_camera
-    from edgegrad.fit import PoseFit
-    from edgegrad.preview import framing
+    from .. import load_camera
+    from ..fit import PoseFit
+    from ..preview import framing
 
     described = any(value is not None for value in (args.fov, args.eye, args.target, args.up))
     camera, source = None, args.camera
@@ -222,7 +222,7 @@ def assume_fov(args: argparse.Namespace, photo: Path, size: tuple[int, int], pos
     40°. In words, what is assumed; empty where nothing is."""
     import math
 
-    from edgegrad.files.focal import read_focal
+    from ..files.focal import read_focal
 
     placed = any(value is not None for value in (args.eye, args.target, args.up))
     if (
@@ -247,7 +247,7 @@ def _has_camera(pose_file: Path) -> bool:
 
 def fitting(camera: Camera, size: tuple[int, int], source: Path) -> Camera:
     """The camera for a picture of that size. Raises ValueError that names its file, unless they are in proportion."""
-    from edgegrad.files.formats.views import resized
+    from ..files.formats.views import resized
 
     found = resized(camera, size)
     if found is None:
@@ -260,7 +260,7 @@ def fitting(camera: Camera, size: tuple[int, int], source: Path) -> Camera:
 
 def read_views(args: argparse.Namespace) -> tuple[list[Camera], list[Tensor], list[Tensor | None]]:
     """Cameras of the images' sizes, images (H, W, 3), and alphas (H, W). Raises ValueError."""
-    from edgegrad import load_camera
+    from .. import load_camera
 
     if len(args.camera) != len(args.images):
         raise ValueError(f"--camera: expected {len(args.images)}, one for each image, got {len(args.camera)}")

@@ -38,9 +38,8 @@ def read_film(path: Path, camera: Path | None = None) -> Film:
 
 
 def _folder(folder: Path, camera: Path | None) -> Film:
-    from edgegrad import read_image
-    from edgegrad.files.image import READABLE
-
+    from .. import read_image
+    from ..files.image import READABLE
     from .inputs import seen_by
 
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in READABLE)
@@ -51,7 +50,7 @@ def _folder(folder: Path, camera: Path | None) -> Film:
 
 
 def _video(path: Path) -> Film:
-    from edgegrad.optional import require
+    from ..optional import require
 
     av = require("av", *VIDEO)
     try:
@@ -72,7 +71,7 @@ def _video(path: Path) -> Film:
 def _decoded(path: Path, av: Any) -> Iterator[Tensor]:
     import torch
 
-    from edgegrad.files.image import srgb_to_linear
+    from ..files.image import srgb_to_linear
 
     try:
         with av.open(str(path)) as container:
@@ -111,8 +110,8 @@ def _fault(path: Path, error: Exception) -> ValueError:
 
 def write_film(folder: Path, pictures: list[Path], fps: Fraction) -> str | None:
     """film.mp4, or without the library of videos film.webp; its name. None without the library of pictures as well."""
-    from edgegrad.files.paths import replacing
-    from edgegrad.optional import DRAWING, require
+    from ..files.paths import replacing
+    from ..optional import DRAWING, require
 
     if not pictures:
         return None

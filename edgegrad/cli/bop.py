@@ -13,7 +13,7 @@ from .arguments import count, millimetres, number
 from .outputs import make_folder
 
 if TYPE_CHECKING:
-    from edgegrad.bop import Estimate, Refined
+    from ..bop import Estimate, Refined
 
 
 def add(commands: Any) -> None:
@@ -70,8 +70,8 @@ def _add_files(parser: argparse.ArgumentParser) -> None:
 def _errors(args: argparse.Namespace) -> int:
     """Prints recalls as BOP19 defines them (AR of VSD, MSSD and MSPD), of ADD(-S) below 10 % of the diameter, and median errors,
     by object and of all."""
-    from edgegrad.bop import Dataset, evaluate, read_results
-    from edgegrad.files.paths import check_suffix, replacing
+    from ..bop import Dataset, evaluate, read_results
+    from ..files.paths import check_suffix, replacing
 
     if args.out is not None:
         check_suffix(args.out, (".json",))  # before the work rather than after it
@@ -94,9 +94,8 @@ def _refine(args: argparse.Namespace) -> int:
     an image grows by that of all its rows."""
     from tqdm import tqdm
 
-    from edgegrad.bop import Dataset, read_results, refine, write_results
-    from edgegrad.files.paths import check_suffix
-
+    from ..bop import Dataset, read_results, refine, write_results
+    from ..files.paths import check_suffix
     from . import INTERRUPTED
 
     check_suffix(args.out, (".csv",))
@@ -104,7 +103,7 @@ def _refine(args: argparse.Namespace) -> int:
     dataset = Dataset(args.dataset, args.split, args.models)
     done = _done(args, given)
     if args.pictures is not None:
-        from edgegrad.optional import DRAWING, require
+        from ..optional import DRAWING, require
 
         require("matplotlib", *DRAWING)
         make_folder(args.pictures)
@@ -143,7 +142,7 @@ def _refine(args: argparse.Namespace) -> int:
 
 def _done(args: argparse.Namespace, given: Sequence[Estimate]) -> list[Estimate]:
     """The rows of an earlier run. Raises ValueError."""
-    from edgegrad.bop import read_results
+    from ..bop import read_results
 
     if args.out.exists() and args.results.exists() and args.out.samefile(args.results):
         raise ValueError(f"--out: expected another file than {args.results}, got the same; its poses would be lost")
@@ -183,7 +182,7 @@ def _timed(done: Sequence[Estimate], given: Sequence[Estimate], spent: dict[tupl
 
 def _draw(folder: Path, number: int, found: Refined) -> None:
     """Nothing where no step was taken."""
-    from edgegrad.fit.pose.pictures import draw_fit
+    from ..fit.pose.pictures import draw_fit
 
     if found.fit is not None and found.fit.history:
         row = found.estimate

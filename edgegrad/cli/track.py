@@ -21,9 +21,9 @@ from .inputs import assume_fov, read_pose, read_scene, read_view
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from edgegrad import Camera
-    from edgegrad.fit import TrackedPose
-    from edgegrad.scene.scene import Scene
+    from .. import Camera
+    from ..fit import TrackedPose
+    from ..scene.scene import Scene
 
 EVERY = 10  # frames from one poses.json to the next
 FOUND, LOST = (60, 230, 90), (230, 60, 60)  # colours of contours
@@ -67,8 +67,7 @@ def _rate(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Follows a mesh through the frames of a video, from its pose in the first one. poses.json is written every few frames;
     Ctrl-C and broken frames keep the poses so far."""
-    from edgegrad.fit import track
-
+    from ..fit import track
     from . import INTERRUPTED
 
     scene, init = read_scene(args), read_pose(args.init)
@@ -118,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write_poses(folder: Path, poses: list[TrackedPose]) -> None:
-    from edgegrad.files.paths import replacing
+    from ..files.paths import replacing
 
     rows = [
         {
@@ -136,8 +135,8 @@ def _write_overlay(path: Path, frame: Tensor, scene: Scene, camera: Camera, pose
     """The frame with the contour of the mesh."""
     import torch
 
-    from edgegrad import render_aovs, write_image
-    from edgegrad.files.image import srgb_to_linear
+    from .. import render_aovs, write_image
+    from ..files.image import srgb_to_linear
 
     with torch.no_grad():
         moved = scene.transformed(pose.R, pose.t, pose.scale)

@@ -24,7 +24,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Finds the texture of a mesh that has texture coordinates from pictures of it. Ctrl-C keeps the best so far, and --resume
     goes on from there."""
-    from edgegrad.fit import fit_texture
+    from ..fit import fit_texture
 
     mesh = read_mesh(args)
     cameras, pictures, alphas = read_views(args)

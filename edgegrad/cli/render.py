@@ -35,8 +35,8 @@ def run(args: argparse.Namespace) -> int:
     """Renders a mesh to an image file; one without colours under a headlight."""
     import torch
 
-    from edgegrad import render, write_image
-    from edgegrad.preview import under_headlight
+    from .. import render, write_image
+    from ..preview import under_headlight
 
     scene = read_scene(args)
     pose = None if args.pose is None else read_pose(args.pose)

@@ -9,6 +9,8 @@ import platform
 import time
 from typing import Any
 
+from .. import __version__
+
 LIBRARIES = ("torch", "numpy", "embreex", "trimesh", "OpenImageIO")
 # Which extra brings what, and what for.
 OPTIONAL = {
@@ -30,10 +32,10 @@ TOLERANCE = 0.02  # of the gradient's size; its own error is 0.1 %
 
 
 class Version(argparse.Action):
-    """Prints the version and ends; that of the installed package, or of one that is only on the path."""
+    """Print the version and exit."""
 
     def __call__(self, *_: object) -> None:
-        print(f"edgegrad {_version('edgegrad') or _of_source()}")
+        print(f"edgegrad {__version__}")
         raise SystemExit(0)
 
 
@@ -47,10 +49,9 @@ def run(args: argparse.Namespace) -> int:
     code is 1 if that is wrong."""
     import torch
 
-    import edgegrad
-    from edgegrad.library import core, embree_path
+    from ..library import core, embree_path
 
-    lines = {"edgegrad": edgegrad.__version__, "Python": f"{platform.python_version()} on {platform.platform()}"}
+    lines = {"edgegrad": __version__, "Python": f"{platform.python_version()} on {platform.platform()}"}
     lines |= {name: _version(name) or "not installed" for name in LIBRARIES}
     number = core.embree_version()
     lines["Embree"] = f"{number // 10000}.{number // 100 % 100}.{number % 100}, {embree_path()}"
@@ -82,12 +83,12 @@ def gradient_error() -> float:
     """
     import torch
 
-    import edgegrad as eg
+    from .. import Camera, Mesh, render
 
     verts = torch.tensor([[-0.7, -0.6, 0.0], [0.8, -0.3, 0.0], [-0.1, 0.75, 0.0]], dtype=torch.float64)
-    mesh = eg.Mesh(verts.clone().requires_grad_(), torch.tensor([[0, 1, 2]]), colors=torch.ones(3, 1))
-    camera = eg.Camera.orthographic((0, 0, 2), (0, 0, 0), height=2.0, size=(64, 64))
-    eg.render(mesh, camera, spp=4, edge_samples=4096).sum().backward()
+    mesh = Mesh(verts.clone().requires_grad_(), torch.tensor([[0, 1, 2]]), colors=torch.ones(3, 1))
+    camera = Camera.orthographic((0, 0, 2), (0, 0, 0), height=2.0, size=(64, 64))
+    render(mesh, camera, spp=4, edge_samples=4096).sum().backward()
     assert mesh.verts.grad is not None
     found = mesh.verts.grad[:, :2]
     sides = verts.roll(-2, 0) - verts.roll(-1, 0)  # opposite to each vertex
@@ -100,9 +101,3 @@ def _version(package: str) -> str | None:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def _of_source() -> str:
-    import edgegrad
-
-    return edgegrad.__version__

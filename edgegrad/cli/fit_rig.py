@@ -30,8 +30,8 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Finds how a skinned mesh or a robot is posed from masks, from coarse to fine, beginning at rest. Ctrl-C keeps the best so
     far, and --resume goes on from there."""
-    from edgegrad import load_rig, load_robot
-    from edgegrad.fit import fit_rig
+    from .. import load_rig, load_robot
+    from ..fit import fit_rig
 
     rig = load_robot(args.rig) if args.rig.suffix.lower() == ".urdf" else load_rig(args.rig, materials=False)
     cameras, _, _ = read_views(args)

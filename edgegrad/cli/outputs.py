@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from edgegrad.fit import CameraFit, Fit, PoseFit
-    from edgegrad.live import Viewer
+    from ..fit import CameraFit, Fit, PoseFit
+    from ..live import Viewer
 
 
 def make_folder(folder: Path) -> None:
@@ -40,7 +40,7 @@ def live(args: argparse.Namespace) -> Iterator[Viewer | None]:
     if not args.view:
         yield None
         return
-    from edgegrad import viewer
+    from .. import viewer
 
     with viewer(args.port, server=True) as view:
         print(f"live view: {view.url}", flush=True)
@@ -56,7 +56,7 @@ def linger(view: Viewer | None, fit: Fit | PoseFit | CameraFit) -> None:
 
 
 def write_pose(folder: Path, fit: PoseFit) -> None:
-    from edgegrad.files.paths import replacing
+    from ..files.paths import replacing
 
     with replacing(folder / "pose.json") as temporary:
         temporary.write_text(fit.to_json() + "\n", encoding="utf-8")
@@ -70,7 +70,7 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
             if name == "pose.json":
                 write_pose(folder, fit)
             else:
-                from edgegrad.fit.pose import pictures  # matplotlib takes a while to import
+                from ..fit.pose import pictures  # matplotlib takes a while to import
 
                 draw = {
                     "fit.png": pictures.draw_fit,
@@ -98,7 +98,7 @@ def finish(fit: Fit, folder: Path, save: Callable[..., list[str]] | None = None,
 
 
 def _can_draw() -> bool:
-    from edgegrad.optional import require
+    from ..optional import require
 
     try:
         for module in ("matplotlib", "PIL"):

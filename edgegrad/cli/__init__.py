@@ -1,7 +1,6 @@
 """The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-rig, fit-texture, fit-camera, track, render, bop, demo, doctor.
 
-It lies beside the library rather than in it, for importing any part of that imports torch, which takes seconds: help and
-faults of arguments are said before. Each command imports what it uses when it runs.
+Each command imports what it uses when it runs: torch takes seconds to import, help and faults of arguments do without it.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = parser().parse(argv)
         with _ended_by_ctrl_c():
-            import edgegrad  # noqa: F401  which each command uses
+            from .. import render  # noqa: F401  with torch and the kernel, which each command uses
         return args.run(args)
     except KeyboardInterrupt:
         print("edgegrad: interrupted", file=sys.stderr)

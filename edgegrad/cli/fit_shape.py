@@ -26,8 +26,8 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Finds the shape of an object from masks, beginning with the mesh, which a sphere around the object may be. Ctrl-C keeps
     the best so far, and --resume goes on from there."""
-    from edgegrad import load_mesh
-    from edgegrad.fit import fit_shape
+    from .. import load_mesh
+    from ..fit import fit_shape
 
     mesh = load_mesh(args.mesh, materials=False)
     cameras, _, _ = read_views(args)
