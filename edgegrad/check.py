@@ -273,6 +273,13 @@ def check_positive_int(name: str, value: object, *, most: int = 2**31 - 1) -> in
     return check_int(name, value, 1, most)
 
 
+def check_dtype(dtype: torch.dtype | None) -> torch.dtype | None:
+    """Return float32, float64 or None itself. Raises TypeError."""
+    if dtype not in (None, torch.float32, torch.float64):
+        raise TypeError(f"dtype: expected torch.float32, torch.float64 or None, got {dtype!r}")
+    return dtype
+
+
 def check_flag(name: str, flag: object) -> bool:
     """True or False itself. Raises TypeError."""
     if not isinstance(flag, bool):

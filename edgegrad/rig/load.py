@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ..files.formats.gltf_rig import Bound, RigFile
-from ..files.formats.part import Part, Wanted, naming
+from ..files.formats.gltf_rig import RigFile, SkinBinding
+from ..files.formats.part import LoadOptions, Part, errors_with_path
 from ..files.parts import read_rig
 from ..files.paths import PathLike
 from ..files.welding import to_mesh, welded
@@ -32,12 +32,12 @@ def load_rig(path: PathLike, materials: bool = True, lit: bool = False, dtype: t
     channels of animations, morph targets and lights that cannot be read are left out.
 
     The other arguments are those of load_scene, and so are the errors; beside them ValueError for a skin whose joints are not in
-    the scene, other faults of a skin, and nodes in a circle.
+    the scene, other errors of a skin, and nodes in a circle.
     """
     roma()
-    wanted = Wanted(materials, lit, rigged=True, dtype=dtype)
-    with naming(path):
-        found, model = read_rig(path, wanted)
+    options = LoadOptions(materials, lit, rigged=True, dtype=dtype)
+    with errors_with_path(path):
+        found, model = read_rig(path, options)
         joints = Joints(
             [node.name for node in found.nodes],
             [node.parent for node in found.nodes],
@@ -58,7 +58,7 @@ def load_rig(path: PathLike, materials: bool = True, lit: bool = False, dtype: t
         )
 
 
-def _bound(part: Part, bound: Bound, world: np.ndarray, dtype: torch.dtype) -> tuple[Mesh, Skin]:
+def _bound(part: Part, bound: SkinBinding, world: np.ndarray, dtype: torch.dtype) -> tuple[Mesh, Skin]:
     """The mesh, and how it hangs on the joints."""
     moves = [*bound.targets, bound.weights]
     by = welded(np.concatenate([part.verts, *moves], 1), part.faces)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..files.formats.source import Unsupported
+from ..files.formats.context import UnreadLog
 from ..files.paths import PathLike, check_readable
 from ..optional import require
 from ..scene.scene import Scene
@@ -48,9 +48,9 @@ def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ())
     file = check_readable(path, (".urdf", ".xml"))
     packages = _folders(package_dirs)
     yourdfpy, pk = require("yourdfpy", *EXTRA), require("pytorch_kinematics", *EXTRA)
-    with _naming(file):
+    with _errors_with_path(file):
         given = yourdfpy.URDF.load(str(file), load_meshes=False, build_scene_graph=False)
-    robot, unread = given.robot, Unsupported()
+    robot, unread = given.robot, UnreadLog()
     joints = list(robot.joints)
     links = [link.name for link in robot.links]
     parents = _parents(file, links, joints)
@@ -65,7 +65,7 @@ def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ())
             carries += [place] * len(found)
     if not meshes:
         raise ValueError(f"{file}: expected links with visuals, got none; nothing of it is seen")
-    with _naming(file):
+    with _errors_with_path(file):
         # As it was understood, for the other's parser refuses what is not of the format.
         chain = (pk.build_chain_from_urdf(given.write_xml_string()) if joints else _chain(pk, links[0])).to(
             dtype=torch.float64
@@ -83,7 +83,7 @@ def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ())
     rest = torch.zeros(len(free), dtype=torch.float64).clamp(low, high)
     control = Control(rest, low, high, tuple(joint.name for joint in free))
     deformer = Links(chain, tuple(carries), tuple(links), parents, couple, offset, {"angles": control})
-    unread.say(path)
+    unread.warn(path)
     return Rig(meshes[0] if len(meshes) == 1 else Scene(meshes), deformer)
 
 
@@ -176,7 +176,7 @@ def _coupling(file: Path, moving: list[Any], free: list[Any], order: dict[str, i
     return couple, offset
 
 
-def _limit(joint: Any, side: str, unread: Unsupported) -> float:
+def _limit(joint: Any, side: str, unread: UnreadLog) -> float:
     """0 where the joint's limit does not say it, as the format defines it; infinite without a limit."""
     if joint.limit is None or joint.type == "continuous":
         return -np.inf if side == "lower" else np.inf
@@ -190,7 +190,7 @@ def _limit(joint: Any, side: str, unread: Unsupported) -> float:
 
 
 @contextmanager
-def _naming(file: Path) -> Iterator[None]:
+def _errors_with_path(file: Path) -> Iterator[None]:
     """Whatever the libraries say of a file names it."""
     try:
         yield
