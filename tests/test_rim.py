@@ -296,15 +296,18 @@ def test_plan() -> None:
     view, scene = camera("fold"), eg.Scene([white_room()], torch.zeros(1, dtype=F64))
     verts = scene.meshes[0].verts.clone().requires_grad_()
     wanted = view.replace(K=view.K.clone().requires_grad_())
-    term = eg.plan(scene, wanted)["rim"]
+    term = eg.plan(scene, wanted)["lens boundary"]
     perimeter = 2 * math.pi * 16
     assert term.on and int(term.why.split()[-4]) == pytest.approx(perimeter, rel=0.1)
-    row = eg.plan(eg.Scene([scene.meshes[0].replace(verts=verts)]), view)["rim"]
+    row = eg.plan(eg.Scene([scene.meshes[0].replace(verts=verts)]), view)["lens boundary"]
     assert not row.on and row.why == "neither K nor distortion requires a gradient"
-    assert eg.plan(scene, view)["rim"].why == "neither verts nor the camera require a gradient"
-    assert eg.plan(scene, wanted.crop(15, 18, 8, 9))["rim"].why == "no lens ends in view"
-    assert eg.plan(scene, wanted, visibility=False)["rim"].why == "visibility=False"
-    assert eg.plan(scene, wanted.replace(distortion=torch.zeros(8, dtype=F64)))["rim"].why == "no lens ends in view"
+    assert eg.plan(scene, view)["lens boundary"].why == "neither verts nor the camera require a gradient"
+    assert eg.plan(scene, wanted.crop(15, 18, 8, 9))["lens boundary"].why == "no lens ends in view"
+    assert eg.plan(scene, wanted, visibility=False)["lens boundary"].why == "visibility=False"
+    assert (
+        eg.plan(scene, wanted.replace(distortion=torch.zeros(8, dtype=F64)))["lens boundary"].why
+        == "no lens ends in view"
+    )
 
 
 def test_same_bits_at_any_number_of_threads() -> None:

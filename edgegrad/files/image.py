@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..camera.mistakes import warn_of_bytes
+from ..camera.convention_warnings import warn_of_bytes
 from ..check import as_tensor, check_finite, check_not_meta, check_shape
 from ..optional import require
 from ..warnings import warn
@@ -133,7 +133,7 @@ def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb
         raise ValueError(
             f"curve: expected none for {path}, whose floating-point pixels are linear, got one; leave it out"
         )
-    # Not OpenImageIO's own conversion: what it does depends on the OCIO configuration that it finds.
+    # OpenImageIO's own conversion depends on the OCIO configuration that it finds.
     if largest is not None:
         for rows in color.split(
             max(1, (1 << 20) // color[0].numel())

@@ -27,7 +27,7 @@ MESHES = (".obj", *GLTFS, ".ply", ".stl", ".off", ".3mf")
 Appearance = Callable[[dict[str, Any]], dict[str, Any]]  # the fields of a part, from the arrays of a file
 
 
-# What trimesh logs, tracebacks among it, becomes an error here; whoever sets up logging still gets it.
+# Errors here replace the tracebacks that trimesh logs; a user who sets up logging still gets them.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 

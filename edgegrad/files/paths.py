@@ -67,7 +67,7 @@ def replacing(path: PathLike) -> Iterator[Path]:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(f"{path}: expected a folder to write to, got {file.parent} ({error.strerror})") from error
-    # The same ending, since libraries choose the format by it; not tempfile, whose files only their owner may read.
+    # Libraries choose the format by the ending. Files of tempfile may only be read by their owner.
     temporary = file.with_name(f".{file.stem[:64]}-{secrets.token_hex(6)}{file.suffix}")
     try:
         yield temporary

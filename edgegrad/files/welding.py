@@ -81,7 +81,7 @@ def to_mesh(part: Part, dtype: torch.dtype = torch.float32, by: Welded | None = 
         raise FormatError(
             f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh"
         )
-    # Those that nothing of the file needs are for textures to come, and for shaders.
+    # Coordinates that no texture of the file needs serve later textures, and shaders.
     if part.uvs is not None and (textured or bool((np.abs(part.uvs) <= LARGEST_UV).all())):
         images["uvs"], images["uv_faces"] = _weld(part.uvs, part.faces if part.uv_faces is None else part.uv_faces)
     if textured:

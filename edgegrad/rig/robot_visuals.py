@@ -30,13 +30,13 @@ class Appearance(NamedTuple):
 
 
 class Visuals:
-    """The visuals of a file. Notes what of them is not shown."""
+    """The visuals of a file, and a record of those that are not shown."""
 
     def __init__(self, file: Path, robot: Any, packages: Sequence[Path], unread: UnreadLog) -> None:
         self.file, self.robot, self.packages, self.unread = file, robot, packages, unread
 
     def meshes(self, link: str, visual: Any) -> list[Mesh]:
-        """In the link's coordinates. Raises FileNotFoundError or ValueError."""
+        """Return the meshes in the link's coordinates. Raises FileNotFoundError or ValueError."""
         geometry = visual.geometry
         matrix = np.eye(4) if visual.origin is None else np.asarray(visual.origin, np.float64)
         if geometry.mesh is not None:
@@ -77,7 +77,7 @@ class Visuals:
         return mesh.replace(face_colors=faces, uvs=mesh.uvs, uv_faces=mesh.uv_faces)
 
     def _appearance(self, link: str, material: Any) -> Appearance:
-        """Return what a material says; its numbers are sRGB, as displays show them."""
+        """Return the appearance of a material; its numbers are sRGB, as displays show them."""
         if material is None:
             return Appearance(None, None)
         shared = [one for one in self.robot.materials if one.name == material.name]  # defined once for the whole robot
@@ -124,8 +124,8 @@ class Visuals:
             raise ValueError(f"{self.file}: link {link!r}: {error}") from error
 
     def _find(self, name: str) -> Path | None:
-        """A file by its path, or by a URL such as package://NAME/PATH: in the folders of packages, else in that of the robot's
-        file and those above it."""
+        """Return a file by its path, or by a URL such as package://NAME/PATH: in the folders of packages, else in that of the
+        robot's file and those above it."""
         scheme, _, rest = name.rpartition("://")
         package, _, within = rest.partition("/")
         here = self.file.absolute().parent

@@ -19,7 +19,7 @@ from .views import View
 
 MATRICES = ("camera_matrix", "cameraMatrix", "intrinsic", "K", "k", "M1")
 COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "dist_coeff", "distortion", "D", "d", "D1")
-# Of a stereo pair: matrices and coefficients of the first and the second camera.
+# A stereo pair has matrices and coefficients of the first and the second camera.
 PAIRS = {
     ("M1", "M2"): ("D1", "D2"),
     ("K1", "K2"): ("D1", "D2"),
@@ -27,7 +27,7 @@ PAIRS = {
 }
 SIZES = ("image_size", "imageSize", "size", "resolution")  # (width, height)
 BROWN_CONRADY, FISHEYES = ("plumb_bob", "rational_polynomial"), ("equidistant", "fisheye")
-# How the calibration was done, and what follows from the rest: rectified cameras, essential and fundamental matrices.
+# These keys describe the calibration's procedure, or follow from the rest: rectified cameras, essential matrices.
 HARMLESS = {
     "calibration_time", "nframes", "nr_of_frames", "board_width", "board_height", "square_size", "marker_size", "aspectRatio",
     "fix_aspect_ratio", "flags", "flagValue", "avg_reprojection_error", "per_view_reprojection_errors", "image_points",
@@ -113,11 +113,7 @@ def _single(fields: _Fields, size: tuple[int, int] | None) -> dict[str, View]:
 
 
 def _stereo(
-    fields: _Fields,
-    pair: tuple[str, str],
-    file: Path,
-    size: tuple[int, int] | None,
-    unread: UnreadLog,
+    fields: _Fields, pair: tuple[str, str], file: Path, size: tuple[int, int] | None, unread: UnreadLog
 ) -> dict[str, View]:
     """Return the first camera at the origin and the second at R and T. These stand in this file, or in extrinsics next to
     intrinsics, as OpenCV's example of stereo calibration writes them."""

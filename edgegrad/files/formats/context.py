@@ -18,7 +18,7 @@ from ..paths import PathLike
 from .file_type import check_file_type
 from .part import FormatError, LoadOptions
 
-# What Pillow is let loose on. Not EPS, above all, for which it runs another program.
+# Pillow may open these. EPS is not among them, because Pillow runs another program for it.
 TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
 
 

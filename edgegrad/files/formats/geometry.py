@@ -23,7 +23,7 @@ def shape(name: str, raw: dict[str, Any], matrix: np.ndarray) -> Part:
         # Elementwise: a matrix product may round equal rows differently, and they would not be welded.
         v = v[:, 0:1] * matrix[:3, 0] + v[:, 1:2] * matrix[:3, 1] + v[:, 2:3] * matrix[:3, 2] + matrix[:3, 3]
     part = Part(name, np.ascontiguousarray(v), np.ascontiguousarray(faces))
-    # In a mirror the front of a face stays its front.
+    # The front of a face stays its front in a mirror.
     return part.reversed() if np.linalg.det(matrix[:3, :3]) < 0.0 else part
 
 
@@ -94,8 +94,7 @@ def typed(model: MeshFile, dtype: torch.dtype | None, context: LoadContext) -> M
         cost, precise = rounding(*verts, *places)
     if precise and dtype is torch.float32:
         context.unread.note(
-            "positions in float64",
-            f"rounded by up to {cost:.2g}, more than a millionth of the extent, as dtype says",
+            "positions in float64", f"rounded by up to {cost:.2g}, more than a millionth of the extent, as dtype says"
         )
     dtype = dtype or (torch.float64 if precise else torch.float32)
     model = model._replace(dtype=dtype, lights=[moved(light, dtype) for light in model.lights])

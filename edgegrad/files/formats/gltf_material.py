@@ -114,7 +114,7 @@ def appearance(
         found |= {"uvs": primitive.uvs(place, "base_color"), "wrap": texture.wrap, "filter": texture.near}
     alpha_mask = _alpha(primitive, texture)
     if lit:
-        # What cuts out by vertices takes the mesh's own coordinates.
+        # An alpha mask by vertices takes the mesh's own coordinates.
         return {**found, **alpha_mask, **_lit(primitive, None if "uvs" in alpha_mask else place, known)}
     return {**found, **alpha_mask, **_unlit(primitive, texture, colors)}
 

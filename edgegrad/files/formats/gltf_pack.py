@@ -48,7 +48,7 @@ def _packed(
         made = trimesh.Trimesh(verts, faces, process=False, vertex_attributes=attributes)
         if appearance.material:
             images = {name: _picture(image) for name, image in appearance.images.items()}
-            # Of another name each, or trimesh takes those with the same images for one.
+            # Names differ, because trimesh joins materials with the same images.
             material = trimesh.visual.material.PBRMaterial(name=f"material {k}", **images)
             made.visual = trimesh.visual.TextureVisuals(material=material)
         parts[str(k)] = made

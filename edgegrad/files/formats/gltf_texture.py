@@ -12,7 +12,7 @@ from .gltf import entry
 from .gltf_arrays import Arrays, content
 from .part import FormatError
 
-# What a glTF calls its samplers' settings.
+# glTF has these codes for settings of samplers.
 WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 NEAREST, LINEAR = 9728, 9729
 FARTHER: dict[int | None, str] = {

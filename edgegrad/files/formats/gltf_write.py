@@ -100,7 +100,7 @@ class GltfAppearance:
         alpha = self._within("alpha", mesh.alpha.detach().cpu().double())
         if alpha.numel() == 1:
             return float(alpha)
-        # Where texels are larger than pixels, mipmaps are linear.
+        # Mipmaps are linear where texels are larger than pixels.
         near = base is not None and FILTERS[base.filter][0] == FILTERS[mesh.filter][0]
         lies = Texture(
             alpha[..., None], None, None, mesh.wrap, base.filter if base is not None and near else mesh.filter

@@ -32,7 +32,7 @@ def read_keys(file: Path) -> dict[str, Any]:
         return _of_opencv(file)
     yaml = require("yaml", "edgegrad[cameras]", "reading YAML")
     try:
-        # Of several documents the first: a message of ROS, which `ros2 topic echo` ends by ---.
+        # The first of several documents counts: `ros2 topic echo` ends a message of ROS by ---.
         found = next((document for document in yaml.safe_load_all(text) if document is not None), None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise FormatError(

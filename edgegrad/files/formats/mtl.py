@@ -16,9 +16,9 @@ from .part import FormatError
 from .text import as_utf8
 
 READ = {"kd", "map_kd", "ke", "ks", "ns", "illum", "d", "tr", "map_d", "pr", "pm"}
-# What changes no picture here: light from all sides, the index of refraction (dielectrics have that of 1.5), hints.
+# These change no picture: ambient light, the index of refraction (dielectrics have that of 1.5), hints.
 HARMLESS = {"ka", "ni", "sharpness", "map_aat"}
-# What nothing reads, and only lit scenes would: maps, and numbers that are nothing where they have this value.
+# Only lit scenes would use these, which nothing reads: maps, and numbers that have no effect at this value.
 MAPS = {
     "map_ka", "map_ks", "map_ns", "map_ke", "map_pr", "map_pm", "map_ps", "map_bump", "bump", "norm", "disp", "decal",
     "refl", "map_refl", "map_tr", "map_tf", "map_ni",

@@ -16,9 +16,9 @@ from .text import unquoted
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-bm": 1, "-type": 1,
            "-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # fmt: skip
 FEWER = ("-o", "-s", "-t")
-# What is followed, what is a hint on filters, and what is of bumps alone.
+# These are applied, are hints on filters, or concern bumps alone.
 APPLIED = ("-o", "-s", "-clamp", "-blendu", "-blendv", "-boost", "-texres", "-bm")
-# What the others say where they change nothing; of -imfchan, that grey comes from brightness.
+# The others change nothing with these values; for -imfchan, grey comes from brightness.
 NEUTRAL = {"-cc": ("off",), "-mm": ("0", "1"), "-t": ("0", "0", "0"), "-imfchan": ("l",)}
 
 

@@ -18,7 +18,7 @@ from .polygons import triangulate
 CORNERS = ("vertex_indices", "vertex_index")
 COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 UVS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
-# What changes no picture: alpha, which is dropped from all files but those that cut out, and what scanners say of a point.
+# These change no picture: alpha, which only glTF and OBJ files use, and what scanners say of a point.
 HARMLESS = {"alpha", "diffuse_alpha", "a", "confidence", "quality", "flags"}
 
 

@@ -8,7 +8,7 @@ from ...optional import require
 from .context import LoadContext
 from .part import FormatError
 
-# Of the area of a face: how far a triangle may be turned over, which rounded coordinates make of a corner of 180 degrees.
+# Rounded coordinates may turn a triangle over by this share of its face's area, at a corner of 180 degrees.
 SLACK = 1e-6
 
 

@@ -43,7 +43,7 @@ def note_unread(root: Any, context: LoadContext) -> None:
     """Note elements of a model part, each with all that lies below it, and attributes that nobody reads."""
     elements: dict[str, str] = {}  # tag to a name with the prefix of the file
     attributes: dict[str, set[str]] = {}
-    # Not one by one the many vertices and triangles that hold no more than they must.
+    # The many vertices and triangles without further attributes are not visited one by one.
     odd = require("lxml.etree", "edgegrad[files]", "reading 3MF").XPath(
         "*[@*[4] or not(self::c:vertex or self::c:triangle)]", namespaces={"c": CORE}
     )

@@ -25,7 +25,7 @@ READ = {
     "frames", "file_path", "transform_matrix", "w", "h", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy",
     "camera_model", "is_fisheye", *COEFFICIENTS,
 }  # fmt: skip
-# What cameras and images do not depend on: how instant-ngp trains, where nerfstudio's points and lists of images are.
+# Cameras and images do not depend on these: how instant-ngp trains, where nerfstudio's points and lists of images are.
 HARMLESS = {
     "aabb", "aabb_scale", "scale", "offset", "up", "sharpness", "n_frames", "n_extra_learnable_dims", "render_aabb",
     "enable_depth_loading", "enable_ray_loading", "integer_depth_scale", "white_transparent", "black_transparent", "fix_premult",
@@ -132,12 +132,7 @@ def _parts(name: str) -> tuple[str, ...]:
     return tuple(part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..") and ":" not in part)
 
 
-def _camera(
-    own: Mapping[str, Any],
-    shared: Mapping[str, Any],
-    found: Found,
-    size: tuple[int, int] | None,
-) -> Camera:
+def _camera(own: Mapping[str, Any], shared: Mapping[str, Any], found: Found, size: tuple[int, int] | None) -> Camera:
     given = {**shared, **own}
     if "w" in given and "h" in given:
         H, W = image_size(float(given["w"]), float(given["h"]))

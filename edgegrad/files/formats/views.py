@@ -32,7 +32,7 @@ class View(NamedTuple):
 def resized(camera: Camera, size: tuple[int, int]) -> Camera | None:
     """Return the camera for (H, W) pixels, or None where these are not in proportion to its own."""
     (H, W), (h, w) = size, camera.size
-    # One that is scaled to the other ends less than a pixel from it: sizes of scaled images are rounded.
+    # A scaled size ends less than a pixel from the other one, because sizes of scaled images are rounded.
     return camera.resized(size) if abs(H * w - W * h) <= max(H, W, h, w) else None
 
 
