@@ -163,7 +163,7 @@ def test_borders_that_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def sums(*u: float) -> Tensor:
         """The measure, and its moments by barycentrics and axis."""
-        found = texel_borders.TexelBorders.of(mesh, texture, area, u)
+        found = texel_borders.TexelBorders.from_mesh(mesh, texture, area, u)
         assert found is not None
         measure = found.running.diff(prepend=torch.zeros(1, dtype=F64))
         middle = (found.begin + found.end) / 2

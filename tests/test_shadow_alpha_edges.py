@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from cut_outs import disc, quad
+from alpha_masks import disc, quad
 from finite_differences import Case, check, estimate
 from finite_differences import gradient as derivative
 from lit_scenes import by_quadrature, from_above, plane

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..camera.lens import MOST
-from ..camera.mistakes import warn_if_behind
+from ..camera.convention_warnings import warn_if_behind
+from ..camera.lens import MOST_COEFFICIENTS
 from ..check import as_int, check_not_meta, check_positive, check_positive_int, check_shape
 from ..library import core
 from ..scene.mesh import Mesh
@@ -221,12 +221,14 @@ def pack_camera(camera: Camera) -> PackedCamera:
     world_to_camera = camera.world_to_camera.cpu().double().reshape(-1, 4, 4)
     K = camera.K.cpu().double().reshape(-1, 3, 3)
     distortion = camera.coefficients.cpu().double()
-    distortion = torch.nn.functional.pad(distortion, (0, MOST - distortion.shape[-1])).reshape(-1, MOST)
+    distortion = torch.nn.functional.pad(distortion, (0, MOST_COEFFICIENTS - distortion.shape[-1])).reshape(
+        -1, MOST_COEFFICIENTS
+    )
     B = max(world_to_camera.shape[0], K.shape[0], distortion.shape[0])
     return PackedCamera(
         world_to_camera.expand(B, 4, 4).contiguous(),
         K.expand(B, 3, 3).contiguous(),
-        distortion.expand(B, MOST).contiguous(),
+        distortion.expand(B, MOST_COEFFICIENTS).contiguous(),
         camera.projection != "orthographic",
         camera.lens,
         *camera.size,

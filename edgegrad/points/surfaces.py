@@ -118,7 +118,7 @@ class Surfaces:
             normal_faces = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
             given = (mesh.verts, mesh.faces), (mesh.normals, normal_faces), (uvs, uv_faces)
             values = values_of(*(tensor for pair in given for tensor in pair))
-            fans = Fans.of(*zip(values[::2], values[1::2], strict=True))
+            fans = Fans.from_corners(*zip(values[::2], values[1::2], strict=True))
             self._tangents[index] = fans.tangents(*(rows_of(x.to(mesh.verts.device), at.long()) for x, at in given))
         return self._tangents[index]
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...aovs import IDS, aovs_request, by_name, check_aovs
 from ...camera.camera import Camera
-from ...camera.lens import MOST
+from ...camera.lens import MOST_COEFFICIENTS
 from ...kernel.operators import forward_kernel, jvp_kernel
 from ...scene.scene import Scene
 
@@ -114,7 +114,7 @@ class Rendered:
         if motion.K is not None:
             tangents["K"] = motion.K[:, None]
         if motion.distortion is not None:
-            unsought = MOST - motion.distortion.shape[1]
+            unsought = MOST_COEFFICIENTS - motion.distortion.shape[1]
             tangents["distortion"] = torch.nn.functional.pad(motion.distortion, (0, unsought))[:, None]
         if isinstance(motion, Motions):
             return tangents  # of silhouettes and colours alone

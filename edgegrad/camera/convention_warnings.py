@@ -1,4 +1,4 @@
-"""Warnings of what other libraries' conventions make of a scene: allowed, but hardly ever meant."""
+"""Warnings of scenes that other libraries' conventions make: allowed, but hardly ever meant."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ BYTES = 16.0, 255.0  # the largest of whole numbers that are bytes rather than r
 
 
 def warn_if_behind(verts: Tensor, world_to_camera: Tensor) -> None:
-    """Where all vertices (V, 3) lie behind each of the cameras (B, 4, 4)."""
+    """Warn where all vertices (V, 3) lie behind each of the cameras (B, 4, 4)."""
     if not values_visible(verts, world_to_camera):
         return
-    # Of one vertex first, in numbers of Python: a small scene renders in a millisecond.
-    # One by one, for tensors under torch.func have no tolist() in torch 2.9 and before.
+    # One vertex is tested first, in numbers of Python, because a small scene renders in a millisecond.
+    # Tensors under torch.func have no tolist() in torch 2.9 and before.
     first, row = [x.item() for x in verts[0]], [x.item() for x in world_to_camera[0, 2]]
     if sum(a * b for a, b in zip(first, row, strict=False)) + row[3] > 0.0:
         return
@@ -33,7 +33,7 @@ def warn_if_behind(verts: Tensor, world_to_camera: Tensor) -> None:
 
 
 def warn_of_bytes(name: str, image: Tensor) -> None:
-    """Where an image (…, C) has whole numbers up to 255, not radiance from 0 to 1."""
+    """Warn where an image (…, C) has whole numbers up to 255 instead of radiance from 0 to 1."""
     if image.numel() < 64 or not values_visible(image):
         return
     values = image.detach()

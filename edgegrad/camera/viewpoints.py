@@ -11,8 +11,8 @@ from .fields import CameraFields, CameraT
 from .poses import Vector, constant, image_size, intrinsics, intrinsics_of_view, looking_at
 
 
-class Views(CameraFields):
-    """What Camera has of them."""
+class Viewpoints(CameraFields):
+    """Constructors of Camera from a place and a direction."""
 
     @classmethod
     def look_at(
@@ -24,10 +24,17 @@ class Views(CameraFields):
         size: tuple[int, int] = (256, 256),
         fov_x: float | Tensor | None = None,
     ) -> CameraT:
-        """Perspective camera at `eye` (3,) looking at `target` (3,), with `up` (3,) upwards in the image.
+        """Return a perspective camera at `eye` (3,) that looks at `target` (3,), with `up` (3,) upwards in the image.
 
-        fov_y: full vertical field of view in degrees, in (0, 180), 40 when neither is given; or fov_x, the horizontal one. Square
-        pixels, principal point in the middle. Raises TypeError or ValueError.
+        Pixels are square, with the principal point in the middle. Raises TypeError or ValueError.
+
+        Parameters
+        ----------
+        eye, target, up : (3,)
+            up is +Y by default.
+        fov_y, fov_x : float, degrees in (0, 180)
+            Full vertical or horizontal field of view; fov_y is 40 when neither is given.
+        size : (H, W), default (256, 256)
         """
         if fov_x is not None and fov_y is not None:
             raise TypeError("look_at: expected one of fov_y and fov_x, got both; leave one out")
@@ -45,7 +52,8 @@ class Views(CameraFields):
         height: float | Tensor = 2.0,
         size: tuple[int, int] = (256, 256),
     ) -> CameraT:
-        """Orthographic camera that looks from `eye` towards `target` and shows `height` world units from top to bottom."""
+        """Return an orthographic camera that looks from `eye` towards `target` and shows `height` world units from top to
+        bottom."""
         world_to_camera = looking_at(eye, target, up)
         height = as_scalar("height", height, like=world_to_camera)
         if values_visible(height) and not 0.0 < float(height.detach()) < math.inf:
@@ -58,15 +66,18 @@ class Views(CameraFields):
     def panorama(
         cls: type[CameraT], world_to_camera: Vector, size: tuple[int, int], K: Vector | None = None
     ) -> CameraT:
-        """All around the camera (equirectangular): longitude to the right, latitude downwards, +Z in the middle.
+        """Return a camera that sees all around (equirectangular): longitude to the right, latitude downwards, +Z in the middle.
 
-        world_to_camera  (4, 4)   rigid, +X right, +Y down, +Z forward
-        size             (H, W)   pixels
-        K                (3, 3)   pixels a radian and the pixel where +Z is seen, for a part of it or for several turns; None:
-                                  360° from left to right, 180° from top to bottom
+        It continues beyond ±180°, and over the poles along the opposite meridian, so an object that crosses the image's border
+        comes back at the other. Raises TypeError or ValueError.
 
-        It goes on beyond ±180°, and over the poles along the opposite meridian, so what crosses the image's border comes back at
-        the other. Raises TypeError or ValueError.
+        Parameters
+        ----------
+        world_to_camera : (4, 4)
+            Rigid, +X right, +Y down, +Z forward.
+        size : (H, W) in pixels
+        K : (3, 3), default 360° from left to right, 180° from top to bottom
+            Pixels a radian and the pixel where +Z is seen, for a part of it or for several turns.
         """
         pose = as_tensor("world_to_camera", world_to_camera, floating=True)
         check_float("world_to_camera", pose)

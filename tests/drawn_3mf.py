@@ -1,4 +1,4 @@
-"""Odd but valid 3MF files, which hypothesis draws, each with the arrays that it was written from."""
+"""Unusual but valid 3MF files, which hypothesis draws, each with the arrays that it was written from."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from drawn_files import DrawnFile, ExpectedMesh, one_of, placed
 from hypothesis import strategies as st
-from odd_scenes import Odd, Shown, one_of, placed
 
 Draw = Callable[[st.SearchStrategy], Any]
 MICROSOFT = "http://schemas.microsoft.com/3dmanufacturing"
@@ -68,7 +68,9 @@ def reference(xml: Xml, tag: str, one: Reference, part: int, paths: list[str]) -
     return xml.element(tag, attributes)
 
 
-def mesh_3mf(xml: Xml, random: np.random.Generator, palettes: np.ndarray | None) -> tuple[str, dict[str, Any], Shown]:
+def mesh_3mf(
+    xml: Xml, random: np.random.Generator, palettes: np.ndarray | None
+) -> tuple[str, dict[str, Any], ExpectedMesh]:
     """The mesh, attributes of its object, and what it shows."""
     points = random.integers(-40, 41, (int(random.integers(3, 7)), 3)) / 8
     faces = np.stack([random.permutation(len(points))[:3] for _ in range(int(random.integers(1, 4)))])
@@ -97,17 +99,17 @@ def mesh_3mf(xml: Xml, random: np.random.Generator, palettes: np.ndarray | None)
         for (a, b, c), more in zip(faces.tolist(), of_faces, strict=True)
     )
     text = xml.element("mesh", {}, xml.element("vertices", {}, vertices) + xml.element("triangles", {}, triangles))
-    return text, attributes, Shown(points[faces], colors)
+    return text, attributes, ExpectedMesh(points[faces], colors)
 
 
 @st.composite
-def threemf_files(draw: Draw) -> Odd:
+def threemf_files(draw: Draw) -> DrawnFile:
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     paths = [one_of(random, "3D/3dmodel.model", "3D/3DModel.Model", "a/b.model")]
     paths += [f"3D/Objects/part_{k}.model" for k in range(draw(st.integers(0, 2)))]
     unit = one_of(random, None, "inch", "meter", "micron")
     texts: dict[str, str] = {}
-    known: dict[tuple[int, str], Shown | list[Reference]] = {}
+    known: dict[tuple[int, str], ExpectedMesh | list[Reference]] = {}
 
     def refer(candidates: list[tuple[int, str]]) -> Reference:
         part, id = candidates[int(random.integers(len(candidates)))]
@@ -151,10 +153,12 @@ def threemf_files(draw: Draw) -> Odd:
         inside = metadata + xml.element("resources", {}, resources) + xml.element("build", {}, build)
         texts[paths[part]] = xml.element("model", spaces | more, inside)
 
-    def show(one: Reference, above: np.ndarray) -> list[Shown]:
+    def show(one: Reference, above: np.ndarray) -> list[ExpectedMesh]:
         world, found = above @ one.matrix, known[one.part, one.id]
         return (
-            [placed(found, world)] if isinstance(found, Shown) else [s for inner in found for s in show(inner, world)]
+            [placed(found, world)]
+            if isinstance(found, ExpectedMesh)
+            else [s for inner in found for s in show(inner, world)]
         )
 
     stream = io.BytesIO()
@@ -174,4 +178,4 @@ def threemf_files(draw: Draw) -> Odd:
                 f'<?xml version="1.0" encoding="{encoding.removesuffix("-sig")}"?>\n' if random.random() < 0.7 else ""
             )
             archive.writestr(path, (head + text).encode(encoding))
-    return Odd({"a.3mf": stream.getvalue()}, [found for item in items for found in show(item, np.eye(4))])
+    return DrawnFile({"a.3mf": stream.getvalue()}, [found for item in items for found in show(item, np.eye(4))])

@@ -1,4 +1,4 @@
-"""Odd but valid glTF and GLB files, which hypothesis draws, each with the arrays that it was written from."""
+"""Unusual but valid glTF and GLB files, which hypothesis draws, each with the arrays that it was written from."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from drawn_files import DrawnFile, ExpectedMesh, one_of, placed
 from hypothesis import strategies as st
-from odd_scenes import Odd, Shown, one_of, placed
 
 Draw = Callable[[st.SearchStrategy], Any]
 COMPONENTS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
@@ -159,7 +159,7 @@ def topology(random: np.random.Generator) -> tuple[dict[str, int], np.ndarray | 
     return given, flat if indexed else None, len(flat) if not indexed else count, np.array(triangles)
 
 
-def primitive(random: np.random.Generator, storage: Storage, quantized: bool) -> tuple[dict, Shown]:
+def primitive(random: np.random.Generator, storage: Storage, quantized: bool) -> tuple[dict, ExpectedMesh]:
     given, indices, count, triangles = topology(random)
     whole = ("f4", "i1", "u1", "i2", "u2", "I1", "U1", "I2", "U2") if quantized else ("f4",)
     rows, normalized, positions = numbers(random, (count, 3), whole)
@@ -182,7 +182,7 @@ def primitive(random: np.random.Generator, storage: Storage, quantized: bool) ->
         given["indices"] = storage.indices(indices)
     values = (None if v is None else v[triangles] for v in (positions, colors, uvs, normals))
     corners, colors, uvs, normals = values
-    return given, Shown(corners, None if colors is None else colors[..., :3], uvs, normals)
+    return given, ExpectedMesh(corners, None if colors is None else colors[..., :3], uvs, normals)
 
 
 def node(random: np.random.Generator) -> tuple[dict, np.ndarray]:
@@ -201,11 +201,11 @@ def node(random: np.random.Generator) -> tuple[dict, np.ndarray]:
 
 
 @st.composite
-def gltf_files(draw: Draw) -> Odd:
+def gltf_files(draw: Draw) -> DrawnFile:
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     storage = Storage(random, draw(st.integers(1, 3)))
     quantized, extensions = one_of(random, False, True), set()
-    meshes: list[tuple[dict, list[Shown]]] = []
+    meshes: list[tuple[dict, list[ExpectedMesh]]] = []
     for _ in range(draw(st.integers(1, 2))):
         made = [primitive(random, storage, quantized) for _ in range(draw(st.integers(1, 2)))]
         meshes.append(({"primitives": [given for given, _ in made]}, [shown for _, shown in made]))
@@ -273,10 +273,10 @@ def gltf_files(draw: Draw) -> Odd:
         tree = dict(reversed(tree.items()))
     text = json.dumps(tree, indent=one_of(random, None, 1, "\t"), ensure_ascii=one_of(random, True, False)).encode()
     if not glb:
-        return Odd({"a.gltf": one_of(random, b"", b"\n ", b"\xef\xbb\xbf") + text, **files}, shown)
+        return DrawnFile({"a.gltf": one_of(random, b"", b"\n ", b"\xef\xbb\xbf") + text, **files}, shown)
     text += b" " * (-len(text) % 4)
     chunks = [(b"JSON", text), *([(b"BIN\0", chunk)] if chunk is not None else [])]
     if one_of(random, False, False, True):
         chunks.append((b"ODD\0", random.bytes(8)))  # of a type that readers must ignore
     content = b"".join(struct.pack("<I4s", len(data), name) + data for name, data in chunks)
-    return Odd({"a.glb": struct.pack("<4sII", b"glTF", 2, 12 + len(content)) + content, **files}, shown)
+    return DrawnFile({"a.glb": struct.pack("<4sII", b"glTF", 2, 12 + len(content)) + content, **files}, shown)

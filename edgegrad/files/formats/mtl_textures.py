@@ -8,29 +8,32 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .part import Fault
-from .source import Source
+from .context import LoadContext
+from .part import FormatError
 from .text import unquoted
 
 # How many words follow an option, at most; those of -o, -s and -t are numbers, of which the last may be missing.
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-bm": 1, "-type": 1,
            "-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # fmt: skip
 FEWER = ("-o", "-s", "-t")
-# What is followed, what is a hint on filters, and what is of bumps alone.
-FOLLOWED = ("-o", "-s", "-clamp", "-blendu", "-blendv", "-boost", "-texres", "-bm")
-# What the others say where they change nothing; of -imfchan, that grey comes from brightness.
+# These are applied, are hints on filters, or concern bumps alone.
+APPLIED = ("-o", "-s", "-clamp", "-blendu", "-blendv", "-boost", "-texres", "-bm")
+# The others change nothing with these values; for -imfchan, grey comes from brightness.
 NEUTRAL = {"-cc": ("off",), "-mm": ("0", "1"), "-t": ("0", "0", "0"), "-imfchan": ("l",)}
 
 
-class Texture(NamedTuple):
+class MtlTexture(NamedTuple):
+    """A texture of a material library, and how it lies on the mesh."""
+
     name: str
     scale: tuple[float, float] = (1.0, 1.0)  # of texture coordinates, before
     offset: tuple[float, float] = (0.0, 0.0)  # this is added
     wrap: tuple[str, str] = ("repeat", "repeat")
 
     @classmethod
-    def of(cls, statement: str, keyword: str, source: Source) -> Texture:
-        """That of `map_Kd -s 2 2 1 wood grain.png`, without the keyword. Notes options that nothing follows. Raises Fault."""
+    def from_statement(cls, statement: str, keyword: str, context: LoadContext) -> MtlTexture:
+        """Parse a statement such as `map_Kd -s 2 2 1 wood grain.png`, without the keyword. Notes unread options. Raises
+        FormatError."""
         options, rest = dict[str, tuple[str, ...]](), statement.strip()
         while (option := rest.split(None, 1)[0].lower() if rest else "") in OPTIONS:
             words = rest.split(None, OPTIONS[option] + 1)[1:]
@@ -40,23 +43,27 @@ class Texture(NamedTuple):
             options[option] = tuple(value.lower() for value in values)
             rest = rest.split(None, len(values) + 1)[-1] if len(words) > len(values) else ""
         rest = unquoted(rest)
-        if re.match("-[a-z]", option) and not source.folder.holds(rest):
+        if re.match("-[a-z]", option) and not context.folder.holds(rest):
             known = ", ".join(sorted(OPTIONS))
-            raise Fault(f"expected options of a texture ({known}), got {option} in {keyword} {statement!r}; remove it")
+            raise FormatError(
+                f"expected options of a texture ({known}), got {option} in {keyword} {statement!r}; remove it"
+            )
         if not rest:
-            raise Fault(f"expected the name of an image after {keyword} {statement!r}, got none; repair the material")
+            raise FormatError(
+                f"expected the name of an image after {keyword} {statement!r}, got none; repair the material"
+            )
         for option, values in options.items():
-            if option not in FOLLOWED and not _is_neutral(option, values):
-                source.unsupported.note(" ".join([keyword, option, *values]))
+            if option not in APPLIED and not _is_neutral(option, values):
+                context.unread.note(" ".join([keyword, option, *values]))
         wrap = "clamp" if options.get("-clamp") == ("on",) else "repeat"
         return cls(rest, _pair(options.get("-s", ()), 1.0), _pair(options.get("-o", ()), 0.0), (wrap, wrap))
 
     @property
-    def place(self) -> tuple[object, ...]:
+    def transform(self) -> tuple[object, ...]:
         return self.scale, self.offset, self.wrap
 
-    def placed(self, uvs: np.ndarray) -> np.ndarray:
-        """Texture coordinates (N, 2) where this texture lies."""
+    def transformed_uvs(self, uvs: np.ndarray) -> np.ndarray:
+        """Return texture coordinates (N, 2) scaled and shifted for this texture."""
         if self.scale == (1.0, 1.0) and self.offset == (0.0, 0.0):
             return uvs
         return (uvs.astype(np.float64) * self.scale + self.offset).astype(np.float32)
@@ -70,10 +77,12 @@ def _is_neutral(option: str, values: tuple[str, ...]) -> bool:
 
 
 def _pair(words: tuple[str, ...], default: float) -> tuple[float, float]:
-    """The first two numbers. Raises Fault."""
+    """Return the first two numbers. Raises FormatError."""
     values = [float(word) for word in words]
     if not np.isfinite(values).all():
-        raise Fault(f"expected finite numbers for the options of a texture, got {' '.join(words)}; repair the material")
+        raise FormatError(
+            f"expected finite numbers for the options of a texture, got {' '.join(words)}; repair the material"
+        )
     return values[0] if values else default, values[1] if len(values) > 1 else default
 
 

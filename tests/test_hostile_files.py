@@ -1,4 +1,4 @@
-"""Files made to do harm: they are refused with an error that names them, or load as they should; none runs code, reads what
+"""Hostile files are refused with an error that names them, or load as they should; none runs code, reads what
 lies outside its folder, hangs, or takes memory for what it merely announces."""
 
 from __future__ import annotations
@@ -10,65 +10,33 @@ import pickle
 import struct
 import subprocess
 import sys
-import zipfile
-import zlib
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from mesh_files import GOOD, OFF, SQUARE, STL, TEXELS, TRIANGLES, glb, linear, ply, square_glb
-from PIL import EpsImagePlugin, Image
+from mesh_3mf import bomb, model, nested
+from mesh_files import (
+    GOOD,
+    IMAGES,
+    OFF,
+    SQUARE,
+    TEXTURED,
+    TRIANGLES,
+    changed,
+    gltf_tree,
+    load,
+    ply,
+    png,
+    saved,
+    square_glb,
+    write,
+)
+from PIL import EpsImagePlugin
 
 import edgegrad as eg
 from edgegrad.files.parts import MESHES
-
-IMAGES = (".png", ".jpg", ".bmp", ".tif", ".hdr", ".exr")
-
-
-def load(path: Path) -> object:
-    """What a user would call."""
-    if path.suffix in IMAGES:
-        return eg.read_image(path)
-    return eg.load_camera(path) if path.suffix == ".json" else eg.load_scene(path)
-
-
-def write(folder: Path, name: str, content: bytes | str) -> Path:
-    path = folder / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
-
-
-def gltf_tree(data: bytes) -> dict:
-    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
-
-
-def changed(change: Callable[[dict], object], data: bytes | None = None) -> bytes:
-    """A GLB file, by default the square, with its JSON changed."""
-    data = square_glb() if data is None else data
-    tree = gltf_tree(data)
-    change(tree)
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + struct.unpack("<I", data[12:16])[0] :]
-    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
-
-
-def png(width: int, height: int, rows: bytes = bytes(100), depth: int = 8, color: int = 2) -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows, 9)) + chunk(b"IEND", b"")
-
-
-def saved(kind: str, image: Image.Image | None = None) -> bytes:
-    stream = io.BytesIO()
-    (Image.fromarray(TEXELS) if image is None else image).save(stream, kind)
-    return stream.getvalue()
-
 
 # -- headers that announce what is not there --------------------------------------------------------------------------
 
@@ -102,25 +70,6 @@ def without_data(tree: dict, count: int) -> None:
     tree["accessors"][0]["count"] = count
 
 
-@cache
-def bomb(megabytes: int) -> bytes:
-    """A 3MF of a few kilobytes that holds so many spaces."""
-    head, tail = MODEL.split("</resources>")
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/3dmodel.model", "w") as model:
-        model.write(head.encode())
-        for _ in range(megabytes):
-            model.write(b" " * 2**20)
-        model.write(b"</resources>" + tail.encode())
-    return stream.getvalue()
-
-
-MODEL = (
-    '<model unit="millimeter" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"><resources>'
-    '<object id="1" type="model"><mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/>'
-    '<vertex x="0" y="1" z="0"/></vertices><triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh></object>'
-    '</resources><build><item objectid="1"/></build></model>'
-)
 BINARY = ply(SQUARE, TRIANGLES, binary=True)
 TEXT = ply(SQUARE, TRIANGLES)
 MANY = b"1000000000"
@@ -170,7 +119,7 @@ from edgegrad.files.parts import MESHES
 import lxml.etree, OpenImageIO, PIL.Image, trimesh.exchange.load
 
 sys.path.insert(0, sys.argv[1])
-from test_bad_files import load
+from mesh_files import load
 
 def peak():
     return int(next(row for row in open("/proc/self/status") if row.startswith("VmHWM")).split()[1])
@@ -229,7 +178,6 @@ OUTSIDE = [
     "~/secret.png",
     "link.png",
 ]
-TEXTURED = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
 WAYS: dict[str, Callable[[str], dict[str, bytes | str]]] = {
     "mtllib": lambda name: {"a.obj": f"mtllib {name}\n{GOOD}"},
     "map_Kd": lambda name: {
@@ -337,78 +285,6 @@ def test_postscript_is_no_texture(tmp_path, monkeypatch, kind, gloss):
         assert eg.load_scene(path).meshes[0].texture is not None
 
 
-def model(changes: dict[str, str] | None = None, extra: dict[str, str] | None = None) -> bytes:
-    """A 3MF with its text changed, and with more files."""
-    text = MODEL
-    for old, new in (changes or {}).items():
-        assert old in text
-        text = text.replace(old, new)
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in {"3D/3dmodel.model": text, **(extra or {})}.items():
-            archive.writestr(name, content)
-    return stream.getvalue()
-
-
-def nested(depth: int) -> dict[str, str]:
-    """Objects of two components each, the one below: 2^depth triangles."""
-    objects = "".join(
-        f'<object id="{i}"><components><component objectid="{i - 1}"/>'
-        f'<component objectid="{i - 1}" transform="1 0 0 0 1 0 0 0 1 0 0 {2.0**i}"/></components></object>'
-        for i in range(2, depth + 2)
-    )
-    return {"</resources>": objects + "</resources>", 'item objectid="1"': f'item objectid="{depth + 1}"'}
-
-
-def chain(depth: int) -> dict[str, str]:
-    """Objects of one component each, the one below."""
-    objects = "".join(
-        f'<object id="{i}"><components><component objectid="{i - 1}"/></components></object>'
-        for i in range(2, depth + 1)
-    )
-    return {"</resources>": objects + "</resources>", 'item objectid="1"': f'item objectid="{depth}"'}
-
-
-PRODUCTION = "http://schemas.microsoft.com/3dmanufacturing/production/2015/06"
-LOL = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
-
-
-@pytest.mark.parametrize(
-    "content, fault",
-    [
-        (model({"<model": f'<!DOCTYPE a [<!ENTITY l0 "0">{LOL}]><model', 'x="0"': 'x="&l9;"'}), "without a DOCTYPE"),
-        (model({"<model": '<!DOCTYPE a [<!ENTITY s SYSTEM "file:///etc/passwd">]><model'}), "without a DOCTYPE"),
-        (model({"<model": '<!DOCTYPE a SYSTEM "http://127.0.0.1:9/a.dtd"><model'}), "without a DOCTYPE"),
-        (
-            model(
-                {'item objectid="1"': f'item objectid="1" xmlns:p="{PRODUCTION}" p:path="/3D/other.model"'},
-                {"3D/other.model": '<!DOCTYPE a SYSTEM "a.dtd"><model/>'},
-            ),
-            r"in '3d/other\.model'",
-        ),
-        (model(nested(38)), "at most 100000 instances of objects, got 274877906944"),
-        (model(chain(100)), "nested up to 64 times, got more"),
-        (
-            model({"</resources>": '<object id="2"><components><component objectid="2"/></components></object></resources>',
-                   'item objectid="1"': 'item objectid="2"'}),
-            "object 2 inside itself",
-        ),
-        (model({'item objectid="1"': 'item objectid="7"'}), "an object with the id 7 in '3d/3dmodel.model', got none"),
-        (model({'<vertex x="1"': '<vertex w="1"'}), "the attributes x, y and z of each vertex of object 1, got one without 'x'"),
-        (model({'<vertex x="1"': '<vertex x="1,5"'}), "numbers alone in x, y and z of each vertex of object 1, got '1,5'"),
-        (model({'v3="2"': 'v3="9"'}), "indices from 0 to 2, got 9"),
-        (model({"</build>": ""}), "cannot be read"),
-        (model()[:-30], "cannot be read"),
-        (bomb(70), "an archive that grows up to 100 times"),
-    ],
-)  # fmt: skip
-def test_3mf_faults(tmp_path, content, fault):
-    path = write(tmp_path, "a.3mf", content)
-    with pytest.raises(ValueError, match=fault) as caught:
-        eg.load_scene(path)
-    assert str(caught.value).startswith(str(path)) and len(content) < 200_000
-
-
 def test_3mf_that_looks_odd_and_is_not(tmp_path):
     """Components in components, and files beside the model with any name: none is written anywhere."""
     path = write(tmp_path, "a.3mf", model(nested(2), {"../../evil.txt": "x", "/tmp/evil.txt": "x"}))
@@ -427,20 +303,6 @@ def test_deeply_nested_nodes_keep_their_places(tmp_path):
     content = square_glb(nodes=[*nodes, {"mesh": 0, "translation": [1, 0, 0]}], scenes=[{"nodes": [0]}])
     places = [mesh.verts[0, 0].item() for mesh in eg.load_scene(write(tmp_path, "a.glb", content)).meshes]
     assert sorted(places) == list(range(1, deep + 1))
-
-
-@pytest.mark.parametrize(
-    "nodes",
-    [
-        [{"mesh": 0, "children": [0]}],
-        [{"mesh": 0, "children": [1]}, {"children": [0]}],
-        [{"children": [2]}, {"children": [2]}, {"mesh": 0}],
-    ],
-)
-def test_nodes_that_are_no_tree(tmp_path, nodes):
-    path = write(tmp_path, "a.glb", square_glb(nodes=nodes))
-    with pytest.raises(ValueError, match=r"a\.glb: expected a tree of nodes"):
-        eg.load_scene(path)
 
 
 # -- what else stands in a folder -------------------------------------------------------------------------------------
@@ -472,108 +334,3 @@ def test_without_the_permission_to_read(tmp_path, monkeypatch, suffix):
         monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(PermissionError, match=rf"a\{suffix}: expected a file that may be read"):
         load(path)
-
-
-# -- every byte counts ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["a.glb", "a.ply", "b.ply", "a.3mf", "a.stl", "a.off", "a.png", "a.bmp", "a.exr"])
-def test_cut_anywhere(tmp_path, name):
-    """Every beginning of a good file is an error that names it, or loads as the whole does."""
-    eg.write_image(tmp_path / "whole.exr", torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(1)))
-    material = {"images": [{"bufferView": 3}], "textures": [{"source": 0}], "extra": [saved("PNG")]}
-    stl = STL.replace("endsolid a", STL[8:])
-    whole = {
-        "a.glb": square_glb(TEXTURED, uv=True, **material),
-        "a.ply": ply(SQUARE, TRIANGLES, binary=True),
-        "b.ply": ply(SQUARE, TRIANGLES),
-        "a.3mf": model(),
-        "a.stl": stl.encode(),
-        "a.off": OFF.encode(),
-        "a.png": saved("PNG"),
-        "a.bmp": saved("BMP"),
-        "a.exr": (tmp_path / "whole.exr").read_bytes(),
-    }[name]
-    expected = load(write(tmp_path, name, whole))
-    for end in range(1, len(whole), max(1, len(whole) // 70)):
-        try:
-            found = load(write(tmp_path, name, whole[:end]))
-        except ValueError as error:
-            assert str(error).startswith(str(tmp_path / name))
-            continue
-        if isinstance(expected, torch.Tensor):
-            assert torch.equal(found, expected), end
-        else:
-            assert repr(found) == repr(expected), end
-            for mesh, other in zip(found.meshes, expected.meshes, strict=True):
-                assert torch.equal(mesh.verts, other.verts) or (name, end) == ("a.off", len(whole) - 1), end
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_bytes_changed_at_random(tmp_path, seed):
-    """A changed file loads or is refused; the names of the errors are all that a caller must know."""
-    material = {"images": [{"bufferView": 3}], "textures": [{"source": 0}], "extra": [saved("PNG")]}
-    names = {
-        "a.glb": square_glb(TEXTURED, uv=True, **material),
-        "a.ply": ply(SQUARE, TRIANGLES, [[1, 2, 3]] * 4, binary=True),
-        "b.ply": TEXT,
-        "a.obj": GOOD.encode() * 2,
-        "a.stl": STL.encode(),
-        "a.3mf": model(),
-        "a.png": saved("PNG"),
-        "a.jpg": saved("JPEG"),
-        "a.tif": saved("TIFF"),
-        "a.bmp": saved("BMP"),
-    }
-    random = np.random.default_rng(seed)
-    refused = 0
-    for name, whole in names.items():
-        for _ in range(25):
-            content = bytearray(whole)
-            for at in random.integers(0, len(content), random.integers(1, 6)):
-                content[at] = random.integers(0, 256)
-            path = write(tmp_path, name, bytes(content))
-            try:
-                load(path)
-            except (ValueError, FileNotFoundError) as error:
-                assert str(path) in str(error)
-                refused += 1
-    assert 30 < refused < 250
-
-
-# -- kinds of images that must load -----------------------------------------------------------------------------------
-
-STORED = np.random.default_rng(5).integers(0, 256, (4, 5, 4), dtype=np.uint8)
-
-
-@pytest.mark.parametrize(
-    "mode, channels",
-    [("1", 1), ("L", 1), ("LA", 2), ("P", 3), ("RGB", 3), ("RGBA", 4), ("I;16", 1)],
-)
-def test_modes_of_png_and_tiff(tmp_path, mode, channels):
-    """Also as textures, where alpha is dropped."""
-    if mode == "I;16":
-        image = Image.fromarray(np.random.default_rng(6).integers(0, 65536, (4, 5), dtype=np.uint16))
-        values = np.asarray(image)[..., None] / 257.0
-    else:
-        image = Image.fromarray(STORED).convert("RGB").convert(mode) if mode != "RGBA" else Image.fromarray(STORED)
-        if mode == "LA":
-            image.putalpha(Image.fromarray(STORED[..., 3]))
-        values = np.asarray(image.convert({"P": "RGB", "1": "L"}.get(mode, mode)), np.float64).reshape(4, 5, -1)
-    colors = channels - (channels in (2, 4))
-    expected = np.concatenate([linear(values[..., :colors]), values[..., colors:] / 255.0], -1)
-    for suffix in ("png", "tif"):
-        image.save(tmp_path / f"a.{suffix}")
-        found = eg.read_image(tmp_path / f"a.{suffix}")
-        assert found.shape == (4, 5, channels)
-        # Pillow writes the 16-bit palette of a TIFF as 256 times the byte, not 257.
-        loose = mode == "P" and suffix == "tif"
-        np.testing.assert_allclose(found.numpy(), expected, atol=0.01 if loose else 1e-6)
-    material = {"images": [{"bufferView": 3}], "textures": [{"source": 0}], "extra": [saved("PNG", image)]}
-    mesh = eg.load_mesh(write(tmp_path, "a.glb", square_glb(TEXTURED, uv=True, **material)))
-    np.testing.assert_allclose(mesh.texture.numpy(), np.broadcast_to(expected[..., :colors], (4, 5, 3)), atol=1e-6)
-
-
-def test_glb_helper_makes_what_these_tests_change():
-    """So that a refused file is refused for its change."""
-    assert changed(lambda tree: None)[:12] == square_glb()[:12] and glb({})[:4] == b"glTF"

@@ -1,4 +1,4 @@
-"""Valid files as other programs write them, whose colours and faces must not be lost, and what is said of what is not read."""
+"""Variants of formats, as other programs write them, keep their colours and faces; a warning names what is not read."""
 
 import struct
 import warnings
@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from mesh_files import GOOD, OFF, SQUARE, STL, TEXELS, TRIANGLES, linear, ply, write_obj
+from mesh_files import GOOD, OFF, SQUARE, STL, TEXELS, TEXTURED, TRIANGLES, linear, ply, saved, square_glb, write_obj
 from PIL import Image
 
 import edgegrad as eg
@@ -420,3 +420,36 @@ def test_images_of_one_file_are_read_once(tmp_path):
     path.write_text(path.read_text().replace("f 1/2 3/4", "usemtl two\nf 1/2 3/4"))
     first, second = eg.load_scene(path).meshes
     assert first.texture is second.texture and Image.open(tmp_path / "skin.png").size == (2, 2)
+
+
+# -- images ------------------------------------------------------------------------------------------------------------
+
+STORED = np.random.default_rng(5).integers(0, 256, (4, 5, 4), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    "mode, channels",
+    [("1", 1), ("L", 1), ("LA", 2), ("P", 3), ("RGB", 3), ("RGBA", 4), ("I;16", 1)],
+)
+def test_modes_of_png_and_tiff(tmp_path, mode, channels):
+    """Also as textures, where alpha is dropped."""
+    if mode == "I;16":
+        image = Image.fromarray(np.random.default_rng(6).integers(0, 65536, (4, 5), dtype=np.uint16))
+        values = np.asarray(image)[..., None] / 257.0
+    else:
+        image = Image.fromarray(STORED).convert("RGB").convert(mode) if mode != "RGBA" else Image.fromarray(STORED)
+        if mode == "LA":
+            image.putalpha(Image.fromarray(STORED[..., 3]))
+        values = np.asarray(image.convert({"P": "RGB", "1": "L"}.get(mode, mode)), np.float64).reshape(4, 5, -1)
+    colors = channels - (channels in (2, 4))
+    expected = np.concatenate([linear(values[..., :colors]), values[..., colors:] / 255.0], -1)
+    for suffix in ("png", "tif"):
+        image.save(tmp_path / f"a.{suffix}")
+        found = eg.read_image(tmp_path / f"a.{suffix}")
+        assert found.shape == (4, 5, channels)
+        # Pillow writes the 16-bit palette of a TIFF as 256 times the byte, not 257.
+        loose = mode == "P" and suffix == "tif"
+        np.testing.assert_allclose(found.numpy(), expected, atol=0.01 if loose else 1e-6)
+    material = {"images": [{"bufferView": 3}], "textures": [{"source": 0}], "extra": [saved("PNG", image)]}
+    mesh = eg.load_mesh(write(tmp_path, "a.glb", square_glb(TEXTURED, uv=True, **material)))
+    np.testing.assert_allclose(mesh.texture.numpy(), np.broadcast_to(expected[..., :colors], (4, 5, 3)), atol=1e-6)

@@ -1,4 +1,4 @@
-"""Faces that are cut out by alpha, and textures whose nearest texel is taken, for tests."""
+"""Alpha-tested faces, and textures whose nearest texel is taken, for tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Odd but valid OBJ, PLY, STL and OFF files, drawn by hypothesis, each with the arrays that it was written from.
+"""Unusual but valid OBJ, PLY, STL and OFF files, drawn by hypothesis, each with the arrays that it was written from.
 
 Vertices lie on a parabola in a plane, so that any of them in their order are the corners of a convex face, whose fan is known.
 """
@@ -9,23 +9,9 @@ import struct
 from typing import Any, NamedTuple
 
 import numpy as np
+from drawn_files import DrawnFile, ExpectedMesh
 from hypothesis import strategies as st
 from mesh_files import linear
-
-
-class Expected(NamedTuple):
-    """One part of a file, in triangles."""
-
-    name: str | None
-    corners: np.ndarray  # (T, 3, 3) float64
-    uvs: np.ndarray | None = None  # (T, 3, 2)
-    normals: np.ndarray | None = None  # (T, 3, 3), of any length
-    colors: np.ndarray | None = None  # (T, 3, 3) linear, of corners
-
-
-class File(NamedTuple):
-    contents: dict[str, bytes]  # by name; the first is the mesh
-    parts: list[Expected]
 
 
 class Shape(NamedTuple):
@@ -104,7 +90,7 @@ def encoded(draw: Any, lines: list[str]) -> bytes:
 
 
 @st.composite
-def obj_files(draw: Any) -> File:
+def obj_files(draw: Any) -> DrawnFile:
     """Lines in any order that the format allows, with materials, objects, and corners of all four kinds."""
     verts, faces = draw(shapes())
     colors = draw(st.one_of(st.none(), st.lists(COLORS, min_size=len(verts), max_size=len(verts))))
@@ -168,18 +154,18 @@ def obj_files(draw: Any) -> File:
         used[name] = used.get(name, 0) + 1
         index = np.array([[[-1 if ref is None else ref for ref in refs] for refs in t] for t in triangles])
         v, vt, vn = index[..., 0], index[..., 1], index[..., 2]
-        look = None
+        appearance = None
         if colors is not None:
-            look = linear(np.array(colors))[v]
+            appearance = linear(np.array(colors))[v]
         elif m is not None:
-            look = np.broadcast_to(np.array(materials[m]) / 255, (*v.shape, 3))
+            appearance = np.broadcast_to(np.array(materials[m]) / 255, (*v.shape, 3))
         expected.append(
-            Expected(
-                name if used[name] == 1 else f"{name}_{used[name] - 1}",
+            ExpectedMesh(
                 verts[v],
+                appearance,
                 np.array(uvs)[vt] if (vt >= 0).all() else None,
                 np.array(normals)[vn] if (vn >= 0).all() else None,
-                look,
+                name if used[name] == 1 else f"{name}_{used[name] - 1}",
             )
         )
     content = {"a.obj": encoded(draw, [part for line in lines for part in line.split("\n")])}
@@ -188,7 +174,7 @@ def obj_files(draw: Any) -> File:
         for name, color in materials.items():
             text += [draw(COMMENTS), f"newmtl {name}", f"\tKd {numbers(draw, np.array(color) / 255)}", "illum 1"]
         content[library] = encoded(draw, text)
-    return File(content, expected)
+    return DrawnFile(content, expected)
 
 
 TYPES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d",
@@ -198,7 +184,7 @@ COLOR_NAMES = [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffu
 
 
 @st.composite
-def ply_files(draw: Any) -> File:
+def ply_files(draw: Any) -> DrawnFile:
     """Properties and elements in any order, of any type and name, among others that nobody reads."""
     verts, faces = draw(shapes())
     n, f = len(verts), len(faces)
@@ -213,7 +199,7 @@ def ply_files(draw: Any) -> File:
                   draw(st.sampled_from(["vertex_indices", "vertex_index"])), faces)])  # fmt: skip
     strips = draw(st.lists(st.lists(st.integers(0, n - 1), max_size=6), max_size=3)) if draw(st.booleans()) else None
     triangles = np.array(fans(faces) + stripped(strips or []))
-    uvs = normals = look = None
+    uvs = normals = appearance = None
     if draw(st.booleans()):
         rows = [[draw(EIGHTHS), draw(EIGHTHS), 1.0] for _ in range(n)]
         normals = np.array(rows)[triangles]
@@ -244,9 +230,9 @@ def ply_files(draw: Any) -> File:
         shade = linear(rows)
         many = [len(corners) - 2 for corners in faces]
         if on == "vertex":
-            look = shade[triangles]
+            appearance = shade[triangles]
         elif strips is None:
-            look = np.repeat(shade.repeat(many, 0)[:, None], 3, 1)
+            appearance = np.repeat(shade.repeat(many, 0)[:, None], 3, 1)
 
     def others(count: int) -> list[list[tuple[str, str, list]]]:
         """A number and a list that nothing reads."""
@@ -296,11 +282,11 @@ def ply_files(draw: Any) -> File:
     newline = draw(st.sampled_from(["\n", "\r\n"]))
     text = newline.join([*head, "end_header", ""]).encode(draw(st.sampled_from(["utf-8", "latin-1"])))
     content = text + (body if order else newline.join([*rows, ""]).encode())
-    return File({"a.ply": content}, [Expected(None, verts[triangles], uvs, normals, look)])
+    return DrawnFile({"a.ply": content}, [ExpectedMesh(verts[triangles], appearance, uvs, normals)])
 
 
 @st.composite
-def stl_files(draw: Any) -> File:
+def stl_files(draw: Any) -> DrawnFile:
     """Binary, or text of several solids in capitals or not, whose names may be keywords."""
     if draw(st.booleans()):
         verts, faces = draw(shapes())
@@ -312,7 +298,7 @@ def stl_files(draw: Any) -> File:
         head = head.ljust(80, draw(st.sampled_from([b" ", b"\0"])))
         more = bytes(draw(st.integers(0, 3)))
         content = head + struct.pack("<I", len(records)) + records.tobytes() + more
-        return File({"a.stl": content}, [Expected(None, corners.astype(np.float64))])
+        return DrawnFile({"a.stl": content}, [ExpectedMesh(corners.astype(np.float64))])
     lines, parts = [], []
     capital, indent = draw(st.booleans()), draw(st.sampled_from(["", "  ", "\t"]))
     for name in draw(st.lists(st.one_of(st.just(""), NAMES), min_size=1, max_size=3)):
@@ -325,18 +311,18 @@ def stl_files(draw: Any) -> File:
             block += [f"{indent}endloop", "endfacet", *[""] * draw(st.integers(0, 1))]
             lines += [line.upper() if capital else line for line in block]
         lines.append(f"{'ENDSOLID' if capital else 'endsolid'} {draw(st.sampled_from(['', name]))}")
-        parts.append(Expected(name or None, corners))
-    return File({"a.stl": encoded(draw, lines)}, parts)
+        parts.append(ExpectedMesh(corners, name=name or None))
+    return DrawnFile({"a.stl": encoded(draw, lines)}, parts)
 
 
 @st.composite
-def off_files(draw: Any) -> File:
+def off_files(draw: Any) -> DrawnFile:
     """With normals, colours and texture coordinates of vertices, or colours of faces."""
     verts, faces = draw(shapes())
     triangles = np.array(fans(faces))
     rows: list[list] = verts.tolist()
     word = "OFF"
-    uvs = normals = look = None
+    uvs = normals = appearance = None
     if draw(st.booleans()):
         word = "N" + word
         given = [[draw(EIGHTHS), draw(EIGHTHS), 1.0] for _ in verts]
@@ -355,7 +341,7 @@ def off_files(draw: Any) -> File:
         word = "C" + word
         given, shade = shades(len(verts))
         rows = [row + more for row, more in zip(rows, given, strict=True)]
-        look = shade[triangles]
+        appearance = shade[triangles]
     if draw(st.booleans()):
         word = "ST" + word
         given = [[draw(EIGHTHS), draw(EIGHTHS)] for _ in verts]
@@ -366,7 +352,7 @@ def off_files(draw: Any) -> File:
     if colors == "face":
         given, shade = shades(len(faces))
         text = [f"{row} {numbers(draw, more)}" for row, more in zip(text, given, strict=True)]
-        look = np.repeat(shade.repeat([len(corners) - 2 for corners in faces], 0)[:, None], 3, 1)
+        appearance = np.repeat(shade.repeat([len(corners) - 2 for corners in faces], 0)[:, None], 3, 1)
     counts = f"{len(verts)} {len(faces)}{draw(st.sampled_from(['', ' 0', ' 12']))}"
     head = [f"{word} {counts}"] if draw(st.booleans()) else [word, draw(COMMENTS), counts]
     lines = (
@@ -374,7 +360,7 @@ def off_files(draw: Any) -> File:
         + [part for row in rows for part in (numbers(draw, row), *[draw(COMMENTS)] * draw(st.integers(0, 1)))]
         + text
     )
-    return File({"a.off": encoded(draw, lines)}, [Expected(None, verts[triangles], uvs, normals, look)])
+    return DrawnFile({"a.off": encoded(draw, lines)}, [ExpectedMesh(verts[triangles], appearance, uvs, normals)])
 
 
-FILES = {"obj": obj_files(), "ply": ply_files(), "stl": stl_files(), "off": off_files()}
+TEXT_FORMATS = {"obj": obj_files(), "ply": ply_files(), "stl": stl_files(), "off": off_files()}
