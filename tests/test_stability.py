@@ -18,7 +18,7 @@ from scenes import cube, front_camera, one_triangle
 
 import edgegrad as eg
 import edgegrad_cli as cli
-from edgegrad.fit.smooth import Smooth
+from edgegrad.fit.laplacian import LaplacianSolver
 from edgegrad.report.stability import fits, statistics, steps
 from edgegrad.report.stability.cases import CASES, bounced, measure
 from edgegrad.report.stability.cases.case import Case, Problem, everything
@@ -304,7 +304,7 @@ def test_a_squared_loss_has_no_bias_in_the_gradient_for_what_moves():
 
 def test_smoothing_solves():
     mesh = cube(1.0)
-    solve = Smooth(mesh.faces, len(mesh.verts), fits.SMOOTHNESS)
+    solve = LaplacianSolver(mesh.faces, len(mesh.verts), fits.SMOOTHNESS)
     x = torch.randn((8, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(solve(solve.times(x)), x)
     ones = torch.ones((8, 3), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Fitting: what pictures say about a scene, found by following the gradients of `render`."""
+"""Fits: find scenes, cameras, poses, shapes and textures from pictures by the gradients of `render`."""
 
 from . import losses, priors, regularizers
 from .descent.fit_scene import Progress, fit_scene
