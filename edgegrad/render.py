@@ -109,21 +109,22 @@ def render(
     before it allocates, with the figure and what to lower; so does its backward pass. A second derivative raises
     RuntimeError. Warns of options of lit scenes and of shaders that have no effect on the image.
     """
-    if shader is not None or as_scene(scene).is_shaded:
-        scene, camera = savable(as_scene(scene)), savable(camera)
+    scene = as_scene(scene)
+    if shader is not None or scene.is_shaded:
+        scene, camera = savable(scene), savable(camera)
     request = make_request(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
     lighting = Lighting.of(shadows, light_samples, bounces)
     shading = {"creases": creases, "check_shader": check_shader, **lighting.options}
-    warn_of_unused(as_scene(scene), shader is not None, shading)
-    if shader is None and as_scene(scene).is_shaded:
-        return lit_image(lighting, as_scene(scene), camera, request, creases)
+    warn_of_unused(scene, shader is not None, shading)
+    if shader is None and scene.is_shaded:
+        return lit_image(lighting, scene, camera, request, creases)
     if shader is not None:
-        return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)
+        return render_shaded(scene, camera, shader, request, creases, check_shader)
     image = render_image(request, batched=camera.batch is not None)
-    return image.to(as_scene(scene).meshes[0].verts.device)
+    return image.to(scene.meshes[0].verts.device)
 
 
 SMALL = 1 << 22  # samples of an image, up to which one thread an image is better than all of them

@@ -15,8 +15,7 @@ from bop_scenes import SIZE, TRUTHS, K, camera, estimates, meshes, pose
 from PIL import Image
 
 import edgegrad as eg
-import edgegrad_cli as cli
-from edgegrad import bop
+from edgegrad import bop, cli
 
 pytest_plugins = "bop_fixtures"
 

@@ -107,7 +107,8 @@ def test_equations_are_typeset() -> None:
 def test_reference_has_all_that_is_public(module: ModuleType) -> None:
     reference = "".join(page.read_text(encoding="utf-8") for page in (FOLDER / "api").glob("*.md"))
     listed = set(re.findall(r"^\.\. auto\w+:: (\S+)$", reference, re.MULTILINE))
-    names = {f"{module.__name__}.{name}" for name in module.__all__} - {"edgegrad.fit"}  # a page of its own
+    public = [name for name in module.__all__ if not isinstance(getattr(module, name), ModuleType)]  # those have pages
+    names = {f"{module.__name__}.{name}" for name in public}
     assert names <= listed, f"docs/api lacks {sorted(names - listed)}"
     assert all(resolves(name) for name in listed)
 

@@ -13,7 +13,7 @@ from PIL import Image
 from trimesh.creation import icosphere
 
 import edgegrad as eg
-import edgegrad_cli as cli
+from edgegrad import cli
 from edgegrad.report import scenes
 from edgegrad.report.error_time import mitsuba, references
 from edgegrad.report.error_time.methods import Edgegrad, FiniteDifferences, rigid

@@ -17,7 +17,7 @@ from PIL import Image
 from scenes import cube, front_camera, one_triangle
 
 import edgegrad as eg
-import edgegrad_cli as cli
+from edgegrad import cli
 from edgegrad.fit.laplacian import LaplacianSolver
 from edgegrad.report.stability import fits, statistics, steps
 from edgegrad.report.stability.cases import CASES, bounced, measure

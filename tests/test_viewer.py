@@ -16,7 +16,7 @@ from test_fit import BACKGROUND, START, bracket, camera, picture
 from test_fit_scene import pictures, views
 
 import edgegrad as eg
-import edgegrad_cli as cli
+from edgegrad import cli
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, write_image
 from edgegrad.fit import Parameter, fit_camera, fit_pose, fit_rig, fit_scene, fit_shape, fit_texture

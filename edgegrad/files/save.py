@@ -32,8 +32,10 @@ SCENES = (".glb", ".gltf")
 
 
 def from_trimesh(given: Any) -> Mesh:
-    """See Mesh.from_trimesh."""
-    trimesh = require("trimesh", "trimesh", "Mesh.from_trimesh")
+    """A mesh from a trimesh.Trimesh: equal vertices welded, with its vertex or face colours or its texture, which are sRGB there,
+    or the colour of its material, which is linear. float64 where float32 would move vertices by more than a millionth of the
+    extent, else float32. Raises TypeError, ValueError or ImportError."""
+    trimesh = require("trimesh", "trimesh", "from_trimesh")
     if isinstance(given, trimesh.Scene):
         raise TypeError("mesh: expected a trimesh.Trimesh, got a Scene; take scene.to_mesh(), or one of scene.geometry")
     if not isinstance(given, trimesh.Trimesh):
@@ -52,8 +54,14 @@ def from_trimesh(given: Any) -> Mesh:
 
 
 def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
-    """See Mesh.to_trimesh. faces_colored: False where faces have none of their own, which those of their vertices then hold."""
-    trimesh = require("trimesh", "trimesh", "Mesh.to_trimesh")
+    """A trimesh.Trimesh of a mesh, with colours or texture as 8-bit sRGB; vertices are split where texture coordinates or the
+    colours of corners differ.
+
+    faces_colored  False: the colours of faces are given to the vertices, which are split for them
+
+    Raises ValueError for other than 1 or 3 channels, ImportError.
+    """
+    trimesh = require("trimesh", "trimesh", "to_trimesh")
     _check_channels(mesh)
     faces = _array(mesh.faces)
     verts, colors = _array(mesh.verts), mesh.colors
@@ -117,7 +125,8 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     if lost:
         warn(
             f"left out of {kind}",
-            f"save_mesh: {file.name} holds no {', no '.join(lost)}; torch.save(mesh, path) keeps all of a Mesh",
+            f"save_mesh: {file.name} holds no {', no '.join(lost)}; "
+            "torch.save(Scene(mesh).state_dict(), path) keeps all of a Mesh",
         )
     for name, data in {**beside, file.name: content}.items():
         with replacing(file.parent / Path(name).name) as temporary:
@@ -152,8 +161,8 @@ def save_scene(
     if lost:
         warn(
             f"left out of {file.suffix}",
-            f"save_scene: {file.name} holds no {', no '.join(lost)}; torch.save(scene, path) keeps all of a Scene, and "
-            "save_camera() all of a camera",
+            f"save_scene: {file.name} holds no {', no '.join(lost)}; "
+            "torch.save(scene.state_dict(), path) keeps all of a Scene, and save_camera() all of a camera",
         )
     with replacing(file) as temporary:
         temporary.write_bytes(content)
