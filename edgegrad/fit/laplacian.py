@@ -1,6 +1,6 @@
-"""Large steps for shapes: coordinates in which a step of one vertex takes its neighbours along.
+"""Coordinates of a mesh in which a step of one vertex moves its neighbours along.
 
-With L the graph's Laplacian of a mesh, u = (I + λ L) v stands for the vertices v. A step in u moves v = (I + λ L)⁻¹ u, smooth
+With the graph Laplacian L of the mesh, u = (I + λ L) v stands for the vertices v. A step in u moves v = (I + λ L)⁻¹ u smoothly,
 however noisy the gradient is (Nicolet, Jacobson and Jakob, Large Steps in Inverse Rendering of Geometry, 2021).
 """
 
@@ -16,8 +16,9 @@ from ..optional import require
 from .regularizers import edges
 
 
-class Smooth:
-    """(I + λ L)⁻¹ of rows (V, n), differentiable, by cholespy's factorization. Raises ImportError without cholespy."""
+class LaplacianSolver:
+    """The map from u (V, n) to v = (I + λ L)⁻¹ u, differentiable, by cholespy's factorization. Raises ImportError without
+    cholespy."""
 
     def __init__(self, faces: Tensor, count: int, smoothness: float) -> None:
         cholespy = require("cholespy", "edgegrad[fit]", "a smooth shape")
@@ -33,12 +34,12 @@ class Smooth:
             count, rows.int().numpy(), columns.int().numpy(), values.numpy(), cholespy.MatrixType.COO
         )
 
-    def times(self, v: Tensor) -> Tensor:
-        """u = (I + λ L) v."""
+    def to_differential(self, v: Tensor) -> Tensor:
+        """Return u = (I + λ L) v."""
         return (self._matrix @ v.double()).to(v.dtype)
 
     def __call__(self, u: Tensor) -> Tensor:
-        """v = (I + λ L)⁻¹ u."""
+        """Return v = (I + λ L)⁻¹ u."""
         return _Solve.apply(u, self)  # type: ignore[return-value]
 
     def solve(self, u: Tensor) -> Tensor:
@@ -49,7 +50,7 @@ class Smooth:
 
 class _Solve(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, u: Tensor, smooth: Smooth) -> Tensor:
+    def forward(ctx: Any, u: Tensor, smooth: LaplacianSolver) -> Tensor:
         ctx.smooth = smooth
         return smooth.solve(u)
 

@@ -1,4 +1,4 @@
-"""From the values of parameters to a scene and its cameras."""
+"""Build a scene and its cameras from the values of parameters."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ Built = tuple[Scene, list[Camera]]
 Build = Callable[[Values], Built]
 
 
-class Known:
-    """What a scene and its cameras hold: tensors, by name, and what may get a pose, by the pose's name."""
+class SceneTensors:
+    """The tensors of a scene and its cameras by name, and the objects that may get a pose by the pose's name."""
 
     def __init__(self, start: Scene | Mesh, cameras: list[Camera]) -> None:
         found = dict(named_tensors(start)) | {f"cameras.{name}": tensor for name, tensor in named_tensors(cameras)}
@@ -33,8 +33,8 @@ class Known:
         self.movable |= {f"cameras.{i}.pose": start for i in range(len(cameras))}
 
 
-def builder(scene: object, cameras: list[Camera], drop_background: bool) -> tuple[Build, Known | None]:
-    """A function from values to scene and cameras, and what may be sought; None when a function says."""
+def builder(scene: object, cameras: list[Camera], drop_background: bool) -> tuple[Build, SceneTensors | None]:
+    """Return a function from values to scene and cameras, and what may be sought; None if the scene is a function."""
 
     def ready(scene: Scene | Mesh) -> Scene:
         whole = Scene([scene]) if isinstance(scene, Mesh) else scene
@@ -52,7 +52,7 @@ def builder(scene: object, cameras: list[Camera], drop_background: bool) -> tupl
             there, seen = _moved(with_named(start, inside), list(with_named(cameras, outside)), poses)
             return ready(there), seen
 
-        return replaced, Known(start, cameras)
+        return replaced, SceneTensors(start, cameras)
     if not callable(scene):
         raise TypeError(f"scene: expected a Scene, a Mesh, or a function that makes one, got {type(scene).__name__}")
 
@@ -70,12 +70,12 @@ def builder(scene: object, cameras: list[Camera], drop_background: bool) -> tupl
 
 
 def _moved(scene: Scene | Mesh, cameras: list[Camera], poses: Mapping[str, Pose]) -> tuple[Scene | Mesh, list[Camera]]:
-    """With meshes and cameras moved by their poses."""
+    """Move meshes and cameras by their poses."""
     for name, pose in poses.items():
         kind, _, rest = name.partition(".")
         place = int(rest.partition(".")[0]) if rest else 0
         if kind == "cameras":
-            # A camera that moves by M sees what stands still as the old one sees it moved by M⁻¹.
+            # A camera moved by M sees the world as the old one sees the world moved by M⁻¹.
             back = rigid(pose.R.mT, -(pose.R.mT @ pose.t))
             W = cameras[place].world_to_camera
             cameras[place] = cameras[place].replace(world_to_camera=(W.double() @ back.double()).to(W))
@@ -88,14 +88,14 @@ def _moved(scene: Scene | Mesh, cameras: list[Camera], poses: Mapping[str, Pose]
     return scene, cameras
 
 
-def like(name: str, names: Sequence[str]) -> str:
-    """What to add to an error about an unknown name."""
+def suggestion(name: str, names: Sequence[str]) -> str:
+    """Return what to add to an error about an unknown name."""
     close = difflib.get_close_matches(name, names, n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-def checked_parameters(parameters: object, known: Known | None) -> dict[str, Parameter | Placement]:
-    """Each with a value to start from. Raises TypeError or ValueError."""
+def checked_parameters(parameters: object, known: SceneTensors | None) -> dict[str, Parameter | Placement]:
+    """Return each parameter with an initial value. Raises TypeError or ValueError."""
     if not isinstance(parameters, Mapping):
         raise TypeError(
             f"parameters: expected a mapping of names to learning rates or Parameters, got {type(parameters).__name__}; give "
@@ -120,7 +120,7 @@ def checked_parameters(parameters: object, known: Known | None) -> dict[str, Par
             if name not in known.tensors:
                 names = [*known.tensors, *known.movable]
                 raise ValueError(
-                    f"parameters: expected names among {', '.join(names)}, got {name!r}{like(name, names)}"
+                    f"parameters: expected names among {', '.join(names)}, got {name!r}{suggestion(name, names)}"
                 )
             value = known.tensors[name]
             if parameter.value is None:
@@ -131,21 +131,21 @@ def checked_parameters(parameters: object, known: Known | None) -> dict[str, Par
     return found
 
 
-def _placement(name: str, given: PoseParameter, known: Known | None) -> Placement:
+def _placement(name: str, given: PoseParameter, known: SceneTensors | None) -> Placement:
     if known is None:
         return given.placed(name)
     if name not in known.movable:
         names = list(known.movable)
         raise ValueError(
-            f"parameters: expected a pose's name among {', '.join(names)}, got {name!r}{like(name, names)}"
+            f"parameters: expected a pose's name among {', '.join(names)}, got {name!r}{suggestion(name, names)}"
         )
     if name.startswith("cameras.") and given.scale is not None:
         raise ValueError(f"{name}: scale: expected None for a camera, got {given.scale!r}; leave it out")
     return given.placed(name, known.movable[name])
 
 
-def built(build: Build, values: Values) -> Built:
-    """Without gradients."""
+def build_detached(build: Build, values: Values) -> Built:
+    """Build without gradients."""
     with torch.no_grad():
         scene, cameras = build({name: _detached(value) for name, value in values.items()})
         return scene.detach(), [map_tensors(camera, Tensor.detach) for camera in cameras]
