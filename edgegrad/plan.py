@@ -418,7 +418,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
 
 
 def _bound(samples: int, wanted: int) -> str:
-    """What plan() says where the budget (csrc/backward/budget.h) may cut the default samples."""
+    """What plan() says where the budget (csrc/estimator/budget.h) may cut the default samples."""
     return f"; by default up to {wanted:,}, but no more than take the image's time" if 0 < samples < wanted else ""
 
 

@@ -7,19 +7,19 @@
 #include <type_traits>
 #include <vector>
 
-#include "backward/budget.h"
-#include "backward/vertex_image.h"
-#include "boundary/bounces.h"
-#include "boundary/boundary.h"
 #include "boundary/curve.h"
-#include "boundary/curve_measure.h"
-#include "boundary/shadows.h"
-#include "boundary/steps.h"
-#include "boundary/surface_borders.h"
-#include "boundary/unseen_shadows.h"
-#include "camera/windows.h"
+#include "camera/sub_cameras.h"
+#include "discontinuities/discontinuities.h"
+#include "estimator/budget.h"
+#include "estimator/vertex_image.h"
 #include "interior/interior.h"
 #include "interior/surface_measure.h"
+#include "primary/curve_measure.h"
+#include "primary/primary_curves.h"
+#include "secondary/indirect_shadows.h"
+#include "secondary/secondary_edges.h"
+#include "secondary/shadows.h"
+#include "secondary/surface_edges.h"
 
 namespace edgegrad {
 

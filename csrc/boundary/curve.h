@@ -11,7 +11,7 @@
 #include <limits>
 #include <vector>
 
-#include "backward/view.h"
+#include "estimator/view.h"
 #include "scene/topology.h"
 #include "shading/shade.h"
 

@@ -5,7 +5,7 @@
 #include <span>
 #include <vector>
 
-#include "boundary/contractions.h"
+#include "boundary/accumulation.h"
 #include "boundary/curve_source.h"
 #include "boundary/visibility.h"
 

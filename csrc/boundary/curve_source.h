@@ -1,4 +1,4 @@
-// What the estimator (boundary.cpp) knows of a curve along which the image jumps.
+// What the estimator (primary_curves.cpp) knows of a curve along which the image jumps.
 //
 // A sample is a point of a curve. Its ray, from the camera to that point, ignores the faces that meet in the curve;
 // what it finds hides the point, or lies behind it. A source of curves says where the point is and which faces the ray
@@ -13,9 +13,9 @@
 #include <span>
 #include <vector>
 
-#include "contract/forward.h"
-#include "contract/scatter.h"
-#include "shading/surface.h"
+#include "accumulate/scatter.h"
+#include "accumulate/tangent.h"
+#include "camera/face_map.h"
 
 namespace edgegrad {
 

@@ -9,9 +9,9 @@
 #include <span>
 #include <vector>
 
-#include "backward/beside.h"
-#include "backward/view.h"
 #include "boundary/curve_source.h"
+#include "estimator/near_misses.h"
+#include "estimator/view.h"
 #include "scene/contact.h"
 
 namespace edgegrad {

@@ -32,7 +32,7 @@ struct IntrinsicsGrad {
 
 // What is visible through a lens that bends: a disc, and the box of the straight image, px, in which all lies that a
 // pixel filter reaches; and how far bending moves places there, at most: |∂x/∂u| entry by entry. Of a window
-// (windows.h): which borders of its box, in the order of ViewVolume, belong to its neighbours.
+// (sub_cameras.h): which borders of its box, in the order of ViewVolume, belong to its neighbours.
 struct LensView {
     LensDisc disc;
     // The angle to the axis, radians, where the image ends; none if it does not.
@@ -201,7 +201,7 @@ inline void to_pixels_vjp(const Camera& c, Vec2 m, Vec2 bar, Vec2& m_bar, double
     m_bar += Vec2{c.k[0] * bar.x + c.k[3] * bar.y, c.k[1] * bar.x + c.k[4] * bar.y};
 }
 
-// Through a lens that is not straight (through_lens.cpp; few cameras have one, and it is much code): backwards,
+// Through a lens that is not straight (distorted.cpp; few cameras have one, and it is much code): backwards,
 // to_pixels of n bent to m; and n of m, alone or with m itself and the lens's coefficients, of a cotangent m_bar of A⁻¹
 // x.
 void bent_to_pixels_vjp(const Camera& c, Vec2 n, Vec2 bar, Vec2& n_bar, IntrinsicsGrad& intrinsics);

@@ -6,8 +6,8 @@
 #include <vector>
 
 #include "camera/camera.h"
+#include "camera/sub_cameras.h"
 #include "camera/view_volume.h"
-#include "camera/windows.h"
 
 namespace edgegrad {
 

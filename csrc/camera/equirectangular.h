@@ -6,13 +6,13 @@
 #include <limits>
 #include <optional>
 
-#include "camera/cube_side.h"
+#include "camera/cube_face.h"
 #include "core/math.h"
 
 namespace edgegrad {
 
-// A panorama sees through the six sides of a cube around the eye (windows.h). Each has a frame of its own, in which it
-// is a pinhole with |n.x|, |n.y| ≤ 1; this lens takes n to the panorama. Of the direction d = turnᵀ (n, 1) in the
+// A panorama sees through the six sides of a cube around the eye (sub_cameras.h). Each has a frame of its own, in which
+// it is a pinhole with |n.x|, |n.y| ≤ 1; this lens takes n to the panorama. Of the direction d = turnᵀ (n, 1) in the
 // camera's frame, with h = hypot(d.x, d.z):
 //
 //     λ = atan2(d.x, d.z)    φ = atan2(d.y, h)    x = K (λ', φ', 1)

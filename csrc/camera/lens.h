@@ -30,7 +30,7 @@ concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_
     lens.bend_vjp(n, n, n_bar, coefficients_bar);
 };
 
-// One that sees through the sides of a cube (cube_side.h), each of which is a window (windows.h).
+// One that sees through the sides of a cube (cube_face.h), each of which is a window (sub_cameras.h).
 template <class L>
 concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 box) {
     { lens.scale() } -> std::same_as<Vec2>;

@@ -5,7 +5,7 @@
 #include <optional>
 #include <vector>
 
-#include "camera/cube_side.h"
+#include "camera/cube_face.h"
 #include "camera/fisheye.h"
 #include "core/math.h"
 

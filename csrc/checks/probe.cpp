@@ -6,9 +6,9 @@
 #include <algorithm>
 #include <vector>
 
+#include "accumulate/scatter.h"
 #include "backward/backward.h"
 #include "camera/vertices.h"
-#include "contract/scatter.h"
 #include "shading/shade.h"
 
 namespace edgegrad {

@@ -2,7 +2,7 @@
 
 #include <algorithm>
 
-#include "forward/side.h"
+#include "forward/sub_camera_rays.h"
 
 namespace edgegrad {
 

@@ -6,7 +6,7 @@
 #include <optional>
 
 #include "core/sobol.h"
-#include "forward/image_borders.h"
+#include "forward/discontinuous_pixels.h"
 #include "forward/pixel_hits.h"
 #include "forward/sky_guide.h"
 #include "shading/lit/indirect.h"

@@ -25,7 +25,7 @@ struct LitImage {
 };
 
 // Pixels that borders of shadows or of nearest texels run through are shaded again, at several points
-// (image_borders.h).
+// (discontinuous_pixels.h).
 template <class T>
 LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                        const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,

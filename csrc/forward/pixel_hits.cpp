@@ -7,9 +7,9 @@
 #include <limits>
 
 #include "camera/depth_bound.h"
+#include "camera/face_map.h"
 #include "forward/reachable.h"
-#include "forward/side.h"
-#include "shading/surface.h"
+#include "forward/sub_camera_rays.h"
 
 namespace edgegrad {
 

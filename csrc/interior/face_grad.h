@@ -1,7 +1,7 @@
 // What a run of samples on one face adds to the gradient.
 #pragma once
 
-#include "backward/view.h"
+#include "estimator/view.h"
 #include "interior/control.h"
 #include "shading/shade.h"
 

@@ -13,14 +13,15 @@
 #include <memory>
 #include <vector>
 
-#include "backward/beside.h"
 #include "camera/polygon.h"
-#include "core/draws.h"
+#include "core/ordered_draws.h"
 #include "core/sampler.h"
 #include "core/sobol.h"
 #include "core/systematic.h"
+#include "estimator/near_misses.h"
+#include "estimator/pixel_samples.h"
 #include "film/film.h"
-#include "interior/contractions.h"
+#include "interior/accumulation.h"
 #include "interior/surface_measure.h"
 #include "shading/shade.h"
 

@@ -4,8 +4,8 @@
 #include <optional>
 #include <vector>
 
-#include "backward/view.h"
-#include "contract/contraction.h"
+#include "accumulate/accumulation.h"
+#include "estimator/view.h"
 
 namespace edgegrad {
 

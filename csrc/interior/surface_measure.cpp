@@ -5,9 +5,9 @@
 #include <cmath>
 #include <optional>
 
-#include "backward/vertex_image.h"
 #include "camera/polygon.h"
 #include "core/sampler.h"
+#include "estimator/vertex_image.h"
 #include "interior/control.h"
 #include "interior/face_lanes.h"
 #include "shading/shade.h"

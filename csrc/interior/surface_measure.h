@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "backward/view.h"
+#include "estimator/view.h"
 
 namespace edgegrad {
 

@@ -2,8 +2,8 @@
 
 #include <algorithm>
 
-#include "camera/windows.h"
-#include "shading/texture.h"
+#include "camera/sub_cameras.h"
+#include "texture/texture.h"
 
 namespace edgegrad {
 

@@ -10,7 +10,7 @@
 #include "forward/forward.h"
 #include "python/checks.h"
 #include "python/unlocked.h"
-#include "scene/geometry.h"
+#include "rays/geometry.h"
 
 namespace edgegrad {
 

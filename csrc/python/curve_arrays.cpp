@@ -1,6 +1,6 @@
 #include "python/curve_arrays.h"
 
-#include "contract/curve_hits.h"
+#include "accumulate/curve_hits.h"
 #include "python/shaped.h"
 #include "python/unlocked.h"
 

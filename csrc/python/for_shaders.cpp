@@ -8,15 +8,15 @@
 #include <optional>
 
 #include "backward/backward.h"
-#include "boundary/shadows.h"
+#include "forward/image_points.h"
 #include "forward/pixel_hits.h"
-#include "forward/places.h"
-#include "forward/trace.h"
 #include "python/arrays.h"
 #include "python/curve_arrays.h"
 #include "python/shaped.h"
 #include "python/unlocked.h"
-#include "shading/pyramid.h"
+#include "rays/trace.h"
+#include "secondary/shadows.h"
+#include "texture/pyramid.h"
 
 using namespace nanobind::literals;
 

@@ -14,7 +14,8 @@
 
 #include "backward/backward.h"
 #include "camera/camera.h"
-#include "camera/windows.h"
+#include "camera/face_map.h"
+#include "camera/sub_cameras.h"
 #include "checks/probe.h"
 #include "core/sampler.h"
 #include "core/sobol.h"
@@ -26,8 +27,7 @@
 #include "python/unlocked.h"
 #include "scene/intersections.h"
 #include "scene/topology.h"
-#include "shading/surface.h"
-#include "shading/texture.h"
+#include "texture/texture.h"
 
 using namespace nanobind::literals;
 

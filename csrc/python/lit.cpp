@@ -8,7 +8,7 @@
 #include <optional>
 #include <vector>
 
-#include "contract/record.h"
+#include "accumulate/records.h"
 #include "forward/lit_image.h"
 #include "python/arrays.h"
 #include "python/lit_arrays.h"
@@ -16,7 +16,7 @@
 #include "python/unlocked.h"
 #include "shading/lit/flat_light.h"
 #include "shading/lit/indirect.h"
-#include "shading/lit/towards_camera.h"
+#include "shading/lit/light_tracing.h"
 
 using namespace nanobind::literals;
 

@@ -13,7 +13,7 @@
 #include <utility>
 
 #include "python/shaped.h"
-#include "shading/lit/mesh_towards.h"
+#include "shading/lit/mesh_light_sampling.h"
 
 using namespace nanobind::literals;
 

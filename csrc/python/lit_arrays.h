@@ -9,7 +9,7 @@
 
 #include "python/arrays.h"
 #include "python/checks.h"
-#include "shading/lit/lamp_tree.h"
+#include "shading/lit/emissive_face_tree.h"
 #include "shading/lit/lit_scene.h"
 
 namespace edgegrad {

@@ -25,7 +25,7 @@ namespace edgegrad {
 void bind_memory(nb::module_& m);       // memory.cpp
 void bind_for_shaders(nb::module_& m);  // for_shaders.cpp
 void bind_lit(nb::module_& m);          // lit.cpp
-void bind_bounces(nb::module_& m);      // bounces.cpp
+void bind_bounces(nb::module_& m);      // secondary_edges.cpp
 void bind_moving_hits(nb::module_& m);  // moving_hits.cpp
 void bind_raster(nb::module_& m);       // raster.cpp
 template <class T>

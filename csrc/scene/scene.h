@@ -56,7 +56,7 @@ struct Sampler {
 // A row of a table of textures: first texel, height, width, and the sampler's three numbers.
 constexpr int texture_columns = 6;
 
-// Faces that are cut out where an alpha texture is below a cutoff (shading/cut_outs.h).
+// Faces that are cut out where an alpha texture is below a cutoff (rays/alpha_mask.h).
 template <class T>
 struct CutOutArrays {
     const T* alphas = nullptr;  // (Y,) all alpha textures, row by row

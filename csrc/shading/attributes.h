@@ -3,10 +3,10 @@
 // interpolated: n = m / |m|, δn = (δm − n (n · δm)) / |m|.
 #pragma once
 
-#include "contract/scatter.h"
-#include "scene/gradients.h"
+#include "accumulate/gradients.h"
+#include "accumulate/scatter.h"
+#include "camera/face_map.h"
 #include "scene/scene.h"
-#include "shading/surface.h"
 
 namespace edgegrad {
 

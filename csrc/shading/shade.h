@@ -7,14 +7,14 @@
 #include <type_traits>
 #include <vector>
 
-#include "contract/scatter.h"
+#include "accumulate/gradients.h"
+#include "accumulate/scatter.h"
+#include "camera/face_map.h"
 #include "core/channels.h"
-#include "scene/gradients.h"
+#include "rays/alpha_mask.h"
 #include "scene/scene.h"
 #include "shading/attributes.h"
-#include "shading/cut_outs.h"
-#include "shading/surface.h"
-#include "shading/texture.h"
+#include "texture/texture.h"
 
 namespace edgegrad {
 

@@ -104,7 +104,7 @@ _NAMES = {Tensor: "Tensor", bool: "bool", int: "SymInt", float: "float", str: "s
 # The arguments of the operators. A SymInt may stay symbolic under torch.compile, an int would compile once for each value.
 SCHEMA = ", ".join(f"{_NAMES[kind]} {field}" for field, kind in zip(FIELDS, _TYPES, strict=True))
 
-# What a gradient can be asked for, from the kernel's table (csrc/scene/gradients.h), and where it is among the packed values.
+# What a gradient can be asked for, from the kernel's table (csrc/accumulate/gradients.h), and where it is among the packed values.
 SLOTS: tuple[str, ...] = core.GRADIENT_SLOTS
 POSITIONS = tuple(FIELDS.index(name) for name in SLOTS)
 _LABELS = {"texels": "texture", "alphas": "alpha"}

@@ -1,13 +1,13 @@
-"""Borders of what surfaces of paths of light see of one another (csrc/boundary/bounce_source.h): an edge, or the rim of a
+"""Borders of what surfaces of paths of light see of one another (csrc/secondary/edge_line_source.h): an edge, or the rim of a
 cut-out, on the line between a point that sends light and one that receives it. And curves at which surfaces of paths begin to
-send light (csrc/boundary/surface_borders.cpp): where faces pass through each other, and rims of cut-outs as textures move.
+send light (csrc/secondary/surface_edges.cpp): where faces pass through each other, and rims of cut-outs as textures move.
 
 Where the camera sees the point that receives, the first are curves in the image. From where it need not, light is followed on to
 the camera, by so many steps more:
 
     δI = Σ_k k(x_k − c) B_k δF        over samples
 
-of borders F = 0, with the light B_k that comes to the place x_k of the image (csrc/shading/lit/towards_camera.h).
+of borders F = 0, with the light B_k that comes to the place x_k of the image (csrc/shading/lit/light_tracing.h).
 """
 
 from __future__ import annotations

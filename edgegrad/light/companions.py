@@ -1,4 +1,4 @@
-"""Directions in fours, in which what the derivatives of a glossy lobe have of both signs cancels (csrc/shading/lit/companions.h,
+"""Directions in fours, in which what the derivatives of a glossy lobe have of both signs cancels (csrc/shading/lit/antithetic.h,
 which names the sources)."""
 
 from __future__ import annotations

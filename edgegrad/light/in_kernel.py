@@ -133,7 +133,7 @@ def image(frame: Frame, options: Options, points: int) -> Tensor:
 def bounce_samples(frame: Frame, options: Options, further: int) -> tuple[CurveRecords, Tensor, Tensor]:
     """Samples on the borders of what surfaces of paths see of one another, and (S, C) float64 by how much the image jumps there,
     times what a sample stands for. Where light goes `further` steps after that: what has come to the first point of each, and
-    (S, 3) from which unit directions (csrc/boundary/bounces.h)."""
+    (S, 3) from which unit directions (csrc/secondary/secondary_edges.h)."""
     own = {"further": further, "seen": further == 0}
     return _samples_of_lines(frame, options, "bounce_samples", derived_seed(frame.sampler.grad_seed, -further), own)
 
@@ -165,7 +165,7 @@ def _samples_of_lines(
 
 def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, int]) -> list[Tensor]:
     """What comes to the image of light that has come to points, without derivatives: which point it is of (M,) int64, the places
-    in the image (M, 2), and the radiance times px² (M, C). See csrc/shading/lit/towards_camera.h.
+    in the image (M, 2), and the radiance times px² (M, C). See csrc/shading/lit/light_tracing.h.
 
     arrivals  faces (N,), barycentrics (N, 3), seeds (N,), unit directions (N, 3) where the light came from, and how much (N, C)
     steps     the first and the last after which it goes to the camera

@@ -1,5 +1,5 @@
 """Meshes that emit as surfaces meet them: which of their faces lie in a direction, and what hides them
-(csrc/shading/lit/mesh_towards.h, lamp_tree.h)."""
+(csrc/shading/lit/mesh_light_sampling.h, lamp_tree.h)."""
 
 from __future__ import annotations
 

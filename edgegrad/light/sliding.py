@@ -10,7 +10,7 @@ over the part l … r of a pixel's width in which one sees the face, and L(l) an
 their paths go on in the same directions. So a sample at any place between them has D_a δξ_a with D_a = (L(r) − L(l)) / (r − l).
 That is exact where δξ is linear in a pixel and the filter a box; of wider filters the width is a quarter of a pixel.
 
-From afar the derivative is the quieter one. So L is only what comes from within a radius (csrc/shading/lit/near_part.h).
+From afar the derivative is the quieter one. So L is only what comes from within a radius (csrc/shading/lit/near_field.h).
 """
 
 from __future__ import annotations

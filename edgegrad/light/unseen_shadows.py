@@ -3,8 +3,8 @@ by way of such surfaces changes as the borders move on them.
 
     δI = Σ_k k(x_k − c) B_k δF        over samples
 
-of a border F = 0 (csrc/boundary/unseen_shadows.cpp), with the light B_k that comes from the surface there to the place x_k of the
-image, by so many steps more (csrc/shading/lit/towards_camera.h).
+of a border F = 0 (csrc/secondary/indirect_shadows.cpp), with the light B_k that comes from the surface there to the place x_k of the
+image, by so many steps more (csrc/shading/lit/light_tracing.h).
 """
 
 from __future__ import annotations

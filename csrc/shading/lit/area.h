@@ -1,7 +1,7 @@
 // Faces that emit: E = L cos θ / r² over the density by area of a point that stays at its barycentrics while they move.
 #pragma once
 
-#include "shading/lit/lamp.h"
+#include "shading/lit/light.h"
 
 namespace edgegrad {
 

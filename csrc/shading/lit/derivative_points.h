@@ -4,12 +4,12 @@
 #include <algorithm>
 #include <vector>
 
-#include "shading/lit/companions.h"
+#include "shading/lit/antithetic.h"
 #include "shading/lit/light_sample.h"
 
 namespace edgegrad {
 
-// As Resampled, but what is drawn, weighted and kept are directions with their companions (companions.h): the target
+// As Resampled, but what is drawn, weighted and kept are directions with their companions (antithetic.h): the target
 // of four is what all of them give, and each of them is lit.
 class ResampledFours {
    public:
@@ -47,7 +47,7 @@ class ResampledFours {
         double target = 0, running = 0;  // the density of a point is the measure that it stands for
     };
 
-    // The density of the lobe is known above the surface alone (lobe_draw.h): what it draws below is dropped.
+    // The density of the lobe is known above the surface alone (bsdf_sampling.h): what it draws below is dropped.
     void add(const LightPoint& p, Vec3 l, bool of_lobe) {
         if (of_lobe && !(dot(n_, l) > 0)) return;
         const Companions all(v_, n_, alpha_, l);

@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "shading/lit/lamp.h"
+#include "shading/lit/light.h"
 
 namespace edgegrad {
 

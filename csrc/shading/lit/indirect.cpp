@@ -3,7 +3,7 @@
 #include <algorithm>
 
 #include "shading/lit/lit.h"
-#include "shading/lit/near_part.h"
+#include "shading/lit/near_field.h"
 #include "shading/lit/path_radiance.h"
 #include "shading/lit/point_cotangents.h"
 

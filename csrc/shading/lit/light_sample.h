@@ -5,10 +5,10 @@
 #include <vector>
 
 #include "core/sobol.h"
+#include "shading/lit/bsdf_sampling.h"
 #include "shading/lit/environment.h"
 #include "shading/lit/lit_surface.h"
-#include "shading/lit/lobe_draw.h"
-#include "shading/lit/mesh_towards.h"
+#include "shading/lit/mesh_light_sampling.h"
 #include "shading/lit/punctual.h"
 
 namespace edgegrad {

@@ -7,9 +7,9 @@
 #include <vector>
 
 #include "core/math.h"
+#include "shading/lit/antithetic.h"
 #include "shading/lit/area.h"
-#include "shading/lit/companions.h"
-#include "shading/lit/lamp.h"
+#include "shading/lit/light.h"
 #include "shading/lit/normals.h"
 #include "shading/lit/source.h"
 #include "shading/lit/tables.h"
@@ -107,7 +107,7 @@ struct LitOptions {
     double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
     int bounces = 1;  // how often light is scattered on its way, at most (path.h)
     // World units, 0: none. Derivatives by where points lie on their faces, of light that is scattered more than once,
-    // are those of what does not come from nearer (near_part.h); `only_near`: values are those of what does.
+    // are those of what does not come from nearer (near_field.h); `only_near`: values are those of what does.
     double near = 0;
     bool only_near = false;
     int by_paths = -1;  // a lamp of which no points are drawn for Lambertian surfaces: paths from them find it

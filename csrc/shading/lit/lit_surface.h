@@ -5,8 +5,8 @@
 #include <vector>
 
 #include "core/dual.h"
+#include "shading/lit/bsdf.h"
 #include "shading/lit/lit_scene.h"
-#include "shading/lit/scattering.h"
 
 namespace edgegrad {
 

@@ -16,8 +16,8 @@
 #include <optional>
 #include <vector>
 
-#include "forward/trace.h"
-#include "shading/lit/bounce_draw.h"
+#include "rays/trace.h"
+#include "shading/lit/path_sampling.h"
 #include "shading/lit/visibility.h"
 
 namespace edgegrad {

@@ -1,7 +1,7 @@
 // Lights of one point or one direction, as in glTF (KHR_lights_punctual).
 #pragma once
 
-#include "shading/lit/lamp.h"
+#include "shading/lit/light.h"
 
 namespace edgegrad {
 

@@ -2,7 +2,7 @@
 // (Ramamoorthi and Hanrahan 2001).
 #pragma once
 
-#include "shading/lit/lamp.h"
+#include "shading/lit/light.h"
 
 namespace edgegrad {
 

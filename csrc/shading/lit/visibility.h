@@ -6,10 +6,10 @@
 #include <cstdint>
 #include <vector>
 
-#include "forward/trace.h"
+#include "rays/alpha_mask.h"
 #include "rays/raycast.h"
+#include "rays/trace.h"
 #include "scene/scene.h"
-#include "shading/cut_outs.h"
 #include "shading/lit/derivative_points.h"
 
 namespace edgegrad {
