@@ -9,7 +9,7 @@
 
 namespace edgegrad {
 
-// Above this roughness a lobe is so wide that directions drawn by it only cost (docs/performance.md).
+// Above this roughness a lobe is so wide that directions drawn by it only cost.
 constexpr double widest_lobe = 0.65;
 
 // Two unit vectors across n, and n (Duff et al. 2017, "Building an orthonormal basis, revisited").
