@@ -5,7 +5,7 @@
 //
 // As x₁ slides on its face with x₂ held on its own, light changes by up to 1 / d of it, and next to corners the
 // variance of that is infinite. So of what is near no such derivatives are taken: it is compared at places that lie
-// apart (edgegrad/light/sliding.py). Of the rest they are bounded by some 1 / r.
+// apart (edgegrad/light/near_field.py). Of the rest they are bounded by some 1 / r.
 #pragma once
 
 #include <algorithm>
