@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from cut_outs import F64, quad
+from alpha_masks import F64, quad
 from scenes import front_camera
 from torch import Tensor
 

@@ -24,7 +24,7 @@ from benchmarks.stability.cases import CASES, bounced, measure
 from benchmarks.stability.cases.case import Case, Problem, everything
 from benchmarks.stability.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WRONG, Effort
 from benchmarks.stability.painted import PAINTED
-from edgegrad.fit.smooth import Smooth
+from edgegrad.fit.laplacian import LaplacianSolver
 
 FAST = [name for name, case in CASES.items() if not case.slow and case.group not in ("light", "bounces")]
 # Of each there is another that is more extreme, or differs in one thing.
@@ -304,7 +304,7 @@ def test_a_squared_loss_has_no_bias_in_the_gradient_for_what_moves():
 
 def test_smoothing_solves():
     mesh = cube(1.0)
-    solve = Smooth(mesh.faces, len(mesh.verts), fits.SMOOTHNESS)
+    solve = LaplacianSolver(mesh.faces, len(mesh.verts), fits.SMOOTHNESS)
     x = torch.randn((8, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(solve(solve.times(x)), x)
     ones = torch.ones((8, 3), dtype=torch.float64)

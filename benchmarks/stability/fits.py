@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
-from edgegrad.fit.smooth import Smooth
+from edgegrad.fit.laplacian import LaplacianSolver
 from edgegrad.render import render
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
@@ -84,7 +84,7 @@ def vertex_fit(steps: int = STEPS, preconditioned: bool = False, say: Say = lamb
     back = background().float()
     with torch.no_grad():
         target = render(Scene([mesh.replace(verts=goal)], back), cameras, spp=256)
-    solve = Smooth(mesh.faces, len(mesh.verts), SMOOTHNESS) if preconditioned else None
+    solve = LaplacianSolver(mesh.faces, len(mesh.verts), SMOOTHNESS) if preconditioned else None
     v = mesh.verts.clone()
     u = v if solve is None else solve.times(v)
     mean, square = torch.zeros_like(u), torch.zeros_like(u)
