@@ -63,8 +63,8 @@ def load() -> tuple[Any, Any]:
 def sky_image(radiance: Tensor) -> Tensor:
     """Return the image (h, w, C) of an environment as Mitsuba's `envmap` takes it, (2 h + 1, w, C).
 
-    Mitsuba has the first and the last row at the poles and all others evenly between. In edgegrad the centres of texels are half a
-    row off the poles, so an unchanged image would be stretched by h / (h − 1). Here every second row is one of the image, and
+    Mitsuba has the first and the last row at the poles and all others evenly between. In edgegrad the centres of texels lie half
+    a row off the poles, so an unchanged image would be stretched by h / (h − 1). Here every second row is one of the image, and
     both interpolate alike.
     """
     between = (radiance[1:] + radiance[:-1]) / 2
