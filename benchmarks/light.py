@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Kernel
+from common import Kernel, parts
 from table import Bench, Row, milliseconds, ratio_row, seconds_of
 from torch import Tensor
 
@@ -21,7 +21,7 @@ from edgegrad.light.radiance import Lighting
 from edgegrad.points.frame import Frame
 from edgegrad.report import build
 from edgegrad.report.scenes import ReportScene
-from edgegrad.shader import Effort, _Image
+from edgegrad.shader import Effort, UserShader, _Image
 
 # Samples on the borders of shadows.
 COUNTS = {
@@ -71,7 +71,7 @@ def images(bench: Bench) -> list[Row]:
         images[:] = [eg.render(eg.Scene([moved], lights=shining), globe.camera)]
 
     bare, plain, open_, shadowed, ahead, back = bench.interleaved(
-        9, lambda: core.for_tests.bare_loop(kernel.scene, kernel.camera, kernel.options, packet, threads),
+        9, lambda: parts.bare_loop(kernel.scene, kernel.camera, kernel.options, packet, threads),
         image(unlit), image(lit, shadows=False), image(lit), lambda: seconds_of(whole),
         lambda: seconds_of(lambda: torch.autograd.backward(images[0], globe.adjoint, inputs=[*leaves, *powers])),
     )  # fmt: skip
@@ -115,7 +115,7 @@ def border_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, 
     verts = scene.verts.float().requires_grad_()
     moved = scene.moved(verts)
     request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
-    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False, Effort(keeps_little=True, additive=True))
+    image = Borders(Frame(moved, request, 0), UserShader(Lighting(True, 1)), False, False, Effort(keeps_little=True, additive=True))
     found = image.render()
     begin = time.perf_counter()
     (gradient,) = torch.autograd.grad((found * scene.adjoint).sum(), verts)
