@@ -15,11 +15,13 @@ import edgegrad as eg
 from edgegrad.files.paths import replacing
 from edgegrad.kernel.operators import Hits, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad.kernel.request import make_request
-from edgegrad.library import core
+from edgegrad.library import core, load
 from edgegrad.report.error_time.methods import differentiate
 from edgegrad.report.error_time.references import standard_error
 from edgegrad.report.scenes import ReportScene, smooth_adjoint
 from edgegrad.report.scenes import sphere as icosphere
+
+parts = load("_core_tests")  # what only tests and benchmarks call
 
 
 def sphere(size: int | tuple[int, int], subdivisions: int = 6) -> tuple[eg.Mesh, eg.Camera, Tensor]:

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from common import Kernel, Step, sphere
+from common import Kernel, Step, parts, sphere
 from table import Bench, Row, Skipped, milliseconds, quartiles
 from torch import Tensor
 
@@ -160,7 +160,7 @@ def interior(bench: Bench) -> list[Row]:
         # The forward pass again, and the shading differentiated at each hit. The seconds are those of its pixel loop and of
         # adding up; not of what the kernel sets up around it and this estimator does not need.
         image = core.ImageOptions(spp=round(spp), filter="box", seed=seed)
-        seconds = core.for_tests.pixel_backward(
+        seconds = parts.pixel_backward(
             kernel.scene, kernel.camera, image, torch.get_num_threads(), kernel.adjoint.numpy(), verts.zero_().numpy()
         )
         return verts.clone(), seconds
