@@ -102,7 +102,7 @@ def test_a_pose_from_photographs_without_masks() -> None:
     start = {"rotations": 0.5 * TRUTH}
     found = fit_rig(rig, cameras, photos, loss="region", start=start, coarsest=24, progress=False)
     assert degrees(0.5 * TRUTH, TRUTH) > 15.0 and degrees(found.values["rotations"], TRUTH) < 5.0
-    assert found.converged and all(view.outlined for view in found.fit.views)
+    assert found.converged and all(view.by_region for view in found.fit.views)
     far = {"translation": [50.0, 0.0, 0.0]}
     with pytest.raises(ValueError, match="expected an object that the pictures show at the start"):
         fit_rig(rig, cameras, photos, loss="region", start=far, progress=False)

@@ -60,7 +60,7 @@ def directions(view: eg.Camera, x: np.ndarray) -> np.ndarray:
 
 
 def windows(view: eg.Camera, reach: float = 0.0) -> list:
-    return parts.windows(kernel_camera(pack_camera(view)), reach)
+    return parts.sub_cameras(kernel_camera(pack_camera(view)), reach)
 
 
 def seen_through(window, turn: list, q: np.ndarray) -> np.ndarray | None:

@@ -107,7 +107,7 @@ def directions(view: eg.Camera, x: np.ndarray) -> np.ndarray:
 
 
 def windows(view: eg.Camera, reach: float = 0.0) -> list:
-    return parts.windows(kernel_camera(pack_camera(view)), reach)
+    return parts.sub_cameras(kernel_camera(pack_camera(view)), reach)
 
 
 # -- positions ----------------------------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ def test_points_agree_with_the_formula(view: eg.Camera) -> None:
             x, y, z = np.array(turn) @ q
             if z > 0 and max(abs(x), abs(y)) <= z:
                 found.append(parts.project(window, [x, y, z]))
-                seen = parts.bend(window, parts.project_straight(window, [x, y, z]), [0.0, 0.0])[1]
+                seen = parts.distort(window, parts.project_straight(window, [x, y, z]), [0.0, 0.0])[1]
                 assert (seen > 0) == (math.atan2(math.hypot(q[0], q[1]), q[2]) < end)
         inside = 0 < expected[0] < W and 0 < expected[1] < H and math.atan2(math.hypot(q[0], q[1]), q[2]) < end
         assert len(found) == 1 or not inside

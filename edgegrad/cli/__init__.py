@@ -1,5 +1,4 @@
-"""The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-rig, fit-texture, fit-camera, track, render, bop, demo, report,
-doctor.
+"""The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-rig, fit-texture, fit-camera, track, render, bop, demo, doctor.
 
 Each command imports what it uses when it runs: torch takes seconds to import, help and faults of arguments do without it.
 """
@@ -13,7 +12,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_rig, fit_shape, fit_texture, render, report, track
+from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_rig, fit_shape, fit_texture, render, track
 from .arguments import Parser
 
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, as shells have it
@@ -75,7 +74,6 @@ def parser() -> Parser:
         render,
         bop,
         demo,
-        report,
         doctor,
     ):
         module.add(commands)

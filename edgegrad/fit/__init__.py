@@ -1,4 +1,4 @@
-"""Fitting: what pictures say about a scene, found by following the gradients of `render`."""
+"""Fits: find scenes, cameras, poses, shapes and textures from pictures by the gradients of `render`."""
 
 import lazy_loader as _lazy
 
