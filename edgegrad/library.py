@@ -32,9 +32,9 @@ def embree_path() -> str:
 
 
 def load(name: str = "_core") -> Any:
-    """Return a compiled module, with Embree open: the kernel, or `_core_tests`, what only tests call. Raises ImportError that says
-    how to get what is missing. Two environment variables serve tests. EDGEGRAD_KERNEL is the file of another build of the kernel,
-    with sanitizers. EDGEGRAD_EMBREE has options of Embree's device, such as "max_isa=avx2" for what older processors run."""
+    """Return a compiled module, with Embree open: the kernel, or `_core_tests`, which only tests call. Raises ImportError that
+    says how to get what is missing. Two environment variables serve tests. EDGEGRAD_KERNEL is the file of another build of the
+    kernel, with sanitizers. EDGEGRAD_EMBREE has options of Embree's device, such as "max_isa=avx2" for older processors."""
     if path := os.environ.get("EDGEGRAD_KERNEL"):
         path = os.path.join(os.path.dirname(path), os.path.basename(path).replace("_core", name, 1))
         spec = importlib.util.spec_from_file_location(f"edgegrad.{name}", path)
