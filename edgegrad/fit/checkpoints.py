@@ -19,7 +19,7 @@ from .options import Options, Parameter
 from .placement import Placement
 from .views import View
 
-FORMAT = 7
+FORMAT = 8
 SAME = (
     "loss",
     "mask_loss",

@@ -14,7 +14,7 @@ from ..aovs import render_aovs
 from ..camera.camera import Camera
 from ..files.image import linear_to_srgb
 from ..fit import Calibration, CameraFit, Fit, PoseFit, Progress, RigFit
-from ..fit.pose.photo.shown import shown
+from ..fit.pose.photo.overlay import overlay
 from ..fit.pose.result import Step
 from ..fit.pose.task import PoseTask
 from ..fit.sides import outlined
@@ -109,7 +109,7 @@ def _frame_of_pose(task: PoseTask, step: Step) -> Frame:
     def render(index: int) -> Tensor:
         one = dataclasses.replace(task, shots=[task.shots[index]])
         factor = min(1.0, LARGEST / max(one.shots[0].camera.size))
-        return shown(one, one.level(factor, blur=0.0, coarseness=1.0, spp=SPP, free=[]), step.pose)[0]
+        return overlay(one, one.level(factor, blur=0.0, coarseness=1.0, spp=SPP, dofs=[]), step.pose)[0]
 
     cameras = [task.lens(shot.camera, step.pose) for shot in task.shots]
     return Frame(task.scene, step.pose.matrix, cameras, [shot.target for shot in task.shots], render)
