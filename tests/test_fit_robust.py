@@ -20,7 +20,7 @@ from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.robust_loss import Comparison
 from edgegrad.fit.pose.task import STEP_PARTS, PoseTask, Unknowns, blurred, is_clutter
-from edgegrad.fit.views import before_black
+from edgegrad.fit.views import over_black
 
 
 def covered(view, image):
@@ -59,9 +59,9 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
         return aside[0], True
 
     monkeypatch.setattr(color_search.ColorSearch, "_down", ends_aside)
-    monkeypatch.setattr(color_search, "ENOUGH", 0.0)  # all ends are taken for right
+    monkeypatch.setattr(color_search, "MIN_EDGE_SUPPORT", 0.0)  # all ends are taken for right
     if not looks:
-        monkeypatch.setattr(color_search, "BLOCK_ERROR", math.inf)
+        monkeypatch.setattr(color_search, "MIN_BLOCK_ERROR", math.inf)
     fit = fit_pose(bracket(), image, view, init=START, background=BACKGROUND, steps=24, progress=False)
     assert (errors(fit)[0] < 1.0) == looks and fit.converged
     assert torch.equal([step for step in fit.history if step.best][-1].pose.matrix, fit.matrix)
@@ -135,7 +135,7 @@ def test_an_unlit_mesh_in_a_lit_picture_stays_near_its_start(further):
 
 
 def test_an_answer_shows_as_much_of_the_edges():
-    start = color_search.Score(loss=1.0, edge_support=0.5, apart=0.1, edges=10.0)
+    start = color_search.Score(loss=1.0, edge_support=0.5, block_error=0.1, edges=10.0)
     assert start._replace(loss=0.9, edge_support=0.6).beats(start)
     assert not start._replace(loss=1.1, edge_support=0.9).beats(start)
     assert not start._replace(loss=0.9, edge_support=0.4).beats(start)
@@ -502,14 +502,14 @@ def test_what_a_picture_holds_at_a_soft_mask_does_not_matter(kind):
     assert degrees < 0.08 and percent < 0.15, (degrees, percent)  # mostly 0.02 and 0.01; a hard mask: 0.7 and 0.8
 
 
-def test_the_object_before_black():
+def test_the_object_over_black():
     mask = torch.tensor([0.0, 0.0, 0.3, 0.6, 1.0, 1.0, 1.0, 0.5])[None, :, None]
     inside = torch.tensor([9.0, 9.0, 9.0, 9.0, 2.0, 3.0, 4.0, 9.0])[None, :, None]
-    image, sure = before_black(inside, mask)
+    image, sure = over_black(inside, mask)
     torch.testing.assert_close(image.flatten(), torch.tensor([0.0, 0.0, 0.6, 1.2, 2.0, 3.0, 4.0, 2.0]))
     assert sure.flatten().tolist() == [1, 1, 0, 0, 1, 1, 1, 0]
     for same in (mask.round(), 0.5 * mask):  # nothing between, nothing full
-        image, sure = before_black(inside, same)
+        image, sure = over_black(inside, same)
         assert torch.equal(image, inside * same) and sure is None
 
 

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..verdict import ENOUGH, coherent, edges_of, explained
+from ..edge_support import MIN_EDGE_SUPPORT, block_error, edge_amount, edge_support
 from .blur_estimate import estimate_blur
 from .gauss_newton import INITIAL_DAMPING, MEMORY, PROBES_MEMORY, GaussNewton
 from .pose import Pose, angle
@@ -32,7 +32,7 @@ JUDGE_SPP = 64  # samples a pixel when candidates are compared
 RESTART_ROUNDS = 2
 # Where the means of blocks differ by more of the pictures' range, the object is occluded or a pose nearby is ambiguous, unless
 # the pictures show such a share of the render's edges.
-BLOCK_ERROR, CLEAR_SUPPORT = 0.03, 0.9
+MIN_BLOCK_ERROR, CLEAR_SUPPORT = 0.03, 0.9
 ALMOST = 0.95  # A share of edges this much lower counts as equal, for noise.
 MIN_SECOND_LEVEL_SUPPORT = 0.4  # Share of edges on the second level below which a candidate is dropped.
 # A restart samples so many poses, takes a few steps from some, and refines the best.
@@ -47,7 +47,7 @@ class Score(NamedTuple):
 
     loss: float
     edge_support: float  # share of the render's edges that the pictures show
-    apart: float  # difference of the means of blocks, see coherent()
+    block_error: float  # difference of the means of blocks, see block_error()
     edges: float  # total edge strength of the render
 
     def beats(self, best: Score) -> bool:
@@ -68,7 +68,7 @@ class ColorSearch:
     """The state of a search. `best`, `loss` and `history` are valid after each step, and `log` at any time: a search
     given it resumes."""
 
-    enough = ENOUGH
+    enough = MIN_EDGE_SUPPORT
     ambiguous = ()  # Ambiguous poses are not known.
 
     def __init__(
@@ -106,10 +106,14 @@ class ColorSearch:
         start = self._judge(self.start, stays)
         best = found if found.judged.beats(start.judged) else start
         self._take(best)
-        if self.further and best.judged.edge_support < ENOUGH:
+        if self.further and best.judged.edge_support < MIN_EDGE_SUPPORT:
             best = self._from_afar(best, near)
         deep = self.further and self.steps > TILT_STEPS
-        if deep and ENOUGH <= best.judged.edge_support < CLEAR_SUPPORT and best.judged.apart > BLOCK_ERROR:
+        if (
+            deep
+            and MIN_EDGE_SUPPORT <= best.judged.edge_support < CLEAR_SUPPORT
+            and best.judged.block_error > MIN_BLOCK_ERROR
+        ):
             begins = len(self.history)
             ends = self._ranked(finer[0], self._tilted(best.pose))
             self._better(best, self._judge(*self._down(ends[0], finer[1:])), begins)
@@ -126,7 +130,7 @@ class ColorSearch:
         if ends[0] is not near:
             best = self._on(best, self._ranked(second, ends[:1]), begins)
         for _ in range(RESTART_ROUNDS if self.steps > TILT_STEPS else 0):
-            if best.judged.edge_support >= ENOUGH:
+            if best.judged.edge_support >= MIN_EDGE_SUPPORT:
                 break
             begins = len(self.history)
             ends = distinct(self._ranked(coarse, [*self._others(best.pose), *ends[1:]]), REFINED_SAMPLES)
@@ -172,7 +176,7 @@ class ColorSearch:
     def _take(self, end: ColorCandidate) -> None:
         self.loss, self.edge_support = end.judged.loss, end.judged.edge_support
         self.best, self._answered = end.pose, True
-        self.converged = end.short and end.judged.edge_support >= ENOUGH
+        self.converged = end.short and end.judged.edge_support >= MIN_EDGE_SUPPORT
 
     def _ranked(self, level: PyramidLevel, starts: list[Pose], *ends: Pose) -> list[Pose]:
         """Return where a few steps lead from each start, together with earlier `ends`, the best first."""
@@ -284,7 +288,7 @@ class ColorSearch:
                 a, b = a[..., :-1], b[..., :-1]
             pairs.append((a, b, shot.target, weight))
         loss = first.loss(MIN_WIDTH * task.extent)[0]
-        return Score(loss, explained(pairs), coherent(pairs), edges_of(pairs))
+        return Score(loss, edge_support(pairs), block_error(pairs), edge_amount(pairs))
 
     def _others(self, best: Pose) -> list[Pose]:
         """Return the best few of many poses around the start and the best one, by their loss on the coarsest level."""

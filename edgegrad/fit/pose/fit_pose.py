@@ -26,7 +26,7 @@ from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
 from ..checkpoints import Checkpoint, traits
 from ..options import check_checkpoint
-from ..upside_down import BETTER, say_upside_down
+from ..row_order import MIN_IOU_GAIN, warn_of_flipped_rows
 from .color_search import ColorSearch
 from .initial_pose import initial_pose
 from .inputs import ArgumentNames, check_settings, warn_of_scale
@@ -350,7 +350,7 @@ def _warn_of_flipped_pictures(
     else:
         again = ColorSearch(turned, turned.pyramid(start, max_size, spp), start, *settings)
     found = again.first_end()
-    if found >= max(again.enough, search.edge_support + BETTER):
-        say_upside_down(
+    if found >= max(again.enough, search.edge_support + MIN_IOU_GAIN):
+        warn_of_flipped_rows(
             search.task.names.target, f"it shows {found:.0%} of the render's edges, as given {search.edge_support:.0%}"
         )

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...aovs import IDS, aovs_request, by_name, check_aovs
 from ...camera.camera import Camera
-from ...camera.lens import MOST
+from ...camera.lens import MOST_COEFFICIENTS
 from ...kernel.operators import forward_kernel, jvp_kernel
 from ...scene.scene import Scene
 
@@ -95,13 +95,13 @@ class Rendered:
 
     def _tangents(self, motion: Motion | Motions) -> dict[str, Tensor]:
         """Return the tangents of the kernel's inputs."""
-        flat, camera, beside = self._request.scene, self._request.camera, self._request.beside
+        flat, camera, auxiliary = self._request.scene, self._request.camera, self._request.auxiliary
         points = motion.of_points(flat.verts)
         tangents = {"verts": points}
         if motion.K is not None:
             tangents["K"] = motion.K[:, None]
         if motion.distortion is not None:
-            unsought = MOST - motion.distortion.shape[1]
+            unsought = MOST_COEFFICIENTS - motion.distortion.shape[1]
             tangents["distortion"] = torch.nn.functional.pad(motion.distortion, (0, unsought))[:, None]
         if isinstance(motion, Motions):
             return tangents
@@ -111,11 +111,11 @@ class Rendered:
         if "depth" in self.aovs:
             parts.append(points @ camera.world_to_camera[0, 2, :3, None])
         if "shading_normal" in self.aovs:
-            parts.append(motion.of_directions(beside.vertex_attributes[0, :, -3:]))
+            parts.append(motion.of_directions(auxiliary.vertex_attributes[0, :, -3:]))
         if parts:
             tangents["vertex_attributes"] = torch.cat(parts, -1)[:, None]
         if "normal" in self.aovs:
-            tangents["face_attributes"] = motion.of_directions(beside.face_attributes)
+            tangents["face_attributes"] = motion.of_directions(auxiliary.face_attributes)
         return tangents
 
 

@@ -74,5 +74,12 @@ def _packed(state: DescentState) -> dict[str, Any]:
 
 
 def _unpacked(packed: dict[str, Any]) -> DescentState:
-    steps = tuple(Step(size, loss, Pose.of(pose), *rest) for size, loss, pose, *rest in packed["steps"])
-    return DescentState(**{**packed, "pose": Pose.of(packed["pose"]), "here": Pose.of(packed["here"]), "steps": steps})
+    steps = tuple(Step(size, loss, Pose.from_numbers(pose), *rest) for size, loss, pose, *rest in packed["steps"])
+    return DescentState(
+        **{
+            **packed,
+            "pose": Pose.from_numbers(packed["pose"]),
+            "here": Pose.from_numbers(packed["here"]),
+            "steps": steps,
+        }
+    )

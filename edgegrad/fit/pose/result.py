@@ -17,9 +17,9 @@ from ...camera.camera import Camera
 from ...camera.poses import rigid
 from ...files.paths import PathLike, replacing
 from ...optional import DRAWING, require
+from ..edge_support import MIN_EDGE_SUPPORT
 from ..ending import Ending, reason_of
 from ..history import number_or_none
-from ..verdict import ENOUGH
 from .pose import Pose, pose_from_matrix
 from .uncertainty import MAX_FOCAL, Uncertainty
 
@@ -70,7 +70,7 @@ class PoseFit:
     uncertainty: Uncertainty | None = field(default=None, repr=False)  # None before the answer
     visible: float = 1.0  # share of this object that the others of fit_poses() do not hide; not kept in JSON
     conflict: str = ""  # the other pose or object that may be the right one, in words; not kept in JSON
-    enough: float = ENOUGH  # least `explained` of a right pose; not kept in JSON
+    enough: float = MIN_EDGE_SUPPORT  # least `explained` of a right pose; not kept in JSON
 
     @property
     def matrix(self) -> Tensor:

@@ -23,7 +23,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..verdict import edge_strength
+from ..edge_support import edge_strength
 from .task import PoseTask, PyramidLevel, Shot
 
 MIN_WIDTH = 0.1  # Least c, relative to the pictures' range.

@@ -15,7 +15,7 @@ from torch import Tensor
 from ...rig.joints import Joints
 from ...rig.rig import Rig
 from ...rig.rotations import roma
-from ...rig.skinned import Skinned
+from ...rig.skinned import SkinDeformer
 from .free_parameters import FreeParameters
 
 
@@ -39,7 +39,7 @@ class Alternatives:
     @property
     def joints(self) -> Joints | None:
         """The joints; None where a rig does not say how they hang."""
-        return self.rig.deformer.joints if isinstance(self.rig.deformer, Skinned) else None
+        return self.rig.deformer.joints if isinstance(self.rig.deformer, SkinDeformer) else None
 
     def exchanged(self, values: Mapping[str, Tensor], one: Sequence[int], other: Sequence[int]) -> Tensor:
         """Put two groups of rows each where the other one is. Without joints, rows take their counterparts' rotation
@@ -97,7 +97,7 @@ class Alternatives:
 
     def _middle(self, place: int) -> Tensor:
         """Return the weighted mean (3,) of the vertices that hang on a joint, from it, along its own axes at rest."""
-        assert isinstance(self.rig.deformer, Skinned)
+        assert isinstance(self.rig.deformer, SkinDeformer)
         total, count = torch.zeros(3, dtype=torch.float64), 0.0
         for skin, mesh in zip(self.rig.deformer.skins, self.rig.meshes, strict=True):
             for k in (skin.joints == place).nonzero()[:, 0].tolist():

@@ -16,7 +16,7 @@ from ..descent.fit_scene import options_of
 from ..losses import REGION
 from ..options import Parameter
 from ..priors import Prior, checked_priors, towards
-from ..views import Images, outlined_views, views_of
+from ..views import Images, region_views, views_of
 from .free_parameters import FreeParameters
 from .keypoints import keypoint_term
 from .levels import CoarseToFine
@@ -84,7 +84,7 @@ def fit_rig(
     )
     views = views_of(cameras, images, masks, weights)
     if opts.loss == REGION:
-        views = outlined_views(views)
+        views = region_views(views)
     rest = {name: control.rest for name, control in rig.controls.items()}
     terms = [towards(rest)] if priors is None else checked_priors(priors, free.values(free.start))
     points = (

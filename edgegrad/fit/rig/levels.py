@@ -11,30 +11,31 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...aovs import render_aovs
-from ...rig.function import OfFunction
+from ...rig.function import FunctionDeformer
 from ...rig.rig import Rig
 from ...rig.rotations import roma
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
-from ..descent.building import Built
-from ..descent.curvature import MOST
-from ..descent.fit_scene import reporter, way_of
-from ..descent.gauss_newton import GaussNewtonSteps
+from ..descent.curvature import MAX_NUMBERS
+from ..descent.fit_scene import make_optimizer, reporter
+from ..descent.gauss_newton import GaussNewtonOptimizer
 from ..descent.loop import Descent, descend
-from ..descent.objective import FINAL_SPP, Objective, judged
-from ..descent.regions import LAST
+from ..descent.objective import Objective
+from ..descent.region_loss import FINAL_STEP
+from ..descent.result import RESULT_SPP, make_fit
+from ..descent.scene_builder import Built
 from ..ending import Ending
 from ..history import Record
 from ..losses import REGION
 from ..options import Options, Parameter
 from ..placement import Coordinates
 from ..priors import Prior
-from ..views import View
+from ..views import Observation
 from .alternatives import Alternatives
 from .axial_rotations import search_axial_rotations
-from .edge_support import edge_support_by_joint, left_out
 from .free_parameters import FreeParameters
+from .joint_support import edge_support_by_joint, left_out
 from .limbs import ByContour, ByLoss, Limb, LimbSearch, limbs
 from .result import RigFit
 from .uncertainty import JointUncertainty, uncertainty_of
@@ -58,7 +59,7 @@ class CoarseToFine:
     """The levels of one fit."""
 
     def __init__(
-        self, rig: Rig, free: FreeParameters, views: list[View], options: Options, priors: Sequence[Prior], annealed: bool,
+        self, rig: Rig, free: FreeParameters, views: list[Observation], options: Options, priors: Sequence[Prior], annealed: bool,
         points: Prior | None, coarsest: int, tries: int, look: Callable[..., Scene | Mesh],
     ) -> None:  # fmt: skip
         self.rig, self.free, self.views, self.options = rig, free, views, options
@@ -81,7 +82,7 @@ class CoarseToFine:
         values = self.free.start
         first = dict(values)
         given = {"start": self.free.fixed, "parameters": parameters, "tries": self.tries, "factors": self.factors}
-        checkpoint = Checkpoint.of(self.options, self.views, given)
+        checkpoint = Checkpoint.from_fit(self.options, self.views, given)
         saved, level, history, seconds = checkpoint.read(), 0, [], 0.0
         if saved is not None:
             level, values, seconds = saved["level"], saved["values"], saved["seconds"]
@@ -99,10 +100,10 @@ class CoarseToFine:
             if found.ending is Ending.INTERRUPTED or level == len(self.factors) - 1:
                 break
             level += 1
-        objective = Objective(self.build(self.views), self.views, self.options, many=self.many(self.views))
+        objective = Objective(self.build(self.views), self.views, self.options, build_batch=self.many(self.views))
         with torch.no_grad():
             start, _ = objective.build(first)
-        fit = judged(objective, Descent(values, history, seconds, found.ending), start, Coordinates({}))
+        fit = make_fit(objective, Descent(values, history, seconds, found.ending), start, Coordinates({}))
         found_values = {name: value.detach() for name, value in self.free.all(values).items()}
         with torch.no_grad():
             alphas = [render_aovs(fit.scene, view.camera, ["alpha"], spp=16)["alpha"] for view in self.views]
@@ -113,37 +114,37 @@ class CoarseToFine:
     ) -> tuple[dict[str, float], JointUncertainty | None]:
         """Return, for each joint, what the pictures show of it, and how exactly."""
         joints = self.free.joints
-        if not joints or sum(value.numel() for value in values.values()) > MOST:
+        if not joints or sum(value.numel() for value in values.values()) > MAX_NUMBERS:
             return {}, None
         rates = {name: p.lr for name, p in self.free.parameters.items()}
         # Noise of few samples would count as noise of the pictures.
-        options = dataclasses.replace(self.options, spp=max(self.options.spp, FINAL_SPP))
-        objective = Objective(objective.build, self.views, options, many=objective.many)
+        options = dataclasses.replace(self.options, spp=max(self.options.spp, RESULT_SPP))
+        objective = Objective(objective.build, self.views, options, build_batch=objective.build_batch)
         if objective.regions is not None:
-            objective.renew(values, LAST)
+            objective.renew(values, FINAL_STEP)
         try:
             return edge_support_by_joint(objective, values, joints), uncertainty_of(objective, values, rates, joints)
         except TypeError:  # There is no forward mode.
             return {}, None
 
-    def build(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], Built]:
+    def build(self, views: Sequence[Observation]) -> Callable[[Mapping[str, Tensor]], Built]:
         values = self.free
         return lambda tensors: self._scene(self.rig.posed(**values.all(tensors)), values.appearance_of(tensors), views)
 
-    def many(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], list[Built]]:
+    def many(self, views: Sequence[Observation]) -> Callable[[Mapping[str, Tensor]], list[Built]]:
         """Return what build() does for a batch of values. Rotations become matrices first: three rotation vectors of three
         joints have the shape of three matrices."""
 
         def built(tensors: Mapping[str, Tensor]) -> list[Built]:
             values = dict(self.free.all(tensors))
-            if "rotations" in values and not isinstance(self.rig.deformer, OfFunction):
+            if "rotations" in values and not isinstance(self.rig.deformer, FunctionDeformer):
                 values["rotations"] = roma().rotvec_to_rotmat(values["rotations"])
             every = self.rig.posed(**values)
             return [self._scene(posed, self.free.appearance_of(tensors, k), views) for k, posed in enumerate(every)]
 
         return built
 
-    def _scene(self, posed: Scene | Mesh, values: Mapping[str, Tensor], views: Sequence[View]) -> Built:
+    def _scene(self, posed: Scene | Mesh, values: Mapping[str, Tensor], views: Sequence[Observation]) -> Built:
         posed = self.look(posed, **values)
         if not isinstance(posed, Mesh | Scene):
             raise TypeError(f"look: expected it to return a Mesh or a Scene, got {type(posed).__name__}")
@@ -175,7 +176,7 @@ class CoarseToFine:
         fine = level == len(self.factors) - 1
         spp = LAST_SPP_FACTOR * spp if fine else spp
         options = dataclasses.replace(self.options, spp=spp, steps=steps)
-        objective = Objective(build, views, options, prior=prior, many=self.many(views))
+        objective = Objective(build, views, options, prior=prior, build_batch=self.many(views))
         if fresh and level == 0:
             objective.check(values)
         title = f"level {level + 1} of {len(self.factors)}"
@@ -190,7 +191,7 @@ class CoarseToFine:
         if fine and self.tries and name == "rotations" and objective.regions is None and not interrupted:
             try:
                 search = self._search(objective, found.values, options, name, AXIAL_STEPS)
-                near = objective.left(found.values) < NEARLY_FITTED
+                near = objective.residual(found.values) < NEARLY_FITTED
                 values = search.rotated(found.values) if near else found.values
                 values = search_axial_rotations(objective, search.alternatives, self.free.parameters[name], values)
             except KeyboardInterrupt:
@@ -228,7 +229,7 @@ class CoarseToFine:
             groups = [Limb(list(range(k, len(values[name])))) for k in range(len(values[name]))]
 
         def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
-            found = descend(way_of(parameters, few), objective, lambda state: None)
+            found = descend(make_optimizer(parameters, few), objective, lambda state: None)
             if found.ending is Ending.INTERRUPTED:
                 raise KeyboardInterrupt
             return found.values
@@ -246,10 +247,10 @@ class CoarseToFine:
         parameters = {
             name: dataclasses.replace(p, value=p.within(values[name])) for name, p in self.free.parameters.items()
         }
-        optimiser = way_of(parameters, options)
-        near = objective.regions is None and fine and objective.left(values) < NEARLY_FITTED
-        if isinstance(optimiser, GaussNewtonSteps) and near:
-            optimiser.unseen, optimiser.damping = HARDLY_SEEN, NEAR_DAMPING
+        optimiser = make_optimizer(parameters, options)
+        near = objective.regions is None and fine and objective.residual(values) < NEARLY_FITTED
+        if isinstance(optimiser, GaussNewtonOptimizer) and near:
+            optimiser.unseen_damping, optimiser.damping = HARDLY_SEEN, NEAR_DAMPING
         return descend(
             optimiser, objective, save, saved, title,
             reporter(objective.build, objective.views, bones=self.bones),

@@ -19,13 +19,13 @@ import torch
 from torch import Tensor
 
 from ...rig.rig import Rig
-from ..descent.curvature import left, misfit
+from ..descent.curvature import misfit, residuals
 from ..descent.objective import Objective
-from ..descent.regions import LAST
+from ..descent.region_loss import FINAL_STEP
+from ..edge_support import MIN_EDGE_SUPPORT
 from ..options import Parameter
-from ..verdict import ENOUGH
 from .alternatives import Alternatives
-from .edge_support import edge_support_by_joint
+from .joint_support import edge_support_by_joint
 
 DRAWS = 64  # rotations of a limb that are compared
 SPREADS = 0.2, 0.4  # radians, of each component, alternating
@@ -98,7 +98,7 @@ class ByLoss:
 
     def _left(self, values: Values) -> float:
         with torch.no_grad():
-            return self.objective.left(values)
+            return self.objective.residual(values)
 
     def off(self, values: Values) -> Tensor:
         return misfit(self.objective, values, 0)[self.name]
@@ -122,7 +122,7 @@ class ByContour:
         return float(self.off(values).mean())
 
     def matches(self, values: Values) -> bool:
-        return float(self.off(values).max()) < 1.0 - ENOUGH
+        return float(self.off(values).max()) < 1.0 - MIN_EDGE_SUPPORT
 
     def nearly_matches(self, values: Values) -> bool:
         return False  # No finer level draws limbs.
@@ -135,7 +135,7 @@ class ByContour:
 
     def renew(self, values: Values) -> None:
         """Compute what losses of compared poses hold fixed at these values."""
-        self.objective.renew(values, LAST)
+        self.objective.renew(values, FINAL_STEP)
 
 
 Judge = ByLoss | ByContour
@@ -199,7 +199,7 @@ class LimbSearch:
             return values
         best, least = values, self.judge.cost(values)
         for _ in range(SWEEPS):
-            remaining, before = left(self.objective, best, 0)[self.name].mean(1), least
+            remaining, before = residuals(self.objective, best, 0)[self.name].mean(1), least
             for rotation in sorted(rotations, key=lambda one: -float(remaining[one.row]))[:WORST_JOINTS]:
                 if self.judge.matches(best):
                     return best
@@ -266,7 +266,7 @@ class LimbSearch:
 
         low, high = (None if b is None else torch.as_tensor(b)[place] for b in (parameter.low, parameter.high))
         own = Parameter(parameter.lr, start[self.name][place], low, high)
-        return whole(self.steps(self.objective.of(whole), {self.name: own}))
+        return whole(self.steps(self.objective.reparametrized(whole), {self.name: own}))
 
     def within(self, value: Tensor) -> Tensor:
         return self.parameters[self.name].within(value)

@@ -16,8 +16,8 @@ from ...rig.rig import Rig
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..descent.result import Fit
+from ..edge_support import MIN_EDGE_SUPPORT
 from ..history import Record
-from ..verdict import ENOUGH
 from .uncertainty import JointUncertainty
 
 MISSED_REGION = 0.01  # A region of a larger share of a mask is a missed limb.
@@ -87,7 +87,7 @@ class RigFit:
         """The joints of whose edges the pictures show too few: they lie in another place."""
         if not self.explained:
             return []
-        least = max(ENOUGH, SHARE_OF_MEDIAN * statistics.median(self.explained.values()))
+        least = max(MIN_EDGE_SUPPORT, SHARE_OF_MEDIAN * statistics.median(self.explained.values()))
         return [name for name, share in self.explained.items() if share < least]
 
     @property

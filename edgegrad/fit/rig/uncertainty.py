@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..descent.curvature import scores
 from ..descent.objective import Objective
-from .edge_support import SUPPORT_STEPS, places_of
+from .joint_support import SUPPORT_STEPS, places_of
 
 JOINT_PRIOR_DEVIATION = (
     1.0  # radian, or as many learning rates as make one: the deviation of what the pictures do not show at all

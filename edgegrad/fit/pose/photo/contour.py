@@ -1,4 +1,4 @@
-"""The contour term: across the silhouette a picture changes from the object's colour to that of the background (sides.py).
+"""The contour term: across the silhouette a picture changes from the object's colour to the background's (contour_colors.py).
 
 Variances of the two sides weight the difference. The region term decides on which side of the contour a pixel lies; this term
 measures its share of each side. Blurred pixels are mixtures, which neither histogram contains.
@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ...sides import TOLERANCE, Sides
+from ...contour_colors import TOLERANCE, ContourColors
 from ..gauss_newton import NormalEquations
 from .picture import Picture
 
 MIN_CONTOUR_PIXELS = 20
 
 
-def contour_loss(picture: Picture, sides: Sides) -> float:
+def contour_loss(picture: Picture, sides: ContourColors) -> float:
     """Return half the robust squares of the contour's differences, in variances, less their expectation from noise, so that
     longer contours are no less likely."""
     squares = ((sides.mixed - picture.outlined).square() / sides.variance).sum(-1)
@@ -24,7 +24,7 @@ def contour_loss(picture: Picture, sides: Sides) -> float:
     return 0.5 * float((sides.band * picture.weight * excess).sum())
 
 
-def contour_term(picture: Picture, sides: Sides, tangents: Tensor) -> NormalEquations | None:
+def contour_term(picture: Picture, sides: ContourColors, tangents: Tensor) -> NormalEquations | None:
     """Return the equations of alpha's derivatives (n, h, w), blurred as alpha was; None where there is hardly any contour."""
     band = sides.band
     if int(band.sum()) < MIN_CONTOUR_PIXELS:

@@ -97,7 +97,7 @@ class MultiStartSearch:
         """Return the starts after a few steps, those that the pictures show most of first, as logged."""
         flat = self.log.replay(self._compared)
         size = len(self.start.numbers)
-        return [Pose.of(flat[k : k + size]) for k in range(0, len(flat), size)]
+        return [Pose.from_numbers(flat[k : k + size]) for k in range(0, len(flat), size)]
 
     def _compared(self) -> list[float]:
         found = []

@@ -320,7 +320,7 @@ class PhotoSearch:
         def starts() -> Iterator[tuple[Pose, list[Tensor]]]:
             flat = self.log.replay(compared)
             for at in range(0, len(flat), size + 1):
-                pose, side = Pose.of(flat[at : at + size]), int(flat[at + size])
+                pose, side = Pose.from_numbers(flat[at : at + size]), int(flat[at + size])
                 yield pose, [at_one_side(seen.alpha, side) for seen in first.comparisons(pose, self.seed)]
 
         return self._refine_occluded(best, starts(), begins, answered)
