@@ -56,9 +56,9 @@ def add(commands: Any) -> None:
 
 
 def _error_time(args: argparse.Namespace) -> int:
-    """Relative error of the gradient (per vertex, and of whole-object translation and rotation) against wall time, for a
-    sweep of samples: edgegrad, finite differences, and every other renderer that is installed. Ctrl-C keeps what is
-    measured; the same command goes on from there."""
+    """Relative error of the gradient (per vertex, and of whole-object translation and rotation) against wall time, for a sweep
+    of samples: edgegrad, finite differences, and every other renderer that is installed. Ctrl-C keeps what is measured; the
+    same command goes on from there."""
     from ..optional import require
     from ..report.error_time.run import error_time
     from . import INTERRUPTED
