@@ -355,7 +355,7 @@ def test_version_as_a_program():
 @pytest.mark.parametrize("typed, meant", [
     (["rendr"], "render"),
     (["render", "mesh.ply", "--out", "a.png", "--sede", "3"], "--seed"),
-    (["report", "stabilty"], "stability"),
+    (["bop", "refin"], "refine"),
 ])  # fmt: skip
 def test_did_you_mean(capsys, typed, meant):
     with pytest.raises(SystemExit):

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..files.formats.part import Wanted, naming
+from ..files.formats.part import LoadOptions, errors_with_path
 from ..files.load import load_mesh
-from ..files.parts import read_model
+from ..files.parts import read_mesh_file
 from ..scene.mesh import Mesh
 from ..scene.symmetries import Symmetries
 from .json_files import numbers
@@ -43,8 +43,8 @@ class Model:
     def points(self) -> Tensor:
         """The vertices (N, 3) float64 in mm as the file has them, with repetitions, for means over them. Raises what load_mesh
         raises."""
-        with naming(self.path):
-            model = read_model(self.path, Wanted(materials=False))
+        with errors_with_path(self.path):
+            model = read_mesh_file(self.path, LoadOptions(materials=False))
         return torch.cat([torch.from_numpy(part.verts).double() for part in model.parts])
 
     def __repr__(self) -> str:

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_rig, fit_shape, fit_texture, render, report, track
+from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_rig, fit_shape, fit_texture, render, track
 from .arguments import Parser
 
 INTERRUPTED = 130  # exit code of shells after Ctrl-C
@@ -63,6 +63,6 @@ def parser() -> Parser:
     found.add_argument("--version", action=doctor.Version, nargs=0, help="show the version and exit")
     commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
     fits = fit_pose, fit_poses, fit_shape, fit_rig, fit_texture, fit_camera
-    for module in (*fits, track, render, bop, demo, report, doctor):
+    for module in (*fits, track, render, bop, demo, doctor):
         module.add(commands)
     return found

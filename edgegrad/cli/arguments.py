@@ -161,20 +161,11 @@ def number(text: str, least: int = 0) -> int:
     return int(text)
 
 
-def seconds(text: str) -> float:
-    if not 0.0 < (found := _float(text)) < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
-    return found
-
-
 def millimetres(text: str) -> float:
-    if not 0.0 <= (found := _float(text)) < float("inf"):
+    try:
+        found = float(text)
+    except ValueError:
+        found = -1.0
+    if not 0.0 <= found < float("inf"):
         raise argparse.ArgumentTypeError(f"expected millimetres from 0 up, got {text!r}")
     return found
-
-
-def _float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")

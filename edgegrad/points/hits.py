@@ -54,7 +54,7 @@ class Hits:
         self._surfaces, self._view, self._rays_at = surfaces, view, rays_at
         self._needs_values = True  # False: radiance may be zeros that have its derivatives (light/in_kernel.py)
         self._on_curve = False  # whether it is asked how radiance jumps there
-        self._near = 0.0  # world units: light from nearer has no derivatives by where these lie (light/sliding.py)
+        self._near = 0.0  # world units: light from nearer has no derivatives by where these lie (light/near_field.py)
         self._seed = torch.arange(len(face), device=face.device) if seed is None else seed
         self._forced = forced
         self._face, self._exact = face, barycentrics
@@ -235,7 +235,7 @@ class Hits:
         """(N, K): a texture (h, w, K), row 0 on top, at texture coordinates uv (N, 2), v running up; those of the surface when
         None.
 
-        wrap     beyond the rim: "repeat", "clamp" or "mirror", or two of these, for u and for v
+        wrap     beyond the border: "repeat", "clamp" or "mirror", or two of these, for u and for v
         filter   "linear" between the centres of texels; "nearest", the texel itself, whose borders are steps: see where()
         mipmap   True: texels are averaged over squares of 2, 4, 8 … so that neighbouring pixels are about a texel apart, linear
                  between two such levels (Williams 1983). Only for hits of a camera

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...aovs import render_aovs
-from ...rig.function import OfFunction
+from ...rig.function import FunctionDeformer
 from ...rig.rig import Rig
 from ...rig.rotations import roma
 from ...scene.mesh import Mesh
@@ -135,7 +135,7 @@ class Levels:
 
         def built(tensors: Mapping[str, Tensor]) -> list[Built]:
             values = dict(self.sought.all(tensors))
-            if "rotations" in values and not isinstance(self.rig.deformer, OfFunction):
+            if "rotations" in values and not isinstance(self.rig.deformer, FunctionDeformer):
                 values["rotations"] = roma().rotvec_to_rotmat(values["rotations"])
             every = self.rig.posed(**values)
             return [self._scene(posed, self.sought.look(tensors, k), views) for k, posed in enumerate(every)]
