@@ -200,9 +200,7 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
     camera, source = None, args.camera
     if args.camera is not None:
         if described:
-            raise ValueError(
-                "--camera: expected none of --fov, --eye, --target, --up with it, got both; leave one out"
-            )
+            raise ValueError("--camera: expected none of --fov, --eye, --target, --up with it, got both; leave one out")
         by_size = args.camera.suffix.lower() in (".gltf", ".glb")  # which have none of their own
         camera = load_camera(args.camera, torch.float64, (size or (512, 512)) if by_size else None)
     elif pose_file is not None and not described:
