@@ -1,4 +1,4 @@
-"""The contour term: across the silhouette a picture changes from the object's colour to that of what lies behind (sides.py).
+"""The contour term: across the silhouette a picture changes from the object's colour to that of what is behind.
 
 Variances of the two sides weigh the difference. Where the region term tells on which side of the contour a pixel lies, this
 tells to which part: blurred pixels are mixtures, and belong to neither histogram.
