@@ -21,9 +21,8 @@ LARGEST_UV = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """An image on the faces of a mesh, whose tensors may all require gradients.
-
-    Raises TypeError or ValueError that names the argument.
+    """An image on the faces of a mesh, whose tensors may all require gradients. Raises TypeError or ValueError that names the
+    argument.
 
     Parameters
     ----------
@@ -110,9 +109,7 @@ class Material:
     from F0 = 0.04 + (base − 0.04) · metallic. If one of the two is left out, metallic is 0, or roughness is 1. α is at least
     1e-4, because a mirror has no pdf. As in glTF, what the layer reflects and what it takes from the base follow different half
     vectors, so a white dielectric returns more than came at grazing angles (1.14 at 75°, roughness 0.3). Numbers outside of 0 …
-    1 are not refused, because an optimisation may pass there.
-
-    Raises TypeError or ValueError that names the argument.
+    1 are not refused, because an optimisation may pass there. Raises TypeError or ValueError that names the argument.
 
     Parameters
     ----------

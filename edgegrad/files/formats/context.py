@@ -141,7 +141,6 @@ class UnreadLog:
         self.names[name] = instead
 
     def warn(self, path: PathLike, what: str = "not rendered as the file asks") -> None:
-        """Issue one warning for a file."""
         if self.names:
             said = [f"{name} ({instead})" for name, instead in self.names.items()]
             more = [f"{len(said) - MOST_SAID} more"] if len(said) > MOST_SAID else []

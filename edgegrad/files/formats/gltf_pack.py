@@ -86,7 +86,6 @@ def _picture(image: np.ndarray) -> Any:
 
 
 def _share(tree: dict[str, Any]) -> None:
-    """Join images, samplers, textures and materials that are equal."""
     images, samplers = (_unique(tree, name) for name in ("images", "samplers"))
     for texture in tree.get("textures", []):
         texture["source"] = images[texture["source"]]

@@ -77,7 +77,6 @@ def _is_neutral(option: str, values: tuple[str, ...]) -> bool:
 
 
 def _pair(words: tuple[str, ...], default: float) -> tuple[float, float]:
-    """Return the first two numbers. Raises FormatError."""
     values = [float(word) for word in words]
     if not np.isfinite(values).all():
         raise FormatError(
