@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...optional import require
-from .context import LoadContext
+from .context import LoadContext, unique_name
 from .gltf import File, entry
 from .gltf_arrays import Arrays, Geometry, normalised
 from .gltf_material import Primitive
 from .gltf_nodes import ROUNDED, Placed, matrix_of, node_name, placed, rotation_of
 from .gltf_scene import primitives
 from .gltf_texture import Images
-from .names import unique_name
 from .part import FormatError
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3, "weights": 0}

@@ -13,9 +13,8 @@ import torch
 from ...camera.camera import Camera
 from ..image import IMAGES, read_size
 from ..paths import StoredPath
-from .context import UnreadLog
+from .context import UnreadLog, unique_name
 from .keys import image_size, note_unread
-from .names import unique_name
 from .part import FormatError
 from .views import View
 
