@@ -181,9 +181,9 @@ def with_channels(request: Request, names: Sequence[str]) -> Request:
         of_vertices.append(unit(around).expand(request.cameras, -1, -1))
     channels = Channels(
         "alpha" in names,
-        torch.cat(of_vertices, -1).contiguous() if of_vertices else request.beside.vertex_attributes,
+        torch.cat(of_vertices, -1).contiguous() if of_vertices else request.auxiliary.vertex_attributes,
         normals,
-        unit(across) if "normal" in names else request.beside.face_attributes,
+        unit(across) if "normal" in names else request.auxiliary.face_attributes,
         "barycentrics" in names,
         "uv" in names,
     )
@@ -194,7 +194,7 @@ def with_channels(request: Request, names: Sequence[str]) -> Request:
     vary = vary or ("image" in names and request.gradient.channels_vary)
     return request._replace(
         scene=flat._replace(background=background),
-        beside=channels,
+        auxiliary=channels,
         gradient=request.gradient._replace(channels_vary=vary),
     )
 

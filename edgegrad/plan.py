@@ -15,11 +15,11 @@ from .kernel import memory as memory
 from .kernel.counts import COUNTS, table
 from .kernel.derivatives import moves
 from .kernel.flat import Flat
-from .kernel.operators import Hits, backward_kernel, image_room, pass_size
+from .kernel.operators import Hits, backward_kernel, image_memory, pass_size
 from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
 from .library import core
+from .light.antithetic import MOST_SETS, SETS
 from .light.bounces import check_bounces
-from .light.companions import FOURS, MOST_FOURS
 from .light.radiance import LIGHTING, Lighting
 from .light.resampled import how_drawn
 from .light.unused_options import warn_of_unused
@@ -145,7 +145,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     inside = sum(lighting.in_gradient(scene, light) for light in scene.casting)
     more = (
         f"; for the gradient inside faces {inside}, in antithetic sets of four whose opposite signs cancel, and up to "
-        f"{MOST_FOURS // FOURS} times as many where faces are seen from aside"
+        f"{MOST_SETS // SETS} times as many where faces are seen from aside"
         if inside > lights
         else ""
     )
@@ -284,7 +284,7 @@ def _moving_alpha_edges(scene: Scene, request: Request) -> bool:
 
 def _most_bounce_samples(request: Request) -> int:
     each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
-    return each if each >= 0 else core.most_bounce_samples(*size, request.image.spp)
+    return each if each >= 0 else core.most_secondary_edge_samples(*size, request.image.spp)
 
 
 def _has_alpha(scene: Scene) -> bool:
@@ -300,7 +300,7 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
     needs = core.image_bytes(pass_size(request), B)
     copied = _bytes_of_copies(scene, request.scene)
     cameras = "" if B == 1 else f", {B} cameras"
-    textures, alpha_masks = len(request.scene.textures), len(request.scene.cut_outs)
+    textures, alpha_masks = len(request.scene.textures), len(request.scene.alpha_masks)
     return {
         "scene": Term(
             copied > 0,
@@ -328,7 +328,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     moves = any(name in wanted for name in MOVING)
 
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
-    with image_room(request):
+    with image_memory(request):
         ones = flat.colors.new_ones((B, camera.height, camera.width, request.channels))
     hits = Hits(
         ones[..., 0].contiguous(),
@@ -339,7 +339,8 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     _, profiles = backward_kernel(ones, hits, request, wanted, dry=True, lit=lit)
     counts = {name: int(sum(profile[name] for profile in profiles)) for name in COUNTS}
     surface, edge, silhouettes, creases, intersections, lens_boundary = (
-        counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "rim")
+        counts[name]
+        for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "lens_boundary")
     )
     needs = core.gradient_bytes(
         pass_size(request), motion=work.motion, boundary=work.boundary, steps=work.steps, wanted=list(wanted),
@@ -426,7 +427,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
 
 
 def _bound(samples: int, wanted: int) -> str:
-    """Return the text where the budget (csrc/backward/budget.h) may cut the default samples."""
+    """Return the text where the budget (csrc/estimator/budget.h) may cut the default samples."""
     return f"; by default up to {wanted:,}, but no more than take the image's time" if 0 < samples < wanted else ""
 
 

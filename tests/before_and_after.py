@@ -1,4 +1,4 @@
-"""Images and gradients of six scenes, to be compared bit by bit before and after a change that is to change no result.
+"""Images and gradients of 25 scenes, to be compared bit by bit before and after a change that is to change no result.
 
 python tests/before_and_after.py FILE.npz            writes them
 python tests/before_and_after.py FILE.npz --compare  fails where one differs from what is in the file
@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 import edgegrad as eg
+import edgegrad.raster as dr
+from edgegrad import fit
 
 Arrays = dict[str, Tensor]
 SIZE = (40, 48)
@@ -143,11 +146,200 @@ def directional() -> Arrays:
     return {"screen": screen, "image": primal, "tangent": tangent}
 
 
-SCENES: tuple[Callable[[], Arrays], ...] = (colored, textured, lit, shaded, channels, directional)
+def through(**fields: Any) -> Callable[[], Arrays]:
+    """The coloured sheet through another camera than a pinhole."""
+
+    def scene() -> Arrays:
+        verts, faces = grid()
+        verts = leaf(verts)
+        view: eg.Camera = fields["make"]()
+        view = view.replace(world_to_camera=leaf(view.world_to_camera))
+        mesh = eg.Mesh(verts, faces, face_colors=colors(len(faces)))
+        image = eg.render(mesh, view, spp=4, seed=9, filter=fields.get("filter", "box"))
+        return gradients(image, verts=verts, pose=view.world_to_camera)
+
+    return scene
+
+
+def orthographic() -> eg.Camera:
+    return eg.Camera.orthographic((0.3, 0.5, 3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, SIZE)
+
+
+def fisheye(angle: float) -> eg.Camera:
+    matrix = camera().detach().world_to_camera
+    focal = 24.0 / math.radians(angle)
+    K = torch.tensor([[focal, 0.0, SIZE[1] / 2], [0.0, focal, SIZE[0] / 2], [0.0, 0.0, 1.0]])
+    return eg.Camera.fisheye(matrix[:3, :3], matrix[:3, 3], K, SIZE, torch.tensor([0.02, -0.01, 0.003, -0.001]))
+
+
+def panorama() -> eg.Camera:
+    return eg.Camera.panorama(camera().detach().world_to_camera, SIZE)
+
+
+def under(lights: Callable[[], Sequence[Any]], options: dict[str, Any], **look: Any) -> Callable[[], Arrays]:
+    """A sheet below a triangle with materials, both moving, under other lights."""
+
+    def scene() -> Arrays:
+        verts, faces = grid()
+        verts, base, rough = leaf(verts), leaf(colors(len(verts))), leaf(torch.tensor(0.3))
+        caster = leaf(torch.tensor([[-0.4, -0.3, 0.6], [0.5, -0.3, 0.9], [0.0, 0.6, 0.7]]))
+        alpha = None if "alpha_mode" not in look else colors(64, 1).reshape(8, 8)
+        flat = eg.Mesh(verts, faces, material=eg.Material(base, 0.6, rough), normals=eg.vertex_normals(verts, faces))
+        uvs = torch.tensor([[0.1, 0.1], [0.9, 0.2], [0.4, 0.8]])
+        over = eg.Mesh(
+            caster, torch.tensor([[0, 1, 2]]), uvs=uvs, uv_faces=torch.tensor([[0, 1, 2]]), alpha=alpha,
+            material=eg.Material(0.6, 0.0, 0.5, alpha_mode=look.get("alpha_mode", "MASK")),
+        )  # fmt: skip
+        view = camera()
+        image = eg.render(eg.Scene([flat, over], lights=lights()), view, spp=4, seed=10, **options)
+        leaves = {"verts": verts, "caster": caster, "base": base, "rough": rough}
+        return gradients(image, **leaves, pose=view.world_to_camera)
+
+    return scene
+
+
+def point() -> list[Any]:
+    return [eg.PointLight(torch.tensor([0.5, 1.5, 2.5]), 4.0)]
+
+
+def cone_and_sun() -> list[Any]:
+    down = torch.tensor([-0.1, -0.5, -1.0])
+    cone = eg.SpotLight(torch.tensor([0.2, 0.6, 2.0]), down, 5.0, inner_angle=0.2, outer_angle=0.5)
+    return [cone, eg.DirectionalLight(torch.tensor([0.4, -0.6, -1.0]), 1.5)]
+
+
+def shining_mesh() -> list[Any]:
+    corners = torch.tensor([[-0.8, 1.0, 1.8], [0.9, 1.1, 1.5], [0.1, 0.2, 2.4], [0.3, 1.6, 2.2]])
+    faces = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    return [eg.Mesh(corners, faces, material=eg.Material(0.0, emission=4.0))]
+
+
+def sky() -> list[Any]:
+    return [eg.Environment(colors(8 * 16).reshape(8, 16, 3)), eg.SphericalHarmonics(colors(9) / 3)]
+
+
+def minified() -> Arrays:
+    """Mipmaps, a normal map and a texture with corners whose colours differ, in double."""
+    verts, faces = grid()
+    verts = leaf(verts.double())
+    uvs = leaf(6 * (verts.detach()[:, :2] + 1))
+    texture = leaf(colors(32 * 32, dtype=torch.float64).reshape(32, 32, 3))
+    bumps = eg.Texture(
+        colors(64, dtype=torch.float64).reshape(8, 8, 3) * 0.3 + torch.tensor([0.35, 0.35, 0.7]).double()
+    )
+    material = eg.Material(eg.Texture(texture, filter="mipmap"), 0.2, 0.5, normal_map=bumps)
+    mesh = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, material=material)
+    light = eg.DirectionalLight(torch.tensor([0.2, -0.3, -1.0], dtype=torch.float64), 2.0)
+    image = eg.render(eg.Scene(mesh, lights=[light]), camera().to(torch.float64), spp=4, seed=11)
+    return gradients(image, verts=verts, texture=texture, uvs=uvs)
+
+
+def stepping() -> Arrays:
+    """A shader that declares where its colours jump, and looks up light and shadows itself."""
+    verts, faces = grid()
+    verts, edge = leaf(verts), leaf(torch.tensor(0.1))
+
+    def shade(hits: eg.Hits) -> Tensor:
+        light = hits.lights[0]
+        points = hits.light_points(light)
+        arriving = light.arriving(points, hits.position) * hits.visible_from(light, points).reshape(-1, 1)
+        stripe = hits.where(hits.position[:, 0] - edge, torch.tensor(0.2), torch.tensor(0.9))
+        return stripe.reshape(-1, 1) * arriving.reshape(len(hits), -1)
+
+    view = camera()
+    caster = torch.tensor([[-0.4, -0.3, 0.6], [0.5, -0.3, 0.9], [0.0, 0.6, 0.7]])
+    meshes = [eg.Mesh(verts, faces), eg.Mesh(caster, torch.tensor([[0, 1, 2]]))]
+    image = eg.render(eg.Scene(meshes, lights=point()), view, spp=4, seed=12, shader=shade)
+    return gradients(image, verts=verts, edge=edge, pose=view.world_to_camera)
+
+
+def lit_directional() -> Arrays:
+    """The derivative of a lit image along a direction of the vertices, with shadows and two bounces."""
+    verts, faces = grid()
+    sheet = eg.Mesh(verts, faces, material=eg.Material(0.7))
+    caster = torch.tensor([[-0.4, -0.3, 0.6], [0.5, -0.3, 0.9], [0.0, 0.6, 0.7]])
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(caster, torch.cos(caster))
+        scene = eg.Scene([sheet, eg.Mesh(dual, torch.tensor([[0, 1, 2]]), material=eg.Material(0.5))], lights=point())
+        primal, tangent = torch.autograd.forward_ad.unpack_dual(
+            eg.render(scene, camera().detach(), spp=4, seed=13, bounces=2)
+        )
+    assert tangent is not None
+    return {"image": primal, "tangent": tangent}
+
+
+def rasterized() -> Arrays:
+    """nvdiffrast's four operators, with centres and with exact coverage."""
+    verts, faces = grid()
+    verts, texture = leaf(verts), leaf(colors(64).reshape(1, 8, 8, 3))
+    w = 2.5 - verts[:, 2:] + 0.3 * verts[:, :1]
+    pos = torch.cat([verts[:, :2] * 1.6, w - 1.5, w], 1)[None]
+    tri = faces.int()
+    rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos, tri, SIZE)
+    uv, uv_da = dr.interpolate((verts[None, :, :2] + 1) / 2, rast, tri, rast_db, diff_attrs="all")
+    color = dr.texture(texture, uv, uv_da, filter_mode="linear-mipmap-linear")
+    both = [dr.antialias(color, rast, pos, tri), dr.antialias(color, rast, pos, tri, exact=True)]
+    return gradients(torch.cat(both, -1), verts=verts, texture=texture)
+
+
+def bracket() -> tuple[eg.Mesh, Tensor]:
+    verts = torch.tensor(
+        [[0, 0, 0], [1, 0, 0], [1, 0.2, 0], [0.2, 0.2, 0], [0.2, 0.8, 0], [0, 0.8, 0]], dtype=torch.float32
+    )
+    solid = torch.cat([verts, verts + torch.tensor([0.0, 0.0, 0.3])]) - torch.tensor([0.4, 0.35, 0.15])
+    front = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    around = torch.arange(6)
+    following = (around + 1) % 6
+    sides = torch.cat(
+        [torch.stack([around, around + 6, following], 1), torch.stack([following, around + 6, following + 6], 1)]
+    )
+    faces = torch.cat([front.flip(1), front + 6, sides.flip(1)])
+    mesh = eg.Mesh(solid, faces, face_colors=colors(len(faces)))
+    matrix = torch.eye(4)
+    matrix[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0, -0.15, 0.1], [0.15, 0, -0.2], [-0.1, 0.2, 0.0]]))
+    return mesh, matrix
+
+
+def posed() -> Arrays:
+    """A pose that a fit finds in a few steps."""
+    mesh, matrix = bracket()
+    view = camera().detach()
+    moved = mesh.replace(verts=mesh.verts @ matrix[:3, :3].T)
+    target = eg.render(moved, view, spp=32)
+    found = fit.fit_pose(mesh, target, view, init=torch.eye(4), steps=6, progress=False)
+    return {"matrix": found.matrix}
+
+
+def fitted() -> Arrays:
+    """The colour and the place of a scene after a few steps of a fit."""
+    mesh, matrix = bracket()
+    view = camera().detach()
+    target = eg.render(mesh.replace(verts=mesh.verts @ matrix[:3, :3].T), view, spp=16)
+    found = fit.fit_scene(mesh, view, [target], {"verts": 0.01, "face_colors": 0.02}, steps=8, progress=False)
+    return {"verts": found.scene.meshes[0].verts, "colors": found.scene.meshes[0].face_colors}
+
+
+SCENES: dict[str, Callable[[], Arrays]] = {
+    **{scene.__name__: scene for scene in (colored, textured, lit, shaded, channels, directional)},
+    "orthographic": through(make=orthographic, filter="gaussian"),
+    "fisheye": through(make=lambda: fisheye(50.0)),
+    "wide fisheye": through(make=lambda: fisheye(110.0)),
+    "panorama": through(make=panorama),
+    "tent filter": through(make=lambda: camera().detach(), filter="tent"),
+    "cone and sun": under(cone_and_sun, {}),
+    "point light, three bounces": under(point, {"bounces": 3}),
+    "mesh that shines": under(shining_mesh, {"light_samples": 2}),
+    "mesh that shines, two bounces": under(shining_mesh, {"bounces": 2}),
+    "sky": under(sky, {}),
+    "alpha-tested, shadows": under(point, {}, alpha_mode="MASK"),
+    "alpha-blended, sky": under(sky, {}, alpha_mode="BLEND"),
+    "without shadows": under(cone_and_sun, {"shadows": False}),
+    **{scene.__name__: scene for scene in (minified, stepping, lit_directional, rasterized, posed, fitted)},
+}
 
 
 def measured() -> dict[str, np.ndarray]:
-    return {f"{scene.__name__} {n}": t.detach().numpy() for scene in SCENES for n, t in scene().items()}
+    return {f"{name} {n}": t.detach().numpy() for name, scene in SCENES.items() for n, t in scene().items()}
 
 
 def main(file: str, compare: bool) -> int:

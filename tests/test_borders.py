@@ -11,8 +11,8 @@ from scenes import front_camera
 from torch import Tensor
 
 import edgegrad as eg
+from benchmarks.stability.painted import PAINTED
 from edgegrad.points import borders
-from edgegrad.report.stability.painted import PAINTED
 
 SIZE = 24
 FLAT = eg.Camera(

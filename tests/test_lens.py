@@ -89,7 +89,7 @@ def test_boxes_hold_what_they_say(lens: str) -> None:
         middle, half = rng.uniform(-30, 80, 2), rng.uniform(0, 20, 2) ** 2 / 10
         low, high = core.for_tests.image_box(kernel, middle - half, middle + half)
         for u in rng.uniform(middle - half, middle + half, (30, 2)):
-            x, area_scale, _ = core.for_tests.bend(kernel, u, [0.0, 0.0])
+            x, area_scale, _ = core.for_tests.distort(kernel, u, [0.0, 0.0])
             if area_scale > 0 and (np.array(x) > -1).all() and x[0] < SIZE[1] + 1 and x[1] < SIZE[0] + 1:
                 assert (np.array(x) >= np.array(low) - 1e-9).all() and (np.array(x) <= np.array(high) + 1e-9).all()
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 from alpha_masks import F64, checkerboard, disc, quad
 from finite_differences import Case, check_ratio, estimate, gradient, loss, right_ratio, rotation
+from oracles import reference
 from scenes import cube, front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad import reference
 from edgegrad.plan import Term
 
 SIZE = 32

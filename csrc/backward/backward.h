@@ -4,72 +4,16 @@
 #include <cstdint>
 #include <vector>
 
-#include "contract/record.h"
-#include "forward/forward.h"
-#include "scene/geometry.h"
-#include "scene/gradients.h"
+#include "accumulate/gradients.h"
+#include "accumulate/records.h"
+#include "estimator/gradient_input.h"
 #include "scene/light_parts.h"
 
 namespace edgegrad {
 
-struct LitPaths;  // boundary/bounces.h
-struct BounceSamples;
-struct MovingBorders;
-
-struct GradientOptions {
-    int64_t surface_samples = -1;  // in all; −1: the default (surface_measure.cpp)
-    int64_t edge_samples = -1;     // in all; −1: the default (curve_measure.cpp)
-    uint64_t seed = 0;
-    bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
-    bool boundary = true;
-    bool intrinsics = true;  // whether they may move; where boundary does count, the rim of what a lens shows then does
-    bool steps = true;       // whether what moves steps within faces counts
-    double step_spacing = 1;  // px between the lines that find them
-    bool lit = false;         // whether samples are shaded by lights, at several times the cost
-    bool dry = false;         // only count the samples
-    bool controls = true;  // whether integrals that are known serve as control variates; they are of one given adjoint
-    int pixel_spp = 0;     // if not zero, all of the interior term from so many samples a pixel, for the benchmarks
-};
-
-// What a backward pass did, and the seconds that each part took.
-struct BackwardProfile {
-    int64_t surface_samples = 0, edge_samples = 0;
-    int64_t surface_wanted = 0, edge_wanted = 0;              // default samples before the budget (budget.h)
-    int64_t silhouettes = 0, creases = 0, intersections = 0;  // curves in view
-    double rim = 0;                                           // px in view of that of a lens
-    int64_t step_lines = 0;                                   // that look for steps within faces
-    int64_t shadow_samples = 0;
-    double view = 0;                 // vertices in camera coordinates, where the loss looks
-    double measure = 0, curves = 0;  // triangles and curves laid end to end
-    double surface[2] = {0, 0}, edge[2] = {0, 0}, step[2] = {0, 0};  // samples with their rays; adding what they found
-    double world = 0;                                                // from camera coordinates to the user's arrays
-
-    // Of another window of the camera.
-    BackwardProfile& operator+=(const BackwardProfile& o);
-};
-
-// What a gradient is taken of.
-template <class T>
-struct BackwardInput {
-    const SceneView<T>& scene;
-    const Camera& camera;
-    const Geometry& geometry;
-    const ImageOptions& image;  // of the image that was made
-    const T* adjoint;           // ∂loss/∂image (H, W, C); null for records, which are drawn before it is known
-    HitBuffers<T> hits;         // of that image
-    // (F,): faces that look as a texture says, which the scene's own colours need not; null: none.
-    const uint8_t* detailed = nullptr;
-    // (F,): faces that one sees through, so that they hide no curve; null: none.
-    const uint8_t* panes = nullptr;
-    // (H, W), above zero: how much records are to look at each pixel, for want of an adjoint; null: the same
-    // everywhere.
-    const T* looks = nullptr;
-};
-
-// The geometry that the terms of a derivative need.
-inline GeometryWanted geometry_for(bool interior, bool boundary) {
-    return {.topology = boundary, .parts = interior || boundary, .intersections = boundary};
-}
+struct LitPaths;  // secondary/secondary_edges.h
+struct SecondaryEdgeSamples;
+struct MovingEdges;
 
 // Adds the gradient to what `grad` points to.
 template <class T>
@@ -96,25 +40,27 @@ template <class T>
 std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
                                          const GradientOptions& options, const LightParts& light, int64_t samples,
                                          Team& team);
-// So many on those that lie on surfaces, seen or not (boundary/unseen_shadows.h).
+// So many on those that lie on surfaces, seen or not (secondary/indirect_shadows.h).
 template <class T>
-std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                                const GradientOptions& options, const LightParts& light,
-                                                int64_t samples, Team& team);
+std::vector<CurveRecords> record_indirect_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                  const GradientOptions& options, const LightParts& light,
+                                                  int64_t samples, Team& team);
 
-// The samples on the borders of what surfaces of paths of light see of one another (boundary/bounces.h).
+// The samples on the borders of what surfaces of paths of light see of one another (secondary/secondary_edges.h).
 template <class T>
-std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                         const GradientOptions& options, const LitPaths& paths, int64_t samples,
-                                         Team& team, BounceSamples& out);
-// Those on curves at which surfaces begin to send light (boundary/surface_borders.h).
+std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                 const GradientOptions& options, const LitPaths& paths, int64_t samples,
+                                                 Team& team, SecondaryEdgeSamples& out);
+// Those on curves at which surfaces begin to send light (secondary/surface_edges.h).
 template <class T>
-std::vector<CurveRecords> record_surface_borders(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                                 const GradientOptions& options, const LitPaths& paths,
-                                                 MovingBorders moving, int64_t samples, Team& team, BounceSamples& out);
+std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                               const GradientOptions& options, const LitPaths& paths,
+                                               MovingEdges moving, int64_t samples, Team& team,
+                                               SecondaryEdgeSamples& out);
 
-// q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
-void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,
+// q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a
+// sub-camera.
+void add_world(const Camera& sub_camera, const double* verts, const Array<double>& q_bar, Team& team,
                const Gradients& grad);
 
 }  // namespace edgegrad

@@ -8,9 +8,9 @@
 #include <limits>
 #include <optional>
 
+#include "camera/face_map.h"
 #include "camera/view_volume.h"
 #include "core/sierpinski.h"
-#include "shading/surface.h"
 
 namespace edgegrad {
 

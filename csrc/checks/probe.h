@@ -3,8 +3,8 @@
 
 #include <cstdint>
 
+#include "accumulate/gradients.h"
 #include "forward/forward.h"
-#include "scene/gradients.h"
 
 namespace edgegrad {
 

@@ -1,6 +1,6 @@
 // The threads are OpenMP's, and the runtime is torch's, which is loaded before the kernel. They stay in one parallel
 // region for good and take the loops of all calls from a queue. A region for each loop, or for each call, ends only
-// when all of its threads had a processor, work or no work, and shares them with torch's operators: beside two busy
+// when all of its threads had a processor, work or no work, and shares them with torch's operators: next to two busy
 // processes a step took 1.5 to 2.3 times as long (docs/tried.md).
 #include "core/parallel.h"
 
@@ -23,7 +23,7 @@ namespace edgegrad {
 
 namespace {
 
-// Long enough to be there for the next loop of the same pass; short beside what other processes would miss.
+// Long enough to be there for the next loop of the same pass; short next to what other processes would miss.
 constexpr std::chrono::microseconds spin_time(100);
 constexpr std::chrono::milliseconds asking_time(50);
 
@@ -94,7 +94,7 @@ void release(void*) {}
 void acquire(void*) {}
 #endif
 
-// The workers: as many as there are processors, or as a call asked for beside its own thread. Calls at the same time
+// The workers: as many as there are processors, or as a call asked for next to its own thread. Calls at the same time
 // share them.
 class Pool {
    public:

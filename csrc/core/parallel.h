@@ -75,8 +75,8 @@ class Team {
         });
     }
 
-    // body(k, first, last) for the blocks k of 0 … n − 1. Their size is fixed, so that sums over them are rounded alike
-    // at any number of threads.
+    // body(k, first, last) for the blocks k of 0 … n − 1. Their size is fixed, so that sums over them are rounded
+    // equally at any number of threads.
     static constexpr int64_t block = 4096;
     static int64_t blocks(int64_t n) { return (n + block - 1) / block; }
     template <class Body>
@@ -84,7 +84,7 @@ class Team {
         each(blocks(n), [&](int64_t k) { body(k, k * block, std::min(n, (k + 1) * block)); });
     }
     // What body(first, last) returns for each block, in their order. Each is made on the thread's own stack: threads
-    // that write beside one another in an array wait for each other's caches.
+    // that write next to one another in an array wait for each other's caches.
     template <class Body>
     auto of_blocks(int64_t n, Body body) {
         std::vector<decltype(body(n, n))> out(blocks(n));

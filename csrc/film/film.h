@@ -60,6 +60,12 @@ class Filter {
     FilterKind kind_;
 };
 
+struct ImageOptions {
+    int spp;  // samples a pixel
+    Filter filter;
+    uint64_t seed;
+};
+
 // The pixels of an image with their filter.
 class FilteredPixels {
    public:

@@ -4,8 +4,8 @@
 #include <cstdint>
 
 #include "camera/camera.h"
-#include "camera/camera_rays.h"
 #include "core/parallel.h"
+#include "rays/camera_rays.h"
 #include "scene/scene.h"
 
 namespace edgegrad {

@@ -12,35 +12,15 @@
 #include <vector>
 
 #include "camera/depth_bound.h"
+#include "camera/sub_cameras.h"
 #include "camera/vertices.h"
-#include "camera/windows.h"
 #include "core/channels.h"
 #include "core/sampler.h"
 #include "forward/reachable.h"
-#include "forward/side.h"
+#include "forward/sub_camera_rays.h"
 #include "shading/shade.h"
 
 namespace edgegrad {
-
-EDGEGRAD_VECTORIZED void place_in_pixel(const Camera& camera, const Filter& filter, int x, int y, int n, double* n_x,
-                                        double* n_y) {
-    filter.sample(n, n_x), filter.sample(n, n_y);
-    // normalised(), with what the samples share in locals: the compiler cannot know that the arrays lie elsewhere.
-    const Vec2 n0 = normalised(camera, {x + 0.5, y + 0.5});
-    const double a = camera.k_inverse[0], b = camera.k_inverse[1], c = camera.k_inverse[2], d = camera.k_inverse[3];
-    for (int i = 0; i < n; ++i) {
-        const double dx = n_x[i], dy = n_y[i];
-        n_x[i] = n0.x + (a * dx + b * dy), n_y[i] = n0.y + (c * dx + d * dy);
-    }
-    if (!camera.is_straight()) straighten_near(camera.lens, camera.lens_view.disc, n0, n, n_x, n_y);
-}
-
-EDGEGRAD_VECTORIZED void PixelRays::append(int x, int y, int first, int n, CameraRays& rays) const {
-    double *n_x = rays.n_x + rays.count, *n_y = rays.n_y + rays.count;
-    lattice_.fill(hash(seed_, uint64_t(y) * camera_.width + x), first, n, n_x, n_y);
-    place_in_pixel(camera_, filter_, x, y, n, n_x, n_y);
-    rays.count += n;
-}
 
 namespace {
 
@@ -131,7 +111,7 @@ class PixelRow {
     // in the next one.
     struct alignas(N ? 256 : 8) Shaded {
         int32_t face = -1;
-        bool textured = false, unseen = false;
+        bool textured = false, indirect = false;
         FaceMap map;
         DepthBound depth;
         AffineRadiance<N> radiance;
@@ -176,7 +156,7 @@ class PixelRow {
                     const int first = std::countr_zero(left);
                     const int32_t face = rays_.face[i + first];
                     const Shaded& s = shaded(face);
-                    if (s.unseen) [[unlikely]] {
+                    if (s.indirect) [[unlikely]] {
                         cast_beyond();
                         left &= ~on_face(rays_.face + i, -1);
                         continue;
@@ -199,7 +179,7 @@ class PixelRow {
                     }
                 }
             for (; i < end; ++i) {
-                if (rays_.face[i] >= 0 && shaded(rays_.face[i]).unseen) [[unlikely]]
+                if (rays_.face[i] >= 0 && shaded(rays_.face[i]).indirect) [[unlikely]]
                     cast_beyond();
                 if (rays_.face[i] >= 0) hits += add(i, part_[p].column, sum);
             }
@@ -263,10 +243,10 @@ class PixelRow {
     // Casts the rays again, through the faces whose plane holds the eye. What the others hit stays the same.
     void cast_beyond() {
         rays_.prepare();
-        side_->frame.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
+        side_->frame.cast_with_alpha_test(rays_, nullptr, [&](int32_t face) { return !is_indirect(face); });
     }
 
-    bool is_unseen(int32_t face) const {
+    bool is_indirect(int32_t face) const {
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Array<Vec3>& q = side_->q;
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
@@ -281,8 +261,8 @@ class PixelRow {
         const Array<Vec3>& q = side_->q;
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
         s.map = face_map(camera, corner);
-        s.unseen = camera.passes_through_eye(corner);
-        if (s.unseen) return;
+        s.indirect = camera.passes_through_eye(corner);
+        if (s.indirect) return;
         s.depth.set(camera, corner, s.map);
         if (!s.textured) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.

@@ -17,7 +17,7 @@ struct LitSampling {
     uint64_t seed, again;  // of the first pass, and of pixels that are shaded again
 };
 
-// (H · W, C) before what lies behind the surfaces, and for each lamp whether a point asked for its shadow.
+// (H · W, C) before what lies behind the surfaces, and for each light whether a point asked for its shadow.
 template <class T>
 struct LitImage {
     Array<T> radiance;
@@ -25,7 +25,7 @@ struct LitImage {
 };
 
 // Pixels that borders of shadows or of nearest texels run through are shaded again, at several points
-// (image_borders.h).
+// (discontinuous_pixels.h).
 template <class T>
 LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                        const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,

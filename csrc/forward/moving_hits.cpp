@@ -4,7 +4,7 @@
 #include <cmath>
 #include <vector>
 
-#include "contract/scatter.h"
+#include "accumulate/scatter.h"
 #include "core/dual.h"
 
 namespace edgegrad {

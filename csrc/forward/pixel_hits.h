@@ -10,9 +10,9 @@
 #include <memory>
 #include <vector>
 
+#include "camera/face_map.h"
 #include "core/array.h"
 #include "forward/forward.h"
-#include "shading/surface.h"
 
 namespace edgegrad {
 

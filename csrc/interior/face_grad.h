@@ -1,7 +1,7 @@
 // What a run of samples on one face adds to the gradient.
 #pragma once
 
-#include "backward/view.h"
+#include "estimator/view.h"
 #include "interior/control.h"
 #include "shading/shade.h"
 
@@ -12,7 +12,7 @@ namespace edgegrad {
 template <int N, class T>
 class FaceGrad {
    public:
-    FaceGrad(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
+    FaceGrad(const BackwardView<T>& view, bool geometry, const GradientSink& to, LocalGradients& grad)
         : view_(view),
           geometry_(geometry),
           to_(to),
@@ -68,8 +68,8 @@ class FaceGrad {
    private:
     const BackwardView<T>& view_;
     const bool geometry_;
-    const Destination& to_;
-    ChunkGrad& grad_;
+    const GradientSink& to_;
+    LocalGradients& grad_;
 
     int32_t face_ = -1;
     bool controlled_ = false, seen_ = false;

@@ -5,8 +5,8 @@
 #include <cstdint>
 #include <vector>
 
-#include "backward/occlusion.h"
 #include "core/math.h"
+#include "estimator/occlusion.h"
 #include "film/importance.h"
 
 namespace edgegrad {

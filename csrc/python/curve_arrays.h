@@ -5,7 +5,7 @@
 
 #include <vector>
 
-#include "contract/record.h"
+#include "accumulate/records.h"
 
 namespace edgegrad {
 

@@ -10,16 +10,16 @@
 #include <string>
 #include <vector>
 
-#include "backward/image_hits.h"
-#include "boundary/crease_faces.h"
-#include "boundary/curve_measure.h"
-#include "boundary/meeting_parts.h"
-#include "boundary/steps.h"
+#include "accumulate/scatter.h"
+#include "camera/sub_cameras.h"
 #include "camera/vertices.h"
-#include "camera/windows.h"
-#include "contract/scatter.h"
-#include "core/draws.h"
-#include "scene/geometry.h"
+#include "core/ordered_draws.h"
+#include "discontinuities/discontinuities.h"
+#include "estimator/image_hits.h"
+#include "primary/crease_faces.h"
+#include "primary/curve_measure.h"
+#include "primary/meeting_parts.h"
+#include "rays/geometry.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -38,7 +38,7 @@ struct PassSize {
     bool textured;
     bool jumps;  // whether neighbouring faces may differ where they meet
     int threads;
-    int sides;  // of the camera (windows.h)
+    int sides;  // of the camera (sub_cameras.h)
 
     // Of a closed mesh.
     int64_t edges() const { return 3 * faces / 2; }

@@ -2,7 +2,7 @@
 
 #ifdef _WIN32
 #define NOMINMAX
-#include <windows.h>
+#include <sub_cameras.h>
 #else
 #include <dlfcn.h>
 #endif

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from ..check import as_int, as_tensor, check_fields, check_finite, check_float, check_int
+from ..scene.state import from_state, to_state
 from .conventions import Conventions
 from .lens import distort, longitude_latitude
 from .poses import constant, image_size
@@ -207,6 +208,15 @@ class Camera(Viewpoints, Conventions):
     def detach(self) -> Camera:
         """Return the camera cut from the autograd graph."""
         return self._map(Tensor.detach)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The camera, or batch, as a dictionary of tensors, strings and numbers; see Scene.state_dict()."""
+        return to_state(self, (Camera,))
+
+    @staticmethod
+    def from_state_dict(state: dict[str, Any]) -> Camera:
+        """The camera of a state_dict(), with the same tensors. Raises TypeError or ValueError."""
+        return from_state(state, Camera, (Camera,))
 
     def _map(self, f: Callable[[Tensor], Tensor]) -> Camera:
         distortion = None if self.distortion is None else f(self.distortion)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 if sys.platform == "win32":
     from pathlib import WindowsPath as NativePath
@@ -74,3 +76,22 @@ def replacing(path: PathLike) -> Iterator[Path]:
         os.replace(temporary, file)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: PathLike, text: str) -> None:
+    """Write a text file in UTF-8, whole or not at all. Raises OSError."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: PathLike, content: Any, indent: int = 2) -> None:
+    """Write a JSON file, whole or not at all. Raises OSError."""
+    write_text(path, json.dumps(content, indent=indent) + "\n")
+
+
+def write_figures(folder: Path, draw: Mapping[str, Callable[[], Any]]) -> list[str]:
+    """Write matplotlib figures, each whole or not at all, and return their names. Raises OSError or what drawing raises."""
+    for name, figure in draw.items():
+        with replacing(folder / name) as temporary:
+            figure().savefig(temporary)
+    return list(draw)

@@ -33,8 +33,13 @@ SCENES = (".glb", ".gltf")
 
 
 def from_trimesh(given: Any) -> Mesh:
-    """Return the Mesh of a trimesh.Trimesh; see Mesh.from_trimesh."""
-    trimesh = require("trimesh", "trimesh", "Mesh.from_trimesh")
+    """Return the mesh of a trimesh.Trimesh with equal vertices welded.
+
+    It has the vertex or face colours or the texture, which are sRGB there, or the colour of its material, which is linear.
+    It is float64 where float32 would move vertices by more than a millionth of the extent, else float32. Raises TypeError,
+    ValueError or ImportError.
+    """
+    trimesh = require("trimesh", "trimesh", "from_trimesh")
     if isinstance(given, trimesh.Scene):
         raise TypeError("mesh: expected a trimesh.Trimesh, got a Scene; take scene.to_mesh(), or one of scene.geometry")
     if not isinstance(given, trimesh.Trimesh):
@@ -53,9 +58,12 @@ def from_trimesh(given: Any) -> Mesh:
 
 
 def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
-    """Return the trimesh.Trimesh of a mesh; see Mesh.to_trimesh. Without `faces_colored`, colours of faces become colours of
-    vertices."""
-    trimesh = require("trimesh", "trimesh", "Mesh.to_trimesh")
+    """Return a trimesh.Trimesh of a mesh, with colours or texture as 8-bit sRGB.
+
+    Vertices are split where texture coordinates or the colours of corners differ. Without `faces_colored`, colours of faces
+    become colours of vertices, which are split for them. Raises ValueError for other than 1 or 3 channels, ImportError.
+    """
+    trimesh = require("trimesh", "trimesh", "to_trimesh")
     _check_channels(mesh)
     faces = _array(mesh.faces)
     verts, colors = _array(mesh.verts), mesh.colors
@@ -118,7 +126,8 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     if lost:
         warn(
             f"left out of {kind}",
-            f"save_mesh: {file.name} holds no {', no '.join(lost)}; torch.save(mesh, path) keeps all of a Mesh",
+            f"save_mesh: {file.name} holds no {', no '.join(lost)}; "
+            "torch.save(Scene(mesh).state_dict(), path) keeps all of a Mesh",
         )
     for name, data in {**extra_files, file.name: content}.items():
         with replacing(file.parent / Path(name).name) as temporary:
@@ -155,8 +164,8 @@ def save_scene(
     if lost:
         warn(
             f"left out of {file.suffix}",
-            f"save_scene: {file.name} holds no {', no '.join(lost)}; torch.save(scene, path) keeps all of a Scene, and "
-            "save_camera() all of a camera",
+            f"save_scene: {file.name} holds no {', no '.join(lost)}; "
+            "torch.save(scene.state_dict(), path) keeps all of a Scene, and save_camera() all of a camera",
         )
     with replacing(file) as temporary:
         temporary.write_bytes(content)

@@ -1,5 +1,5 @@
 """Directions drawn by how glossy surfaces scatter: mirrored at normals of microfacets that the viewer sees
-(csrc/shading/lit/lobe_draw.h, which names the sources)."""
+(csrc/shading/lit/bsdf_sampling.h, which names the sources)."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class Pyramid(NamedTuple):
 
 
 class _Means(NamedTuple):
-    """csrc/shading/pyramid.h"""
+    """csrc/texture/pyramid.h"""
 
     height: int
     width: int

@@ -133,10 +133,10 @@ class Surfaces:
         """(F, 3, K): all properties that may jump and were asked for, each divided by its largest value."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
         attributes = columns([scaled(p) for p in parts if p.shape[-1]], len(self.faces), self.verts)
-        return _Beside.apply(attributes) if transformed() else attributes
+        return _NextToSteps.apply(attributes) if transformed() else attributes
 
 
-class _Beside(torch.autograd.Function):
+class _NextToSteps(torch.autograd.Function):
     """Attributes (F, 3, K). Under torch.vmap, those of all elements side by side: these share the samples of one image."""
 
     @staticmethod
@@ -158,7 +158,7 @@ class _Beside(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int, ...], *args: Any) -> tuple[Tensor, None]:
         (attributes,), (batch,) = args, in_dims
-        return _Beside.apply(attributes.movedim(batch, -1).flatten(2)), None
+        return _NextToSteps.apply(attributes.movedim(batch, -1).flatten(2)), None
 
 
 def every_face(count: int) -> Tensor:

@@ -21,7 +21,6 @@ from ..check import (
     check_shape,
 )
 from ..library import core
-from . import provided
 from .affine import Affine
 from .material import LARGEST_UV, LOOKUPS, Material, Texture, checked_wrap
 from .tree import map_tensors, moved
@@ -272,27 +271,3 @@ class Mesh:
         look += ", lit" if self.material is not None else ""
         name = "" if self.name is None else f"{self.name!r}, "
         return f"Mesh({name}{self.verts.shape[0]} vertices, {self.faces.shape[0]} faces, {look}, {self.verts.dtype})"
-
-    def _repr_png_(self) -> bytes | None:
-        """What notebooks show: the mesh as a whole, under a headlight unless it has colours."""
-        return provided.picture(self)
-
-    # -- trimesh ------------------------------------------------------------------------------------------------------------
-
-    @staticmethod
-    def from_trimesh(mesh: Any) -> Mesh:
-        """Return the mesh of a trimesh.Trimesh with equal vertices welded.
-
-        It has the vertex or face colours or the texture, which are sRGB there, or the colour of its material, which is linear.
-        It is float64 where float32 would move vertices by more than a millionth of the extent, else float32. Raises TypeError,
-        ValueError or ImportError.
-        """
-        return provided.from_trimesh(mesh)
-
-    def to_trimesh(self) -> Any:
-        """Return a trimesh.Trimesh, with colours or texture as 8-bit sRGB.
-
-        Vertices are split where texture coordinates or the colours of corners differ. Raises ValueError for other than 1 or 3
-        channels, ImportError.
-        """
-        return provided.to_trimesh(self)

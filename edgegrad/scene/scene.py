@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from ..check import MOST_ROWS, as_tensor, check_fields, check_finite, check_float, check_shape
-from . import provided
-from .lights import Light
+from .environment import Environment
+from .lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
+from .material import Material, Texture
 from .mesh import Mesh
 from .mesh_light import MeshLight
+from .state import from_state, to_state
 from .tree import map_tensors, moved
 
 
@@ -184,14 +186,29 @@ class Scene:
         """Return the scene cut from the autograd graph."""
         return map_tensors(self, Tensor.detach)
 
+    def state_dict(self) -> dict[str, Any]:
+        """All of the scene in nested dictionaries and lists of tensors, strings and numbers, for torch.save().
+
+        torch.load(…, weights_only=True) reads them. Tensors are detached, and share their memory with the scene's. Raises
+        TypeError for a light of a class of one's own.
+        """
+        return to_state(self, CLASSES)
+
+    @staticmethod
+    def from_state_dict(state: dict[str, Any]) -> Scene:
+        """The scene of a state_dict(), with the same tensors; none requires gradients. Raises TypeError or ValueError, which
+        name missing and unexpected keys."""
+        return from_state(state, Scene, CLASSES)
+
     def __repr__(self) -> str:
         back = "black" if self.background is None else f"background {tuple(self.background.shape)}"
         lights = "".join(f", {type(light).__name__}" for light in self.lights)
         return f"Scene({', '.join(map(repr, self.meshes))}; {back}{lights})"
 
-    def _repr_png_(self) -> bytes | None:
-        """What notebooks show; None where it cannot be drawn."""
-        return provided.picture(self)
+
+CLASSES = (
+    Scene, Mesh, Material, Texture, DirectionalLight, PointLight, SpotLight, SphericalHarmonics, Environment,
+)  # fmt: skip
 
 
 def as_scene(scene: Scene | Mesh) -> Scene:

@@ -7,7 +7,7 @@
 #include <cstdint>
 
 #include "shading/lit/tables.h"
-#include "shading/texture.h"
+#include "texture/texture.h"
 
 namespace edgegrad {
 

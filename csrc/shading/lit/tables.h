@@ -5,7 +5,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "contract/scatter.h"
+#include "accumulate/scatter.h"
 #include "core/dual.h"
 
 namespace edgegrad {

@@ -108,7 +108,7 @@ class Rendered:
 
     def _tangents(self, motion: Motion | Motions) -> dict[str, Tensor]:
         """Of what the kernel is given."""
-        flat, camera, beside = self._request.scene, self._request.camera, self._request.beside
+        flat, camera, beside = self._request.scene, self._request.camera, self._request.auxiliary
         points = motion.of_points(flat.verts)
         tangents = {"verts": points}
         if motion.K is not None:

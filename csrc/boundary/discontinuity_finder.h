@@ -1,0 +1,242 @@
+// Where lines across the image meet steps within a face: an alpha edge, or a border between texels where the
+// nearest one is taken.
+//
+// Along a line in the image the barycentrics of a face are (P_a + t (P_b − P_a)) / w, with P and w affine (FaceMap), so
+// with τ = t w_b / ((1 − t) w_a + t w_b) they are affine in τ, and so are texture coordinates. A segment of the line
+// then runs through the cells of the texture as a straight line does (Amanatides and Woo 1987). In a cell of four
+// texels a bilinear α is a polynomial of degree 2 in τ: its zeros are known, and nothing is missed between points.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+#include "core/sampler.h"
+#include "estimator/view.h"
+#include "shading/shade.h"
+
+namespace edgegrad {
+
+// A line across a face meets a step F = 0 at u in the undistorted image. F is affine in the texture coordinates near
+// there; an alpha-tested face is there where F > 0.
+struct StepCrossing {
+    int32_t face = -1;
+    bool is_alpha_edge = false;  // of a alpha-tested face; else a border of texels
+    bool vertical = false;       // the line
+    Vec2 u;
+    Vec2 slope;            // ∂F/∂uv
+    double side = 0;       // F on the two sides of a border of texels, ±; 0: F is α less the cutoff
+    Footprint alpha = {};  // of which F is made, if it is
+};
+
+// Calls visit(i, j, from, to) for the cells of a unit grid that a + τ d, from τ = first to last, runs through; at most
+// `most` of them.
+template <class Visit>
+void each_cell(Vec2 a, Vec2 d, double first, double last, int most, Visit visit) {
+    double i = std::floor(a.x + first * d.x), j = std::floor(a.y + first * d.y);
+    const auto next = [](double cell, double a, double d) {
+        if (d == 0) return std::numeric_limits<double>::infinity();
+        return ((d > 0 ? cell + 1 : cell) - a) / d;
+    };
+    for (double from = first; most-- > 0;) {
+        const double at_i = next(i, a.x, d.x), at_j = next(j, a.y, d.y);
+        const double to = std::clamp(std::min(at_i, at_j), from, last);
+        visit(i, j, from, to);
+        if (!(to < last)) return;
+        if (at_i <= at_j) i += d.x > 0 ? 1 : -1;
+        else j += d.y > 0 ? 1 : -1;
+        from = to;
+    }
+}
+
+// Calls visit(t) for the t in [0, 1] where c0 + c1 t + c2 t² changes between < 0 and ≥ 0. What is no more than
+// `rounding` counts as zero: two faces, or two cells, then agree where a zero lies on their border, and one of them has
+// it.
+template <class Visit>
+void each_sign_change(double c0, double c1, double c2, double rounding, Visit visit) {
+    const auto at = [&](double t) {
+        const double value = c0 + t * (c1 + t * c2);
+        return std::fabs(value) <= rounding ? 0 : value;
+    };
+    const double turn = c2 != 0 ? -c1 / (2 * c2) : -1;
+    double from = 0;
+    for (const double to : {turn > 0 && turn < 1 ? turn : 0.0, 1.0}) {
+        if (!(to > from)) continue;
+        if ((at(from) >= 0) != (at(to) >= 0)) {
+            // Of both roots the one in between; the form that does not cancel.
+            const double root = std::sqrt(std::max(0.0, c1 * c1 - 4 * c2 * c0));
+            const double q = -0.5 * (c1 + (c1 > 0 ? root : -root));
+            const double r0 = q != 0 ? c0 / q : from, r1 = c2 != 0 ? q / c2 : r0;
+            const auto outside = [&](double r) { return std::max(from - r, r - to); };
+            visit(std::clamp(!(outside(r1) < outside(r0)) ? r0 : r1, from, to));
+        }
+        from = to;
+    }
+}
+
+template <class T>
+class StepFinder {
+   public:
+    explicit StepFinder(const BackwardView<T>& view) : view_(view) {}
+
+    // Whether there may be steps in a face.
+    static bool may_step(const SceneView<T>& scene, int64_t face) {
+        return scene.alpha_masks.on(face) || takes_nearest(scene, face);
+    }
+
+    // From now on.
+    void set(int32_t face) {
+        if (face == face_) return;
+        face_ = face;
+        const auto corner = corners_of(view_, face);
+        map_ = face_map(view_.camera, corner.data());
+        front_ = side_of(view_, face) == 1 ? -1 : 1;
+    }
+
+    // Calls visit(crossing, weight) for the steps on the segment from a to b, a line of the undistorted image, as far
+    // as it lies on the face. Of more than `most` cells of a texture so many are looked at, drawn by a random number;
+    // they then stand for all.
+    template <class Visit>
+    void find(Vec2 a, Vec2 b, bool vertical, int most, uint64_t random, Visit visit) const {
+        Segment s;
+        if (!clip(a, b, s)) return;
+        StepCrossing crossing{.face = face_, .is_alpha_edge = false, .vertical = vertical, .u = {}, .slope = {}};
+        const auto at = [&](double tau) {
+            const double t = tau * s.w[0] / ((1 - tau) * s.w[1] + tau * s.w[0]);
+            crossing.u = s.u[0] + t * (s.u[1] - s.u[0]);
+        };
+        const SceneView<T>& scene = view_.scene;
+        if (is_textured(scene, face_)) {
+            const Texture<T> texture = texture_of(scene, face_);
+            const int C = scene.radiance;
+            const auto differ = [&](int64_t m, int64_t n) {
+                const T *p = texture.texels + m * C, *q = texture.texels + n * C;
+                return m != n && !std::equal(p, p + C, q);
+            };
+            if (texture.sampler.filter == TextureFilter::nearest)
+                each_border(texture, s, most, hash(random, 1), [&](const Border& border) {
+                    if (!differ(border.low, border.high)) return;
+                    at(border.tau), crossing.slope = border.slope, crossing.side = border.side;
+                    visit(crossing, border.weight);
+                });
+        }
+        if (!scene.alpha_masks.on(face_)) return;
+        crossing.is_alpha_edge = true;
+        const Texture<T> alpha = alpha_of(scene, face_);
+        const double cutoff = cutoff_of(scene, face_);
+        if (alpha.sampler.filter == TextureFilter::nearest) {
+            each_border(alpha, s, most, hash(random, 2), [&](const Border& border) {
+                const bool low = alpha.texels[border.low] >= cutoff, high = alpha.texels[border.high] >= cutoff;
+                if (low == high) return;
+                at(border.tau), crossing.slope = (high ? 1.0 : -1.0) * border.slope, crossing.side = border.side;
+                visit(crossing, border.weight);
+            });
+            return;
+        }
+        const Walk walk = walk_of(alpha, s, {0.5, 0.5}, most, hash(random, 2));
+        each_cell(walk.a, walk.d, walk.first, walk.last, walk.most, [&](double i, double j, double from, double to) {
+            const double x = walk.a.x + from * walk.d.x - i, y = walk.a.y + from * walk.d.y - j;
+            Footprint f = footprint_at(alpha, i, j, x, y);
+            const auto texel = [&](int k) { return double(alpha.texels[f.texel[k]]) - cutoff; };
+            const double t0 = texel(0), t1 = texel(1), t2 = texel(2), t3 = texel(3);
+            if (std::min({t0, t1, t2, t3}) > 0 || std::max({t0, t1, t2, t3}) < 0) return;
+            // t0 + x by_x + y by_y + x y both, along x + t dx, y + t dy.
+            const double by_x = t1 - t0, by_y = t2 - t0, both = t0 - t1 - t2 + t3;
+            const double dx = (to - from) * walk.d.x, dy = (to - from) * walk.d.y;
+            const double rounding =
+                1e-12 * (std::fabs(t0) + std::fabs(t1) + std::fabs(t2) + std::fabs(t3) + std::fabs(cutoff));
+            each_sign_change(t0 + x * by_x + y * by_y + x * y * both, dx * by_x + dy * by_y + (x * dy + y * dx) * both,
+                             dx * dy * both, rounding, [&](double t) {
+                                 constexpr double one = 1;
+                                 f.a = x + t * dx, f.b = y + t * dy;
+                                 at(from + t * (to - from));
+                                 crossing.alpha = f, crossing.slope = eval_vjp<1>(alpha, f, 1, &one);
+                                 visit(crossing, walk.weight);
+                             });
+        });
+    }
+
+   private:
+    // A part of a line that lies on the face: its ends, their places, texture coordinates and denominators w.
+    struct Segment {
+        Vec2 u[2], uv[2];
+        double w[2];
+    };
+    bool clip(Vec2 a, Vec2 b, Segment& s) const {
+        const Vec3 p = map_.times(normalised(view_.camera, a)), q = map_.times(normalised(view_.camera, b));
+        double first = 0, last = 1;
+        const auto keep = [&](double at_a, double at_b) {  // where this is not negative
+            at_a *= front_, at_b *= front_;
+            if (at_a < 0 && at_b < 0) last = -1;
+            else if (at_a < 0) first = std::max(first, at_a / (at_a - at_b));
+            else if (at_b < 0) last = std::min(last, at_a / (at_a - at_b));
+        };
+        keep(p.x, q.x), keep(p.y, q.y), keep(p.z - p.x - p.y, q.z - q.x - q.y);
+        if (!(last > first)) return false;
+        for (int k = 0; k < 2; ++k) {
+            const double t = k ? last : first;
+            const Vec3 at = (1 - t) * p + t * q;
+            s.u[k] = (1 - t) * a + t * b, s.w[k] = at.z;
+            s.uv[k] = interpolated_uv(view_.scene, face_, inside({at.x / at.z, at.y / at.z}));
+            if (!std::isfinite(s.uv[k].x + s.uv[k].y)) return false;
+        }
+        return true;
+    }
+
+    // What of a segment is walked: a + τ d in cells.
+    struct Walk {
+        Vec2 a, d;
+        double first = 0, last = 1, weight = 1;
+        int most;
+    };
+    Walk walk_of(const Texture<T>& texture, const Segment& s, Vec2 origin, int most, uint64_t random) const {
+        const Vec2 a = texture.place(s.uv[0]) - origin, b = texture.place(s.uv[1]) - origin;
+        Walk walk{.a = a, .d = b - a, .most = most + 4};
+        const double parts = std::ceil((std::fabs(walk.d.x) + std::fabs(walk.d.y)) / most);
+        if (parts > 1) {
+            walk.first = std::floor(to_unit(random) * parts) / parts, walk.last = walk.first + 1 / parts;
+            walk.weight = parts;
+        }
+        return walk;
+    }
+
+    // Where the segment crosses a border between texels.
+    struct Border {
+        double tau, weight;
+        int64_t low, high;  // the texels on either side, by their coordinate
+        Vec2 slope;         // of that coordinate less the border's, by uv
+        double side;        // by how much it is moved to be well within a texel
+    };
+    template <class Visit>
+    void each_border(const Texture<T>& texture, const Segment& s, int most, uint64_t random, Visit visit) const {
+        const Walk walk = walk_of(texture, s, {}, most, random);
+        double last_i = 0, last_j = 0;
+        bool begun = false;
+        each_cell(walk.a, walk.d, walk.first, walk.last, walk.most, [&](double i, double j, double from, double) {
+            // A border along an edge of the face is a crease (lies_between_texels), and rounding must not find it
+            // again.
+            constexpr double rounding = 1e-9;
+            if (begun && from > rounding && from < 1 - rounding) {
+                const bool across = i != last_i, up = i + j > last_i + last_j;
+                const int64_t here = texel_at(texture, i, j).texel[0],
+                              before = texel_at(texture, last_i, last_j).texel[0];
+                const double place = std::fabs(across ? i : j);
+                visit(Border{.tau = from,
+                             .weight = walk.weight,
+                             .low = up ? before : here,
+                             .high = up ? here : before,
+                             .slope = across ? Vec2{double(texture.width), 0} : Vec2{0, -double(texture.height)},
+                             .side = 0x1p-20 + 0x1p-44 * place});
+            }
+            begun = true, last_i = i, last_j = j;
+        });
+    }
+
+    const BackwardView<T>& view_;
+    int32_t face_ = -1;
+    FaceMap map_;
+    double front_ = 1;  // the sign of w where the face is seen
+};
+
+}  // namespace edgegrad

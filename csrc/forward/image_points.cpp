@@ -1,0 +1,95 @@
+#include "forward/image_points.h"
+
+#include <algorithm>
+#include <atomic>
+#include <limits>
+
+#include "camera/face_map.h"
+#include "camera/sub_cameras.h"
+#include "camera/vertices.h"
+#include "rays/alpha_mask.h"
+#include "rays/camera_rays.h"
+
+namespace edgegrad {
+
+namespace {
+
+constexpr Vec2 nowhere{std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::quiet_NaN()};
+
+// Where a place lies in the image plane of a side, in normalised coordinates; not numbers where it does not show it.
+Vec2 through(const Camera& side, Vec2 x) {
+    return side.may_show(x, 0) ? normalised(side, undistort(side, x)) : nowhere;
+}
+
+}  // namespace
+
+template <class T>
+PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry, const Places& places,
+                  Team& team) {
+    PlaceHits out;
+    out.face.assign(places.size, -1), out.part.assign(places.size, -1), out.b.assign(2 * places.size, 0.0);
+    for (const Camera& side : sides_of(camera)) {
+        const Array<Vec3> q = camera_vertices(side, scene.verts, scene.n_verts, team);
+        const AlphaMasks<T> alpha_masks(scene, side, q.data());
+        const CameraFrame frame(geometry.caster(), side, scene.alpha_masks.face ? &alpha_masks : nullptr);
+        const auto corners = [&](int32_t face) {
+            const int32_t* v = scene.faces + 3 * int64_t(face);
+            return std::array<Vec3, 3>{q[v[0]], q[v[1]], q[v[2]]};
+        };
+        // A face whose plane holds the eye is not seen; the image shows what is behind it, too.
+        const auto is_seen = [&](int32_t face) { return !side.passes_through_eye(corners(face).data()); };
+        team.each_block(places.size, [&](int64_t, int64_t first, int64_t last) {
+            team.check();
+            CameraRays rays(frame);
+            int64_t place[RayBatch::size];
+            const auto cast = [&] {
+                rays.prepare();
+                frame.cast(rays);
+                for (int i = 0; i < rays.count; ++i) {
+                    const int32_t face = frame.beyond_float(rays.n(i), rays.face[i], {}, is_seen);
+                    if (face < 0) continue;
+                    const Barycentrics b = barycentrics_of_hit(face_map(side, corners(face).data()), rays.n(i));
+                    out.face[place[i]] = face;
+                    out.part[place[i]] = geometry.parts().of(scene.faces[3 * int64_t(face)]);
+                    out.b[2 * place[i]] = b.u, out.b[2 * place[i] + 1] = b.v;
+                }
+                rays.count = 0;
+            };
+            for (int64_t k = first; k < last; ++k) {
+                const Vec2 n = through(side, places[k]);
+                if (!std::isfinite(n.x + n.y)) continue;
+                place[rays.count] = k;
+                rays.n_x[rays.count] = n.x, rays.n_y[rays.count] = n.y;
+                if (++rays.count == RayBatch::size) cast();
+            }
+            cast();
+        });
+    }
+    return out;
+}
+
+RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, Team& team) {
+    const std::vector<Camera> sides = sides_of(camera);
+    std::vector<RayRecords> blocks(Team::blocks(places.size));
+    team.each_block(places.size, [&](int64_t block, int64_t first, int64_t last) {
+        RayRecords& to = blocks[block];
+        for (int64_t k = first; k < last; ++k) {
+            const Camera* sub_camera = &sides.front();
+            Vec2 n = nowhere;
+            for (const Camera& side : sides)
+                if (const Vec2 here = through(side, places[k]); std::isfinite(here.x + here.y))
+                    sub_camera = &side, n = here;
+            append_ray(*sub_camera, n, to.along, intrinsics ? &to.along_by_k : nullptr, &to.along_by_x);
+        }
+    });
+    RayRecords all;
+    for (const RayRecords& block : blocks)
+        for (const auto field : {&RayRecords::along, &RayRecords::along_by_x, &RayRecords::along_by_k})
+            (all.*field).insert((all.*field).end(), (block.*field).begin(), (block.*field).end());
+    return all;
+}
+
+template PlaceHits hits_at(const SceneView<float>&, const Camera&, const Geometry&, const Places&, Team&);
+template PlaceHits hits_at(const SceneView<double>&, const Camera&, const Geometry&, const Places&, Team&);
+
+}  // namespace edgegrad

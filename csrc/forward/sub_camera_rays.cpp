@@ -1,0 +1,39 @@
+#include "forward/sub_camera_rays.h"
+
+#include <cmath>
+
+#include "camera/sub_cameras.h"
+#include "camera/vertices.h"
+
+namespace edgegrad {
+
+template <class T>
+Side::Side(const SceneView<T>& scene, const Camera& camera_, const RayCaster& caster, const ImageOptions& o, Team& team)
+    : camera(camera_),
+      q(camera_vertices(camera, scene.verts, scene.n_verts, team)),
+      frame(caster, camera, see_through(scene)),
+      pixel_rays(camera, o),
+      reach{o.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
+            o.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))} {}
+
+Side::~Side() = default;
+
+template <class T>
+const AlphaTest* Side::see_through(const SceneView<T>& scene) {
+    return scene.alpha_masks.face ? &alpha_masks.template emplace<AlphaMasks<T>>(scene, camera, q.data()) : nullptr;
+}
+
+template <class T>
+std::deque<Side> make_sides(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
+                            const ImageOptions& o, Team& team) {
+    std::deque<Side> sides;
+    for (const Camera& side : sides_of(camera)) sides.emplace_back(scene, side, caster, o, team);
+    return sides;
+}
+
+template std::deque<Side> make_sides(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&,
+                                     Team&);
+template std::deque<Side> make_sides(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&,
+                                     Team&);
+
+}  // namespace edgegrad

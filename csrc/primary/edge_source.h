@@ -1,0 +1,301 @@
+// Silhouettes, open borders and creases as a source of curves. The radiance of an incident face is known exactly at the
+// edge, so the ray through the edge point, which ignores the faces of that edge, finds what lies behind, or that
+// something lies before.
+//
+// Where other curves lie on this one in the image (coincident_segments.h), the ray runs along the borders of their
+// faces, and which of these it meets would be left to rounding. So they are asked in double. A face whose curve lies
+// apart by more than the rounding of doubles, or meets this one at an angle, covers the point or not, and the ray
+// ignores those that do; faces of curves on the same line it ignores too, and coincidence.h puts them in order.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <deque>
+#include <span>
+#include <vector>
+
+#include "boundary/curve.h"
+#include "boundary/curve_source.h"
+#include "boundary/visibility.h"
+#include "primary/coincidence.h"
+#include "primary/coincident_segments.h"
+#include "primary/face_set.h"
+
+namespace edgegrad {
+
+template <class T>
+class EdgeSource {
+   public:
+    using Curve = edgegrad::Curve;
+
+    // The point t of an edge.
+    struct Sample : CurveSample {
+        int place = 0;
+        double t = 0;
+        CoincidentShare share = {};
+    };
+
+    EdgeSource(const BackwardView<T>& view, const CurveFinder<T>& finder, const CoincidentCurves& coincident)
+        : view_(view), finder_(finder), visibility_(view), coincident_(coincident), coincidence_(view, finder) {}
+
+    Vec2 position(const Curve& curve, double s) const { return curve.position(s); }
+
+    bool place(const Curve& curve, double s, Sample& sample) {
+        if (places_ == 0 || place_[places_ - 1].own.curve.edge != curve.edge) {
+            // A place of which no sample waits, for all were hidden, is free again: so there are never more than lanes.
+            if (places_ > 0 && pending_ != places_ - 1) --places_;
+            start(place_[places_++], curve);
+        }
+        Place& place = place_[places_ - 1];
+        const double t = curve.parameter(s);
+        sample.place = places_ - 1;
+        sample.point = (1 - t) * curve.a + t * curve.b;
+        sample.t = t;
+        sample.behind = {};
+        sample.share = {.side = {curve.minus, curve.plus}, .side_t = {t, t}};
+        if (view_.alpha_masks && !show(curve, t, sample.share)) return false;
+        const std::span<const int32_t> own = place.faces.faces;
+        sample.gathered.clear();
+        if ((place.segment || place.edge_on) && !share(place, sample)) return false;
+        if (!sample.gathered.empty()) {
+            sample.gathered.insert(sample.gathered.end(), own.begin(), own.end());
+            std::sort(sample.gathered.begin(), sample.gathered.end());
+        }
+        sample.ignored = sample.gathered.empty() ? own : std::span<const int32_t>(sample.gathered);
+        pending_ = sample.place;
+        return true;
+    }
+
+    const CurveFaces& faces_of(const Sample& sample) const { return place_[sample.place].faces; }
+
+    SampleSurfaces surfaces(Sample& sample) const {
+        CoincidentShare& share = sample.share;
+        const SurfacePoint& behind = sample.behind;
+        // What the ray meets may lie before the others.
+        if (share.far_depth > behind.depth) share.side[1 - share.front].face = -1;
+        SampleSurfaces surfaces;
+        for (int k = 0; k < 2; ++k) {
+            const HalfEdge& h = share.side[k];
+            surfaces.at[k] = h.face >= 0 ? SurfacePoint{h.face, next_to_edge(view_.scene, h, share.side_t[k])} : behind;
+        }
+        if (uncovers(sample))
+            surfaces.at[surfaces.count++] =
+                share.uncovered >= 0 ? SurfacePoint{share.uncovered, share.uncovered_b} : behind;
+        return surfaces;
+    }
+
+    CurveJumps jumps(const Sample& sample, const double* radiance) const {
+        const CoincidentShare& share = sample.share;
+        const double scale = sample.weight * share.weight, jump = scale * (radiance[0] - radiance[1]);
+        double to_second = 0;
+        if (share.halves) to_second = jump / 2;
+        else if (uncovers(sample))
+            to_second = scale / 2 * (share.front == 0 ? radiance[2] - radiance[1] : radiance[0] - radiance[2]);
+        return {jump - to_second, to_second};
+    }
+
+    // δx ∧ τ = δx · (τ_y, −τ_x).
+    Vec2 normal(const Sample& sample) const {
+        const Vec2 tangent = distorted_tangent(sample);
+        return {tangent.y, -tangent.x};
+    }
+
+    // δx ∧ τ of the point, with the vertices of the faces on either side in equal parts, as flush() has it.
+    CurveJumps velocities(const Sample& sample, const Direction& direction) const {
+        if (!direction.moves()) return {};
+        const Curve& curve = place_[sample.place].own.curve;
+        const Vec2 tangent = distorted_tangent(sample);
+        const auto velocity = [&](Vec3 point, Vec3 point_dot) {
+            return wedge(project_jvp(view_.camera, point, point_dot, direction.intrinsics), tangent);
+        };
+        Vec3 point_dot;
+        for (const HalfEdge* h : {&curve.minus, &curve.plus}) {
+            if (h->face < 0) continue;
+            const double half = curve.is_crease() ? 0.5 : 1;
+            point_dot += half * ((1 - sample.t) * direction.q[vertex(view_.scene, *h, h->first())] +
+                                 sample.t * direction.q[vertex(view_.scene, *h, h->second())]);
+        }
+        const EdgePoint& second = sample.share.second;
+        const double of_second = second.vertex[0] >= 0 && second.vertex[1] >= 0
+                                     ? velocity(second.point, (1 - second.t) * direction.q[second.vertex[0]] +
+                                                                  second.t * direction.q[second.vertex[1]])
+                                     : 0;
+        return {velocity(sample.point, point_dot), of_second};
+    }
+
+    void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) {
+        const Curve& curve = place_[sample.place].own.curve;
+        const CoincidentShare& share = sample.share;
+        const Vec2 tangent = distorted_tangent(sample);
+        const auto move = [&](Vec3 point, double jump) {
+            Vec3 point_bar;
+            project_vjp(view_.camera, point, {jump * tangent.y, -jump * tangent.x}, point_bar, grad.k);
+            return point_bar;
+        };
+        if (current_.edge != curve.edge) flush(grad), current_ = curve, a_bar_ = b_bar_ = {};
+        const Vec3 point_bar = move(sample.point, jumps.first);
+        a_bar_ += (1 - sample.t) * point_bar;
+        b_bar_ += sample.t * point_bar;
+        if (jumps.second == 0) return;
+        const EdgePoint& second = share.second;
+        if (second.vertex[0] != second_[0] || second.vertex[1] != second_[1]) {
+            flush_second(grad);
+            for (int i = 0; i < 2; ++i) second_[i] = second.vertex[i], second_bar_[i] = {};
+        }
+        const Vec3 second_bar = move(second.point, jumps.second);
+        second_bar_[0] += (1 - second.t) * second_bar;
+        second_bar_[1] += second.t * second_bar;
+    }
+
+    void cast() { places_ = 0, pending_ = -1; }
+
+    void finish(LocalGradients& grad) {
+        flush(grad);
+        flush_second(grad);
+    }
+
+   private:
+    // A curve of which samples wait.
+    struct Place {
+        CoincidentCurve own;          // without its faces until they are asked for
+        const ImageSegment* segment;  // where others lie on it somewhere; else null
+        bool edge_on, with_faces;     // whether a face of it is seen edge-on; whether `own` has them
+        CurveFaces faces;
+    };
+
+    void start(Place& place, const Curve& curve) {
+        const Topology& topology = view_.geometry.topology();
+        place.own.curve = curve;
+        place.segment = coincident_.find(curve.edge);
+        const auto halves = topology.half_edges(curve.edge);
+        place.edge_on =
+            std::any_of(halves.begin(), halves.end(), [&](const HalfEdge& h) { return finder_.turn_of(h) == 0; });
+        place.with_faces = false;
+        const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
+        place.faces = {topology.faces(curve.edge), largest_coordinate(view_.scene, h),
+                       view_.scene.spacing->of(vertex(view_.scene, h, h.first()))};
+        other_edges_.clear();
+    }
+
+    // Sets what is there on either side at the point t, where faces may be alpha-tested; false if nothing is.
+    bool show(const Curve& curve, double t, CoincidentShare& share) const {
+        share.side[0].face = share.side[1].face = -1;
+        for (const HalfEdge& h : view_.geometry.topology().half_edges(curve.edge)) {
+            const int turn = finder_.turn_of(h);
+            if (turn == 0 || !shows(view_.scene, h.face, next_to_edge(view_.scene, h, t))) continue;
+            HalfEdge& side = share.side[turn > 0 ? 0 : 1];
+            if (side.face < 0 || !in_front(view_, side, h, curve.a, curve.b)) side = h;
+        }
+        return share.side[0].face >= 0 || share.side[1].face >= 0;
+    }
+
+    // Another curve on the line of the latest.
+    const CoincidentCurve& other(int64_t edge, const Curve& line) {
+        const size_t k = std::find(other_edges_.begin(), other_edges_.end(), edge) - other_edges_.begin();
+        if (k < other_edges_.size()) return others_[k];
+        other_edges_.push_back(edge);
+        if (k == others_.size()) others_.emplace_back();
+        Curve c;
+        finder_.find(edge, c);
+        return others_[k] = coincidence_.on_line(c, line);
+    }
+
+    // dx/ds at the pixel position.
+    Vec2 distorted_tangent(const Sample& sample) const {
+        return distort_jvp(view_.camera, sample.n, place_[sample.place].own.curve.tangent());
+    }
+
+    // What the curves that lie on this one leave to a sample of it; false if nothing. Gathers their faces.
+    bool share(Place& place, Sample& sample) {
+        const Curve curve = place.own.curve;
+        const Topology& topology = view_.geometry.topology();
+        std::vector<int32_t>& ignored = sample.gathered;
+        const auto begin = [&] {
+            if (!place.with_faces) place.own = coincidence_.on_line(curve, curve), place.with_faces = true;
+            coincidence_.start(place.own, sample.u, sample.t);
+        };
+        bool alone = true, visible = true;
+        const auto add = [&](const ImageSegment& o, CoincidentCurves::Meeting meeting) {
+            const bool on_line = meeting == CoincidentCurves::Meeting::along;
+            if (alone && on_line) begin(), alone = false;
+            const auto faces = topology.faces(o.edge);
+            const Vec2 along = o.b - o.a, from = sample.u - o.a;
+            const double squared = along.x * along.x + along.y * along.y,
+                         s = (from.x * along.x + from.y * along.y) / squared;
+            const double apart = std::fabs(wedge(along, from)) / std::sqrt(squared);
+            if (on_line && apart <= std::max(curve.rounding, o.rounding)) {
+                ignored.insert(ignored.end(), faces.begin(), faces.end());
+                if (s < 0 || s > 1) return true;
+                const CoincidentCurve& c = other(o.edge, curve);
+                CoincidentShare there;
+                if (view_.alpha_masks && !show(c.curve, c.curve.parameter(s), there)) return true;
+                return visible = coincidence_.add(c, c.curve.parameter(s));
+            }
+            for (const int32_t f : faces) {
+                // One that the ray misses stays for it to find: where float takes it for a neighbour, that one is found
+                // as well (Visibility::beyond_float).
+                if (!asked_.insert(f) || !meets(view_, f, sample.n)) continue;
+                ignored.push_back(f);
+                if (!visibility_.lies_behind(f, place.faces, sample)) return visible = false;
+            }
+            return true;
+        };
+        asked_.clear();
+        for (const int32_t f : place.faces.faces) asked_.insert(f);
+        if (place.segment) coincident_.at(*place.segment, sample.u, add);
+        if (!visible) return false;
+        if (alone) {
+            if (!place.edge_on) return true;
+            begin();
+        }
+        return coincidence_.finish(sample.share);
+    }
+
+    // Whether a second curve has a share of the jump that depends on what this one uncovers.
+    static bool uncovers(const Sample& sample) {
+        const CoincidentShare& share = sample.share;
+        return !share.halves && share.second.vertex[0] >= 0 &&
+               !(share.uncovered_depth > sample.behind.depth && share.uncovered >= 0);
+    }
+
+    // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to
+    // each, which matters only if they have copies of their own of the vertices.
+    void flush(LocalGradients& grad) {
+        if (current_.edge < 0) return;
+        const bool both = current_.is_crease();
+        for (const HalfEdge* h : {&current_.minus, &current_.plus}) {
+            if (h->face < 0) continue;
+            const Vec3 a = (both ? 0.5 : 1.0) * a_bar_, b = (both ? 0.5 : 1.0) * b_bar_;
+            grad.q.add<3>(vertex(view_.scene, *h, h->first()), &a.x);
+            grad.q.add<3>(vertex(view_.scene, *h, h->second()), &b.x);
+        }
+        current_.edge = -1;
+    }
+
+    void flush_second(LocalGradients& grad) {
+        for (int i = 0; i < 2; ++i)
+            if (second_[i] >= 0) grad.q.add<3>(second_[i], &second_bar_[i].x);
+        second_[0] = second_[1] = -1;
+    }
+
+    const BackwardView<T>& view_;
+    const CurveFinder<T>& finder_;
+    const Visibility<T> visibility_;
+    const CoincidentCurves& coincident_;
+    Coincidence<T> coincidence_;
+
+    Place place_[RayBatch::size];         // of the samples that wait
+    int places_ = 0, pending_ = -1;       // the place of the latest sample that waits
+    std::vector<int64_t> other_edges_;    // of the curves on the line of the latest
+    std::deque<CoincidentCurve> others_;  // theirs; those beyond wait to be used again
+    FaceSet asked_;                       // whether the latest sample's ray meets them
+
+    // Sums for the latest curve, and for the latest second one.
+    Curve current_;
+    Vec3 a_bar_, b_bar_;
+    int32_t second_[2] = {-1, -1};  // vertices
+    Vec3 second_bar_[2];
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,215 @@
+// Lines along which faces pass through each other, as a source of curves.
+//
+// Of two planes A and B let F be the difference of what is affine in the image: 1/z in perspective, −z in an
+// orthographic view,
+//
+//     F(x) = 1/z_A − 1/z_B   or   z_B − z_A,     A is in front where F > 0.
+//
+// The curve F = 0 is straight, and its share of ∂loss/∂Φ is ∫ Ã · [L_A − L_B] δF / |∇F| dℓ, where δF is taken at fixed
+// x: on the plane with the normal N, through q_i, along the ray q(z) at x,
+//
+//     (N · dq/dz) δz = N · (Σ b_i δq_i − δq(z)).
+//
+// Where a lens bends the image, dℓ / |∇F| is that of the undistorted image times the area scale.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "boundary/curve_source.h"
+#include "estimator/view.h"
+#include "rays/alpha_mask.h"
+#include "scene/intersections.h"
+
+namespace edgegrad {
+
+// In the image.
+struct IntersectionCurve {
+    const Intersection* faces = nullptr;
+    Vec3 a, b;              // ends within the view, camera coordinates
+    double w0 = 1, w1 = 1;  // denominators of the projection there
+    Vec2 x0, x1;            // their pixel positions
+    double length = 0;      // px
+
+    Vec2 low() const { return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)}; }  // of its box
+    Vec2 high() const { return {std::max(x0.x, x1.x), std::max(x0.y, x1.y)}; }
+    double nearest_depth() const { return std::min(a.z, b.z); }
+};
+
+// False where it is out of view, where a face is seen edge-on, or where it is an edge that is a silhouette: that is a
+// curve by itself, and stands for it. `facing` (F,): see facing_of_faces.
+template <class T>
+bool find_intersection(const BackwardView<T>& view, const Array<int8_t>& facing, const Intersection& i,
+                       IntersectionCurve& c) {
+    if (facing[i.face[0]] == 0 || facing[i.face[1]] == 0) return false;
+    if (i.next >= 0 && facing[i.next] * facing[i.face[i.ending]] <= 0) return false;
+    const Camera& camera = view.camera;
+    const Vec3 a = camera.to_camera(i.a), b = camera.to_camera(i.b);
+    double t0, t1;
+    if (!view.volume.clip_segment(a, b, t0, t1)) return false;
+    c.faces = &i;
+    c.a = (1 - t0) * a + t0 * b, c.b = (1 - t1) * a + t1 * b;
+    c.w0 = camera.depth_weight(c.a), c.w1 = camera.depth_weight(c.b);
+    if (!(c.w0 > 0 && c.w1 > 0)) return false;  // ends in the eye itself
+    c.x0 = view.volume.inside(project(camera, c.a)), c.x1 = view.volume.inside(project(camera, c.b));
+    c.length = length(c.x1 - c.x0);
+    return c.length > 0 && std::isfinite(c.length);
+}
+
+// Of the planes of both faces, what the points of a curve share.
+struct IntersectionPlanes {
+    FaceMap map[2];
+    Vec3 normal[2];
+    Vec2 slope;        // ∂F/∂n
+    double scale = 0;  // length / |∇F| in the undistorted image, times the weight of the intersection
+
+    template <class T>
+    IntersectionPlanes& set(const BackwardView<T>& view, const IntersectionCurve& curve) {
+        const Camera& camera = view.camera;
+        slope = {};
+        for (int k = 0; k < 2; ++k) {
+            const auto q = corners_of(view, curve.faces->face[k]);
+            map[k] = face_map(camera, q.data());
+            normal[k] = cross(q[1] - q[0], q[2] - q[0]);
+            slope += (k ? -1.0 : 1.0) * camera.affine_depth_gradient(normal[k], q[0]);
+        }
+        scale = curve.faces->weight * curve.length / length(place_vjp(camera, slope));
+        return *this;
+    }
+
+    // The length, px, of a silhouette whose motion would change the image as much, at a point of the curve.
+    double as_silhouette(const Camera& camera, double z, Vec2 n) const {
+        double squares = 0;
+        for (const Vec3 N : normal) squares += dot(N, N) / std::pow(camera.along_ray(N, n), 2);
+        return scale * std::fabs(camera.affine_depth_slope(z)) * camera.pixel_at_depth(z) * std::sqrt(squares / 2);
+    }
+};
+
+template <class T>
+class IntersectionSource {
+   public:
+    using Curve = IntersectionCurve;
+
+    struct Sample : CurveSample {
+        int place = 0;
+        SurfacePoint side[2];
+    };
+
+    explicit IntersectionSource(const BackwardView<T>& view) : view_(view) {}
+
+    Vec2 position(const Curve& curve, double s) const { return curve.x0 + s * (curve.x1 - curve.x0); }
+
+    bool place(const Curve& curve, double s, Sample& sample) {
+        const bool another = places_ == 0 || place_[places_ - 1].curve.faces != curve.faces;
+        if (another) start(place_[places_++], curve);
+        Place& place = place_[places_ - 1];
+        const double t = s * curve.w0 / ((1 - s) * curve.w1 + s * curve.w0);
+        sample.place = places_ - 1;
+        sample.point = (1 - t) * curve.a + t * curve.b;
+        sample.behind = {};
+        sample.ignored = place.faces.faces;
+        for (int k = 0; k < 2; ++k) {
+            sample.side[k] = {curve.faces->face[k], barycentrics_of_hit(place.planes.map[k], sample.n), sample.point.z};
+        }
+        // A face seen edge-on has no image.
+        bool visible = std::isfinite(place.planes.scale);
+        for (const Vec3 N : place.planes.normal) visible &= view_.camera.along_ray(N, sample.n) != 0;
+        for (const SurfacePoint& p : sample.side) visible &= shows(view_.scene, p.face, p.b);
+        if (!visible) places_ -= another;
+        return visible;
+    }
+
+    const CurveFaces& faces_of(const Sample& sample) const { return place_[sample.place].faces; }
+
+    SampleSurfaces surfaces(const Sample& sample) const { return {{sample.side[0], sample.side[1]}}; }
+
+    CurveJumps jumps(const Sample& sample, const double* radiance) const {
+        return {sample.weight * (radiance[0] - radiance[1]), 0};
+    }
+
+    // The curve moves with δx as F does with −δx.
+    Vec2 normal(const Sample& sample) const {
+        const Place& place = place_[sample.place];
+        return (-place.planes.scale * sample.area_scale) * pixel_vjp(view_.camera, sample.n, place.planes.slope);
+    }
+
+    CurveJumps velocities(const Sample& sample, const Direction& direction) const {
+        if (!direction.moves()) return {};
+        const Place& place = place_[sample.place];
+        const double z = sample.point.z;
+        const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
+        double F_dot = 0;
+        for (int k = 0; k < 2; ++k) {
+            const Vec3 N = place.planes.normal[k];
+            double moved = -view_.camera.unit_at_depth(z) * (N.x * n_dot.x + N.y * n_dot.y);
+            for (int i = 0; i < 3; ++i)
+                moved += sample.side[k].b[i] *
+                         dot(N, direction.q[view_.scene.faces[3 * int64_t(place.curve.faces->face[k]) + i]]);
+            F_dot += (k ? -1 : 1) * view_.camera.affine_depth_slope(z) * moved / view_.camera.along_ray(N, sample.n);
+        }
+        return {place.planes.scale * sample.area_scale * F_dot, 0};
+    }
+
+    void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) {
+        const Place& place = place_[sample.place];
+        if (current_ != place.curve.faces) finish(grad), current_ = place.curve.faces;
+        const double z = sample.point.z, F_bar = place.planes.scale * sample.area_scale * jumps.first;
+        Vec2 n_bar;
+        for (int k = 0; k < 2; ++k) {
+            const Vec3 N = place.planes.normal[k];
+            const double z_bar =
+                (k ? -F_bar : F_bar) * view_.camera.affine_depth_slope(z) / view_.camera.along_ray(N, sample.n);
+            for (int i = 0; i < 3; ++i) q_bar_[k][i] += z_bar * sample.side[k].b[i] * N;
+            n_bar += (-z_bar * view_.camera.unit_at_depth(z)) * Vec2{N.x, N.y};
+        }
+        normalised_vjp(view_.camera, sample.n, n_bar, grad.k);
+    }
+
+    void cast() { places_ = 0; }
+
+    // Adds what was summed for the latest curve.
+    void finish(LocalGradients& grad) {
+        if (!current_) return;
+        for (int k = 0; k < 2; ++k)
+            for (int i = 0; i < 3; ++i) {
+                grad.q.add<3>(view_.scene.faces[3 * int64_t(current_->face[k]) + i], &q_bar_[k][i].x);
+                q_bar_[k][i] = {};
+            }
+        current_ = nullptr;
+    }
+
+   private:
+    // A curve of which samples wait.
+    struct Place {
+        Curve curve;
+        IntersectionPlanes planes;
+        CurveFaces faces;
+    };
+
+    void start(Place& place, const Curve& curve) {
+        place.curve = curve;
+        place.planes.set(view_, curve);
+        const int32_t (&face)[2] = curve.faces->face;
+        place.faces = {face, 0, 0};
+        for (const int32_t f : face)
+            for (int i = 0; i < 3; ++i) {
+                const int32_t v = view_.scene.faces[3 * int64_t(f) + i];
+                place.faces.spacing = std::max(place.faces.spacing, view_.scene.spacing->of(v));
+                for (int axis = 0; axis < 3; ++axis)
+                    place.faces.coordinate =
+                        std::max(place.faces.coordinate, std::fabs(view_.scene.verts[3 * int64_t(v) + axis]));
+            }
+    }
+
+    const BackwardView<T>& view_;
+    Place place_[RayBatch::size];  // of the samples that wait
+    int places_ = 0;
+
+    // Sums for the latest curve, of the corners of both faces.
+    const Intersection* current_ = nullptr;
+    Vec3 q_bar_[2][3];
+};
+
+}  // namespace edgegrad

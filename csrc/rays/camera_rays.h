@@ -1,0 +1,99 @@
+// The rays of a camera: where they start, and where they go.
+#pragma once
+
+#include <limits>
+#include <span>
+
+#include "camera/camera.h"
+#include "rays/raycast.h"
+
+namespace edgegrad {
+
+// What rays pass through: faces that are not there where the ray at n meets them (rays/alpha_mask.h).
+class AlphaTest {
+   public:
+    virtual bool shows(int32_t face, Vec2 n) const = 0;
+
+   protected:
+    ~AlphaTest() = default;
+};
+
+class CameraRays;
+
+// A camera in the frame of a ray structure.
+class CameraFrame {
+   public:
+    // `through`: null if all faces are there everywhere.
+    CameraFrame(const RayCaster& caster, const Camera& camera, const AlphaTest* alpha_test);
+
+    // The nearest face along each ray that is there, of those that the ray does not ignore.
+    void cast(CameraRays& rays, const RayCaster::Ignored* ignored = nullptr) const;
+
+    // The same through what `meets(face)` refuses.
+    template <class Meets>
+    void cast_with_alpha_test(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const;
+
+    // World units by which a ray may miss a point p that it was aimed at: a few roundings of what Embree is given.
+    double error(Vec3 p) const;
+
+    // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its border a face
+    // may be hit that the ray misses: at a silhouette of a fine mesh that is a neighbour which is seen less wide than
+    // floats are apart. `meets(face)` decides, in double where that matters; what it refuses is passed through.
+    template <class Meets>
+    int32_t beyond_float(Vec2 n, int32_t face, RayCaster::Ignored ignored, Meets meets) const;
+
+   private:
+    friend class CameraRays;
+    const RayCaster& caster_;
+    const AlphaTest* alpha_test_;
+    RayFrame frame_;
+    Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
+    Vec3 eye_;
+    bool perspective_, far_, undistorted_;
+};
+
+// Rays by where they go in the image.
+class CameraRays : public RayBatch {
+   public:
+    explicit CameraRays(const CameraFrame& frame, int width = packet_width());
+
+    // From now on.
+    void look_through(const CameraFrame& frame);
+
+    // Normalised image coordinates; the caller fills them from `count` on.
+    double n_x[size] = {}, n_y[size] = {};
+
+    Vec2 n(int i) const { return {n_x[i], n_y[i]}; }
+
+    // Makes the rays.
+    void prepare();
+
+   private:
+    template <int W>
+    void prepare(Packets<W>& packets) const;
+
+    const CameraFrame* camera_;
+};
+
+template <class Meets>
+void CameraFrame::cast_with_alpha_test(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const {
+    // The rays of a packet mostly ask for the same face together.
+    int32_t latest = -1;
+    bool met = false;
+    caster_.cast_with_alpha_test(rays, ignored, [&](int ray, int32_t face) {
+        if (face != latest) latest = face, met = meets(face);
+        return met && (!alpha_test_ || alpha_test_->shows(face, rays.n(ray)));
+    });
+}
+
+template <class Meets>
+int32_t CameraFrame::beyond_float(Vec2 n, int32_t face, RayCaster::Ignored ignored, Meets meets) const {
+    if (face < 0 || meets(face)) return face;
+    CameraRays ray(*this);
+    ray.n_x[0] = n.x, ray.n_y[0] = n.y, ray.count = 1;
+    ray.prepare();
+    cast_with_alpha_test(ray, &ignored, meets);
+    return ray.face[0];
+}
+
+}  // namespace edgegrad

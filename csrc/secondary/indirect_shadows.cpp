@@ -1,0 +1,115 @@
+// Samples on the borders of shadows, by the area that these sweep on surfaces.
+//
+// With F = N · (y − p) of shadow_source.h, and y at fixed barycentrics of the receiver, which has the unit normal g,
+//
+//     δF = N · (Σ β_i δv_i − w_a δa − w_b δb − w_l δl).
+//
+// On the receiver |∇F| = |N × g|, and per unit of t on the edge the border has the length S |g × N| / |g·d|. So what
+// light the surface gets changes by
+//
+//     ∫ [L(F > 0) − L(F < 0)] δF / |∇F| dℓ = ∫ [L(F > 0) − L(F < 0)] δF S / |g·d| dt.
+//
+// The samples are those of shadows.cpp, but that no camera has a say in where they lie.
+
+#include "secondary/indirect_shadows.h"
+
+#include <cmath>
+#include <vector>
+
+#include "secondary/shadow_samples.h"
+#include "secondary/shadow_source.h"
+
+namespace edgegrad {
+
+namespace {
+
+// A border on a receiver, in world coordinates.
+template <class T>
+struct BorderOnFace {
+    const SceneView<T>& scene;
+    const ShadowPoint& point;
+    ShadowBorder border;
+    Vec3 g, y;
+
+    BorderOnFace(const SceneView<T>& scene_, const LightParts& light, const ShadowPoint& point_)
+        : scene(scene_), point(point_) {
+        border = ShadowBorder::of(point, light.infinite, point.light, [&](int32_t i) {
+            const double* v = scene.verts + 3 * int64_t(i);
+            return Vec3{v[0], v[1], v[2]};
+        });
+        Vec3 v[3];
+        for (int i = 0; i < 3; ++i) v[i] = corner(scene, point.face, i), y += point.on[i] * v[i];
+        g = unit(cross(v[1] - v[0], v[2] - v[0]));
+    }
+    // Area for each unit of F and t.
+    double scale() const { return border.S / std::fabs(dot(g, border.d)); }
+
+    void append_to(CurveRecords& records, double weight) const {
+        const double factor = (point.side < 0 ? 1 : -1) * weight * scale();
+        if (!std::isfinite(factor)) return;
+        const int64_t sample = records.size();
+        append(records.x, {0.0, 0.0});
+        for (int k = 0; k < CurveRecords::surfaces; ++k) {
+            const bool lit = k == 0;
+            records.face.push_back(lit ? point.face : -2), records.factor.push_back(lit ? factor : 0);
+            append(records.b, {point.on.u, point.on.v});
+        }
+        const auto add_vertex = [&](int32_t vertex, double by) {
+            records.row_of.push_back(sample), records.vertex.push_back(vertex);
+            append(records.by_q, {by * border.N.x, by * border.N.y, by * border.N.z});
+        };
+        for (int i = 0; i < 3; ++i) add_vertex(scene.faces[3 * int64_t(point.face) + i], point.on[i]);
+        const Occluder& caster = point.caster;
+        for (int i = 0; i < caster.count; ++i) add_vertex(caster.vertex[i], -border.by_caster[i]);
+        caster.append_alpha_edge(border.by_alpha_edge, sample, records);
+        const Vec3 by_light = -border.by_light * border.N;
+        records.light.push_back(point.part), append(records.light_uv, {point.uv.x, point.uv.y});
+        append(records.by_light, {by_light.x, by_light.y, by_light.z});
+    }
+};
+
+}  // namespace
+
+template <class T>
+void add_indirect_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
+                          int64_t samples, GradientSink& to) {
+    const ShadowCasters<T> edges(view, casters, light, samples);
+    if (edges.empty() || samples == 0) return;
+    std::vector<ShadowStatistics> of_interval(edges.intervals());
+    const uint64_t pilot_seed = hash(view.options.seed, 15, gradient_stream);
+    edges.draw_pilots(pilot_seed, [&](auto ask) {
+        ShadowChunk chunk(edges.scene(), mix(pilot_seed), [&](const ShadowPoint& point, double weight) {
+            const BorderOnFace<T> on(view.scene, light, point);
+            const double cosine = std::fabs(dot(on.g, on.border.d)) / length(on.border.d);
+            const double value = on.border.swept(weight * on.scale(), point.caster) * cosine *
+                                 light.towards(point.part, point.light, on.y);
+            if (std::isfinite(value)) of_interval[point.segment].squares += value * value;
+        });
+        ask(chunk);
+    });
+    Array<double> density = density_of(of_interval);
+    const int64_t samples_of_place = light.extended ? mirrored : 1,
+                  places = (samples + samples_of_place - 1) / samples_of_place;
+    const Places drawn(edges.scene().pieces, density, places, light.extended,
+                       hash(view.options.seed, 16, gradient_stream), view.team);
+    double seconds[2] = {};
+    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
+        ShadowChunk chunk(edges.scene(), hash(view.options.seed, 14, gradient_stream),
+                          [&](const ShadowPoint& point, double weight) {
+                              BorderOnFace<T>(view.scene, light, point).append_to(grad.records.curves, weight);
+                          });
+        Places place(drawn);
+        for (int64_t i = first; i < last; ++i) {
+            const auto [position, interval, weight] = place(i);
+            chunk.add(i, position, interval, weight, samples_of_place);
+        }
+        chunk.cast();
+    });
+}
+
+template void add_indirect_shadows(const BackwardView<float>&, const SceneView<float>&, const LightParts&, int64_t,
+                                   GradientSink&);
+template void add_indirect_shadows(const BackwardView<double>&, const SceneView<double>&, const LightParts&, int64_t,
+                                   GradientSink&);
+
+}  // namespace edgegrad

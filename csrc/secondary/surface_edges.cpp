@@ -1,0 +1,284 @@
+// Samples on the curves at which a surface begins to send light.
+//
+// Points of paths stay at the barycentrics of their faces. So of a face A that a face B passes through, one part is
+// before B and the other behind it, and both change as B moves. With unit normals n, the plane of B through b,
+// barycentrics α and β of a point of the line on A and B, and Φ the light that paths by way of a point of A bring to
+// the image,
+//
+//     δI = ∫ [Φ(F > 0) − Φ(F < 0)] δF / sin θ dℓ,   F(y) = n_B · (y − b),   δF = n_B · (Σ α_i δv_i − Σ β_i δw_i)
+//
+// with θ the angle between the planes, for |∇F| on A is its sine; and the same of B. A face that is alpha-tested is
+// there where f > 0 (occluder.h): along its alpha edge dℓ / |∇f| = |κ M| dt with M the cross product of the sides of
+// the face, and f is moved by texture coordinates and alpha alone.
+//
+// The camera sees some of these points, and for them there are curves in the image. Of Φ this is what goes on to other
+// surfaces: a direction is drawn by the cosine, what it meets gets light from a point that lies a little next to the
+// curve, and from there light goes to the camera (light_tracing.h). Each side of a face counts, and each of its two
+// parts.
+
+#include "secondary/surface_edges.h"
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "core/systematic.h"
+#include "rays/trace.h"
+#include "scene/intersections.h"
+#include "secondary/line_ends.h"
+#include "secondary/occluder.h"
+#include "shading/lit/bsdf_sampling.h"
+
+namespace edgegrad {
+
+namespace {
+
+constexpr int64_t fewest_places = 256, places_of_samples = 4;
+// How far next to the curve light is asked for, in lengths of its piece, and in roundings of the input.
+constexpr double little = 1e-5, roundings = 64;
+
+// One part of a face next to a place of a curve.
+struct Part {
+    int32_t face;
+    int of;         // which of the faces that meet there
+    Vec3 across;    // unit vector on the face, from the curve into the part
+    double factor;  // dℓ / |∇F|, negative where F < 0
+};
+
+// A place of a curve, in the world, and the parts of faces that end there.
+struct Place {
+    struct Row {
+        int of;
+        int32_t vertex;
+        Vec3 by;
+    };
+    Vec3 p;
+    std::vector<Part> parts;
+    std::vector<Row> rows;  // how F moves with vertices, of each face
+    Occluder alpha_edge;    // and f with the texture
+
+    void append_motion(const Part& part, int64_t sample, CurveRecords& records) const {
+        for (const Row& row : rows) {
+            if (row.of != part.of) continue;
+            records.row_of.push_back(sample), records.vertex.push_back(row.vertex);
+            append(records.by_q, {row.by.x, row.by.y, row.by.z});
+        }
+        alpha_edge.append_alpha_edge(1, sample, records);
+    }
+};
+
+// The curves laid end to end by their lengths.
+template <class T>
+class BorderPieces {
+   public:
+    BorderPieces(const BackwardView<T>& view, const SceneView<T>& casters, MovingEdges moving)
+        : view_(view), casters_(casters) {
+        const uint64_t seed = view.options.seed;
+        if (moving.crossings) {
+            const Intersections& found = view.geometry.intersections();
+            if (found.are_drawn()) drawn_ = draw_all(found, hash(seed, 20, gradient_stream));
+            crossings_ = found.are_drawn() ? &drawn_ : &found.all();
+        }
+        if (moving.alpha_edges)
+            alpha_edges_ = AlphaEdgeFinder<T>(casters).find(hash(seed, 13, gradient_stream), view.team);
+    }
+
+    // How many samples each piece gets, relative to others.
+    Array<double> measure() const {
+        const auto n = int64_t(crossings_->size() + alpha_edges_.size());
+        Array<double> out(n);
+        for (int64_t k = 0; k < n; ++k) {
+            const auto [a, b, stands_for] = piece(k);
+            out[k] = stands_for * length(b - a);
+        }
+        return out;
+    }
+
+    // The place t of a piece. False where nothing ends.
+    bool set(int64_t k, double t, Place& out) const {
+        out.parts.clear(), out.alpha_edge = {};
+        if (k < int64_t(crossings_->size())) return set_crossing((*crossings_)[k], t, out);
+        return set_alpha_edge(alpha_edges_[k - int64_t(crossings_->size())], t, out);
+    }
+
+    // Of a place in the plane of a face.
+    Barycentrics barycentrics(int32_t face, Vec3 p) const {
+        const Vec3 q = corner(view_.scene, face, 0), e1 = corner(view_.scene, face, 1) - q,
+                   e2 = corner(view_.scene, face, 2) - q, m = cross(e1, e2), there = p - q;
+        const double scale = 1 / dot(m, m);
+        return {dot(cross(there, e2), m) * scale, dot(cross(e1, there), m) * scale};
+    }
+    Vec3 normal(int32_t face) const {
+        const Vec3 q = corner(view_.scene, face, 0);
+        return cross(corner(view_.scene, face, 1) - q, corner(view_.scene, face, 2) - q);
+    }
+    // How far next to it light is asked for.
+    double aside(int64_t k, int32_t face) const {
+        double size = 0;
+        for (int i = 0; i < 3; ++i) {
+            const Vec3 v = corner(view_.scene, face, i);
+            size = std::max({size, std::fabs(v.x), std::fabs(v.y), std::fabs(v.z)});
+        }
+        const auto [a, b, stands_for] = piece(k);
+        return little * length(b - a) +
+               roundings * view_.scene.spacing->of(view_.scene.faces[3 * int64_t(face)]) * size;
+    }
+
+   private:
+    struct Piece {
+        Vec3 a, b;
+        double stands_for;
+    };
+    Piece piece(int64_t k) const {
+        if (k < int64_t(crossings_->size())) {
+            const Intersection& o = (*crossings_)[k];
+            return {o.a, o.b, o.weight};
+        }
+        const AlphaEdge& alpha_edge = alpha_edges_[k - int64_t(crossings_->size())];
+        return {place(alpha_edge.face, alpha_edge.begin), place(alpha_edge.face, alpha_edge.end), alpha_edge.share};
+    }
+    Array<Intersection> draw_all(const Intersections& found, uint64_t seed) const {
+        Array<float> share(view_.scene.n_faces);
+        std::fill(share.begin(), share.end(), 1.0f);
+        const PlacedFaces faces{view_.scene.faces, view_.scene.n_faces, view_.scene.verts, *view_.scene.spacing,
+                                view_.geometry.topology()};
+        return found.drawn(faces, share, seed, view_.team);
+    }
+    Vec3 place(int32_t face, Barycentrics b) const {
+        Vec3 out;
+        for (int i = 0; i < 3; ++i) out += b[i] * corner(view_.scene, face, i);
+        return out;
+    }
+    bool set_crossing(const Intersection& o, double t, Place& out) const {
+        out.p = (1 - t) * o.a + t * o.b;
+        Vec3 n[2];
+        Barycentrics at[2];
+        for (int k = 0; k < 2; ++k) {
+            n[k] = unit(normal(o.face[k])), at[k] = inside(barycentrics(o.face[k], out.p));
+            if (!shows(casters_, o.face[k], at[k])) return false;
+        }
+        const double sine = length(cross(n[0], n[1])), factor = o.weight * length(o.b - o.a) / sine;
+        if (!(sine > flat)) return false;
+        out.rows.clear();
+        for (int own = 0; own < 2; ++own) {
+            const Vec3 other = n[1 - own], across = (1 / sine) * (other - dot(other, n[own]) * n[own]);
+            for (const double side : {1.0, -1.0}) out.parts.push_back({o.face[own], own, side * across, side * factor});
+            for (int k = 0; k < 2; ++k)
+                for (int i = 0; i < 3; ++i)
+                    out.rows.push_back(
+                        {own, view_.scene.faces[3 * int64_t(o.face[k]) + i], ((k == own ? 1 : -1) * at[k][i]) * other});
+        }
+        return true;
+    }
+    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, Place& out) const {
+        AlphaEdgePoint there{};
+        if (!AlphaEdgeFinder<T>(casters_).place(alpha_edge, t, there)) return false;
+        const Vec3 q = corner(view_.scene, alpha_edge.face, 0), e1 = corner(view_.scene, alpha_edge.face, 1) - q,
+                   e2 = corner(view_.scene, alpha_edge.face, 2) - q, M = cross(e1, e2);
+        const Vec3 gradient = there.slope.u * cross(e2, M) + there.slope.v * cross(M, e1);  // of f, times |M|²
+        out.p = place(alpha_edge.face, there.b), out.rows.clear(),
+        out.alpha_edge = occluder_of(casters_, alpha_edge, there);
+        out.parts.push_back(
+            {alpha_edge.face, 0, unit(gradient), alpha_edge.share * std::fabs(there.kappa) * length(M)});
+        return true;
+    }
+
+    static constexpr double flat = 1e-9;  // radians between planes that are taken for one
+
+    const BackwardView<T>& view_;
+    const SceneView<T>& casters_;
+    const Array<Intersection> none_{0};
+    Array<Intersection> drawn_{0};
+    const Array<Intersection>* crossings_ = &none_;
+    std::vector<AlphaEdge> alpha_edges_;
+};
+
+// Rays from both sides of all parts of faces next to a place, and what gets light along them.
+template <class T>
+class LeavingRays {
+   public:
+    LeavingRays(const LineLight<T>& light, const BorderPieces<T>& pieces) : light_(light), pieces_(pieces) {
+        for (const Light& light : light.lit.lit.lights) eps_ = std::max(eps_, light.eps);
+    }
+
+    void add(int64_t piece, double t, Vec2 u, double weight, CurveRecords& records) {
+        if (!pieces_.set(piece, t, place_)) return;
+        part_.clear(), face_.clear(), b_.clear(), directions_.clear(), contact_.clear();
+        for (const Part& part : place_.parts) {
+            const Vec3 asked = place_.p + pieces_.aside(piece, part.face) * part.across;
+            const Barycentrics b = pieces_.barycentrics(part.face, asked);
+            // Where the face ends at the curve, another one goes on there.
+            if (std::min({b.u, b.v, 1 - b.u - b.v}) < 0 || !light_.lit.lit.mesh_of(part.face).has_material) continue;
+            const Vec3 n = unit(pieces_.normal(part.face));
+            for (const double side : {1.0, -1.0}) {
+                const Vec3 w = draw_by_cosine(side * n, u);
+                part_.push_back(&part), face_.push_back(part.face);
+                append(b_, {b.u, b.v}), append(directions_, {w.x, w.y, w.z});
+                contact_.push_back(16 * eps_ * std::max({std::fabs(asked.x), std::fabs(asked.y), std::fabs(asked.z)}));
+            }
+        }
+        const auto n = int64_t(part_.size());
+        hit_.resize(n), hit_b_.resize(2 * n);
+        depart(light_.casters, light_.view.geometry.caster(),
+               {face_.data(), b_.data(), directions_.data(), contact_.data(), n}, hit_.data(), hit_b_.data());
+        for (int64_t i = 0; i < n; ++i)
+            if (hit_[i] >= 0) append_to(records, i, weight);
+    }
+
+   private:
+    void append_to(CurveRecords& records, int64_t i, double weight) const {
+        const Part& part = *part_[i];
+        const int64_t sample = records.size();
+        append(records.x, {0.0, 0.0});
+        append(records.face, {hit_[i], face_[i], -2});
+        append(records.b, {hit_b_[2 * i], hit_b_[2 * i + 1], b_[2 * i], b_[2 * i + 1], 0.0, 0.0});
+        append(records.factor, {M_PI * weight * part.factor, 0.0, 0.0});  // the cosine over its density
+        place_.append_motion(part, sample, records);
+    }
+
+    const LineLight<T>& light_;
+    const BorderPieces<T>& pieces_;
+    double eps_ = 0;
+    Place place_;
+    std::vector<const Part*> part_;
+    std::vector<int32_t> face_, hit_;
+    std::vector<double> b_, directions_, contact_, hit_b_;
+};
+
+}  // namespace
+
+template <class T>
+void add_surface_edges(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& lit,
+                       MovingEdges moving, int64_t samples, GradientSink& to, SecondaryEdgeSamples& out) {
+    const int64_t all =
+        samples >= 0 ? samples : most_secondary_edge_samples(view.camera.width, view.camera.height, view.image.spp);
+    if (all == 0) return;
+    const int64_t places = std::max(all / places_of_samples, fewest_places);
+    const LineLight<T> light(view, casters, lit);
+    const BorderPieces<T> pieces(view, casters, moving);
+    Array<double> measure = pieces.measure();
+    Systematic drawn(measure, view.team);
+    if (!(drawn.total() > 0)) return;
+    drawn.draw(places, to_unit(hash(view.options.seed, 21, gradient_stream)));
+    double seconds[2] = {};
+    const size_t before = to.records->curves.size();
+    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
+        const ShiftedSequence sequence(hash(view.options.seed, 22, gradient_stream));
+        LeavingRays rays(light, pieces);
+        int64_t k = -1;
+        for (int64_t i = first; i < last; ++i) {
+            const double position = drawn.position(i);
+            k = k < 0 ? drawn.primitive(position) : drawn.primitive(position, k);
+            const double t = std::clamp((position - drawn.begin_of(k)) / drawn.measure_of(k), 0.0, 1.0);
+            rays.add(k, t, sequence(uint64_t(i)), drawn.weight(k), grad.records.curves);
+        }
+    });
+    light_reflectors(light, to.records->curves, before, 23, out);
+}
+
+template void add_surface_edges(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, MovingEdges,
+                                int64_t, GradientSink&, SecondaryEdgeSamples&);
+template void add_surface_edges(const BackwardView<double>&, const SceneView<double>&, const LitPaths&, MovingEdges,
+                                int64_t, GradientSink&, SecondaryEdgeSamples&);
+
+}  // namespace edgegrad

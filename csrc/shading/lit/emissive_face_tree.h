@@ -1,0 +1,200 @@
+// The faces of a mesh that emits, in a tree of boxes: which of them lie in a direction. In double and ray by ray, for
+// each point of a surface asks for a few directions of its own, and what it finds decides about pdfs.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <map>
+#include <vector>
+
+#include "core/math.h"
+
+namespace edgegrad {
+
+class EmissiveFaceTree {
+   public:
+    static constexpr int64_t most_faces = 1 << 16;  // of which a tree is made: it is made anew when they move
+
+    // Of faces (F, 3) with vertices (V, 3), world units.
+    EmissiveFaceTree(const double* verts, int64_t n_verts, const int32_t* faces, int64_t n_faces) {
+        const auto vertex = [&](int32_t v) { return Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]}; };
+        Vec3 low = vertex(faces[0]), high = low;
+        for (int64_t f = 0; f < n_faces; ++f) {
+            const Vec3 q0 = vertex(faces[3 * f]), q1 = vertex(faces[3 * f + 1]), q2 = vertex(faces[3 * f + 2]);
+            triangles_.push_back({q0, q1 - q0, q2 - q0, int32_t(f)});
+            for (const Vec3 q : {q0, q1, q2}) low = least(low, q), high = most(high, q);
+        }
+        center_ = 0.5 * (low + high);
+        for (const Triangle& t : triangles_) {
+            for (int i = 0; i < 3; ++i) radius_ = std::max(radius_, length(t.corner(i) - center_));
+            area_ += 0.5 * length(cross(t.e1, t.e2));
+        }
+        size_ = std::max({std::fabs(low.x), std::fabs(low.y), std::fabs(low.z), std::fabs(high.x), std::fabs(high.y),
+                          std::fabs(high.z)});
+        find_shape(verts, n_verts, faces);
+        nodes_.reserve(2 * triangles_.size() / leaf + 2);
+        nodes_.emplace_back();
+        split(0, 0, int32_t(n_faces));
+    }
+
+    int64_t n_faces() const { return int64_t(triangles_.size()); }
+    // A ball around all faces, and the largest coordinate.
+    Vec3 center() const { return center_; }
+    double radius() const { return radius_; }
+    double size() const { return size_; }
+    double area() const { return area_; }
+    // Whether all faces lie in one plane; whether they are the border of a convex body, and look outwards.
+    bool is_flat() const { return flat_; }
+    bool is_convex() const { return convex_; }
+    // Whether most lines through the ball meet the faces: of lines that meet a convex body the share that meets one
+    // inside of it is that of their surfaces (Crofton).
+    bool fills_ball() const { return convex_ && area_ >= least_filled * 4 * M_PI * radius_ * radius_; }
+
+    // Where origin + t direction meets a face.
+    struct Crossing {
+        int32_t face;
+        double u, v, t;
+    };
+    // Calls found(crossing) for those with t in (start, end), near ones about first. It returns a new `end`.
+    template <class Found>
+    void each_crossing(Vec3 origin, Vec3 direction, double start, double end, Found found) const {
+        const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
+        int32_t waiting[64], n = 0;  // a tree halves its faces at each level
+        waiting[n++] = 0;
+        while (n) {
+            const Node& node = nodes_[waiting[--n]];
+            if (!node.meets(origin, inverse, start, end)) continue;
+            if (!node.count) {
+                const int forwards = along(direction, node.axis) >= 0;
+                waiting[n++] = node.first + forwards, waiting[n++] = node.first + 1 - forwards;
+                continue;
+            }
+            for (int32_t k = node.first; k < node.first + node.count; ++k) {
+                Crossing c;
+                if (triangles_[k].meets(origin, direction, c) && c.t > start && c.t < end) end = found(c);
+            }
+        }
+    }
+
+   private:
+    static constexpr int leaf = 4;
+    static constexpr double least_filled = 0.5;
+    // Of the size: how far from a plane floats may put what lies in it.
+    static constexpr double flatness = 1e-6;
+
+    static Vec3 least(Vec3 a, Vec3 b) { return {std::min(a.x, b.x), std::min(a.y, b.y), std::min(a.z, b.z)}; }
+    static Vec3 most(Vec3 a, Vec3 b) { return {std::max(a.x, b.x), std::max(a.y, b.y), std::max(a.z, b.z)}; }
+    static double along(Vec3 v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+
+    struct Triangle {
+        Vec3 q0, e1, e2;
+        int32_t face;
+
+        Vec3 corner(int i) const { return i == 0 ? q0 : q0 + (i == 1 ? e1 : e2); }
+        // Möller and Trumbore 1997; a rounding next to the border is on it, for the neighbour may be missed as well.
+        bool meets(Vec3 origin, Vec3 direction, Crossing& c) const {
+            constexpr double rounding = 1e-12;
+            const Vec3 p = cross(direction, e2), s = origin - q0;
+            const double scale = 1 / dot(e1, p);
+            const double u = dot(s, p) * scale;
+            if (!(u >= -rounding && u <= 1 + rounding)) return false;
+            const Vec3 q = cross(s, e1);
+            const double v = dot(direction, q) * scale;
+            if (!(v >= -rounding && u + v <= 1 + rounding)) return false;
+            c = {face, std::clamp(u, 0.0, 1.0), std::max(v, 0.0), dot(e2, q) * scale};
+            c.v = std::min(c.v, 1 - c.u);
+            return std::isfinite(c.t);
+        }
+    };
+    struct Node {
+        Vec3 low, high;
+        int32_t first = 0, count = 0;  // triangles of a leaf; of others the first of two nodes, and none
+        int axis = 0;                  // along which the two follow one another
+
+        // Kay and Kajiya 1986. A ray in the plane of a side gives no number.
+        bool meets(Vec3 origin, Vec3 inverse, double start, double end) const {
+            for (int axis = 0; axis < 3; ++axis) {
+                const double i = along(inverse, axis), o = along(origin, axis);
+                const double a = (along(low, axis) - o) * i, b = (along(high, axis) - o) * i;
+                if (std::isnan(a) || std::isnan(b)) continue;
+                start = std::max(start, std::min(a, b)), end = std::min(end, std::max(a, b));
+            }
+            // Rounded by a few spacings.
+            return start <= end + 1e-14 * (std::fabs(start) + std::fabs(end));
+        }
+    };
+
+    void split(int32_t node, int32_t first, int32_t last) {
+        Vec3 low = triangles_[first].q0, high = low, low_middle, high_middle;
+        for (int32_t k = first; k < last; ++k) {
+            for (int i = 0; i < 3; ++i)
+                low = least(low, triangles_[k].corner(i)), high = most(high, triangles_[k].corner(i));
+            const Vec3 m = middle(triangles_[k]);
+            low_middle = k == first ? m : least(low_middle, m), high_middle = k == first ? m : most(high_middle, m);
+        }
+        nodes_[node].low = low, nodes_[node].high = high;
+        if (last - first <= leaf) return void((nodes_[node].first = first, nodes_[node].count = last - first));
+        const Vec3 extent = high_middle - low_middle;
+        const int axis = extent.x >= extent.y && extent.x >= extent.z ? 0 : extent.y >= extent.z ? 1 : 2;
+        const int32_t half = (first + last) / 2;
+        std::nth_element(triangles_.begin() + first, triangles_.begin() + half, triangles_.begin() + last,
+                         [&](const Triangle& a, const Triangle& b) {
+                             const double x = along(middle(a), axis), y = along(middle(b), axis);
+                             return x != y ? x < y : a.face < b.face;
+                         });
+        const int32_t child = int32_t(nodes_.size());
+        nodes_[node].first = child, nodes_[node].axis = axis;
+        nodes_.emplace_back(), nodes_.emplace_back();
+        split(child, first, half), split(child + 1, half, last);
+    }
+    static Vec3 middle(const Triangle& t) { return t.q0 + (1.0 / 3) * (t.e1 + t.e2); }
+
+    void find_shape(const double* verts, int64_t n_verts, const int32_t* faces) {
+        const double near = flatness * radius_;
+        // Whether no vertex lies above a face.
+        const auto is_side = [&](const Triangle& t, double sign) {
+            const Vec3 n = sign * cross(t.e1, t.e2);
+            const double most = dot(n, t.q0) + near * length(n);
+            for (int64_t v = 0; v < n_verts; ++v)
+                if (!(n.x * verts[3 * v] + n.y * verts[3 * v + 1] + n.z * verts[3 * v + 2] <= most)) return false;
+            return true;
+        };
+        const Triangle* largest = &triangles_[0];
+        const auto area = [](const Triangle& t) { return length(cross(t.e1, t.e2)); };
+        for (const Triangle& t : triangles_)
+            if (area(t) > area(*largest)) largest = &t;
+        flat_ = is_side(*largest, 1) && is_side(*largest, -1);
+        constexpr int64_t few = 1 << 22;  // pairs
+        convex_ = !flat_ && n_verts * int64_t(triangles_.size()) <= few &&
+                  std::all_of(triangles_.begin(), triangles_.end(), [&](const Triangle& t) { return is_side(t, 1); }) &&
+                  is_closed(verts, faces);
+    }
+
+    // Whether each edge is run along as often in one direction as in the other; vertices in one place are one.
+    bool is_closed(const double* verts, const int32_t* faces) const {
+        std::map<std::array<double, 3>, int> number;
+        std::map<std::array<int, 2>, int> runs;
+        for (size_t f = 0; f < triangles_.size(); ++f) {
+            int v[3];
+            for (int i = 0; i < 3; ++i) {
+                const double* p = verts + 3 * int64_t(faces[3 * f + i]);
+                v[i] = number.try_emplace({p[0], p[1], p[2]}, int(number.size())).first->second;
+            }
+            for (int i = 0; i < 3; ++i) {
+                const int a = v[i], b = v[(i + 1) % 3];
+                if (a != b) runs[{std::min(a, b), std::max(a, b)}] += a < b ? 1 : -1;
+            }
+        }
+        return std::all_of(runs.begin(), runs.end(), [](const auto& run) { return run.second == 0; });
+    }
+
+    std::vector<Triangle> triangles_;
+    std::vector<Node> nodes_;
+    Vec3 center_;
+    double radius_ = 0, size_ = 0, area_ = 0;
+    bool flat_ = false, convex_ = false;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,129 @@
+#include "texture/pyramid.h"
+
+#include <algorithm>
+#include <utility>
+#include <vector>
+
+#include "core/channels.h"
+
+namespace edgegrad {
+
+namespace {
+
+struct Window {
+    int64_t first, end;
+    double share;  // of one of them
+};
+// Which of `of` texels in a row each of `count` meets that span the same: of the finer ones those that it is a mean of,
+// and of the coarser ones those that it goes into.
+std::vector<Window> windows(int64_t count, int64_t of) {
+    std::vector<Window> out;
+    for (int64_t i = 0; i < count; ++i) {
+        const int64_t first = i * of / count, end = ((i + 1) * of + count - 1) / count;
+        out.push_back({first, end, 1.0 / double(end - first)});
+    }
+    return out;
+}
+
+// How one level lies on the next finer one.
+struct Halving {
+    TexelGrid fine, coarse;
+    std::vector<Window> down, across;       // of the coarser rows and columns
+    std::vector<Window> of_row, of_column;  // of the finer ones
+
+    explicit Halving(const TexelGrid& fine_)
+        : fine(fine_),
+          coarse(fine_.halved()),
+          down(windows(coarse.height, fine.height)),
+          across(windows(coarse.width, fine.width)),
+          of_row(windows(fine.height, coarse.height)),
+          of_column(windows(fine.width, coarse.width)) {}
+    double share(int64_t row, int64_t column) const { return down[row].share * across[column].share; }
+};
+
+// Row y of the means, and its _vjp: what row y of the finer level gets. Pointers to first texels; N channels, 0: any.
+template <int N, class T>
+void mean_row(const Halving& at, int channels, int64_t y, const T* fine, T* to) {
+    const int C = N ? N : channels;
+    for (int64_t x = 0; x < at.coarse.width; ++x, to += C) {
+        for (int c = 0; c < C; ++c) to[c] = 0;
+        for (int64_t j = at.down[y].first; j < at.down[y].end; ++j)
+            for (int64_t i = at.across[x].first; i < at.across[x].end; ++i)
+                for (int c = 0; c < C; ++c) to[c] += fine[(j * at.fine.width + i) * C + c];
+        const T share = T(at.share(y, x));
+        for (int c = 0; c < C; ++c) to[c] *= share;
+    }
+}
+template <int N, class T>
+void mean_row_vjp(const Halving& at, int channels, int64_t y, const T* coarse_bar, T* to) {
+    const int C = N ? N : channels;
+    for (int64_t x = 0; x < at.fine.width; ++x, to += C)
+        for (int64_t j = at.of_row[y].first; j < at.of_row[y].end; ++j)
+            for (int64_t i = at.of_column[x].first; i < at.of_column[x].end; ++i) {
+                const T share = T(at.share(j, i));
+                for (int c = 0; c < C; ++c) to[c] += share * coarse_bar[(j * at.coarse.width + i) * C + c];
+            }
+}
+
+}  // namespace
+
+int PyramidShape::levels() const {
+    int n = 1;
+    for (TexelGrid at = image; at.height > 1 || at.width > 1; at = at.halved()) ++n;
+    return n;
+}
+
+int64_t PyramidShape::texels() const {
+    TexelGrid at = image;
+    for (int left = levels() - 1; left > 0; --left) at = at.halved();
+    return at.first + 1;
+}
+
+template <class T>
+Array<T> pyramid(const PyramidShape& shape, const T* image, Team& team) {
+    const int C = shape.channels;
+    Array<T> out(shape.texels() * C);
+    const int64_t row = shape.image.width * C;
+    team.each(shape.image.height, [&](int64_t y) { std::copy_n(image + y * row, row, out.data() + y * row); });
+    TexelGrid last = shape.image;
+    for (int left = shape.levels() - 1; left > 0; --left) {
+        const Halving at(last);
+        const T* fine = out.data() + at.fine.first * C;
+        T* coarse = out.data() + at.coarse.first * C;
+        team.each(at.coarse.height, [&](int64_t y) {
+            dispatch_channels(C, false,
+                              [&]<int N>() { mean_row<N>(at, C, y, fine, coarse + y * at.coarse.width * C); });
+        });
+        last = at.coarse;
+    }
+    return out;
+}
+
+template <class T>
+Array<T> pyramid_vjp(const PyramidShape& shape, const T* bar, Team& team) {
+    const int C = shape.channels;
+    std::vector<Halving> all;
+    TexelGrid last = shape.image;
+    for (int left = shape.levels() - 1; left > 0; --left) all.emplace_back(last), last = all.back().coarse;
+    Array<T> found(C);
+    std::copy_n(bar + last.first * C, C, found.data());
+    for (; !all.empty(); all.pop_back()) {
+        const Halving& at = all.back();
+        const int64_t row = at.fine.width * C;
+        Array<T> own(at.fine.height * row);
+        team.each(at.fine.height, [&](int64_t y) {
+            T* to = own.data() + y * row;
+            std::copy_n(bar + at.fine.first * C + y * row, row, to);
+            dispatch_channels(C, false, [&]<int N>() { mean_row_vjp<N>(at, C, y, found.data(), to); });
+        });
+        found = std::move(own);
+    }
+    return found;
+}
+
+template Array<float> pyramid(const PyramidShape&, const float*, Team&);
+template Array<double> pyramid(const PyramidShape&, const double*, Team&);
+template Array<float> pyramid_vjp(const PyramidShape&, const float*, Team&);
+template Array<double> pyramid_vjp(const PyramidShape&, const double*, Team&);
+
+}  // namespace edgegrad
