@@ -135,7 +135,9 @@ def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.STARTS", 24)
     case = photo_cases.rendered("pebble", pebble(), [photo_cases.clutter(k) for k in range(2)], "covered", 4)
     task = PoseTask.of(case.mesh, case.picture, case.camera, None, None, None, Lens(), 1.0, Names())
-    start = pose_from_matrix("init", case.beside(case.truth, 15.0, 0.05 * case.size, np.random.default_rng(4)).matrix)
+    start = pose_from_matrix(
+        "init", case.perturbed(case.truth, 15.0, 0.05 * case.size, np.random.default_rng(4)).matrix
+    )
     assert comparable(task, start) and not comparable(task, start._replace(scale=2.0 * start.scale))
     R, t = case.truth.R, case.truth.t
     pose, side = nearby(task, start, 0)[0]

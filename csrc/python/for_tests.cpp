@@ -1,5 +1,6 @@
-// What only tests and benchmarks call: small functions with their _vjp and the parts of topology and sampling, each to
-// be compared with its definition; samples of one pass without the rest; the yardstick of the image's rays.
+// The module of what only tests and benchmarks call: small functions with their _vjp and the parts of topology and
+// sampling, each to be compared with its definition; samples of one pass without the rest; the yardstick of the image's
+// rays.
 
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
@@ -25,6 +26,7 @@
 #include "forward/forward.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
+#include "rays/embree.h"
 #include "scene/intersections.h"
 #include "scene/topology.h"
 #include "texture/texture.h"
@@ -142,8 +144,10 @@ void bind_scene_functions(nb::module_& m) {
 
 }  // namespace
 
-void bind_for_tests(nb::module_& m) {
-    nb::module_ p = m.def_submodule("for_tests", "What only tests and benchmarks call.");
+NB_MODULE(_core_tests, p) {
+    p.doc() = "What only tests and benchmarks call. It holds the kernel once more, but its classes are those of _core.";
+    nb::set_leak_warnings(false);
+    p.def("open_embree", &open_embree, "path"_a, "options"_a, nb::call_guard<Unlocked>());
     bind_scene_functions<float>(p);
     bind_scene_functions<double>(p);
     bind_paths_for_tests(p);

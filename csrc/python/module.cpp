@@ -34,7 +34,6 @@ template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene);
 template <class T>
 void bind_scene_secondary_edges(nb::class_<SceneArrays<T>>& scene);
-void bind_for_tests(nb::module_& m);  // for_tests.cpp
 
 namespace {
 
@@ -280,7 +279,6 @@ NB_MODULE(_core, m) {
     bind_scene<float>(m, "SceneFloat", "HitsFloat");
     bind_scene<double>(m, "SceneDouble", "HitsDouble");
     bind_memory(m);
-    bind_for_tests(m);
 }
 
 }  // namespace edgegrad
