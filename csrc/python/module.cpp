@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "backward/backward.h"
+#include "core/openmp_runtime.h"
 #include "core/stopwatch.h"
 #include "forward/centers.h"
 #include "python/arrays.h"
@@ -235,7 +236,7 @@ NB_MODULE(_core, m) {
         "after_fork",
         [](bool child) {
             if (child) forget_other_callers();
-            after_fork(child);
+            after_fork();
         },
         "child"_a);
     nb::class_<Camera>(m, "Camera")

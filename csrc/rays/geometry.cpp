@@ -5,6 +5,8 @@
 #include <list>
 #include <mutex>
 
+#include "core/openmp_runtime.h"
+
 namespace edgegrad {
 
 Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
@@ -135,12 +137,11 @@ void before_fork() {
     embree_mutex.lock();
     // Embree's threads are not missed in the child, where the one that builds can do all of the work.
     let_embree_sleep();
-    before_fork_of_workers();
+    end_waiting_threads();
 }
 
-void after_fork(bool child) {
+void after_fork() {
     if (--forks) return;
-    after_fork_of_workers(child);
     embree_mutex.unlock();
     mutex.unlock();
 }

@@ -65,6 +65,6 @@ void clear_geometry();
 // To be called around fork(), so that the child can render. Only the thread that forks lives on there. Before, wait
 // until no thread changes kept geometry or builds a ray structure, since the child would find their locks taken.
 void before_fork();
-void after_fork(bool child);  // in the parent and in the child
+void after_fork();  // in the parent and in the child
 
 }  // namespace edgegrad
