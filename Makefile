@@ -8,7 +8,7 @@ SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -nam
 # Tests start Python some hundred times, and each would compile all that it imports where it may not keep it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-browser mutants coverage sanitize sanitize-all sanitize-threads bench lint docs wheel format
+.PHONY: demo test test-slow test-browser mutants coverage sanitize sanitize-all sanitize-threads bench report lint docs wheel format
 .PHONY: clean
 .DELETE_ON_ERROR:
 
@@ -46,12 +46,12 @@ mutants: $(VENV)/.ready
 SANITIZE := build/sanitize
 # Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick; without tests marked
 # `unwatched`.
-WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows rim wide_fisheye aovs lit_kernel glossy_light derivative_points shadow_rims bounce_borders forward_mode samples messages raster raster_texture raster_antialias
+WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows lens_boundary wide_fisheye aovs lit_kernel glossy_light derivative_points shadow_alpha_edges secondary_edges forward_mode samples messages raster raster_texture raster_antialias
 WATCHED_TESTS := $(WATCHED:%=tests/test_%.py)
 CHOSEN := not slow and not unwatched
 # Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for
 # longer; tests of load measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
-WITHOUT := 3mf_files bad_files browser cli derivatives dialects distributed docs fit fit_faults late_imports mesh_files mesh_file_faults gltf_arrays gltf_files images saved_cameras load notebooks odd_files odd_scenes oracles polygons report viewer world_coordinates
+WITHOUT := 3mf_files browser cli derivatives distributed docs fit fit_faults late_imports format_variants hostile_files malformed_files mesh_files unusual_files gltf_arrays gltf_files images saved_cameras load notebooks oracles polygons error_time viewer world_coordinates
 sanitize-all: WATCHED_TESTS := $(WITHOUT:%=--ignore=tests/test_%.py)
 sanitize-all: CHOSEN := not slow
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
@@ -94,8 +94,13 @@ else
 endif
 
 bench: $(VENV)/.ready
-	$(BIN)/python benchmarks/gradient_error.py
-	$(BIN)/python benchmarks/speed.py --out out/speed.json
+	$(BIN)/python -m benchmarks.gradient_error
+	$(BIN)/python -m benchmarks.speed --out out/speed.json
+
+# The gradient's error against run time, with Mitsuba where it is installed, and in extreme cases: an hour each.
+report: $(VENV)/.ready
+	$(BIN)/python -m benchmarks.error_time
+	$(BIN)/python -m benchmarks.stability
 
 lint: $(VENV)/.ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[dev,demo,test]"

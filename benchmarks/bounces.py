@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import torch
-from table import Bench, Row, Skipped, median_row
-from torch import Tensor
-
-import edgegrad as eg
-from edgegrad import shader
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
-
 from bounce_scenes import BounceScene, before_room, cornell, panel, plates
 from bounce_scenes import room as walls
 from mitsuba_rooms import MitsubaRoom
 from room_scenes import ROOMS, box_room, towards_room, vector, without_alpha
 from scenes import icosphere
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad import shader
+
+from .table import Bench, Row, Skipped, median_row
 
 SIZE, SPP = 64, 64
 SAMPLERS = {"independent": {"must": 1.0, "aim": 0.5}, "multijitter": {}}  # Mitsuba's default, and its best one

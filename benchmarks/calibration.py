@@ -1,6 +1,6 @@
 """How exactly calibrate() and fit_camera() find lenses, and whether they know it: errors, their deviations, and processor time.
 
-    python benchmarks/calibration.py [--cases 3] [--pictures 5] [--size 256] [--threads 1] [--plot calibration.png]
+    python -m benchmarks.calibration [--cases 3] [--pictures 5] [--size 256] [--threads 1] [--plot calibration.png]
 
 A painted stone is seen from several sides through a lens with k1, k2, p1, p2 = −0.15, 0.05, 0.001, −0.001 and a principal point
 that is some 2 % of the image aside. Each start is up to 6° and 5 % of the stone's size off, with a focal length that is 6 % too
@@ -12,16 +12,12 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
-from pathlib import Path
 
+import objects
 import roma
 import torch
 from torch import Tensor
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
-import objects
 
 import edgegrad as eg
 from edgegrad.fit import CameraFit, calibrate, fit_camera

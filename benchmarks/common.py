@@ -16,10 +16,10 @@ from edgegrad.files.paths import replacing
 from edgegrad.kernel.operators import Hits, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad.kernel.request import make_request
 from edgegrad.library import core
-from edgegrad.report.error_time.methods import differentiate
-from edgegrad.report.error_time.references import standard_error
-from edgegrad.report.scenes import ReportScene, smooth_adjoint
-from edgegrad.report.scenes import sphere as icosphere
+
+from .error_time.methods import differentiate
+from .error_time.references import standard_error
+from .scenes import ReportScene, icosphere, smooth_adjoint
 
 
 def sphere(size: int | tuple[int, int], subdivisions: int = 6) -> tuple[eg.Mesh, eg.Camera, Tensor]:

@@ -9,15 +9,14 @@ from functools import cache, partial
 from typing import Any
 
 import torch
-from common import Kernel, Step, single, sphere
-from table import Bench, Row, median_row, milliseconds, ratio_row, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.library import core
-from edgegrad.report import build
-from edgegrad.report.scenes import cube, front_camera, smooth_adjoint, smooth_colors
-from edgegrad.report.scenes import sphere as icosphere
+
+from .common import Kernel, Step, single, sphere
+from .scenes import build, cube, front_camera, icosphere, smooth_adjoint, smooth_colors
+from .table import Bench, Row, median_row, median_time, ratio_row, seconds_of
 
 
 @cache
@@ -43,9 +42,9 @@ def forward(bench: Bench) -> list[Row]:
     rows = []
     for width, loop in zip(widths, bare, strict=True):
         what = f"forward: rays/s over the bare loop, packets of {width}"
-        note = f"{512 * 512 * 16 / statistics.median(loop) / 1e6:.1f} M rays/s in the bare loop, {milliseconds(loop)}"
+        note = f"{512 * 512 * 16 / statistics.median(loop) / 1e6:.1f} M rays/s in the bare loop, {median_time(loop)}"
         rows.append(ratio_row(f"{what}, kernel", loop, inside, note=note, **target))
-        rows.append(ratio_row(f"{what}, eg.render", loop, whole, note=milliseconds(whole), **target))
+        rows.append(ratio_row(f"{what}, eg.render", loop, whole, note=median_time(whole), **target))
     return rows
 
 
@@ -65,8 +64,8 @@ def backward(bench: Bench) -> list[Row]:
     )  # fmt: skip
     target: dict[str, Any] = {"must": 0.5, "aim": 0.25}
     return [
-        ratio_row("backward over forward, kernel", back, ahead, note=milliseconds(back), **target),
-        ratio_row("backward over forward, autograd", torch_back, torch_ahead, note=milliseconds(torch_back), **target),
+        ratio_row("backward over forward, kernel", back, ahead, note=median_time(back), **target),
+        ratio_row("backward over forward, autograd", torch_back, torch_ahead, note=median_time(torch_back), **target),
     ]
 
 
@@ -100,7 +99,7 @@ def small(bench: Bench) -> list[Row]:
 def large(bench: Bench) -> list[Row]:
     steps = [Step(*sphere(512, subdivisions)) for subdivisions in (6, 8)]
     few, many = bench.interleaved(9, *(lambda step=step: step()[1] for step in steps))
-    note = f"{milliseconds(many)} over {milliseconds(few)}"
+    note = f"{median_time(many)} over {median_time(few)}"
     return [ratio_row("1.3 M faces: a step over that at 81,920 faces", many, few, must=3, aim=2, note=note)]
 
 
@@ -111,10 +110,10 @@ def threads(bench: Bench) -> list[Row]:
     one, two, one_back, two_back = bench.interleaved(15, *sides)
     target: dict[str, Any] = {"must": 1.8, "aim": 1.95, "more_is_better": True}
     return [
-        ratio_row("2 threads over 1, forward", one, two, note=f"{milliseconds(one)} over {milliseconds(two)}", **target),
+        ratio_row("2 threads over 1, forward", one, two, note=f"{median_time(one)} over {median_time(two)}", **target),
         ratio_row(
             "2 threads over 1, backward", one_back, two_back,
-            note=f"{milliseconds(one_back)} over {milliseconds(two_back)}", **target,
+            note=f"{median_time(one_back)} over {median_time(two_back)}", **target,
         ),
     ]  # fmt: skip
 
@@ -184,7 +183,7 @@ def aovs(bench: Bench) -> list[Row]:
             one, all_ = (Channels(mesh, camera, chosen, gradient).seconds for chosen in (None, names))
             alone, together = bench.interleaved(15, one, all_)
             what = f"{', '.join(names)} over the image, {'with gradient' if gradient else 'forward'}"
-            note = f"{milliseconds(together)} over {milliseconds(alone)}, {len(mesh.faces):,} faces at 256² × 16"
+            note = f"{median_time(together)} over {median_time(alone)}, {len(mesh.faces):,} faces at 256² × 16"
             rows.append(ratio_row(what, together, alone, must=most, note=note))
     return rows
 
@@ -224,7 +223,7 @@ def lenses(bench: Bench) -> list[Row]:
             run = [partial(seconds_of, partial(work, camera, spp)) for camera in cameras]
             straight, *bent = bench.interleaved(21, *run)
             for (name, (_, _, most)), times in zip(LENSES.items(), bent, strict=True):
-                note = f"{milliseconds(times)} over {milliseconds(straight)}, 20,480 faces at 256² × {spp}"
+                note = f"{median_time(times)} over {median_time(straight)}, 20,480 faces at 256² × {spp}"
                 must = most if spp == 16 else None
                 rows.append(ratio_row(f"{name} over a pinhole, {what}", times, straight, must=must, note=note))
     return rows
@@ -236,5 +235,5 @@ def sparse(bench: Bench) -> list[Row]:
     window[200:251, 200:251] = adjoint[200:251, 200:251]  # 1 % of the pixels, inside the sphere
     few, all_ = Kernel(mesh, camera, window), Kernel(mesh, camera, adjoint)
     some, dense = bench.interleaved(21, few.backward, all_.backward)
-    note = f"{milliseconds(some)} over {milliseconds(dense)}, {int(few.profile['surface_samples']):,} surface samples"
+    note = f"{median_time(some)} over {median_time(dense)}, {int(few.profile['surface_samples']):,} surface samples"
     return [ratio_row("loss at 1 % of the image over one at all of it, backward", some, dense, note=note)]

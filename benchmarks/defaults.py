@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import statistics
 from pathlib import Path
 
 import torch
-from common import Converged, Kernel, single, sphere
-from table import Bench, Row, median_row, milliseconds, quartiles, ratio_row
 
 import edgegrad as eg
-from edgegrad.library import core
-from edgegrad.report import build
-from edgegrad.report.error_time.methods import default_samples, differentiate
-from edgegrad.report.scenes import ReportScene
-from edgegrad.report.scenes import sphere as icosphere
+
+from .common import Converged, Kernel, single, sphere
+from .document import kernel_hash
+from .error_time.methods import default_samples, differentiate
+from .scenes import ReportScene, build, icosphere
+from .table import Bench, Row, median_row, median_time, quartiles, ratio_row
 
 CONVERGED = Path(__file__).resolve().parents[1] / "out" / "converged"
 
@@ -26,7 +24,7 @@ def deep(bench: Bench) -> list[Row]:
     nested = eg.Scene([outer.replace(verts=outer.verts * (1.0 - 0.04 * k)) for k in range(20)])
     one, twenty = Kernel(outer, camera, adjoint), Kernel(nested, camera, adjoint)
     alone, all_ = bench.interleaved(11, one.backward, twenty.backward)
-    note = f"{milliseconds(all_)} over {milliseconds(alone)}, 20,480 faces each"
+    note = f"{median_time(all_)} over {median_time(alone)}, 20,480 faces each"
     return [ratio_row("20 nested spheres over the outer one, backward", all_, alone, must=2, note=note)]
 
 
@@ -93,7 +91,3 @@ def default_step(
             note=f"{counts}; {own}", **(error or {}),
         ),
     ]  # fmt: skip
-
-
-def kernel_hash() -> str:
-    return hashlib.sha256(Path(core.__file__).read_bytes()).hexdigest()[:12]

@@ -9,13 +9,14 @@ from functools import cache
 
 import numpy as np
 import torch
-from common import Kernel, Step, sphere
-from table import Bench, Row, Skipped, milliseconds, quartiles
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.library import core
-from edgegrad.report.error_time import mitsuba
+
+from .common import Kernel, Step, sphere
+from .error_time import mitsuba
+from .table import Bench, Row, Skipped, median_time, quartiles
 
 Run = Callable[[float, int], tuple[Tensor, float]]  # (budget, seed) → gradient (V, 3), seconds
 FACTORS = tuple(2.0**k for k in range(-6, 7))  # times edgegrad's default samples
@@ -113,8 +114,8 @@ def equal_error(
     every, chance = range(n), np.random.default_rng(0)
     spread = quartiles([ratio(chance.integers(n, size=n).tolist()) for _ in range(400)])
     (times, budget), (other_times, other_budget) = ours.at(wanted, every), theirs.at(wanted, every)
-    note = f"edgegrad × {budget:.2g} of {samples}, {milliseconds(times)}; {other_budget:.3g} {unit}"
-    note += f", {milliseconds(other_times)}"
+    note = f"edgegrad × {budget:.2g} of {samples}, {median_time(times)}; {other_budget:.3g} {unit}"
+    note += f", {median_time(other_times)}"
     if not theirs.reached:
         note += f", where its error is still {100 * theirs.rms(theirs.budgets[-1]):.2g} %"
     return [Row(what, ratio(every), spread, more_is_better=True, bound=not theirs.reached, note=note, **target)]

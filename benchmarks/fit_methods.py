@@ -1,6 +1,6 @@
 """Adam and Gauss-Newton on the same fits: steps and seconds until the loss is within a third of the better end.
 
-    python benchmarks/fit_methods.py
+    python -m benchmarks.fit_methods
 
 The pose of a lit mesh (6 numbers), a sun and eight colours (27), a camera and a roughness (7): of tests/small_fits.py.
 """
@@ -8,15 +8,11 @@ The pose of a lit mesh (6 numbers), a sun and eight colours (27), a camera and a
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-import torch
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
 import small_fits
+import torch
 
 import edgegrad as eg
 

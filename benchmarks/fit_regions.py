@@ -1,6 +1,6 @@
 """fit_scene(loss="region") from one photograph without a mask: how often it finds a pose, or a shape and its place, and knows.
 
-    python benchmarks/fit_regions.py [--what bracket vase] [--methods adam gauss-newton] [--seeds 2 3 4 5 6 7 8 9]
+    python -m benchmarks.fit_regions [--what bracket vase] [--methods adam gauss-newton] [--seeds 2 3 4 5 6 7 8 9]
 
 bracket  the pose of a bracket without colours at 128², from 12.3° and 8.4 % of its size off
 vase     four radii and the pose of a vase at 96², from 20 % and 3 % of its size off
@@ -9,20 +9,16 @@ vase     four radii and the pose of a vase at 96², from 20 % and 3 % of its siz
 from __future__ import annotations
 
 import argparse
-import sys
 import time
-from pathlib import Path
 
 import torch
+from test_fit import START, bracket, camera, errors
+from test_fit_photo import photograph
+from test_fit_region import RADII, VIEW, vase
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses
 from edgegrad.fit.descent.result import Fit
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
-from test_fit import START, bracket, camera, errors
-from test_fit_photo import photograph
-from test_fit_region import RADII, VIEW, vase
 
 OFF = torch.tensor([1.2, 0.8, 1.2, 0.8])
 

@@ -1,5 +1,5 @@
 """What needs a process of its own; speed.py starts it:
-python fresh.py import | first cube | first sphere | steps edgegrad | steps torch | memory"""
+python -m benchmarks.fresh import | first cube | first sphere | steps edgegrad | steps torch | memory"""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ def import_seconds() -> dict[str, float]:
 def first_render(name: str) -> dict[str, float]:
     """Seconds of the first render of the process, and of later ones: vertices moved, and the same again."""
     import torch
-    from common import single, sphere
 
     import edgegrad as eg
 
+    from .common import single, sphere
+
     if name == "cube":
-        from edgegrad.report.scenes import cube, front_camera
+        from .scenes import cube, front_camera
 
         mesh, camera = single(cube()), front_camera(64)
     else:
@@ -61,7 +62,7 @@ def steps(first: str, repeats: int = 50) -> dict[str, float]:
 
         # isort: split
         import edgegrad as eg
-    from common import sphere
+    from .common import sphere
 
     mesh, camera, _ = sphere(256)
     target = eg.render(mesh.replace(verts=mesh.verts * 1.05), camera)
@@ -81,10 +82,10 @@ def steps(first: str, repeats: int = 50) -> dict[str, float]:
 
 def memory(height: int = 1080, width: int = 1920, spp: int = 64) -> dict[str, float]:
     """Bytes of the peak of an image and its gradients (vertices and colours) above scene, image, adjoint and gradients."""
-    from common import single, sphere
-
     import edgegrad as eg
-    from edgegrad.report.scenes import cube, front_camera
+
+    from .common import single, sphere
+    from .scenes import cube, front_camera
 
     mesh, camera, adjoint = sphere((height, width))
     # Code, threads and what torch keeps of a first backward pass are not this image's.

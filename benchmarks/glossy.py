@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from table import Bench, Row, milliseconds, quartiles, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report.error_time import mitsuba
-from edgegrad.report.scenes import sphere
+
+from .error_time import mitsuba
+from .scenes import icosphere
+from .table import Bench, Row, median_time, quartiles, seconds_of
 
 SIZE = 96
 LAMPS = ((14, 40, 4, 60.0), (20, 90, 3, 120.0), (30, 64, 5, 40.0))  # row, column, size and radiance
@@ -35,9 +36,9 @@ class Images:
     """Of one ball under a sky, with a seed each."""
 
     def __init__(self, kind: str, roughness: float, light_samples: int = 4) -> None:
-        verts = torch.nn.functional.normalize(sphere(5).verts.float(), dim=1)
+        verts = torch.nn.functional.normalize(icosphere(5).verts.float(), dim=1)
         metal = eg.Material(base_color=torch.ones(3), metallic=1.0, roughness=roughness)
-        mesh = eg.Mesh(verts, sphere(5).faces, normals=verts, material=metal)
+        mesh = eg.Mesh(verts, icosphere(5).faces, normals=verts, material=metal)
         self.scene = eg.Scene([mesh], lights=[eg.Environment(sky(kind))])
         self.camera = eg.Camera.look_at((0.0, 0.3, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (SIZE, SIZE))
         self.light_samples = light_samples
@@ -82,9 +83,9 @@ class LampImages:
 
     def __init__(self, kind: str, roughness: float) -> None:
         metal = eg.Material(base_color=torch.ones(3), metallic=1.0, roughness=roughness)
-        unit = torch.nn.functional.normalize(sphere(5).verts.float(), dim=1)
+        unit = torch.nn.functional.normalize(icosphere(5).verts.float(), dim=1)
         place, size = BALL
-        ball = eg.Mesh(unit * size + torch.tensor(place), sphere(5).faces, normals=unit, material=metal)
+        ball = eg.Mesh(unit * size + torch.tensor(place), icosphere(5).faces, normals=unit, material=metal)
         corners = FLOOR * torch.tensor([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
         floor = eg.Mesh(corners, torch.tensor([[0, 2, 1], [0, 3, 2]]), material=metal)
         if kind in QUADS:
@@ -93,8 +94,8 @@ class LampImages:
             lamp = eg.AreaLight.rectangle(*vectors, radiance, two_sided=False)
         else:
             place, size = LAMP_BALL
-            verts = torch.nn.functional.normalize(sphere(3).verts.float(), dim=1) * size + torch.tensor(place)
-            lamp = eg.AreaLight.of(eg.Mesh(verts, sphere(3).faces), 10.0)
+            verts = torch.nn.functional.normalize(icosphere(3).verts.float(), dim=1) * size + torch.tensor(place)
+            lamp = eg.AreaLight.of(eg.Mesh(verts, icosphere(3).faces), 10.0)
         self.scene = eg.Scene([ball, floor, lamp])
         self.camera = eg.Camera.look_at((0.0, 1.6, 3.6), (0.0, 0.35, 0.0), (0.0, 1.0, 0.0), 36.0, (SIZE, SIZE))
 
@@ -203,5 +204,5 @@ def beside(
         ratios.append(noise(found) / noise(their_found) * math.sqrt(share))
     return Row(
         f"… {what}: noise over Mitsuba's of as much time", statistics.median(ratios), quartiles(ratios),
-        must=1.0, aim=0.5, note=f"edgegrad {milliseconds(seconds)}, Mitsuba {milliseconds(others)}, {threads} threads",
+        must=1.0, aim=0.5, note=f"edgegrad {median_time(seconds)}, Mitsuba {median_time(others)}, {threads} threads",
     )  # fmt: skip

@@ -15,14 +15,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from glossy import SIZE, sky
-from table import Bench, Row, milliseconds
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
-from edgegrad.report.error_time import mitsuba
-from edgegrad.report.scenes import sphere
+
+from .document import duration
+from .error_time import mitsuba
+from .glossy import SIZE, sky
+from .scenes import icosphere
+from .table import Bench, Row
 
 Parameters = dict[str, Tensor]
 # What tells the other image from this one.
@@ -43,13 +45,13 @@ def ball(kind: str, roughness: float) -> tuple[Parameters, Callable[[Parameters]
         "base color": torch.tensor([0.9, 0.6, 0.3]),
     }
     given |= {"normals": torch.zeros(3), "translation": torch.zeros(3), "texels": torch.ones(8, 16, 3)}
-    verts, image = normalize(sphere(5).verts.float(), dim=1), sky(kind)
+    verts, image = normalize(icosphere(5).verts.float(), dim=1), sky(kind)
     if kind == "even":  # brighter above: under one that is the same from all around normals hardly matter
         image = image * torch.linspace(1.5, 0.5, len(image))[:, None, None]
 
     def scene(p: Parameters) -> eg.Scene:
         material = eg.Material(p["base color"], metallic=p["metallic"], roughness=p["roughness"])
-        mesh = eg.Mesh(verts + p["translation"], sphere(5).faces, normals=verts + p["normals"], material=material)
+        mesh = eg.Mesh(verts + p["translation"], icosphere(5).faces, normals=verts + p["normals"], material=material)
         radiance = image * p["texels"].repeat_interleave(8, 0).repeat_interleave(8, 1)
         return eg.Scene([mesh], lights=[eg.Environment(radiance)])
 
@@ -271,12 +273,12 @@ def beside_mitsuba(bench: Bench, kind: str, roughness: float, camera: eg.Camera)
         spp = statistics.fmean(e * e * n for (e, _), n in zip(swept, SPP, strict=True)) / error**2
         slope = (swept[-1][1] - swept[0][1]) / (SPP[-1] - SPP[0])
         needed = swept[0][1] + slope * max(spp - SPP[0], 0)
-        errors = ", ".join(f"{e:.3g} % in {milliseconds([t])}" for e, t in swept)
+        errors = ", ".join(f"{e:.3g} % in {duration(t)}" for e, t in swept)
         rows.append(
             Row(
                 f"… {kind} sky, roughness {roughness}, by {name}: Mitsuba's time over edgegrad's", needed / seconds,
                 unit=" ×", must=10.0, aim=30.0, more_is_better=True,
-                note=f"edgegrad {error:.3g} % in {milliseconds([seconds])}; Mitsuba at {SPP} spp {errors}",
+                note=f"edgegrad {error:.3g} % in {duration(seconds)}; Mitsuba at {SPP} spp {errors}",
             )
         )  # fmt: skip
     return rows

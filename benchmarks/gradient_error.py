@@ -1,6 +1,6 @@
 """Relative error of the per-vertex gradient against the number of samples: 81,920-face icosphere, smooth colours, 256².
 
-Run:  python benchmarks/gradient_error.py [--seeds 4]
+Run:  python -m benchmarks.gradient_error [--seeds 4]
 
 The error is ‖g − g*‖ / ‖g*‖ over all vertices, root mean square over seeds; g* is a converged run with seeds of its own, 128
 times the default surface samples and 512 times the default edge samples. All errors are relative to the whole gradient; the
@@ -12,8 +12,9 @@ from __future__ import annotations
 import argparse
 
 import torch
-from common import Kernel, sphere
 from tqdm import tqdm
+
+from .common import Kernel, sphere
 
 
 def main() -> None:

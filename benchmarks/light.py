@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Kernel
-from table import Bench, Row, milliseconds, ratio_row, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
@@ -19,9 +17,11 @@ from edgegrad.kernel.request import make_request
 from edgegrad.library import core
 from edgegrad.light.radiance import Lighting
 from edgegrad.points.frame import Frame
-from edgegrad.report import build
-from edgegrad.report.scenes import ReportScene
 from edgegrad.shader import Effort, _Image
+
+from .common import Kernel
+from .scenes import ReportScene, build
+from .table import Bench, Row, median_time, ratio_row, seconds_of
 
 # Samples on the borders of shadows.
 COUNTS = {
@@ -82,19 +82,19 @@ def images(bench: Bench) -> list[Row]:
     return [
         ratio_row(
             "lit by two punctual lights without shadows over unlit, image", open_, plain, must=2, aim=1.5,
-            note=f"{milliseconds(open_)} over {milliseconds(plain)}, {faces}",
+            note=f"{median_time(open_)} over {median_time(plain)}, {faces}",
         ),
         ratio_row(
             "the same with shadows over the bare rays, three a sample that hits", shadowed, rays, must=1.6, aim=1.25,
-            note=f"{milliseconds(shadowed)} over {milliseconds(rays)}, a surface is shaded about once a pixel",
+            note=f"{median_time(shadowed)} over {median_time(rays)}, a surface is shaded about once a pixel",
         ),
         ratio_row(
             "lit with shadows, all gradients: backward pass over image", back, shadowed, must=1.0, aim=0.6,
-            note=f"{milliseconds(back)} over {milliseconds(shadowed)}",
+            note=f"{median_time(back)} over {median_time(shadowed)}",
         ),
         ratio_row(
             "the same with what a gradient adds to the forward pass, over image", gradient, shadowed, must=1.0, aim=0.6,
-            note=f"{milliseconds(gradient)} over {milliseconds(shadowed)}",
+            note=f"{median_time(gradient)} over {median_time(shadowed)}",
         ),
     ]  # fmt: skip
 

@@ -1,7 +1,7 @@
 """Balls of all materials, metallic × roughness as in Khronos' sample, beside the image of Mitsuba's `direct`
 with the same scattering written as a BSDF of its own: how far apart they are, in standard errors.
 
-Run:  python benchmarks/material_grid.py [--out FILE.png] [--seeds N]          (with mitsuba installed)
+Run:  python -m benchmarks.material_grid [--out FILE.png] [--seeds N]          (with mitsuba installed)
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.stats import t as student
-from table import Bench, Row, Skipped
 from torch import Tensor
 from torch.nn.functional import normalize
 from tqdm import tqdm
 
 import edgegrad as eg
 from edgegrad.light.bsdf import DIELECTRIC
-from edgegrad.report.error_time import mitsuba
-from edgegrad.report.scenes import sphere
-from edgegrad.report.stability.statistics import holm
+
+from .error_time import mitsuba
+from .scenes import icosphere
+from .stability.statistics import holm
+from .table import Bench, Row, Skipped
 
 METALLIC = (0.0, 0.5, 1.0)
 ROUGHNESS = (0.1, 0.25, 0.5, 0.75, 1.0)
@@ -58,7 +59,7 @@ def camera() -> eg.Camera:
 
 
 def ours(seed: int) -> Tensor:
-    shape = sphere(5)  # Mitsuba's balls are round; ours of a quarter as many faces are 0.18 % darker
+    shape = icosphere(5)  # Mitsuba's balls are round; ours of a quarter as many faces are 0.18 % darker
     verts = normalize(shape.verts.float(), dim=1)
     meshes = [
         eg.Mesh(

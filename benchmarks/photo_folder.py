@@ -11,10 +11,11 @@ import numpy as np
 import OpenImageIO as oiio
 import torch
 import yaml
-from photo_cases import Case, Placed
 from torch import Tensor
 
 import edgegrad as eg
+
+from .photo_cases import Case, Placed
 
 JUMP = 0.02  # of the depth: neighbours that are farther apart do not lie on one surface
 WHOLE = 0.99  # share of a pixel that depth must cover

@@ -1,6 +1,6 @@
 """fit_pose and fit_camera in photographs: how often they find the pose, how exactly, and whether they know.
 
-    python benchmarks/photos.py [FOLDER] [--parts lit squirrel …] [--starts 20] [--first 0] [--meshes FILE …]
+    python -m benchmarks.photos [FOLDER] [--parts lit squirrel …] [--starts 20] [--first 0] [--meshes FILE …]
         [--pictures out/photos] [--json out/photos.json]
 
 Without FOLDER, in pictures made here (photo_cases.py), numbered from --first on, of which each has a seed, a mesh and a start of
@@ -32,7 +32,6 @@ import argparse
 import json
 import math
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -40,18 +39,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import photo_edges
-import photo_folder
 import torch
 import torch.nn.functional as F
-from photo_cases import Case, Kind, Placed, clutter, rendered, several
+from objects import pebble
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import PoseFit, fit_camera, fit_pose, fit_poses
 
-sys.path.append(str(Path(__file__).parents[1] / "examples"))
-from objects import pebble
+from . import photo_edges, photo_folder
+from .photo_cases import Case, Kind, Placed, clutter, rendered, several
 
 FAR_OFF = 3.0  # limits: beyond, a fit must not say that it has converged
 FOCAL = 1.06  # by this factor or its inverse

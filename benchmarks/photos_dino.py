@@ -1,6 +1,6 @@
 """Shape and texture of a real figure from calibrated photographs: 12 of 16 views are fitted, 4 are held out.
 
-    python benchmarks/photos_dino.py FOLDER [--first 2] [--out dino.png]
+    python -m benchmarks.photos_dino FOLDER [--first 2] [--out dino.png]
 
 FOLDER holds the data set dinoSparseRing of the Middlebury multi-view benchmark (Seitz et al. 2006): a matte white figure before
 black, 640 × 480, `dinoSR_par.txt` with K, R and t of each view. Silhouettes are where a picture is brighter than 0.15. Dark

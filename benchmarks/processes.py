@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from table import Bench, Row, median_row, milliseconds, ratio_row
+from .table import Bench, Row, median_row, median_time, ratio_row
 
 
 def memory(bench: Bench) -> list[Row]:
@@ -27,15 +27,16 @@ def start(bench: Bench) -> list[Row]:
     rows = [median_row("import edgegrad, after torch", imports, unit=" s", must=0.3, aim=0.1)]
     for name, found in (("cube at 64²", cubes), ("sphere at 512²", spheres)):
         first, moved, same = ([run[key] for run in found] for key in ("first", "moved", "same"))
-        note = f"{milliseconds(first)}; later {milliseconds(moved)}, where nothing moved {milliseconds(same)}"
+        note = f"{median_time(first)}; later {median_time(moved)}, where nothing moved {median_time(same)}"
         rows.append(ratio_row(f"first render of a process over a later one, {name}", first, moved, must=1.5, note=note))
     return rows
 
 
 def fresh(*arguments: str) -> dict[str, float]:
     """What fresh.py measures in a process of its own."""
-    command = [sys.executable, str(Path(__file__).with_name("fresh.py")), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "benchmarks.fresh", *arguments]
+    root = Path(__file__).parents[1]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
     return json.loads(done.stdout)
@@ -54,5 +55,5 @@ def order(bench: Bench) -> list[Row]:
         for key, name in (("median", "median"), ("slow", "90 % quantile")):
             first, second = ([run[key] for run in side] for side in (ours, theirs))
             what = f"a step, torch imported first over edgegrad first, {name}" + (", machine busy" if load else "")
-            rows.append(ratio_row(what, second, first, note=f"{milliseconds(second)} over {milliseconds(first)}"))
+            rows.append(ratio_row(what, second, first, note=f"{median_time(second)} over {median_time(first)}"))
     return rows

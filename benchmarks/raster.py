@@ -1,6 +1,6 @@
 """The operators of edgegrad.raster beside render(spp=1), and render_batch: processor time of a step, forward and backward.
 
-python benchmarks/raster.py [--rounds 5]
+python -m benchmarks.raster [--rounds 5]
 
 The scene is a textured sphere of 20,480 faces, seen by 8 cameras at 512², with gradients of vertices and texture. All take
 turns. render_batch has 32 spheres of 1,280 faces at 64²: plain ones take one thread each, beside the calling one, lit ones come
@@ -27,14 +27,15 @@ from torch import Tensor
 
 import edgegrad as eg
 import edgegrad.raster as dr
-from edgegrad.report.scenes import sphere
+
+from .scenes import icosphere
 
 BATCH, SIZE = 8, 512
 
 
 class Step:
     def __init__(self) -> None:
-        mesh = sphere(5)
+        mesh = icosphere(5)
         self.verts, self.faces = mesh.verts.float(), mesh.faces
         self.uvs = (self.verts[:, :2] + 1) / 2
         self.texture, self.adjoint = torch.rand(512, 512, 3), torch.rand(BATCH, SIZE, SIZE, 3)
@@ -74,7 +75,7 @@ IMAGES = 32
 
 def batch(lit: bool) -> Callable[[], None]:
     """A step of render_batch() over meshes that share vertices."""
-    mesh = sphere(3)
+    mesh = icosphere(3)
     camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (64, 64))
     lights = [eg.DirectionalLight(torch.tensor([0.0, -0.3, -1.0]))] if lit else []
     material = eg.Material() if lit else None

@@ -1,7 +1,7 @@
 """What bends: how exactly poses are found, and what a pose costs.
 
-    python benchmarks/rigs.py body [--count 10] [--first 0] [--size 192]
-    python benchmarks/rigs.py picture | anny | arm | walk | evaluation
+    python -m benchmarks.rigs body [--count 10] [--first 0] [--size 192]
+    python -m benchmarks.rigs picture | anny | arm | walk | evaluation
 
 body        twenty joints of a skinned mesh from four masks, from rest, each turned by up to 40°
 picture     the same from one picture with colours in the light of a sun and a sky that the fit does not know: first in a smooth
@@ -17,23 +17,20 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+import arm
+import body
+import figure
+import robot
 import torch
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, fit_rig, track_rig
-
-sys.path.append(str(Path(__file__).parents[1] / "examples"))
-import arm
-import body
-import figure
-import robot
 
 F64 = torch.float64
 SEEN = 30  # pixels of a limb's own surface in a picture, from which its joint is visible

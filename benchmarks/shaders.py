@@ -1,6 +1,6 @@
 """What shaders written in PyTorch cost, in time, memory and noise: one table.
 
-Run:  python benchmarks/shaders.py [--only time memory noise mipmaps]
+Run:  python -m benchmarks.shaders [--only time memory noise mipmaps]
 
 Times are medians of steps, image and backward pass, on a sphere of 81,920 faces at 256² and 16 samples a pixel; ratios are of
 steps that alternate in one run.
@@ -18,14 +18,13 @@ import time
 from collections.abc import Callable
 
 import torch
-from common import sphere
 from torch import Tensor
 from tqdm import tqdm
 
 import edgegrad as eg
-from edgegrad.report import build
-from edgegrad.report.scenes import front_camera, smooth_adjoint
-from edgegrad.report.scenes import sphere as icosphere
+
+from .common import sphere
+from .scenes import build, front_camera, icosphere, smooth_adjoint
 
 F64 = torch.float64
 

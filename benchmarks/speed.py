@@ -1,6 +1,6 @@
 """How fast edgegrad is, and what it is compared with, against targets: one table.
 
-Run:  python benchmarks/speed.py [--only NAME …] [--quick] [--out FILE.json]
+Run:  python -m benchmarks.speed [--only NAME …] [--quick] [--out FILE.json]
 
 A ratio is taken in one run: its two sides alternate, so that a noisy machine slows both, and what is printed is the median
 over the pairs and their quartiles. "At equal error" is the error of the per-vertex gradient relative to the whole gradient,
@@ -13,28 +13,26 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
-from bounces import bounced_gradients, bounces
-from costs import aovs, backward, bits, forward, large, lenses, small, sparse, textures, threads, update
-from defaults import deep, flat_colors, kernel_hash, noise, tangled
-from equal_error import boundary, interior, step
-from glossy import glossy
-from glossy_gradients import glossy_gradients
-from light import light
-from material_grid import material_grid
-from processes import memory, order, start
-from table import HEAD, Bench, Row, Skipped, line
 from tqdm import tqdm
 
-import edgegrad as eg
-from edgegrad.report.error_time import mitsuba
+from .bounces import bounced_gradients, bounces
+from .costs import aovs, backward, bits, forward, large, lenses, small, sparse, textures, threads, update
+from .defaults import deep, flat_colors, noise, tangled
+from .document import machine
+from .equal_error import boundary, interior, step
+from .error_time import mitsuba
+from .glossy import glossy
+from .glossy_gradients import glossy_gradients
+from .light import light
+from .material_grid import material_grid
+from .processes import memory, order, start
+from .table import HEAD, Bench, Row, Skipped, line
 
 ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "forward": forward,
@@ -72,11 +70,8 @@ GROUPS = {"safe": ("deep", "tangled", "flat-colors", "noise")}
 def settings(quick: bool) -> dict[str, Any]:
     """Where and of what this was measured."""
     return {
-        "date": time.strftime("%Y-%m-%d %H:%M:%S"), "quick": quick, "threads": torch.get_num_threads(),
-        "cores": os.cpu_count(), "load": os.getloadavg()[0], "system": platform.platform(),
-        "python": platform.python_version(), "torch": torch.__version__,
-        "edgegrad": eg.__version__, "mitsuba": mitsuba.available(),
-        "kernel": kernel_hash(),
+        "date": time.strftime("%Y-%m-%d %H:%M:%S"), "quick": quick, "load": os.getloadavg()[0],
+        "mitsuba": mitsuba.available(), **machine(),
     }  # fmt: skip
 
 

@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from tqdm import tqdm
 
+from .document import duration
+
 Value = TypeVar("Value")
 
 
@@ -93,9 +95,8 @@ def quartiles(values: Sequence[float]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def milliseconds(seconds: Sequence[float]) -> str:
-    value = 1e3 * statistics.median(seconds)
-    return f"{value:.0f} ms" if value >= 100 else f"{value:.3g} ms"
+def median_time(seconds: Sequence[float]) -> str:
+    return duration(statistics.median(seconds))
 
 
 def seconds_of(work: Callable[[], object]) -> float:

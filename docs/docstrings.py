@@ -7,7 +7,8 @@ arguments, of which all rows begin in one column and all texts in another:
                            on below
     colors  (V, C) float   one a vertex
 
-Such a table becomes a definition list, whose terms are all columns but the last.
+Such a table becomes a definition list, whose terms are all columns but the last. So do the sections of numpydoc, such as
+Parameters, whose entries are a line `name : type` and indented lines of text.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import NamedTuple
 SPECIAL = re.compile(r"([\\*_|<>])")
 ROW = re.compile(r"(\S[^.]*?)\s{2,}(?=\S)")  # what begins a row: an argument, or several
 WORD = re.compile(r"[A-Za-z_]\w*$")
+UNDERLINE = re.compile(r"-{3,}")  # of a section's name
 References = dict[str, str]
 
 
@@ -41,7 +43,10 @@ def _blocks(lines: list[str], references: References) -> Iterator[str]:
             i += 1
             continue
         yield ""
-        if lines[i].startswith("    "):
+        if i + 1 < len(lines) and UNDERLINE.fullmatch(lines[i + 1]):
+            end = next((k for k in range(i + 2, len(lines) - 1) if UNDERLINE.fullmatch(lines[k + 1])), len(lines))
+            yield from (f".. rubric:: {lines[i]}", "", *_section(lines[i + 2 : end], references))
+        elif lines[i].startswith("    "):
             end = _end(lines, i, lambda line: not line.startswith(" "))
             yield from ("::", "", *("   " + line[1:] for line in lines[i:end]))
         elif ROW.match(lines[i]) and not lines[i].startswith("- "):
@@ -56,6 +61,18 @@ def _blocks(lines: list[str], references: References) -> Iterator[str]:
             yield from (_inline(line, references) for line in lines[i:end])
         yield ""
         i = end
+
+
+def _section(lines: list[str], references: References) -> Iterator[str]:
+    """The entries of a section of numpydoc, as a definition list."""
+    starts = [k for k, line in enumerate(lines) if line and not line.startswith(" ")]
+    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+        name, _, kind = lines[start].partition(" : ")
+        yield f"``{name}``" + f" : *{_inline(kind, {})}*" * bool(kind)
+        text = dedent("\n".join(lines[start + 1 : end])).split("\n")
+        found = list(_blocks(text, references)) if any(text) else ["\\ "]
+        first = next(k for k, line in enumerate(found) if line)
+        yield from ("   " + line for line in found[first:])
 
 
 def _end(lines: list[str], start: int, ends: Callable[[str], bool]) -> int:

@@ -1,4 +1,4 @@
-"""Draws the figures of concepts.md, how-it-works.md and gallery.md:  python docs/figures.py [FOLDER]"""
+"""Draws the figures of concepts.md, how-it-works/ and gallery.md:  python docs/figures.py [FOLDER]"""
 
 from __future__ import annotations
 
@@ -228,16 +228,16 @@ def curve_source(folder: Path) -> None:
 
 
 def stages(folder: Path) -> None:
-    """Sample, shade, contract: what stands in each."""
+    """Sample, shade, accumulate: the three stages and what each holds."""
     columns = [
         ("sample", BLUE, ["points on faces", "points of pixels", "points on curves:\nedges, intersections"]),
         ("shade", INK, ["radiance of a surface point:\ncolours, textures", "its vjp and its jvp"]),
         (
-            "contract",
+            "accumulate",
             ORANGE,
             [
-                "reverse: cotangents of vertices,\ncolours, textures, camera",
-                "forward: derivatives of pixels",
+                "reverse: adjoints of vertices,\ncolours, textures, camera",
+                "forward: tangents of pixels",
                 "by place: (H, W, 2)",
             ],
         ),

@@ -12,14 +12,21 @@ from pathlib import Path
 import grimp
 
 FOLDER = Path(__file__).parent
-FACADES = {"image", "io", "lights"}  # names for users alone, which nothing inside imports
+LEFT_OUT = {
+    "image",
+    "io",
+    "lights",
+    "notebook",
+    "__main__",
+    "_core",
+}  # names for users alone, which nothing inside imports
 INK, BLUE, GREY = "#222222", "#1f6fb2", "#b9bec6"
 
 
 def imports() -> dict[str, set[str]]:
     """Of each package or module in edgegrad, those that it imports."""
     graph = grimp.build_graph("edgegrad", cache_dir=None)
-    left_out = {f"edgegrad.{name}" for name in (*FACADES, "_core")}
+    left_out = {f"edgegrad.{name}" for name in LEFT_OUT}
     children = sorted(graph.find_children("edgegrad") - left_out)
     return {
         name.removeprefix("edgegrad."): {

@@ -1,7 +1,7 @@
 """render_aovs(): several channels of a scene from the samples of one image, differentiable (arbitrary output variables).
 
 Each channel is one number of the surface points that the rays find, and a pixel is its filtered sum, as the image is one of
-radiance. What follows from vertices and camera is made here, by torch operations, so their derivatives are autograd's.
+radiance. Channels that follow from vertices and camera are made here, by torch operations, so their derivatives are autograd's.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .scene.scene import Scene, as_scene
 from .scene.tree import savable
 
 IDS = ("mesh_id", "face_id")
-# In the order in which the kernel has them (csrc/scene/scene.h).
+# The kernel has them in this order (csrc/scene/scene.h).
 AOVS = ("image", "alpha", "position", "depth", "shading_normal", "normal", "barycentrics", "uv", *IDS)
 CONSTANT = ("alpha", "normal")  # over a face
 
@@ -47,30 +47,34 @@ def render_aovs(
     light_samples: int = 1,
     bounces: int = 1,
 ) -> dict[str, Tensor]:
-    """Channels of a scene by name, (H, W, c) each, or (B, H, W, c) for a batch of cameras, all from the same samples.
+    """Return channels of a scene by name, (H, W, c) each, or (B, H, W, c) for a batch of cameras, all from the same samples.
 
-    aovs    names, each once, in any order; c is
-        image           C  render()'s, to the bit
-        alpha           1  the share of the pixel that is covered: the soft mask for silhouette losses
-        depth           1  along the optical axis, +Z of the camera, in world units; not the distance from the eye
-        position        3  of the surface point, world coordinates
-        normal          3  of the face, world axes, length 1, on the side from which its corners run anticlockwise
-        shading_normal  3  interpolated from the vertices and given the length 1 at each point, on that side; at a vertex the
-                           mean of the faces around it by area. Vertices with an index of their own keep an edge sharp
-        uv              2  texture coordinates; all meshes need uvs
-        barycentrics    3  weights of the face's three corners
-        mesh_id         1  int64, place in scene.meshes of what is seen through the pixel's centre; −1: nothing
-        face_id         1  int64, row of that mesh's faces; −1: nothing
+    A pixel holds the filtered sum over its samples, with zero where a sample hits nothing (the image: its background): values
+    are premultiplied with alpha. Where a surface ends within a pixel, or two meet, `depth / alpha` is the mean depth of what is
+    seen there, and a mean normal is shorter than 1. Ids come from the one ray through the centre.
 
-    The other arguments are those of render(). A pixel holds the filtered sum over its samples, with zero where a sample hits
-    nothing (the image: its background): values are premultiplied with alpha. Where a surface ends within a pixel, or two meet,
-    `depth / alpha` is the mean depth of what is seen there, and a mean normal is shorter than 1. Ids come from the one ray
-    through the centre.
+    All but the ids are differentiable, as render() is, in every tensor of scene and camera that they depend on. That includes
+    what moves at silhouettes, and at the creases where a channel jumps: of `normal` at all edges that are not flat, of
+    `barycentrics` at all edges. Channels have the dtype of the image. Raises what render() raises, and ValueError for a name
+    that is unknown or given twice, and for "uv" of a mesh without uvs.
 
-    All but the ids are differentiable, as render() is, in every tensor of scene and camera that they depend on, with what moves
-    at silhouettes, and at the creases where a channel jumps: of `normal` at all edges that are not flat, of `barycentrics` at all
-    edges. Channels have the dtype of the image. Raises what render() raises, and ValueError for a name that is unknown or
-    given twice, and for "uv" of a mesh without uvs.
+    Parameters
+    ----------
+    scene, camera, spp, seed, … : as of render()
+    aovs : sequence of str
+        Names, each once, in any order, of channels with c numbers:
+
+        - image (C): render()'s, to the bit.
+        - alpha (1): the share of the pixel that is covered, the soft mask for silhouette losses.
+        - depth (1): along the optical axis, +Z of the camera, in world units; not the distance from the eye.
+        - position (3): of the surface point, world coordinates.
+        - normal (3): of the face, world axes, length 1, on the side from which its corners run anticlockwise.
+        - shading_normal (3): interpolated from the vertices and given the length 1 at each point, on that side; at a vertex the
+          mean of the faces around it by area. Vertices with an index of their own keep an edge sharp.
+        - uv (2): texture coordinates; all meshes need uvs.
+        - barycentrics (3): weights of the face's three corners.
+        - mesh_id (1): int64, place in scene.meshes of what is seen through the pixel's centre; −1: nothing.
+        - face_id (1): int64, row of that mesh's faces; −1: nothing.
     """
     names = check_aovs(aovs)
     scene = as_scene(scene)
@@ -106,21 +110,20 @@ def render_aovs(
 
 
 def aovs_request(scene: Scene, camera: Camera, aovs: Sequence[str], spp: int, seed: int) -> Request:
-    """What the kernel is asked for channels that it makes alone: no ids, and of a scene that is lit no image."""
+    """Return the kernel's request for channels that it makes alone: no ids, and of a scene that is lit no image."""
     radiance = "image" in aovs
     request = make_request(scene if radiance else _without_radiance(scene), camera, spp, seed, all_uvs="uv" in aovs)
     return with_channels(request, aovs)
 
 
 def by_name(scene: Scene, aovs: Sequence[str], image: Tensor) -> dict[str, Tensor]:
-    """The parts (…, c) of what the kernel makes of with_channels()."""
+    """Return the parts (…, c) of the kernel's image for with_channels()."""
     rendered = [name for name in AOVS if name in aovs]
     widths = [{"image": scene.channels, "alpha": 1, "depth": 1, "uv": 2}.get(n, 3) for n in rendered]
     return dict(zip(rendered, image.split(widths, dim=-1), strict=True))
 
 
 def check_aovs(aovs: Sequence[str]) -> list[str]:
-    """Raises TypeError or ValueError."""
     if isinstance(aovs, str) or not isinstance(aovs, Sequence):
         raise TypeError(f'aovs: expected a list of names, such as ["image", "alpha"], got {aovs!r}')
     if not aovs:
@@ -134,7 +137,6 @@ def check_aovs(aovs: Sequence[str]) -> list[str]:
 
 
 def _check_uvs(scene: Scene) -> None:
-    """Raises ValueError."""
     for i, mesh in enumerate(scene.meshes):
         if mesh.uvs is None:
             raise ValueError(
@@ -144,7 +146,7 @@ def _check_uvs(scene: Scene) -> None:
 
 
 def _without_radiance(scene: Scene) -> Scene:
-    """The same surfaces with one channel of radiance that nobody sees, in the image's dtype."""
+    """Return the surfaces with one channel of radiance that nobody sees, in the image's dtype."""
     dtype = image_dtype(scene)
 
     def bare(mesh: Mesh) -> Mesh:
@@ -155,7 +157,8 @@ def _without_radiance(scene: Scene) -> Scene:
 
 
 def with_channels(request: Request, names: Sequence[str]) -> Request:
-    """The request of an image with these channels, in the order of AOVS; so are those of vertices: position, depth, normal."""
+    """Return the request of an image with these channels, in the order of AOVS; so are those of vertices: position, depth,
+    normal."""
     if list(names) == ["image"]:
         return request
     flat, camera = request.scene, request.camera
@@ -176,28 +179,28 @@ def with_channels(request: Request, names: Sequence[str]) -> Request:
         for corner in range(3):
             around = around.index_add(0, faces[:, corner], across)
         of_vertices.append(unit(around).expand(request.cameras, -1, -1))
-    beside = Channels(
+    channels = Channels(
         "alpha" in names,
-        torch.cat(of_vertices, -1).contiguous() if of_vertices else request.beside.vertex_attributes,
+        torch.cat(of_vertices, -1).contiguous() if of_vertices else request.auxiliary.vertex_attributes,
         normals,
-        unit(across) if "normal" in names else request.beside.face_attributes,
+        unit(across) if "normal" in names else request.auxiliary.face_attributes,
         "barycentrics" in names,
         "uv" in names,
     )
-    width = beside.alpha + beside.vertex_attributes.shape[-1] + beside.face_attributes.shape[-1]
-    width += 3 * beside.barycentrics + 2 * beside.uv
+    width = channels.alpha + channels.vertex_attributes.shape[-1] + channels.face_attributes.shape[-1]
+    width += 3 * channels.barycentrics + 2 * channels.uv
     background = torch.nn.functional.pad(flat.background, (0, width))
     vary = any(name not in CONSTANT for name in names if name != "image")
     vary = vary or ("image" in names and request.gradient.channels_vary)
     return request._replace(
         scene=flat._replace(background=background),
-        beside=beside,
+        auxiliary=channels,
         gradient=request.gradient._replace(channels_vary=vary),
     )
 
 
 def _ids(scene: Scene, face: Tensor) -> dict[str, Tensor]:
-    """From faces as the flat scene counts them, (…, H, W)."""
+    """Return ids of faces (…, H, W) as the flat scene counts them."""
     ends = torch.tensor([len(mesh.faces) for mesh in scene.meshes], device="cpu").cumsum(0)
     face = face.long()[..., None]
     mesh = torch.bucketize(face, ends, right=True)

@@ -1,4 +1,4 @@
-"""Textures from what else is known of a surface: another mesh, a function of its points, or pictures."""
+"""Textures from other knowledge of a surface: another mesh, a function of its points, or pictures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .points.rays import trace
 from .scene.appearance import OnMesh, coordinates
 from .scene.mesh import Mesh
 from .scene.mikktspace import Fans
-from .scene.nearest import Places, Surface
+from .scene.nearest import Places, SurfaceIndex
 from .scene.scene import Scene, as_scene
 from .warnings import warn
 
@@ -32,13 +32,16 @@ NEAR = 1e-4  # of a distance: what lies so close is the surface itself
 
 
 class SurfacePoints(NamedTuple):
-    """N points of a mesh, one for each texel that it uses: what a function for `bake` gets.
+    """N points of a mesh, one for each texel that it uses: the argument of a function for `bake`.
 
-    position      (N, 3) float64
-    normal        (N, 3) float64, of length 1: the mesh's own where it has normals, else the faces'
-    face          (N,) int64
-    barycentrics  (N, 3) float64
-    uv            (N, 2) float64
+    Attributes
+    ----------
+    position : (N, 3) float64
+    normal : (N, 3) float64, of length 1
+        The mesh's own where it has normals, else the faces'.
+    face : (N,) int64
+    barycentrics : (N, 3) float64
+    uv : (N, 2) float64
     """
 
     position: Tensor
@@ -61,26 +64,37 @@ def bake(
     seed: int = 0,
     progress: bool = True,
 ) -> Tensor:
-    """A texture (h, w, C) for a mesh, of what another surface has where the two lie on each other.
-
-    mesh      with texture coordinates that do not overlap, as unwrap() makes them; where they do, a warning counts the texels
-    source    the other surface, or a function of SurfacePoints of `mesh` that returns (N, C)
-    size      texels: one number, or (h, w)
-    what      "color": its colours, or base colours where it is lit; "normal": its normals (C = 3) in world coordinates, of
-              length 1; "normal_map": these in the tangent frames of `mesh`, as Material(normal_map=…) and glTF take them: numbers
-              from 0 to 1, with MikkTSpace's frames where `mesh` has normals; "visibility" (C = 1): the share of the sky
-              above a point of `mesh`, weighed by the cosine, that the source does not cover
-    by        "rays": along the normals of `mesh`, from outside, as far as `reach` on both sides; where these meet nothing, and
-              with "nearest" everywhere, the source's nearest point
-    reach     world units; None: a twentieth of the diagonal of the mesh's box
-    rays      for each texel, of visibility
-    margin    texels around charts that take the colour of the nearest texel within, for bilinear look-ups reach beyond seams;
-              None: all others. What is left is zero, of a normal map the flat (½, ½, 1)
-    seed      of the directions
-    progress  whether a bar is shown
+    """Return a texture (h, w, C) for a mesh, of what another surface has where the two lie on each other.
 
     The result is `mesh.replace(texture=…)`'s: row 0 on top. It has no gradient. Nearest points and margins need SciPy
     (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError that names the argument, ImportError.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        With texture coordinates that do not overlap, as unwrap() makes them; where they do, a warning counts the texels.
+    source : Mesh, Scene or function
+        The other surface, or a function of SurfacePoints of `mesh` that returns (N, C).
+    size : int or (h, w), default 512
+        Texels.
+    what : "color", "normal", "normal_map" or "visibility", default "color"
+        "color": its colours, or base colours where it is lit. "normal": its normals (C = 3) in world coordinates, of length 1.
+        "normal_map": these in the tangent frames of `mesh`, as Material(normal_map=…) and glTF take them: numbers from 0 to 1,
+        with MikkTSpace's frames where `mesh` has normals. "visibility" (C = 1): the share of the sky above a point of `mesh`,
+        weighed by the cosine, that the source does not cover.
+    by : "rays" or "nearest", default "rays"
+        "rays" go along the normals of `mesh`, from outside, as far as `reach` on both sides. Where these meet nothing, and with
+        "nearest" everywhere, it is the source's nearest point.
+    reach : float, world units, default a twentieth of the diagonal of the mesh's box
+    rays : int, default 64
+        Rays for each texel, of visibility.
+    margin : int or None, default 4
+        Texels around charts that take the colour of the nearest texel within, because bilinear look-ups reach beyond seams;
+        None: all others. The rest is zero, of a normal map the flat (½, ½, 1).
+    seed : int, default 0
+        Of the directions.
+    progress : bool, default True
+        Whether a bar is shown.
     """
     _check_mesh(mesh)
     shape = _shape(size)
@@ -122,18 +136,24 @@ def bake_pictures(
     *,
     masks: Sequence[Tensor] | None = None,
 ) -> Tensor:
-    """A texture (h, w, C) for a mesh, from pictures of it: of each texel the mean over the pictures that see it, weighed by the
-    square of the cosine at which they do.
+    """Return a texture (h, w, C) for a mesh, from pictures of it.
 
-    mesh     with texture coordinates that do not overlap, as unwrap() makes them
-    cameras  one for each picture
-    images   (H, W, C) linear radiance
-    size     texels: one number, or (h, w)
-    masks    (H, W) or (H, W, 1), 1 where a picture shows the mesh; what is below ½ does not count
+    Each texel is the mean over the pictures that see it, weighed by the square of the cosine at which they do. It is a start
+    for fit_texture(), which finds what pictures say together: `fit_texture(mesh.replace(texture=…), …)`. Texels that no picture
+    sees take the nearest colour. It has no gradient. Needs SciPy (`pip install 'edgegrad[fit]'`). Raises TypeError or
+    ValueError that names the argument, ImportError.
 
-    A start for fit_texture(), which finds what pictures say together: `fit_texture(mesh.replace(texture=…), …)`. Texels that no
-    picture sees take the nearest colour. It has no gradient. Needs SciPy (`pip install 'edgegrad[fit]'`). Raises TypeError
-    or ValueError that names the argument, ImportError.
+    Parameters
+    ----------
+    mesh : Mesh
+        With texture coordinates that do not overlap, as unwrap() makes them.
+    cameras : sequence of Camera, one for each picture
+    images : sequence of (H, W, C)
+        Linear radiance.
+    size : int or (h, w), default 512
+        Texels.
+    masks : sequence of (H, W) or (H, W, 1)
+        1 where a picture shows the mesh; pixels below ½ do not count.
     """
     _check_mesh(mesh)
     if isinstance(cameras, Camera):
@@ -176,7 +196,7 @@ def bake_pictures(
 
 
 class _Texels(NamedTuple):
-    """Those whose centres lie on a face."""
+    """Texels whose centres lie on a face."""
 
     shape: tuple[int, int]
     place: Tensor  # (N,) int64, row by row, row 0 on top
@@ -209,13 +229,9 @@ class _Texels(NamedTuple):
         return cls(shape, place, points_of(mesh, face, b))
 
     def texture(
-        self,
-        values: Tensor,
-        margin: int | None,
-        known: Tensor | None = None,
-        empty: float | tuple[float, ...] = 0.0,
+        self, values: Tensor, margin: int | None, known: Tensor | None = None, empty: float | tuple[float, ...] = 0.0
     ) -> Tensor:
-        """(h, w, C) of the values of those that are known; beyond the margin `empty`."""
+        """Return a texture (h, w, C) of the values of those that are known; beyond the margin it is `empty`."""
         h, w = self.shape
         place = self.place if known is None else self.place[known]
         left = torch.tensor(empty)
@@ -235,7 +251,7 @@ class _Texels(NamedTuple):
 
 
 def points_of(mesh: Mesh, face: Tensor, b: Tensor) -> SurfacePoints:
-    """Of one mesh, at barycentrics (N, 3)."""
+    """Return points of one mesh, at barycentrics (N, 3)."""
 
     def at(rows: Tensor, index: Tensor) -> Tensor:
         return (b[:, :, None] * rows.double()[index[face].long()]).sum(1)
@@ -253,7 +269,7 @@ def points_of(mesh: Mesh, face: Tensor, b: Tensor) -> SurfacePoints:
 
 
 def _matched(points: SurfacePoints, scene: Scene, by: str, reach: float) -> Places:
-    """The source's points that belong to points of the mesh."""
+    """Return the source's points that belong to points of the mesh."""
     count = len(points.face)
     face, b = np.full(count, -1), np.zeros((count, 3))
     if by == "rays":
@@ -263,14 +279,14 @@ def _matched(points: SurfacePoints, scene: Scene, by: str, reach: float) -> Plac
         face[rows], b[rows] = hits.face[near].numpy(), hits.barycentrics[near].detach().double().numpy()
     lost = face < 0
     if lost.any():
-        found = Surface(scene).nearest(points.position[torch.from_numpy(lost)].numpy())
+        found = SurfaceIndex(scene).nearest(points.position[torch.from_numpy(lost)].numpy())
         face[lost], b[lost] = found.face, found.b
     return Places(np.zeros((count, 3)), face, b)
 
 
 def _of_surface(scene: Scene, places: Places, what: str) -> Tensor:
     if what == "color":
-        colors = Surface(scene).colors(places)
+        colors = SurfaceIndex(scene).colors(places)
         if colors is None:
             raise ValueError(
                 "source: expected colours, a texture or a material, got none; give it some, or what='normal'"
@@ -287,7 +303,7 @@ def _of_surface(scene: Scene, places: Places, what: str) -> Tensor:
 
 
 def _in_tangent_frames(mesh: Mesh, points: SurfacePoints, normal: Tensor) -> Tensor:
-    """(N, 3): unit normals as a normal map of the mesh says them, from 0 to 1, on the outer side of its own."""
+    """Return unit normals (N, 3) as a normal map of the mesh writes them, from 0 to 1, on the outer side of its own."""
     at = OnMesh(mesh, points.face, points.barycentrics, tangents=lambda: _tangents(mesh))
     corners = at.corners()
     flat = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -300,7 +316,7 @@ def _in_tangent_frames(mesh: Mesh, points: SurfacePoints, normal: Tensor) -> Ten
 
 
 def _tangents(mesh: Mesh) -> Tensor:
-    """(F, 3, 4) at the corners of a mesh with normals."""
+    """Return tangents (F, 3, 4) at the corners of a mesh with normals."""
     assert mesh.normals is not None
     uvs, uv_faces = coordinates(mesh, None)
     given = (
@@ -308,12 +324,12 @@ def _tangents(mesh: Mesh) -> Tensor:
         (mesh.normals, mesh.faces if mesh.normal_faces is None else mesh.normal_faces),
         (uvs, uv_faces),
     )
-    fans = Fans.of(*((values.numpy(), index.numpy()) for values, index in given))
+    fans = Fans.from_corners(*((values.numpy(), index.numpy()) for values, index in given))
     return fans.tangents(*(values[index.long()] for values, index in given))
 
 
 def _visibility(points: SurfacePoints, scene: Scene, aside: float, rays: int, seed: int, progress: bool) -> Tensor:
-    """(N, 1): the share of directions, distributed as the cosine to the normal, that leave."""
+    """Return the share (N, 1) of directions, distributed as the cosine to the normal, that meet nothing."""
     count = len(points.face)
     generator = torch.Generator().manual_seed(seed)
     seen = torch.zeros(count, 1, dtype=torch.float64)
@@ -332,7 +348,8 @@ def _visibility(points: SurfacePoints, scene: Scene, aside: float, rays: int, se
 
 
 def _seen(mesh: Mesh, points: SurfacePoints, camera: Camera) -> Tensor:
-    """(N, 1): the square of the cosine between the normal and the way to the camera; 0 where something lies between."""
+    """Return the square of the cosine (N, 1) between the normal and the direction to the camera; 0 where something lies
+    between."""
     pose = camera.world_to_camera.double()
     ahead = pose[2, :3]
     if camera.projection == "orthographic":
@@ -351,7 +368,7 @@ def _seen(mesh: Mesh, points: SurfacePoints, camera: Camera) -> Tensor:
 
 
 def _warn_of_overlaps(first: Tensor, second: Tensor) -> None:
-    """Of numbers of faces + 1 that each texel has, and of others there; 0: none."""
+    """Warn of overlaps, from the numbers of faces + 1 that each texel has, and of others there; 0: none."""
     both = (second > 0) & (second != first)
     if not bool(both.any()):
         return
@@ -364,7 +381,7 @@ def _warn_of_overlaps(first: Tensor, second: Tensor) -> None:
 
 
 def _picture(name: str, image: Tensor, camera: Camera) -> Tensor:
-    """(H, W, C) float64."""
+    """Return a picture (H, W, C) float64."""
     if isinstance(image, str):
         raise TypeError(f"{name}: expected a tensor, got a name; use read_image({image!r})")
     given = as_tensor(name, image)
@@ -375,7 +392,7 @@ def _picture(name: str, image: Tensor, camera: Camera) -> Tensor:
 
 
 def _at(image: Tensor, x: Tensor) -> Tensor:
-    """(N, C) bilinear at places (N, 2), px."""
+    """Interpolate (N, C) bilinearly at places (N, 2), px."""
     H, W = image.shape[:2]
     grid = (2 * x / x.new_tensor([W, H]) - 1)[None, None]
     found = F.grid_sample(image.permute(2, 0, 1)[None], grid, padding_mode="border", align_corners=False)

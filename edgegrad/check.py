@@ -20,11 +20,10 @@ MOST_ROWS = 2**31 - 1  # of any array that is referred to by index: inside, indi
 
 
 def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating: bool = False) -> Tensor:
-    """`value` as a tensor: tensors pass unchanged, numbers, sequences and NumPy arrays are converted, to the device of
-    `like` and, if `like` is floating-point, to a floating-point dtype; with `floating` always to one. UNSIGNED become int64.
-
-    Raises TypeError when `value` is none of these, a sparse tensor, or a sequence of tensors whose gradients would be lost.
-    """
+    """Return `value` as a tensor: tensors pass unchanged, numbers, sequences and NumPy arrays are converted. They go to the
+    device of `like` and, if `like` is floating-point, to a floating-point dtype; with `floating` always to one. UNSIGNED become
+    int64. Raises TypeError when `value` is none of these, a sparse tensor, or a sequence of tensors whose gradients would be
+    lost."""
     if isinstance(value, Tensor):
         if value.layout is not torch.strided or value.is_nested:
             kind = "a nested one" if value.is_nested else f"one of layout {value.layout}"
@@ -59,7 +58,7 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating:
 
 
 def _check_real(name: str, tensor: Tensor) -> None:
-    """A conversion would drop the imaginary part. Raises TypeError."""
+    """Refuse complex numbers, of which a conversion would drop the imaginary part. Raises TypeError."""
     if tensor.is_complex():
         raise TypeError(f"{name}: expected real numbers, got {tensor.dtype}; take their .real")
 
@@ -75,10 +74,7 @@ def shape_text(shape: Sequence[int | str]) -> str:
 
 
 def check_shape(name: str, tensor: Tensor, *expected: Sequence[int | str], fix: str = "") -> None:
-    """`tensor.shape` must match one of `expected`; a string stands for any size ≥ 1.
-
-    Raises ValueError.
-    """
+    """Check that `tensor.shape` matches one of `expected`, in which a string stands for any size ≥ 1. Raises ValueError."""
 
     def matches(shape: Sequence[int | str]) -> bool:
         return len(shape) == tensor.dim() and all(
@@ -92,8 +88,36 @@ def check_shape(name: str, tensor: Tensor, *expected: Sequence[int | str], fix: 
         raise ValueError(f"{name}: expected shape {want}, got {shape_text(tensor.shape)}{fix and '; ' + fix}")
 
 
+def as_real(
+    name: str, value: object, *shapes: Sequence[int | str], like: Tensor | None = None, largest: float = LARGEST
+) -> Tensor:
+    """Return `value` as a finite tensor of float32 or float64, of one of the shapes. Raises TypeError or ValueError."""
+    tensor = as_tensor(name, value, like=like, floating=True)
+    check_float(name, tensor)
+    check_shape(name, tensor, *shapes)
+    check_finite(name, tensor, largest=largest)
+    return tensor
+
+
+def as_double(name: str, value: object, *shapes: Sequence[int | str]) -> Tensor:
+    """Return `value` detached, finite and in float64, of one of the shapes. Raises TypeError or ValueError."""
+    tensor = as_tensor(name, value, floating=True).detach().double()
+    check_shape(name, tensor, *shapes)
+    check_finite(name, tensor)
+    return tensor
+
+
+def as_index(name: str, value: object, shape: Sequence[int | str], count: int, of: str) -> Tensor:
+    """Return `value` as a tensor of indices into `count` rows of `of`. Raises TypeError or ValueError."""
+    tensor = as_tensor(name, value)
+    check_integer(name, tensor)
+    check_shape(name, tensor, shape)
+    check_indices(name, tensor, count, of)
+    return tensor
+
+
 def check_float(name: str, tensor: Tensor) -> None:
-    """float32 or float64. Raises TypeError."""
+    """Check for float32 or float64. Raises TypeError."""
     if tensor.dtype not in (torch.float32, torch.float64):
         fix = (
             "of 8-bit sRGB values take srgb_to_linear(x / 255)"
@@ -104,19 +128,19 @@ def check_float(name: str, tensor: Tensor) -> None:
 
 
 def check_integer(name: str, tensor: Tensor) -> None:
-    """An integer dtype that holds indices. Raises TypeError."""
+    """Check for an integer dtype that holds indices. Raises TypeError."""
     if tensor.dtype not in (torch.int32, torch.int64, torch.int16, torch.uint8):
         raise TypeError(f"{name}: expected an integer dtype (int32 or int64), got {tensor.dtype}; use .long()")
 
 
 def values_visible(*tensors: Tensor) -> bool:
-    """Whether values may be looked at: not while torch.compile traces or torch.vmap runs, where the kernel's own checks take
+    """Return whether values may be read: not while torch.compile traces or torch.vmap runs, where the kernel's own checks take
     over, and not those of meta tensors, which have none."""
     return not torch.compiler.is_compiling() and not any(tensor.is_meta or _batched(tensor) for tensor in tensors)
 
 
 def _batched(tensor: Tensor) -> bool:
-    """Whether torch.vmap shows one element of a batch in its place, perhaps within other transforms of torch.func."""
+    """Return whether torch.vmap shows one element of a batch in its place, perhaps within other transforms of torch.func."""
     functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
     while functorch.is_functorch_wrapped_tensor(tensor):
         if functorch.is_batchedtensor(tensor):
@@ -126,13 +150,13 @@ def _batched(tensor: Tensor) -> bool:
 
 
 def check_not_meta(name: str, tensor: Tensor) -> None:
-    """A tensor that has values, on whatever device. Raises ValueError."""
+    """Check that a tensor has values, on whatever device. Raises ValueError."""
     if tensor.is_meta:
         raise ValueError(f"{name}: expected numbers, got a meta tensor, which has none; make it on another device")
 
 
 def check_fields(thing: Any, given: Iterable[str]) -> None:
-    """What `replace` is given are fields of the dataclass. Raises TypeError."""
+    """Check that the arguments of `replace` are fields of the dataclass. Raises TypeError."""
     known = sorted(field.name for field in dataclasses.fields(thing))
     for name in given:
         if name not in known:
@@ -140,8 +164,8 @@ def check_fields(thing: Any, given: Iterable[str]) -> None:
 
 
 def _ask_kernel(question: Callable[..., bool], tensor: Tensor, *more: Any) -> bool:
-    """Whether the kernel says yes of the numbers of a tensor. No where these are no array in memory: on another device,
-    strided, seen through a transform of torch.func, or without storage. Torch would wake all threads for what one does
+    """Return whether the kernel says yes of the numbers of a tensor. It is no where these are no array in memory: on another
+    device, strided, seen through a transform of torch.func, or without storage. Torch would wake all threads for what one does
     faster; the kernel takes more for long arrays."""
     try:
         return tensor.data_ptr() != 0 and question(tensor.numpy(), *more, torch.get_num_threads())
@@ -150,7 +174,7 @@ def _ask_kernel(question: Callable[..., bool], tensor: Tensor, *more: Any) -> bo
 
 
 def all_below(index: Tensor, count: int) -> bool:
-    """Whether all indices are in [0, count)."""
+    """Return whether all indices are in [0, count)."""
     if _ask_kernel(core.all_below, index, count):
         return True
     low, high = (int(v) for v in torch.aminmax(index))
@@ -158,12 +182,12 @@ def all_below(index: Tensor, count: int) -> bool:
 
 
 def all_finite(tensor: Tensor) -> bool:
-    """Whether no number is NaN or infinite."""
+    """Return whether no number is NaN or infinite."""
     return _ask_kernel(core.all_finite, tensor) or bool(torch.isfinite(tensor).all())
 
 
 def check_storage(name: str, tensor: Tensor) -> None:
-    """Torch would read the numbers of a tensor whose memory was given back, and end the process. Raises ValueError."""
+    """Refuse a tensor whose memory was given back: torch would read it, and end the process. Raises ValueError."""
     try:
         gone = tensor.numel() > 0 and tensor.untyped_storage().nbytes() == 0
     except (RuntimeError, NotImplementedError):  # seen through a transform, which holds the numbers
@@ -173,14 +197,13 @@ def check_storage(name: str, tensor: Tensor) -> None:
 
 
 def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smallest: float = 0.0) -> None:
-    """No NaN, no infinity, and none larger than `largest`; names the first bad index. Not all, unless all are zero, are
-    smaller than `smallest`. Raises ValueError.
-    """
+    """Check for NaN, infinity, and numbers larger than `largest`; the message names the first bad index. Unless all are zero,
+    some must reach `smallest`. Raises ValueError."""
     if not values_visible(tensor):
         return
     check_storage(name, tensor)
     values = tensor.detach()
-    # One fast pass that says yes to nearly everything, then the exact answer. A sum is finite unless a term is not (or the
+    # A fast pass says yes to nearly everything, before the exact answer. A sum is finite unless a term is not (or the
     # sum overflows); what a sum of squares reaches, no term exceeds.
     if largest == LARGEST and not smallest and _ask_kernel(core.all_finite, values):
         return
@@ -208,7 +231,7 @@ def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smalles
 
 
 def check_countable(name: str, tensor: Tensor, count: int, of: str) -> None:
-    """Indices into `count` rows that 32 bits can count. Raises ValueError."""
+    """Check for indices into `count` rows that 32 bits can count. Raises ValueError."""
     if tensor.shape[0] > MOST_ROWS // 3 or count > MOST_ROWS:
         raise ValueError(
             f"{name}: expected at most {MOST_ROWS // 3} faces and {MOST_ROWS} rows of {of} (indices have 32 bits inside), "
@@ -217,7 +240,7 @@ def check_countable(name: str, tensor: Tensor, count: int, of: str) -> None:
 
 
 def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
-    """All in [0, count). Raises ValueError."""
+    """Check that all indices are in [0, count). Raises ValueError."""
     if not values_visible(tensor) or tensor.numel() == 0:
         return
     check_storage(name, tensor)
@@ -233,7 +256,7 @@ def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
 
 
 def as_int(name: str, value: object) -> int:
-    """`value` as an int: ints of Python and NumPy, and tensors of one integer. Raises TypeError."""
+    """Return `value` as an int: ints of Python and NumPy, and tensors of one integer. Raises TypeError."""
     try:
         if isinstance(value, bool):
             raise TypeError
@@ -244,7 +267,7 @@ def as_int(name: str, value: object) -> int:
 
 
 def as_scalar(name: str, value: object, *, like: Tensor) -> Tensor:
-    """A number, or a tensor of one, as a 0-d tensor of the dtype of `like`. Raises TypeError or ValueError."""
+    """Return a number, or a tensor of one, as a 0-d tensor of the dtype of `like`. Raises TypeError or ValueError."""
     tensor = as_tensor(name, value, like=like)
     if tensor.numel() != 1:
         raise ValueError(f"{name}: expected one number, got shape {shape_text(tensor.shape)}")
@@ -252,7 +275,7 @@ def as_scalar(name: str, value: object, *, like: Tensor) -> Tensor:
 
 
 def check_int(name: str, value: object, least: int, most: int) -> int:
-    """An int in [least, most]. Raises TypeError or ValueError."""
+    """Return an int in [least, most]. Raises TypeError or ValueError."""
     number = as_int(name, value)
     if not least <= number <= most:
         raise ValueError(f"{name}: expected an int from {least} to {most}, got {number}")
@@ -260,7 +283,7 @@ def check_int(name: str, value: object, least: int, most: int) -> int:
 
 
 def check_positive(name: str, value: object, *, least: float, most: float) -> float:
-    """A number from `least` to `most`. Raises TypeError or ValueError."""
+    """Return a number from `least` to `most`. Raises TypeError or ValueError."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__} ({value!r})")
     if not least <= value <= most:  # nor where it is none
@@ -269,12 +292,19 @@ def check_positive(name: str, value: object, *, least: float, most: float) -> fl
 
 
 def check_positive_int(name: str, value: object, *, most: int = 2**31 - 1) -> int:
-    """An int ≥ 1. Raises TypeError or ValueError."""
+    """Return an int ≥ 1. Raises TypeError or ValueError."""
     return check_int(name, value, 1, most)
 
 
+def check_dtype(dtype: torch.dtype | None) -> torch.dtype | None:
+    """Return float32, float64 or None itself. Raises TypeError."""
+    if dtype not in (None, torch.float32, torch.float64):
+        raise TypeError(f"dtype: expected torch.float32, torch.float64 or None, got {dtype!r}")
+    return dtype
+
+
 def check_flag(name: str, flag: object) -> bool:
-    """True or False itself. Raises TypeError."""
+    """Return True or False itself. Raises TypeError."""
     if not isinstance(flag, bool):
         raise TypeError(f"{name}: expected True or False, got {type(flag).__name__} ({flag!r})")
     return flag

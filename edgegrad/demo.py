@@ -1,8 +1,7 @@
 """The demo: an airliner above a photograph of the Earth, found again from a wrong pose.
 
 The target is rendered at a known pose with seeds of its own. fit_pose gets the mesh, the picture, the camera, the background
-and the start, and nothing else; the errors are taken afterwards. The light on the airliner is part of its
-colours.
+and the start, and nothing else; the errors are taken afterwards. The light on the airliner is part of its colours.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .camera.camera import Camera
+from .camera.poses import rotation
 from .files.image import read_image
 from .fit import PoseFit, fit_pose
 from .optional import require
@@ -30,7 +30,7 @@ GOOD = 0.5  # degrees and percent: what counts as found
 
 
 class Errors(NamedTuple):
-    """How far a pose is from the true one."""
+    """The distance of a pose from the true one."""
 
     degrees: float  # angle of the rotation between them
     percent: float  # distance of the object's centres, in percent of its size, the diagonal of its bounding box
@@ -43,7 +43,7 @@ class Run(NamedTuple):
 
 
 def airliner() -> Mesh:
-    """The airliner that the pyvista wheel carries, painted, in the light of a high sun and a blue sky."""
+    """Return the airliner that the pyvista wheel carries, painted, in the light of a high sun and a blue sky."""
     examples = require("pyvista.examples", "edgegrad[demo]", "the demo")
     surface = examples.load_airplane().compute_normals(feature_angle=40.0, split_vertices=True)
     verts = torch.from_numpy(np.array(surface.points, np.float64))
@@ -67,14 +67,15 @@ def airliner() -> Mesh:
 
 
 def earth() -> Tensor:
-    """(SIZE, SIZE, 3) linear radiance: Europe, Africa and Arabia, from the photograph map that the pyvista wheel carries."""
+    """Return (SIZE, SIZE, 3) linear radiance: Europe, Africa and Arabia, from the photograph map that the pyvista wheel
+    carries."""
     examples = require("pyvista.examples", "edgegrad[demo]", "the demo")
     view = read_image(examples.mapfile, channels=3)[130:530, 960:1360]
     return F.interpolate(view.movedim(-1, 0)[None], size=(SIZE, SIZE), mode="area")[0].movedim(0, -1).contiguous()
 
 
 def run(mesh: Mesh, background: Tensor, seed: int, progress: bool = True) -> Run:
-    """One target at a random pose, one start beside it, one fit."""
+    """Render one target at a random pose, and fit it from one start near it."""
     rng = np.random.default_rng(seed)
     low, high = mesh.verts.aminmax(dim=0)
     center, size = (low + high) / 2, float((high - low).norm())
@@ -83,14 +84,14 @@ def run(mesh: Mesh, background: Tensor, seed: int, progress: bool = True) -> Run
 
     heading, tilt = rng.uniform(0.0, 2.0 * math.pi), math.radians(rng.uniform(0.0, 40.0))
     axis = rng.uniform(0.0, 2.0 * math.pi)
-    leaning = rotation(tilt * np.array([math.cos(axis), math.sin(axis), 0.0]))
-    R_true = leaning @ rotation(np.array([0.0, 0.0, heading]))
+    leaning = rotation(tilt * torch.tensor([math.cos(axis), math.sin(axis), 0.0]).double())
+    R_true = leaning @ rotation(torch.tensor([0.0, 0.0, heading]).double())
     center_true = center + size * torch.from_numpy(rng.uniform(-0.1, 0.1, 3))
     posed = mesh.transformed(R_true, center_true - R_true @ center)
     target = render(Scene([posed], background), camera, spp=TARGET_SPP, seed=int(rng.integers(2**40, 2**41)))
 
     turn = math.radians(rng.uniform(0.5, 1.0) * MOST_TURN)
-    R_start = rotation(turn * direction(rng)) @ R_true
+    R_start = rotation(torch.from_numpy(turn * direction(rng))) @ R_true
     center_start = center_true + torch.from_numpy(rng.uniform(0.5, 1.0) * MOST_SHIFT / 100.0 * size * direction(rng))
     start = torch.eye(4, dtype=torch.float64)
     start[:3, :3], start[:3, 3] = R_start, center_start - R_start @ center
@@ -98,7 +99,7 @@ def run(mesh: Mesh, background: Tensor, seed: int, progress: bool = True) -> Run
     fit = fit_pose(mesh, target, camera, init=start, background=background, seed=seed, progress=progress)
 
     def errors(R: Tensor, t: Tensor) -> Errors:
-        # From the sine and the cosine: the arc cosine alone loses half the digits of a small angle.
+        # The arc cosine alone loses half the digits of a small angle.
         apart = R @ R_true.T
         sine = (
             0.5 * torch.stack([apart[2, 1] - apart[1, 2], apart[0, 2] - apart[2, 0], apart[1, 0] - apart[0, 1]]).norm()
@@ -109,13 +110,7 @@ def run(mesh: Mesh, background: Tensor, seed: int, progress: bool = True) -> Run
     return Run(errors(start[:3, :3], start[:3, 3]), errors(fit.R, fit.t), fit)
 
 
-def rotation(vector: np.ndarray) -> Tensor:
-    """(3, 3) by |vector| radians about it."""
-    x, y, z = vector.tolist()
-    return torch.linalg.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64))
-
-
 def direction(rng: np.random.Generator) -> np.ndarray:
-    """(3,) of length 1, in any direction alike."""
+    """Return a direction (3,) of length 1, uniform over the sphere."""
     vector = rng.normal(size=3)
     return vector / np.linalg.norm(vector)

@@ -1,4 +1,4 @@
-"""Opens Embree and imports the compiled kernel."""
+"""Opening of Embree and import of the compiled kernel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HOW_TO_GET_EMBREE = (
 
 
 def embree_path() -> str:
-    """Path of libembree4 among the files of the installed embreex distribution. Raises ImportError."""
+    """Return the path of libembree4 among the files of the installed embreex distribution. Raises ImportError."""
     try:
         files = importlib.metadata.distribution("embreex").files or []
     except importlib.metadata.PackageNotFoundError:
@@ -32,11 +32,9 @@ def embree_path() -> str:
 
 
 def load() -> Any:
-    """The kernel module, with Embree open. Raises ImportError that says how to get what is missing.
-
-    Two environment variables serve its tests: EDGEGRAD_KERNEL, the file of another build of it, with sanitizers; and
-    EDGEGRAD_EMBREE, options of Embree's device, such as "max_isa=avx2" for what older processors run.
-    """
+    """Return the kernel module, with Embree open. Raises ImportError that says how to get what is missing. Two environment
+    variables serve its tests. EDGEGRAD_KERNEL is the file of another build of it, with sanitizers. EDGEGRAD_EMBREE has options
+    of Embree's device, such as "max_isa=avx2" for what older processors run."""
     if path := os.environ.get("EDGEGRAD_KERNEL"):
         spec = importlib.util.spec_from_file_location("edgegrad._core", path)
         assert spec is not None and spec.loader is not None, f"EDGEGRAD_KERNEL: expected a compiled module, got {path}"
@@ -53,7 +51,7 @@ def load() -> Any:
 
 
 core = load()
-# Without this a process that ends while daemon threads render is often aborted (csrc/python/unlocked.h).
+# A process that ends while daemon threads render would often be aborted (csrc/python/unlocked.h).
 atexit.register(core.await_callers)
 # Without this a worker of a DataLoader, or of multiprocessing, that is forked after its parent rendered waits for ever.
 if hasattr(os, "register_at_fork"):

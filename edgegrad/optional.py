@@ -9,7 +9,7 @@ DRAWING = "edgegrad[figures]", "drawing a fit"  # the package and the purpose, a
 
 
 def require(module: str, package: str, purpose: str) -> ModuleType:
-    """A module that is imported only when it is needed. Raises ImportError with the way to install it."""
+    """Return a module that is imported only when it is needed. Raises ImportError with the way to install it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

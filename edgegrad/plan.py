@@ -1,4 +1,4 @@
-"""plan(): what a render does and what it leaves out, before it runs."""
+"""plan(): the work of a render, and what it leaves out, before it runs."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .kernel import memory as memory
 from .kernel.counts import COUNTS, table
 from .kernel.derivatives import moves
 from .kernel.flat import Flat
-from .kernel.operators import Hits, backward_kernel, image_room, pass_size
+from .kernel.operators import Hits, backward_kernel, image_memory, pass_size
 from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
 from .library import core
+from .light.antithetic import MOST_SETS, SETS
 from .light.bounces import check_bounces
-from .light.companions import FOURS, MOST_FOURS
 from .light.radiance import LIGHTING, Lighting
 from .light.resampled import how_drawn
 from .light.unused_options import warn_of_unused
@@ -67,12 +67,12 @@ class Plan(Mapping[str, Term]):
 
     @property
     def samples(self) -> int:
-        """Rays in all."""
+        """Return the number of rays in all."""
         return sum(term.samples for term in self.values())
 
     @property
     def bytes(self) -> int:
-        """Estimated peak above the user's own tensors, the image and all gradients included."""
+        """Return the estimated peak memory above the user's own tensors, the image and all gradients included."""
         return sum(term.bytes for term in self.values())
 
     def __str__(self) -> str:
@@ -87,11 +87,12 @@ class Plan(Mapping[str, Term]):
 
 
 def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **options: Any) -> Plan:
-    """What `render(scene, camera, spp, seed, …)` and its backward pass will do: each term, on or off, why, samples, memory.
+    """Return the terms of `render(scene, camera, spp, seed, …)` and its backward pass: each with whether it is on, why, samples
+    and memory.
 
-    Takes the arguments of render() and raises what it raises. Samples of the gradient are counted for a loss that looks
-    everywhere and an image that sees every face: where the adjoint is zero none are taken, and fewer on faces that no
-    sample of the image hits. Nothing is drawn; the ray structure and the edges are built, and render() then finds them.
+    Takes the arguments of render() and raises what it raises. Samples of the gradient are counted for a loss that is nowhere
+    zero and an image that sees every face: where the adjoint is zero none are taken, and fewer on faces that no sample of the
+    image hits. Nothing is drawn; the ray structure and the edges are built, and render() then finds them.
     """
     check_options("plan", options)
     scene = as_scene(scene)
@@ -110,15 +111,16 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
 
 
 def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | None = None) -> dict[str, Term]:
-    """With a shader, of which nothing is asked before it runs: neither what it needs nor at which edges it may jump."""
+    """Return the terms with a shader, of which nothing is asked before it runs: neither what it needs nor at which edges it may
+    jump."""
     attributes = every_face(len(request.scene.faces)) if creases is True else None
     request = request._replace(scene=without_colors(request.scene, attributes))
     moving = [name for name in required(request) if name in MOVING]
-    # Whether a tensor of the shader's own requires a gradient is not known either.
+    # It is not known either whether a tensor of the shader's own requires a gradient.
     wanted = [*moving, "colors"] if torch.is_grad_enabled() else []
     terms = {**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted, lit)}
     rows = CURVE_BYTES * terms["boundary"].samples + SURFACE_BYTES * terms["interior"].samples
-    terms["textures"] = Term(False, "the shader looks up its own")
+    terms["textures"] = Term(False, "left to the shader")
     terms["shader"] = Term(
         True, f"asked for at most {AT_ONCE:,} points at a time; what it keeps of them is not counted here"
     )
@@ -134,7 +136,7 @@ def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | 
 
 
 def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighting) -> dict[str, Term]:
-    """Materials and lights are shaded at points of surfaces and curves, as by a shader."""
+    """Return the terms with materials and lights, which are shaded at points of surfaces and curves, as by a shader."""
     terms = _shaded_terms(scene, request, creases, scene)
     lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
     where = "lit" if scene.is_lit else "seen, with mipmaps"
@@ -142,8 +144,8 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     del terms["shader"]
     inside = sum(lighting.in_gradient(scene, light) for light in scene.casting)
     more = (
-        f"; for the gradient inside faces {inside}, in fours of which what derivatives have of both signs cancels, and up to "
-        f"{MOST_FOURS // FOURS} times as many where faces are seen from aside"
+        f"; for the gradient inside faces {inside}, in antithetic sets of four whose opposite signs cancel, and up to "
+        f"{MOST_SETS // SETS} times as many where faces are seen from aside"
         if inside > lights
         else ""
     )
@@ -164,15 +166,15 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     interior, boundary = terms["interior"].samples, terms["boundary"].samples
     terms["bounces"] = _bounces(scene, interior + boundary, 4 * interior if slides else 0, lighting)
     terms["shadow edges"] = _shadow_edges(scene, request, lighting)
-    terms["unseen shadow edges"] = _unseen_shadow_edges(scene, request, lighting)
+    terms["indirect shadow edges"] = _indirect_shadow_edges(scene, request, lighting)
     terms["bounce edges"] = _bounce_edges(scene, request, lighting)
-    terms["surface borders"] = _surface_borders(scene, request, lighting)
-    terms["texels of lamps"] = _texels_of_lamps(scene, lighting)
+    terms["surface borders"] = _secondary_borders(scene, request, lighting)
+    terms["texels of lights"] = _texels_of_lights(scene, lighting)
     return terms
 
 
-def _bounces(scene: Scene, points: int, beside: int, lighting: Lighting) -> Term:
-    """By points of the gradient, and at how many places beside them light from nearby is compared."""
+def _bounces(scene: Scene, points: int, near_field: int, lighting: Lighting) -> Term:
+    """Return the term of bounces, by points of the gradient and by the places at which the near-field term compares light."""
     if lighting.bounces == 1:
         return Term(False, "bounces=1: light is scattered once on its way")
     shadows = len(scene.casting) if lighting.shadows else 0
@@ -180,24 +182,28 @@ def _bounces(scene: Scene, points: int, beside: int, lighting: Lighting) -> Term
         True,
         f"a path for each point of the gradient, and two for each ray of the image; {1 + shadows} rays for each of at most "
         f"{lighting.bounces - 1} further points"
-        + ("; where what is seen slides on its face, four beside each point" if beside else ""),
-        samples=(lighting.bounces - 1) * (1 + shadows) * (points + beside),
+        + (
+            "; where what is seen slides on its face, four more for the near-field term of each point"
+            if near_field
+            else ""
+        ),
+        samples=(lighting.bounces - 1) * (1 + shadows) * (points + near_field),
     )
 
 
-def _texels_of_lamps(scene: Scene, lighting: Lighting) -> Term:
-    lamps = [light for light in scene.casting if isinstance(light, MeshLight) and light.has_borders]
-    moving = sum(moves(light.coordinates) for light in lamps)
+def _texels_of_lights(scene: Scene, lighting: Lighting) -> Term:
+    emitters = [light for light in scene.casting if isinstance(light, MeshLight) and light.has_borders]
+    moving = sum(moves(light.coordinates) for light in emitters)
     if not moving:
-        return Term(False, "nothing that moves them" if lamps else "no emission is that of the nearest texel")
+        return Term(False, "nothing that moves them" if emitters else "no emission is that of the nearest texel")
     count = moving * lighting.samples
     return Term(True, f"{count} point{'s' * (count > 1)} of their borders for each point of the interior")
 
 
-def _lights_with_borders(
+def _lights_with_moving_shadows(
     scene: Scene, request: Request, lighting: Lighting, names: Collection[str]
 ) -> tuple[list[Light], str]:
-    """Those whose shadows have borders that move, as they do with slots of these names; else why none."""
+    """Return the lights whose shadows have borders that move, as they do with slots of these names; else why there are none."""
     if not scene.casting or not lighting.shadows:
         return [], "shadows=False" if scene.casting else "no lights"
     if not request.gradient.visibility:
@@ -207,7 +213,7 @@ def _lights_with_borders(
 
 
 def _shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
-    lights, why = _lights_with_borders(scene, request, lighting, STEPPING if _cuts(scene) else MOVING)
+    lights, why = _lights_with_moving_shadows(scene, request, lighting, STEPPING if _has_alpha(scene) else MOVING)
     if not lights:
         return Term(False, why or "nothing that casts, receives or gives light moves, nor the camera")
     many = sum(not light.punctual for light in lights)
@@ -217,12 +223,12 @@ def _shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
 
 
-def _unseen_shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+def _indirect_shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
     if lighting.bounces == 1:
         return Term(False, "bounces=1: no surface lights another")
     # How borders lie on surfaces does not depend on the camera.
-    names = ("verts", *(("uvs", "alphas") if _cuts(scene) else ()))
-    lights, why = _lights_with_borders(scene, request, lighting, names)
+    names = ("verts", *(("uvs", "alphas") if _has_alpha(scene) else ()))
+    lights, why = _lights_with_moving_shadows(scene, request, lighting, names)
     if not lights:
         return Term(False, why or "nothing that casts, receives or gives light moves")
     each = request.gradient.edge_samples
@@ -235,49 +241,53 @@ def _unseen_shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> 
 
 
 def _bounce_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
-    if lighting.bounces == 1:
-        return Term(False, "bounces=1: no surface lights another")
-    if not request.gradient.visibility:
-        return Term(False, "visibility=False")
-    moving, cut = required(request), _cuts_that_move(scene, request)
+    if why := _why_no_secondary_edges(request, lighting):
+        return Term(False, why)
+    moving, cut = required(request), _moving_alpha_edges(scene, request)
     if not cut and not any(name in MOVING for name in moving):
         return Term(False, "neither surfaces nor the camera move")
-    # What only the camera moves are borders that it sees.
+    # The camera alone moves only borders that it sees.
     kinds = lighting.bounces - 1 if cut or "verts" in moving else 1
     samples = request.cameras * kinds * _most_bounce_samples(request)
-    past = "edges and rims of cut-outs" if _cuts(scene) else "edges"
+    past = "edges and alpha edges" if _has_alpha(scene) else "edges"
     why = f"what surfaces see of one another: lines past {past}, each two rays, one to the camera and a path at its other end"
     if kinds > 1:
         why += f"; as many whose light goes on to the camera after each of {kinds - 1} further bounces"
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
 
 
-def _surface_borders(scene: Scene, request: Request, lighting: Lighting) -> Term:
-    if lighting.bounces == 1:
-        return Term(False, "bounces=1: no surface lights another")
-    if not request.gradient.visibility:
-        return Term(False, "visibility=False")
+def _secondary_borders(scene: Scene, request: Request, lighting: Lighting) -> Term:
+    if why := _why_no_secondary_edges(request, lighting):
+        return Term(False, why)
     crossings = "verts" in required(request) and has_intersections(request.scene)
-    cut = _cuts_that_move(scene, request)
+    cut = _moving_alpha_edges(scene, request)
     if not (crossings or cut):
-        return Term(False, "no faces that move pass through each other" + ", no rims move on theirs" * _cuts(scene))
+        return Term(
+            False, "no faces that move pass through each other" + ", no alpha edges move on theirs" * _has_alpha(scene)
+        )
     kinds = lighting.bounces - 1
     samples = request.cameras * kinds * max(_most_bounce_samples(request) // 4, 256)
-    where = " and ".join(["where faces pass through each other"] * crossings + ["at rims of cut-outs"] * cut)
-    why = f"light that surfaces send beside curves {where}: up to 8 rays for each place, each with a path and one to the camera"
+    where = " and ".join(["where faces pass through each other"] * crossings + ["at alpha edges"] * cut)
+    why = f"light that surfaces send next to curves {where}: up to 8 rays for each place, each with a path and one to the camera"
     return Term(True, why, samples=samples, bytes=8 * samples * CURVE_BYTES)
 
 
-def _cuts_that_move(scene: Scene, request: Request) -> bool:
-    return _cuts(scene) and any(name in ("uvs", "alphas") for name in required(request))
+def _why_no_secondary_edges(request: Request, lighting: Lighting) -> str:
+    if lighting.bounces == 1:
+        return "bounces=1: no surface lights another"
+    return "" if request.gradient.visibility else "visibility=False"
+
+
+def _moving_alpha_edges(scene: Scene, request: Request) -> bool:
+    return _has_alpha(scene) and any(name in ("uvs", "alphas") for name in required(request))
 
 
 def _most_bounce_samples(request: Request) -> int:
     each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
-    return each if each >= 0 else core.most_bounce_samples(*size, request.image.spp)
+    return each if each >= 0 else core.most_secondary_edge_samples(*size, request.image.spp)
 
 
-def _cuts(scene: Scene) -> bool:
+def _has_alpha(scene: Scene) -> bool:
     return any(mesh.alpha is not None for mesh in scene.meshes)
 
 
@@ -290,23 +300,19 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
     needs = core.image_bytes(pass_size(request), B)
     copied = _bytes_of_copies(scene, request.scene)
     cameras = "" if B == 1 else f", {B} cameras"
-    textures, cut_outs = len(request.scene.textures), len(request.scene.cut_outs)
+    textures, alpha_masks = len(request.scene.textures), len(request.scene.alpha_masks)
     return {
         "scene": Term(
             copied > 0,
             "copied end to end, in the kernel's number types" if copied else "read where it is",
             bytes=copied,
         ),
-        "ray structure": Term(
-            True,
-            "built once, and again when vertices moved",
-            bytes=needs["ray structure"],
-        ),
+        "ray structure": Term(True, "built once, and again when vertices moved", bytes=needs["ray structure"]),
         "image": Term(True, f"{spp} samples a pixel{cameras}", B * camera.height * camera.width * spp, needs["image"]),
         # Their memory is the user's own, or counted with the scene.
         "textures": Term(textures > 0, f"{textures} to look up" if textures else "no mesh has one"),
-        "cut-outs": Term(
-            cut_outs > 0, "rays pass through where alpha is below its cutoff" if cut_outs else "no mesh has alpha"
+        "alpha masks": Term(
+            alpha_masks > 0, "rays pass through where alpha is below its cutoff" if alpha_masks else "no mesh has alpha"
         ),
         "kept for backward": Term(
             any_gradient,
@@ -322,7 +328,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     moves = any(name in wanted for name in MOVING)
 
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
-    with image_room(request):
+    with image_memory(request):
         ones = flat.colors.new_ones((B, camera.height, camera.width, request.channels))
     hits = Hits(
         ones[..., 0].contiguous(),
@@ -332,8 +338,9 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     )
     _, profiles = backward_kernel(ones, hits, request, wanted, dry=True, lit=lit)
     counts = {name: int(sum(profile[name] for profile in profiles)) for name in COUNTS}
-    surface, edge, silhouettes, creases, intersections, rim = (
-        counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "rim")
+    surface, edge, silhouettes, creases, intersections, lens_boundary = (
+        counts[name]
+        for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "lens_boundary")
     )
     needs = core.gradient_bytes(
         pass_size(request), motion=work.motion, boundary=work.boundary, steps=work.steps, wanted=list(wanted),
@@ -347,7 +354,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     # Why the terms are off, "" where nothing keeps them from running.
     still = "" if moves else "neither verts nor the camera require a gradient"
     no_boundary = still or ("" if request.gradient.visibility else "visibility=False")
-    no_rim = "" if {"K", "distortion"} & set(wanted) else "neither K nor distortion requires a gradient"
+    no_lens_boundary = "" if {"K", "distortion"} & set(wanted) else "neither K nor distortion requires a gradient"
     no_interior = ""
     if not (work.motion or work.appearance):
         no_interior = "each face has one radiance, wherever it moves" if moves else "nothing asks for it"
@@ -357,7 +364,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     terms = {
         "view": Term(
             any(work),
-            "where vertices are and where the loss looks" if any(work) else "nothing asks for it",
+            "vertices and importance map of the image" if any(work) else "nothing asks for it",
             bytes=ones.nbytes + bytes_of("view"),
         ),
         "interior": Term(
@@ -368,9 +375,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
             bytes=bytes_of("faces in view", "controls", "surface samples"),
         ),
         "topology": Term(
-            work.boundary,
-            no_boundary or "edges, found once for a set of faces",
-            bytes=bytes_of("topology"),
+            work.boundary, no_boundary or "edges, found once for a set of faces", bytes=bytes_of("topology")
         ),
         "boundary": Term(
             edge > 0,
@@ -396,11 +401,15 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
             no_boundary or (f"{intersections:,} in view" if intersections else "none in view"),
             bytes=bytes_of("intersections"),
         ),
-        "rim": Term(
-            rim > 0,
+        "lens boundary": Term(
+            lens_boundary > 0,
             no_boundary
-            or no_rim
-            or (f"where the lens folds or ends, {rim:,} px in view" if rim else "no lens ends in view"),
+            or no_lens_boundary
+            or (
+                f"where the lens folds or ends, {lens_boundary:,} px in view"
+                if lens_boundary
+                else "no lens ends in view"
+            ),
         ),
     }
     lines = counts["step_lines"]
@@ -418,12 +427,12 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
 
 
 def _bound(samples: int, wanted: int) -> str:
-    """What plan() says where the budget (csrc/estimator/budget.h) may cut the default samples."""
+    """Return the text where the budget (csrc/estimator/budget.h) may cut the default samples."""
     return f"; by default up to {wanted:,}, but no more than take the image's time" if 0 < samples < wanted else ""
 
 
 def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
-    """Of the flat arrays that are not the user's own tensors."""
+    """Return the bytes of the flat arrays that are not the user's own tensors."""
     tensors = [value for mesh in scene.meshes for value in vars(mesh).values() if isinstance(value, Tensor)]
     tensors += [] if scene.background is None else [scene.background]
     own = {tensor.untyped_storage().data_ptr() for tensor in tensors}

@@ -29,7 +29,7 @@ def framing(
     target: Sequence[float] | None = None,
     up: Sequence[float] = (0.0, 1.0, 0.0),
 ) -> Camera:
-    """The whole scene, seen from (0.5, 0.4, 0.77) of the middle of its box as far as nothing else is said."""
+    """Return a camera that sees the whole scene, from (0.5, 0.4, 0.77) of the middle of its box unless told otherwise."""
     verts = torch.cat([mesh.verts for mesh in scene.meshes]).double()
     low, high = verts.aminmax(dim=0)
     middle = (low + high) / 2 if target is None else torch.tensor(target).double()
@@ -44,8 +44,8 @@ def framing(
 
 
 def under_headlight(scene: Scene, camera: Camera) -> Scene:
-    """The scene with a light from behind the camera on meshes that have no colour of their own, which would be flat silhouettes;
-    on all that has a material where there is no light at all. Itself where nothing needs one."""
+    """Return the scene with a light from behind the camera on meshes without a colour, which would be flat silhouettes; on all
+    with a material where there is no light at all. It is the scene itself where nothing needs one."""
     plain = [mesh.material is None and mesh.channels is None for mesh in scene.meshes]
     emits = any(mesh.material is not None and mesh.material.emission is not None for mesh in scene.meshes)
     dark = scene.is_lit and not scene.lights and not emits
@@ -61,13 +61,14 @@ def under_headlight(scene: Scene, camera: Camera) -> Scene:
 
 
 def thumbnail(scene: Scene | Mesh) -> bytes:
-    """A small PNG of the whole scene, for notebooks."""
+    """Return a small PNG of the whole scene, for notebooks."""
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         scene = as_scene(scene).detach().to("cpu")
         camera = framing(scene, SIZE)
         background = None if scene.background is None or scene.background.dim() == 3 else scene.background
         background = torch.full((scene.channels,), BACKGROUND) if background is None else background
-        image = render(under_headlight(scene.replace(background=background), camera), camera, spp=8, shadows=False)
+        shown = under_headlight(scene.replace(background=background), camera)
+        image = render(shown, camera, spp=8, shadows=not shown.is_lit)
         image = image if image.shape[-1] in (1, 3) else image[..., :1]
         write_image(file := Path(folder) / "thumbnail.png", image.clamp(0.0, 1.0))
         return file.read_bytes()

@@ -24,12 +24,12 @@ from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
 from .scene.tree import map_tensors, tensors_in
 
-# What the kernel measures, in the order of a step.
+# The kernel measures these parts, in the order of a step.
 _PARTS = (
     "update", "forward", "view", "surface measure", "surface rays", "surface scatter", "curves", "edge rays",
     "edge scatter", "step rays", "step scatter", "world",
 )  # fmt: skip
-# The same where points are shaded: in lit scenes, and around mipmaps.
+# These are the parts where points are shaded: in lit scenes, and around mipmaps.
 _SHADED = ("image", "samples", "surface shading", "edge shading", "steps", "shadows", "backward")
 _BAR = 24  # characters of a bar of 100 %
 
@@ -37,24 +37,24 @@ _BAR = 24  # characters of a bar of 100 %
 class Profile(Mapping[str, float]):
     """Median seconds of each part of a step, by name, and `samples`, how many of each kind. Prints as a table.
 
-    update           for vertices that moved: the ray structure, who meets at edges, which faces pass through each other
-    forward          the image
-    view             vertices in the image, where the loss looks, and the background's gradient
-    surface …        triangles laid end to end; samples and their rays; adding what they found
-    curves, edge …   the same at edges
-    step …           the same at steps within faces
-    world            from camera coordinates to the user's arrays
-    python           all the rest: checks and copies of tensors
+        update           for vertices that moved: the ray structure, who meets at edges, which faces pass through each other
+        forward          the image
+        view             vertices in the image, the importance map of the loss, and the background's gradient
+        surface …        triangles laid end to end; samples and their rays; adding what they found
+        curves, edge …   the same at edges
+        step …           the same at discontinuities within faces
+        world            from camera coordinates to the user's arrays
+        python           all the rest: checks and copies of tensors
 
     In lit scenes, and where textures have mipmaps, points are shaded, and their shading is differentiated by autograd:
 
-    image              with what is made for vertices that moved
-    samples            of the gradient, inside faces and at edges, and their rays
-    surface shading    inside faces
-    edge shading       on both sides of edges
-    steps, shadows     finding, and shading on both sides of, borders of nearest texels and of shadows
-    backward           what autograd runs
-    python             all the rest
+        image              with what is made for vertices that moved
+        samples            of the gradient, inside faces and at edges, and their rays
+        surface shading    inside faces
+        edge shading       on both sides of edges
+        steps, shadows     finding, and shading on both sides of, borders of nearest texels and of shadows
+        backward           what autograd runs
+        python             all the rest
     """
 
     def __init__(self, seconds: Mapping[str, float], samples: Mapping[str, int]) -> None:
@@ -74,7 +74,7 @@ class Profile(Mapping[str, float]):
 
     @property
     def seconds(self) -> float:
-        """Of the whole step."""
+        """Return the seconds of the whole step."""
         return sum(self.values())
 
     def __str__(self) -> str:
@@ -99,14 +99,18 @@ def profile(
     repeats: int = 5,
     **options: Any,
 ) -> Profile:
-    """Where the time of a step goes: vertices that moved, an image, and the gradient of what requires one.
+    """Return where the time of a step goes: vertices that moved, an image, and the gradient of what requires one.
 
-    adjoint   (H, W, C) or (B, H, W, C), ∂loss/∂image; ones when None
-    repeats   steps of which the medians are taken
-
-    The other arguments are those of render(). If nothing requires a gradient, that of the vertices is taken. A batch of
-    cameras counts as one step. Of scenes that are not lit, autograd itself is not run, so what it costs is not here. Raises what
+    The other arguments are those of render(). If nothing requires a gradient, that of the vertices is taken. A batch of cameras
+    counts as one step. Of scenes that are not lit, autograd itself is not run, so its cost is not included. Raises what
     render() raises.
+
+    Parameters
+    ----------
+    adjoint : (H, W, C) or (B, H, W, C), default ones
+        ∂loss/∂image.
+    repeats : int, default 5
+        Steps of which the medians are taken.
     """
     check_options("profile", options)
     if options.get("shader") is not None:
@@ -118,7 +122,7 @@ def profile(
         )
     options = {name: value for name, value in options.items() if name not in SHADING}
     scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
-    # What is kept between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
+    # Caches between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
     request = make_request(scene, camera, spp, seed, **options)
     wanted = required(request) or ("verts",)
     adjoint = _adjoint(adjoint, camera, request)
@@ -151,18 +155,18 @@ def _of_shaded(
     repeats: int,
     options: Mapping[str, Any],
 ) -> Profile:
-    """Of a scene of which points are shaded."""
+    """Return the profile of a scene of which points are shaded."""
     lighting = Lighting.of(**{name: options[name] for name in LIGHTING if name in options})
     creases, own = options.get("creases", "auto"), {n: v for n, v in options.items() if n not in SHADING}
     scene, camera, leaves = _leaves(scene, camera)
     request = make_request(scene, camera, *spp_and_seed, **own)
     adjoint = _adjoint(adjoint, camera, request)
-    runs, watch = [], _Kept()
+    runs, watch = [], _Recorder()
     for repeat in range(repeats):
         elsewhere = scene.replace(meshes=[m.replace(verts=m.verts * (1.001 + 1e-6 * repeat)) for m in scene.meshes])
         with torch.no_grad():
             lighting.image(elsewhere, camera, make_request(elsewhere, camera, 1, **own), creases)
-        watch = _Kept()
+        watch = _Recorder()
         begin = time.perf_counter()
         with torch.enable_grad():
             step = make_request(scene, camera, *spp_and_seed, **own)
@@ -176,7 +180,8 @@ def _of_shaded(
 
 
 def _leaves(scene: Scene, camera: Camera) -> tuple[Scene, Camera, Sequence[Tensor]]:
-    """The scene and the camera with leaves in place of what requires a gradient, the vertices if nothing does, and these."""
+    """Return the scene and the camera with leaves in place of what requires a gradient, the vertices if nothing does, and these
+    leaves."""
     wanted = [t for t in tensors_in((scene, camera)) if torch.is_grad_enabled() and t.requires_grad]
     wanted = wanted or [mesh.verts for mesh in scene.meshes]
     leaves = {id(t): t.detach().requires_grad_() for t in wanted}
@@ -187,8 +192,8 @@ def _leaves(scene: Scene, camera: Camera) -> tuple[Scene, Camera, Sequence[Tenso
     return map_tensors(scene, leaf), map_tensors(camera, leaf), list(leaves.values())
 
 
-class _Kept(Watch):
-    """Keeps it."""
+class _Recorder(Watch):
+    """A watch that keeps seconds and samples."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -205,7 +210,7 @@ class _Kept(Watch):
 
 
 def _adjoint(adjoint: Tensor | None, camera: Camera, request: Request) -> Tensor:
-    """(B, H, W, C), as the kernel reads it. Raises TypeError or ValueError."""
+    """Return the adjoint (B, H, W, C), as the kernel reads it. Raises TypeError or ValueError."""
     B, shape = request.cameras, (*camera.size, request.channels)
     if adjoint is None:
         return request.scene.colors.new_ones((B, *shape))

@@ -86,7 +86,7 @@ def render(
                      edges if it asked for `face` or `barycentrics`); True, at all; False, at none
     check_shader     asks the shader twice, the second time with half of the points in another order, and compares
     step_spacing     px between the lines along which steps within faces are looked for: those that a shader declares, of which
-                     two borders that lie closer may be missed; rims of what alpha cuts out, and borders of nearest texels.
+                     two borders that lie closer may be missed; alpha_edges of what alpha cuts out, and borders of nearest texels.
                      Closer lines cost more and err less
     shadows          of lit scenes: False lets light pass through everything
     light_samples    of lit scenes: points drawn of each light that has an extent, for each point that is shaded. Of a face in a
@@ -109,21 +109,22 @@ def render(
     before it allocates, with the figure and what to lower; so does its backward pass. A second derivative raises
     RuntimeError. Warns of options of lit scenes and of shaders that have no effect on the image.
     """
-    if shader is not None or as_scene(scene).is_shaded:
-        scene, camera = savable(as_scene(scene)), savable(camera)
+    scene = as_scene(scene)
+    if shader is not None or scene.is_shaded:
+        scene, camera = savable(scene), savable(camera)
     request = make_request(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
     lighting = Lighting.of(shadows, light_samples, bounces)
     shading = {"creases": creases, "check_shader": check_shader, **lighting.options}
-    warn_of_unused(as_scene(scene), shader is not None, shading)
-    if shader is None and as_scene(scene).is_shaded:
-        return lit_image(lighting, as_scene(scene), camera, request, creases)
+    warn_of_unused(scene, shader is not None, shading)
+    if shader is None and scene.is_shaded:
+        return lit_image(lighting, scene, camera, request, creases)
     if shader is not None:
-        return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)
+        return render_shaded(scene, camera, shader, request, creases, check_shader)
     image = render_image(request, batched=camera.batch is not None)
-    return image.to(as_scene(scene).meshes[0].verts.device)
+    return image.to(scene.meshes[0].verts.device)
 
 
 SMALL = 1 << 22  # samples of an image, up to which one thread an image is better than all of them
@@ -138,8 +139,8 @@ def render_batch(
     seed     of all, or one of each
 
     The other arguments are those of render(). Images and gradients have the bits of render() for one pair after the other. If
-    all images are small and neither lit nor shaded, each takes one thread, and as many are rendered, and differentiated, beside
-    each other as there are threads, the first while later scenes are still read; in reverse mode, once. Otherwise, so with one
+    all images are small and neither lit nor shaded, each takes one thread, and as many are rendered, and differentiated, in
+    parallel as there are threads, the first while later scenes are still read; in reverse mode, once. Otherwise, so with one
     lit scene among them, they come one after the other, each with all threads.
 
     Raises what render() raises, with the number of the pair.
@@ -185,8 +186,8 @@ def render_batch(
         for k, (pair, own) in enumerate(zip(scenes, seeds, strict=True)):
             with _of_pair(k):
                 images.append(render(*pair, spp, own, **options))
-    alike = all(image.shape == images[0].shape and image.dtype == images[0].dtype for image in images)
-    return torch.stack(images) if alike else images
+    equal = all(image.shape == images[0].shape and image.dtype == images[0].dtype for image in images)
+    return torch.stack(images) if equal else images
 
 
 @contextmanager
@@ -234,9 +235,9 @@ def jvp(
     aovs       names of channels, but for ids, as render_aovs() has them: then both are dicts of these
 
     All directions share the samples of one pass. The other arguments are those of render(); samples go by area and length
-    alone, for no loss says where it looks. The first call in a process takes some seconds, in which torch loads its own rules of
-    forward mode. The same as torch.func.jvp of render(), under torch.vmap; what it returns is not in
-    the graph. Raises what render() raises.
+    alone, for no adjoint says where samples matter. The first call in a process takes some seconds, in
+    which torch loads its own rules of forward mode. The same as torch.func.jvp of render(), under torch.vmap; what it returns is
+    not in the graph. Raises what render() raises.
     """
     own = {n: v for n, v in options.items() if n not in SHADING}
     make_request(scene, camera, spp, seed, **own)  # checks them

@@ -27,11 +27,11 @@ from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
 from .kernel.request import LEAST_SPACING, Request, derived_seed
 from .points.background import environments
-from .points.blend import Blended, let_through, panes
+from .points.blend import Blended, let_through, transparent
 from .points.borders import Borders
 from .points.frame import Frame
 from .points.hits import Hits
-from .points.records import PixelRecords, shaded_room, without_colors
+from .points.records import PixelRecords, shaded_memory, without_colors
 from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
 from .points.splat import Term, boundary
@@ -69,12 +69,12 @@ class Effort(NamedTuple):
     glossy: bool = False
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
-    closer: float = 1.0  # by which lines that look for steps lie closer, for what is shaded beside them is noisy
+    closer: float = 1.0  # by which lines that look for steps lie closer, for what is shaded next to them is noisy
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
-    beside_steps: float = 0.0  # how far from a step its sides are shaded
-    # Of samples inside faces: how light from nearby changes as they slide on these, and how near that is (light/sliding.py).
-    sliding: Callable[[Frame, Hits], tuple[float, Tensor]] | None = None
+    step_margin: float = 0.0  # how far from a step its sides are shaded
+    # Of samples inside faces: how light from nearby changes as they slide on these, and how near that is (light/near_field.py).
+    near_field: Callable[[Frame, Hits], tuple[float, Tensor]] | None = None
     # What samples on the borders of light that surfaces scatter to one another give to the image.
     indirect: Callable[[Frame, Watch], list[Term]] | None = None
     watch: Watch = Watch()  # is told what it takes
@@ -100,7 +100,7 @@ def render_shaded(
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
     effort = effort or Effort(shaded_points(request.image.spp), blended=scene.blends)
-    with shaded_room(request, textured=effort.lit and scene.textured_faces is not None):
+    with shaded_memory(request, textured=effort.lit and scene.textured_faces is not None):
         images = [
             _Image(Frame(scene, request, k), shader, creases, check, effort).render() for k in range(request.cameras)
         ]
@@ -132,7 +132,7 @@ class _Image:
         self._shader = shader
         if effort.blended:
             self._shader = Blended(frame, shader, self._behind_all)
-            frame.sampler.panes = panes(frame.surfaces)
+            frame.sampler.transparent = transparent(frame.surfaces)
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
         self.steps_move = effort.steps is not None  # whether one of their functions has a derivative
@@ -160,7 +160,7 @@ class _Image:
                 intrinsics=moves(frame.intrinsics),
                 steps=cut,
                 lit=frame.surfaces.scene if self._effort.lit else None,
-                looks=_where_bright(image) if self._effort.glossy else None,
+                importance=_where_bright(image) if self._effort.glossy else None,
             )
         watch.count("surface_samples", len(surface.x))
         with watch.part("surface shading"):
@@ -172,8 +172,8 @@ class _Image:
         if visibility and self._kinds and self.steps_move:
             with watch.part("steps"):
                 declare = self._effort.steps or self._shade
-                beside = self._effort.beside_steps
-                found = StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE, self._step_spacing, beside)
+                margin = self._effort.step_margin
+                found = StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE, self._step_spacing, margin)
                 terms += found.found(watch)
         if visibility:
             with watch.part("shadows"):
@@ -247,9 +247,9 @@ class _Image:
                 # Hits of its own each time, for these keep what was computed from them.
                 hits = samples.part(first, first + at_once).hits
                 hits._needs_values = not self._effort.gives_derivatives
-                if self._effort.sliding is None:
+                if self._effort.near_field is None:
                     return self._shade(hits)
-                hits._near, slid = self._effort.sliding(self._frame, hits)
+                hits._near, slid = self._effort.near_field(self._frame, hits)
                 return self._shade(hits) + slid
 
             # So that memory is that of some points, not of all.
@@ -265,9 +265,9 @@ class _Image:
         terms: list[Term] = []
         count, flat = frame.request.gradient.edge_samples, frame.surfaces.casters
         moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
-        if len(flat.cut_outs) and moves(flat.alphas, flat.uvs):
+        if len(flat.alpha_masks) and moves(flat.alphas, flat.uvs):
             moving = True
-            _warn_of_lamps(frame)
+            _warn_of_lights(frame)
         for index in sorted(frame.surfaces.shadowing):
             seed = derived_seed(frame.sampler.grad_seed, index + 2)
             light = ShadowLight.of(frame.surfaces, index, seed)
@@ -364,16 +364,16 @@ class _Image:
         return radiance.to(self._frame.dtype)
 
 
-def _warn_of_lamps(frame: Frame) -> None:
+def _warn_of_lights(frame: Frame) -> None:
     """Of which alpha cuts out some, not all or nothing."""
-    lamps = (light.mesh for light in frame.surfaces.scene.casting if isinstance(light, MeshLight))
-    for mesh in lamps:
+    lights = (light.mesh for light in frame.surfaces.scene.casting if isinstance(light, MeshLight))
+    for mesh in lights:
         if mesh.alpha is None or mesh.uvs is None or not moves(mesh.alpha, mesh.uvs) or not values_visible(mesh.alpha):
             continue
         there = mesh.alpha.detach() >= (0.5 if mesh.blends else mesh.alpha_cutoff)
         if bool(there.any()) and not bool(there.all()):
             warn(
-                "cut-out lamps",
-                "alpha: the rim of what it cuts out ends a mesh that emits; how that moves on what is lit has no gradient, by "
-                "alpha and uvs; model the lamp's shape as faces, or paint it as emission",
+                "alpha-tested lights",
+                "alpha: an alpha edge ends a mesh that emits; how that moves on what is lit has no gradient, by "
+                "alpha and uvs; model the light's shape as faces, or paint it as emission",
             )

@@ -9,14 +9,13 @@ INSIDE = {"edgegrad", "torch"}  # torch runs the operators, and the forward() of
 
 
 def warn(subject: str, text: str) -> None:
-    """A UserWarning at the line outside of the library that the call came from, however deep it is.
-
-    By Python's default filter it comes once for each line and `subject`, though the numbers in the text may change."""
+    """Issue a UserWarning at the line outside of the library that the call came from, however deep it is. By Python's default
+    filter it comes once for each line and `subject`, though the numbers in the text may change."""
     warnings.warn(_About(text, subject), stacklevel=_stacklevel())  # type: ignore[arg-type]
 
 
 class _About(str):
-    """A text that equals all others on its subject, for Python tells lines apart by what is said there."""
+    """A text that equals all others on its subject, because Python distinguishes warnings of one line by their text."""
 
     subject: str
 
@@ -33,7 +32,7 @@ class _About(str):
 
 
 def _stacklevel() -> int:
-    """Of the innermost frame outside, as seen by the caller; or of the outermost frame of all. Python 3.12 has
+    """Return the level of the innermost frame outside, as seen by the caller; or of the outermost frame of all. Python 3.12 has
     skip_file_prefixes for this."""
     level, frame = 1, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in INSIDE:

@@ -32,7 +32,7 @@ from torch.nn.parallel import DistributedDataParallel
 import edgegrad as eg
 from edgegrad.fit.checkpoints import Checkpoint
 from edgegrad.fit.descent.adam import Adam
-from edgegrad.fit.smooth import Smooth
+from edgegrad.fit.laplacian import LaplacianSolver
 
 
 class Task(NamedTuple):
@@ -67,15 +67,15 @@ class Pictures:
 
 
 class Loss(torch.nn.Module):
-    """The mean squared difference of renders to pictures. Its parameter stands for the vertices (edgegrad.fit.smooth)."""
+    """The mean squared difference of renders to pictures. Its parameter stands for the vertices (edgegrad.fit.laplacian)."""
 
     def __init__(self, pictures: Pictures, task: Task) -> None:
         super().__init__()
         ball = trimesh.creation.icosphere(subdivisions=task.subdivisions)
         verts, self.faces = torch.tensor(ball.vertices), torch.tensor(ball.faces)
         self.pictures, self.spp = pictures, task.spp
-        self.smooth = Smooth(self.faces, len(verts), smoothness=19.0)
-        self.coordinates = torch.nn.Parameter(self.smooth.times(verts))
+        self.smooth = LaplacianSolver(self.faces, len(verts), smoothness=19.0)
+        self.coordinates = torch.nn.Parameter(self.smooth.to_differential(verts))
 
     def mesh(self) -> eg.Mesh:
         return eg.Mesh(self.smooth(self.coordinates), self.faces)

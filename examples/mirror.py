@@ -29,7 +29,7 @@ SMOOTH = 6e-3  # how much a rough environment costs: hardly any light comes from
 def metal(hits: eg.Hits) -> Tensor:
     """The metal in the light of the scene."""
     (light,) = hits.lights
-    points = hits.light_points(light, by="material")
+    points = hits.light_points(light, by=eg.lights.points_by_material)
     n, l = hits.shading_normal, light.incident(points, hits.position)
     arriving = light.arriving(points, hits.position)  # over the density, which has no derivative
     down = (n * l).sum(1, keepdim=True)

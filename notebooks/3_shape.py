@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 import edgegrad as eg
 from edgegrad.fit import fit_shape
-from edgegrad.fit.smooth import Smooth
+from edgegrad.fit.laplacian import LaplacianSolver
 from edgegrad.image import linear_to_srgb
 
 
@@ -102,7 +102,7 @@ print("finite differences", fd.numpy().round(4))
 # the same descent, smoothed over the surface.
 
 # %%
-smooth = Smooth(sphere.faces, len(sphere.verts), 10.0)
+smooth = LaplacianSolver(sphere.faces, len(sphere.verts), 10.0)
 steps = {"gradient": -leaf.grad, "smoothed": -smooth.solve(smooth.solve(leaf.grad))}
 view = cameras[2]
 pictures = [eg.render(lit(sphere), view, spp=64)]

@@ -2,12 +2,13 @@
 # # 7. Error against run time
 #
 # A gradient from samples has an error. More samples, less error, more time. How much of one for how much of the other?
-# First by hand on a triangle, whose exact gradient is known; then a small version of `edgegrad report error-time`,
+# First by hand on a triangle, whose exact gradient is known; then a small version of `python -m benchmarks.error_time`,
 # beside finite differences, and Mitsuba 3 where it is installed.
 
 # %%
 import contextlib
 import io
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -16,8 +17,11 @@ import matplotlib.pyplot as plt
 import torch
 
 import edgegrad as eg
-from edgegrad.report.error_time import error_time
-from edgegrad.report.exact import exact_image
+
+sys.path += ["..", "../tests"]
+from oracles.exact import exact_image
+
+from benchmarks.error_time.run import error_time
 
 # %% [markdown]
 # ## The exact gradient
@@ -137,7 +141,7 @@ plt.tight_layout()
 # %% [markdown]
 # *What to see:* lower and more to the left is better. (Where these outputs were made there was no Mitsuba, and other
 # work on the machine.) Each method's points go down to the right as it takes more samples. These images are small and
-# runs few; `edgegrad report error-time` does it at 256² for eight scenes, with error bars and a check of its
+# runs few; `python -m benchmarks.error_time` does it at 256² for eight scenes, with error bars and a check of its
 # references, and `docs/error-time.md` has a run.
 #
 # In practice: leave the numbers of samples alone, and give each step of an optimiser a seed of its own. Errors of

@@ -2,18 +2,21 @@
 # # 8. Extreme cases
 #
 # Meshes come in nanometres and light years, with faces thinner than a hair, boxes that touch, and planes seen edge-on.
-# Image and gradient should be right there too. Here some such cases, against exact integrals in float64. `edgegrad
-# report stability` has some hundred.
+# Image and gradient should be right there too. Here some such cases, against exact integrals in float64.
+# `python -m benchmarks.stability` has some hundred.
 
 # %%
 import math
+import sys
 
 import matplotlib.pyplot as plt
 import torch
 
 import edgegrad as eg
 from edgegrad.image import linear_to_srgb
-from edgegrad.report.exact import exact_image
+
+sys.path.append("../tests")
+from oracles.exact import exact_image
 
 BACKGROUND = torch.tensor([0.12, 0.15, 0.2])
 y, x = torch.meshgrid(torch.arange(48.0), torch.arange(48.0), indexing="ij")

@@ -29,7 +29,7 @@ def check_boxes(window: object, shown_whole: bool) -> None:
         low, high = np.sort(rng.uniform(box[0], box[1], (2, 2)), 0)
         image_low, image_high = (np.array(p) for p in core.for_tests.image_box(window, low, high))
         for u in rng.uniform(low, high, (20, 2)):
-            x, area_scale, _ = core.for_tests.bend(window, u, [0.0, 0.0])
+            x, area_scale, _ = core.for_tests.distort(window, u, [0.0, 0.0])
             assert area_scale > 0 or not shown_whole
             if area_scale > 0:
                 assert (np.array(x) >= image_low - 1e-9).all() and (np.array(x) <= image_high + 1e-9).all()

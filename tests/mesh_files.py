@@ -1,11 +1,14 @@
-"""Files of meshes that tests write, byte by byte."""
+"""Files of meshes and images that tests write, byte by byte."""
 
 import io
 import json
 import struct
+import zlib
 
 import numpy as np
 from PIL import Image
+
+import edgegrad as eg
 
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
 TRIANGLES = [[0, 1, 2], [0, 2, 3]]
@@ -23,6 +26,25 @@ def texel_at(mesh, face, corner):
     u, v = mesh.uvs[mesh.uv_faces[face, corner]].tolist()
     h, w, _ = mesh.texture.shape
     return mesh.texture[int((1.0 - v) * h), int(u * w)].numpy()
+
+
+IMAGES = (".png", ".jpg", ".bmp", ".tif", ".hdr", ".exr")
+
+
+def load(path):
+    """Call the function that a user would call."""
+    if path.suffix in IMAGES:
+        return eg.read_image(path)
+    return eg.load_camera(path) if path.suffix == ".json" else eg.load_scene(path)
+
+
+def write(folder, name, content):
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+TEXTURED = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
 
 
 def write_obj(folder, name="quad.obj", mtl="newmtl skin\nmap_Kd skin.png\n", body=None):
@@ -92,9 +114,32 @@ def square_glb(material=None, nodes=None, colors=None, uv=False, extra=(), **mor
     return glb(tree, *arrays, *extra)
 
 
-def png_bytes():
+def gltf_tree(data):
+    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+
+
+def changed(change, data=None):
+    """Return a GLB file, by default the square, with its JSON changed."""
+    data = square_glb() if data is None else data
+    tree = gltf_tree(data)
+    change(tree)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + struct.unpack("<I", data[12:16])[0] :]
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+
+
+def png(width, height, rows=bytes(100), depth=8, color=2):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows, 9)) + chunk(b"IEND", b"")
+
+
+def saved(kind, image=None):
     stream = io.BytesIO()
-    Image.fromarray(TEXELS).save(stream, "PNG")
+    (Image.fromarray(TEXELS) if image is None else image).save(stream, kind)
     return stream.getvalue()
 
 

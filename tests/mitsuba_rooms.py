@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
+from benchmarks.error_time import mitsuba
+from benchmarks.error_time.mitsuba import sky_image
 from edgegrad.light.bsdf import DIELECTRIC, LEAST_ALPHA
-from edgegrad.report.error_time import mitsuba
-from edgegrad.report.error_time.mitsuba import sky_image
 
 
 def bsdf_class(mi: Any, dr: Any) -> type:

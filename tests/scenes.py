@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from edgegrad.report.error_time.methods import default_samples
-from edgegrad.report.scenes import (
+from benchmarks.error_time.methods import default_samples
+from benchmarks.scenes import (
     cube,
     front_camera,
+    icosphere,
     occluded_triangle,
     one_triangle,
     random_slivers,
@@ -13,7 +14,6 @@ from edgegrad.report.scenes import (
     smooth_colors,
     soup,
 )
-from edgegrad.report.scenes import sphere as icosphere
 
 __all__ = [
     "cube",

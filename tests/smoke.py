@@ -10,10 +10,10 @@ import torch
 import trimesh
 
 import edgegrad as eg
+from edgegrad.cli import main
+from edgegrad.cli.doctor import gradient_error
 from edgegrad.fit import fit_pose, fit_shape
 from edgegrad.fit.losses import ssim
-from edgegrad_cli import main
-from edgegrad_cli.doctor import gradient_error
 
 
 def painted() -> eg.Mesh:

@@ -9,13 +9,13 @@ from typing import Any, cast
 import pytest
 import torch
 from finite_differences import check, estimate, right_ratio, rotation
+from oracles import reference
+from oracles.exact import exact_image
 from scenes import cube, front_camera, icosphere, one_triangle, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad import reference
 from edgegrad.aovs import AOVS, IDS
-from edgegrad.report.exact import exact_image
 
 F64 = torch.float64
 SIZE = 24

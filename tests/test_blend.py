@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from cut_outs import disc, quad
+from alpha_masks import disc, quad
 from finite_differences import gradient as derivative
 from finite_differences import rotation
 from lit_scenes import from_above, plane, vector

@@ -1,4 +1,4 @@
-"""BOP: its layout, its results, and poses refined by the command line."""
+"""BOP's layout and result files, and poses refined on the command line."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from bop_scenes import SIZE, TRUTHS, K, camera, estimates, meshes, pose
 from PIL import Image
 
 import edgegrad as eg
-import edgegrad_cli as cli
-from edgegrad import bop
+from edgegrad import bop, cli
 
 pytest_plugins = "bop_fixtures"
 
@@ -28,7 +27,7 @@ def run(*arguments: object) -> int:
 # -- the layout ------------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_written_is_read(made: Path) -> None:
+def test_written_data_sets_are_read_back(made: Path) -> None:
     data = bop.Dataset(made)
     assert data.split == "test" and data.objects == [1, 5] and data.scenes == [3] and data.images(3) == [0, 1]
     frame = data.frame(3, 1)
@@ -53,7 +52,7 @@ def test_what_is_written_is_read(made: Path) -> None:
 
 
 def test_pictures_are_read_as_they_are_stored(folder: Path) -> None:
-    """K and poses speak of these pixels, whatever an EXIF orientation says."""
+    """K and poses refer to stored pixels, whatever the EXIF orientation."""
     frame = bop.Dataset(folder).frame(3, 1)
     before, size = frame.picture(), frame.camera.size
     exif = Image.Exif()
@@ -65,8 +64,8 @@ def test_pictures_are_read_as_they_are_stored(folder: Path) -> None:
     assert again.camera.size == size and torch.equal(again.picture(), before)
 
 
-def test_targets_without_a_list(folder: Path) -> None:
-    """What is seen by less than a tenth does not count."""
+def test_targets_without_a_file_are_the_visible_instances(folder: Path) -> None:
+    """Instances that are visible by less than a tenth do not count."""
     (folder / "test_targets_bop19.json").unlink()
     info = folder / "test" / "000003" / "scene_gt_info.json"
     content = json.loads(info.read_text())
@@ -75,7 +74,7 @@ def test_targets_without_a_list(folder: Path) -> None:
     assert bop.Dataset(folder).targets() == [bop.Target(3, 0, 1, 1), bop.Target(3, 0, 5, 1), bop.Target(3, 1, 5, 1)]
 
 
-def test_a_covered_instance(tmp_path: Path) -> None:
+def test_covered_instances_have_visible_masks_and_shares(tmp_path: Path) -> None:
     """The nearer plate covers the left half of the other."""
     corners = torch.tensor([[-40.0, -20, 0], [40, -20, 0], [40, 20, 0], [-40, 20, 0]])
     plate = {2: eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.full((2, 3), 0.2))}
@@ -105,7 +104,7 @@ def test_a_covered_instance(tmp_path: Path) -> None:
         (lambda folder: bop.Dataset(folder).frame(3, 0).mask(7), "expected 000000_000007.png"),
     ],
 )  # fmt: skip
-def test_what_is_not_there(ask: Callable[[Path], object], words: str, made: Path) -> None:
+def test_missing_files_are_named(ask: Callable[[Path], object], words: str, made: Path) -> None:
     with pytest.raises((FileNotFoundError, ValueError), match=words):
         ask(made)
 
@@ -132,7 +131,7 @@ INFO, TRUTH, VIEWS = "models/models_info.json", "test/000003/scene_gt.json", "te
         ("test_targets_bop19.json", '[{"scene_id": 3}]', lambda data: data.targets(), "entry 0: expected the key 'im_id'"),
     ],
 )  # fmt: skip
-def test_spoilt(
+def test_malformed_files_are_named(
     file: str, content: str | None, ask: Callable[[bop.Dataset], object], words: str, folder: Path
 ) -> None:  # fmt: skip
     (folder / file).unlink()
@@ -142,8 +141,8 @@ def test_spoilt(
         ask(bop.Dataset(folder))
 
 
-def test_choice_of_the_models(folder: Path) -> None:
-    """As T-LESS has them: of two folders one must be named; models_eval is for errors alone."""
+def test_models_folder_is_chosen_or_must_be_named(folder: Path) -> None:
+    """Of two folders, as in T-LESS, one must be named; models_eval is for errors alone."""
     (folder / "models").rename(folder / "models_cad")
     shutil.copytree(folder / "models_cad", folder / "models_eval")
     assert bop.Dataset(folder).model(1).path.parent.name == "models_cad"
@@ -155,8 +154,8 @@ def test_choice_of_the_models(folder: Path) -> None:
         bop.Dataset(folder).model(1)
 
 
-def test_choice_of_the_split(folder: Path) -> None:
-    """ "test" goes first; then the only one that begins with it; of others one must be named."""
+def test_split_is_chosen_or_must_be_named(folder: Path) -> None:
+    """ "test" is preferred, then the only split; otherwise one must be named."""
     scenes = folder / "test"
     shutil.copytree(scenes, folder / "test_other")
     assert bop.Dataset(folder).split == "test"
@@ -204,7 +203,7 @@ def test_results_come_back_to_the_bit(tmp_path: Path) -> None:
         ("1,2,3,0.5,-1 0 0 0 1 0 0 0 1,1 2 3,0", "line 2, R: expected a rotation matrix .* determinant -1"),
     ],
 )  # fmt: skip
-def test_wrong_results(line: str, words: str, tmp_path: Path) -> None:
+def test_malformed_result_files_are_named(line: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(f"scene_id,im_id,obj_id,score,R,t,time\n{line}\n")
     with pytest.raises(ValueError, match=words):
         bop.read_results(tmp_path / "a.csv")
@@ -216,19 +215,19 @@ TURN, SHIFT = pose((0.06, -0.05, 0.04), (0, 0, 0)), pose((1e-12, 0, 0), (2.0, -1
 QUICK = ("--steps", 12, "--unconverged")
 
 
-def off(truth: torch.Tensor) -> torch.Tensor:
-    """Turned about the object's own origin, and moved."""
+def pose_off(truth: torch.Tensor) -> torch.Tensor:
+    """Turn about the object's own origin, and shift."""
     found = SHIFT @ truth
     found[:3, :3] = TURN[:3, :3] @ truth[:3, :3]
     return found
 
 
-def test_command_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_writes_errors_and_refined_poses(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     results, out, report = folder / "results.csv", folder / "new" / "better.csv", folder / "report.json"
     data = bop.Dataset(folder)
     # The second in another of the poses that look the same: what comes out is near that one.
     starts = [TRUTHS[0][0][1], TRUTHS[0][1][1] @ data.model(5).symmetries.motions[1]]
-    given = [replace(one, pose=off(start)) for one, start in zip(estimates()[:2], starts, strict=True)]
+    given = [replace(one, pose=pose_off(start)) for one, start in zip(estimates()[:2], starts, strict=True)]
     bop.write_results(results, given)
     assert run("bop", "refine", folder, results, "-o", out, "--limit", 1, "--pictures", folder / "seen", *QUICK) == 0
     said = capsys.readouterr().out
@@ -255,12 +254,12 @@ def test_command_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert content["objects"]["1"]["bop19_average_recall"] > 0.9
 
 
-def test_refined_keeps_what_it_cannot_mend(made: Path) -> None:
+def test_refine_keeps_poses_whose_fit_fails(made: Path) -> None:
     data = bop.Dataset(made)
     beside = bop.Estimate(3, 0, 1, 1.0, pose((0.1, 0, 0), (5000.0, 0.0, 400.0)))
     found = bop.refine(data, beside)
     assert found.kept and found.fit is None and "does not show" in found.why and found.estimate is beside
-    start = replace(estimates()[0], pose=off(TRUTHS[0][0][1]))
+    start = replace(estimates()[0], pose=pose_off(TRUTHS[0][0][1]))
     early = bop.refine(data, start, size=32, steps=1)
     assert early.kept and early.estimate is start and "steps ran out" in early.why
     with pytest.raises(ValueError, match="expected object 7 in it, got 1, 5"):

@@ -1,4 +1,4 @@
-"""BOP's errors against plain formulas, and its recalls by exact numbers."""
+"""BOP's errors against plain formulas, and recalls against exact numbers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def moved(motion: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.array([motion[:3, :3] @ p + motion[:3, 3] for p in x])
 
 
-def test_of_points() -> None:
+def test_point_errors_equal_plain_formulas() -> None:
     a, b, x = E.numpy(), T.numpy(), POINTS.numpy()
     A, B = moved(a, x), moved(b, x)
     assert bop.add(E, T, POINTS) == pytest.approx(
@@ -61,15 +61,15 @@ def test_of_points() -> None:
 
 
 def test_bounds_leave_out_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of continuous symmetries whose errors are close to each other, with bounds from one point in ten."""
+    """Continuous symmetries have errors close to each other, and bounds come from one point in ten."""
     S = TURNS.transforms()
     whole = min(bop.mssd(E, T, POINTS, s[None]) for s in S), min(bop.mspd(E, T, POINTS, s[None], CAMERA) for s in S)
-    monkeypatch.setattr("edgegrad.bop.errors.FEW", 4)
+    monkeypatch.setattr("edgegrad.bop.errors.BOUND_POINTS", 4)
     assert (bop.mssd(E, T, POINTS, S), bop.mspd(E, T, POINTS, S, CAMERA)) == pytest.approx(whole, rel=1e-12)
 
 
 def test_depth_is_that_of_the_plane() -> None:
-    """At the centres of the pixels, in OpenCV's convention of K: n·x = d."""
+    """At the pixels' centres, in OpenCV's convention of K, n·x = d holds."""
     corners = torch.tensor([[-60.0, -50, 10], [70, -40, -20], [0, 80, 30]])
     depth = bop.depth_image(eg.Mesh(corners, torch.tensor([[0, 1, 2]])), T, CAMERA)
     a, b, c = (T[:3, :3] @ corners.double().T).T + T[:3, 3]
@@ -95,7 +95,7 @@ def test_depth_of_what_is_not_in_the_image() -> None:
 
 
 def test_vsd_by_pixels() -> None:
-    """Against a loop over pixels; each case of what is seen occurs."""
+    """The reference is a loop over pixels, in which each case of visibility occurs."""
     random = np.random.default_rng(1)
     size = SIZE
     truth = np.where(random.random(size) < 0.6, random.uniform(400, 440, size), 0.0)
@@ -129,7 +129,7 @@ def test_vsd_by_pixels() -> None:
         ([[1.0]], 1.0, 0),  # below, not at
     ],
 )  # fmt: skip
-def test_matching(errors: list[list[float]], threshold: float, count: int) -> None:
+def test_matching_takes_the_lowest_error_first(errors: list[list[float]], threshold: float, count: int) -> None:
     assert matched(np.array(errors), threshold) == count
 
 
@@ -151,7 +151,7 @@ def test_true_poses_are_all_found(made: Path) -> None:
 
 
 def test_recalls_by_exact_numbers(made: Path) -> None:
-    """Away from the camera by 0.22 of the diameter of object 1: MSSD and ADD are that long, 0.22 · 115.3 = 25.4 mm."""
+    """The estimate is farther from the camera by 0.22 diameters of object 1: MSSD and ADD are 0.22 · 115.3 = 25.4 mm."""
     data = bop.Dataset(made)
     shift = 0.22 * data.model(1).diameter
     found = bop.evaluate(data, estimates(pose((1e-12, 0, 0), (0.0, 0.0, shift))), progress=False)
@@ -175,7 +175,7 @@ def test_recalls_by_exact_numbers(made: Path) -> None:
     assert one.ar_vsd == pytest.approx(sum(e < 0.05 * k - 1e-9 for e in row.errors.vsd for k in range(1, 11)) / 100)
 
 
-def test_what_is_missing_or_too_much(made: Path) -> None:
+def test_missing_and_surplus_estimates(made: Path) -> None:
     data = bop.Dataset(made)
     given = estimates()
     far = pose((0.1, 0, 0), (0.0, 0.0, 900.0))
@@ -200,7 +200,7 @@ def test_what_is_missing_or_too_much(made: Path) -> None:
         bop.evaluate(data, given, [])
 
 
-def test_eval_models_go_first(folder: Path) -> None:
+def test_errors_are_measured_on_models_eval(folder: Path) -> None:
     shutil.copytree(folder / "models", folder / "models_eval")
     info = folder / "models_eval" / "models_info.json"
     content = json.loads(info.read_text())

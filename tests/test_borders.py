@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from cut_outs import F64, quad
+from alpha_masks import F64, quad
 from scenes import front_camera
 from torch import Tensor
 
 import edgegrad as eg
+from benchmarks.stability.painted import PAINTED
 from edgegrad.points import borders
-from edgegrad.report.stability.painted import PAINTED
 
 SIZE = 24
 FLAT = eg.Camera(

@@ -87,7 +87,7 @@ class Oracle:
             total = torch.zeros(1, 3, dtype=F64)
             for k in range(len(points) - 1, -1, -1):
                 if k + 1 < len(points):
-                    total = total * self._step(points[k], points[k + 1]) / self.paths["density"][i, k + 1]
+                    total = total * self._step(points[k], points[k + 1]) / self.paths["pdf"][i, k + 1]
                 if k > 0:
                     total = total + self._direct(points[k].surface, i, k)
             rows.append(total)
@@ -127,7 +127,7 @@ class Oracle:
         for number, light in enumerate(scene.casting):
             if self.paths["seen"][i, k, number] <= 0:
                 continue
-            index, uv, density = (self.paths[name][i, k, number][None] for name in ("index", "uv", "light_density"))
+            index, uv, density = (self.paths[name][i, k, number][None] for name in ("index", "uv", "light_pdf"))
             points = LightPoints(index, uv, density)
             l = light.incident(points, o.position)
             f = o.scattering.evaluate(o.v, o.n, l) * dot(o.n, l) * (1 if o.flat else terminator(o.g, o.n, l))

@@ -61,7 +61,7 @@ def button(browser, label):
 
 
 def image(browser):
-    """The address of the picture in the panel, which changes with it; None before there is one."""
+    """Return the address of the panel's picture, which changes with it; None before there is one."""
     return browser.execute_script(
         "const i = [...document.querySelectorAll('img')].find(i => i.naturalWidth > 2 * i.naturalHeight);"
         "return i ? i.src : null"
@@ -69,7 +69,7 @@ def image(browser):
 
 
 def opened(browser, viewer):
-    """The page, connected to its server."""
+    """Open the page and return it when it is connected to its server."""
     browser.get(viewer.url)
     return wait_for(lambda: list(viewer._display.server.get_clients().values()), "the page to connect")[0]
 
@@ -118,7 +118,7 @@ def test_the_page_pauses_goes_on_and_stops_a_running_fit(browser):
 
 
 def test_the_page_shows_materials(browser):
-    """A purple texture that a factor makes blue, on a metal, is seen as blue."""
+    """A purple texture with a blue factor on a metal is seen as blue."""
     verts = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     texels = torch.tensor([0.9, 0.0, 0.9]).expand(4, 4, 3)
@@ -137,7 +137,7 @@ def test_the_page_shows_materials(browser):
 
 
 def test_the_page_shows_the_meshes_where_the_camera_sees_them(browser):
-    """The same camera sees the same outline in the page, drawn by three.js, as render() does."""
+    """three.js draws the same outline in the page as render() does with the same camera."""
     at = camera(96)
     fit = fit_pose(bracket(), picture(at), at, init=START, background=BACKGROUND, steps=3, spp=4, progress=False)
     moved = bracket().transformed(fit.R, fit.t, fit.scale)

@@ -77,11 +77,11 @@ def test_bend_jvp_and_area_scale(lens):
     u = np.array(pieces.project(pinhole, [0.2, -0.3, 0.9]))
 
     def bent(u):
-        return np.array(pieces.bend(camera, u, [0.0, 0.0])[0])
+        return np.array(pieces.distort(camera, u, [0.0, 0.0])[0])
 
     J = np.stack([(bent(u + h) - bent(u - h)) / 2e-4 for h in 1e-4 * np.eye(2)], 1)
     tangent = np.array([0.7, -1.9])
-    _, area_scale, along = pieces.bend(camera, u, tangent)
+    _, area_scale, along = pieces.distort(camera, u, tangent)
     np.testing.assert_allclose(along, J @ tangent, rtol=1e-7)
     np.testing.assert_allclose(area_scale, np.linalg.det(J), rtol=1e-7)
 

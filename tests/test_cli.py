@@ -16,12 +16,11 @@ from PIL.TiffImagePlugin import IFDRational
 from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
-import edgegrad_cli as cli
-from edgegrad import demo
+from edgegrad import cli, demo
+from edgegrad.cli import doctor, inputs, outputs
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from edgegrad.fit import PoseFit, fit_camera, fit_pose
-from edgegrad_cli import doctor, inputs, outputs
 
 
 @pytest.fixture
@@ -349,16 +348,14 @@ def test_demo_without_pyvista_says_how_to_get_it(tmp_path, capsys, monkeypatch):
 
 
 def test_version_as_a_program():
-    done = subprocess.run(
-        [sys.executable, "-m", "edgegrad_cli", "--version"], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-m", "edgegrad", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"edgegrad {eg.__version__}\n"
 
 
 @pytest.mark.parametrize("typed, meant", [
     (["rendr"], "render"),
     (["render", "mesh.ply", "--out", "a.png", "--sede", "3"], "--seed"),
-    (["report", "stabilty"], "stability"),
+    (["bop", "refin"], "refine"),
 ])  # fmt: skip
 def test_did_you_mean(capsys, typed, meant):
     with pytest.raises(SystemExit):
@@ -367,7 +364,7 @@ def test_did_you_mean(capsys, typed, meant):
 
 
 def test_help_comes_without_torch():
-    code = "import sys, edgegrad_cli\ntry: edgegrad_cli.main(['render', '--help'])\nfinally: assert 'torch' not in sys.modules"
+    code = "import sys\nfrom edgegrad import cli\ntry: cli.main(['render', '--help'])\nfinally: assert 'torch' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 
 
@@ -502,9 +499,9 @@ def test_fit_pose_resumes(files, monkeypatch):
 
 def test_ctrl_c_while_modules_are_imported_is_not_lost():
     code = (
-        "import os, signal, time, edgegrad_cli\n"
+        "import os, signal, time\nfrom edgegrad import cli\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "with edgegrad_cli._ended_by_ctrl_c():\n"
+        "with cli._ended_by_ctrl_c():\n"
         "    try:\n        os.kill(os.getpid(), signal.SIGINT)\n        time.sleep(1)\n"
         "    except BaseException:\n        pass\n"
         "print('went on')"

@@ -9,11 +9,11 @@ import pytest
 import torch
 from combinations import diagonal
 from finite_differences import check_ratio
+from oracles.exact import exact_image
 from scenes import cube, front_camera, icosphere
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report.exact import exact_image
 
 F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)

@@ -9,14 +9,13 @@ from functools import partial
 import pytest
 import torch
 from combinations import diagonal
+from oracles.exact import exact_image
 from scenes import front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report import build
-from edgegrad.report.error_time.methods import default_samples, differentiate
-from edgegrad.report.exact import exact_image
-from edgegrad.report.scenes import unproject
+from benchmarks.error_time.methods import default_samples, differentiate
+from benchmarks.scenes import build, unproject
 
 F64 = torch.float64
 CAMERA = front_camera(48)

@@ -14,8 +14,8 @@ from torch.nn.functional import normalize
 
 import edgegrad as eg
 from edgegrad.light import in_kernel, radiance
+from edgegrad.light.antithetic import antithetic_set
 from edgegrad.light.bsdf import Scattering, dot
-from edgegrad.light.companions import companions
 from edgegrad.light.lobes import Lobes
 from edgegrad.light.resampled import Glossy, resampled
 from edgegrad.points.hits import Hits
@@ -32,7 +32,7 @@ def uniform(count: int, columns: int) -> Tensor:
 
 
 def four(l: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
-    return companions(V.expand_as(l), N.expand_as(l), l.new_full((1, 1), alpha), l)
+    return antithetic_set(V.expand_as(l), N.expand_as(l), l.new_full((1, 1), alpha), l)
 
 
 def test_each_of_four_has_the_same_companions():
@@ -117,12 +117,12 @@ def derivatives(l: Tensor, arriving: Tensor, roughness: float) -> Tensor:
     return torch.stack([*((value(step) - value(-step)) / 2e-5 for step in steps), value(torch.zeros(5, dtype=F64))], 1)
 
 
-def estimates(light: eg.Environment, roughness: float, seeds: int, in_fours: bool) -> Tensor:
+def estimates(light: eg.Environment, roughness: float, seeds: int, antithetic: bool) -> Tensor:
     """(seeds, 6) of the derivatives from four directions, or from one."""
     material = Scattering(vector(0.8)[None], vector(0.8)[None], vector(roughness)[None])
     one = Glossy.of(V[None], N[None], N[None], material, torch.zeros(1, dtype=torch.int64))
     seed = torch.arange(seeds) * 7919 + 13
-    drawn = resampled(light, 5, one.repeated(seeds)._replace(seed=seed), 1, in_fours=in_fours)
+    drawn = resampled(light, 5, one.repeated(seeds)._replace(seed=seed), 1, antithetic=antithetic)
     total = torch.zeros((seeds, len(PARAMETERS)), dtype=F64)
     for points in drawn:
         known = torch.isfinite(points.density)
@@ -139,7 +139,7 @@ def estimates(light: eg.Environment, roughness: float, seeds: int, in_fours: boo
 def test_derivatives_are_unbiased(roughness: float, lamps: bool):
     """The mean over draws against quadrature."""
     light, seeds = sky(lamps), 10_000
-    found = estimates(light, roughness, seeds, in_fours=True)
+    found = estimates(light, roughness, seeds, antithetic=True)
     l, solid = directions(350)
     l = l @ AXES
     expected = (derivatives(l, light.towards(l), roughness)).sum(0) * solid
@@ -154,9 +154,9 @@ def test_derivatives_are_unbiased(roughness: float, lamps: bool):
 
 
 def test_what_has_both_signs_cancels():
-    """At as many rays, under a smooth sky; without companions the first two ratios are one."""
+    """At as many rays, under a smooth sky; without antithetic_set the first two ratios are one."""
     light = sky(False)
-    alone, together = (estimates(light, 0.2, 3000, in_fours=fours).var(0) for fours in (False, True))
+    alone, together = (estimates(light, 0.2, 3000, antithetic=fours).var(0) for fours in (False, True))
     gain = dict(zip(PARAMETERS, (alone / (4 * together)).tolist(), strict=True))
     assert gain["normal"] > 10 and gain["normal across"] > 10 and gain["roughness"] > 3, gain
     assert gain["base color"] > 0.1 and gain["texel"] > 0.1, gain

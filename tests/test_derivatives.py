@@ -1,4 +1,4 @@
-"""Gradients of everything that may require one, against exact derivatives (edgegrad/report/exact.py), in every view through
+"""Gradients of everything that may require one, against exact derivatives (tests/oracles/exact.py), in every view through
 every filter.
 
 A parameter is one number θ that moves the scene or the camera; all are zero, and one backward pass gives the derivatives of
@@ -14,11 +14,11 @@ import pytest
 import torch
 from combinations import diagonal
 from finite_differences import Estimate, check, estimate, rotation
+from oracles.exact import exact_image
 from scenes import cube, front_camera, smooth_adjoint, smooth_colors
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report.exact import exact_image
 
 SIZE = 40
 AXIS = (0.48, 0.6, 0.64)

@@ -10,13 +10,13 @@ import pytest
 import torch
 from combinations import diagonal
 from finite_differences import check, check_ratio, estimate
+from oracles.exact import exact_image
 from scenes import front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report.error_time.methods import default_samples
-from edgegrad.report.exact import exact_image
-from edgegrad.report.scenes import unproject
+from benchmarks.error_time.methods import default_samples
+from benchmarks.scenes import unproject
 
 F64 = torch.float64
 CAMERA = front_camera(48)

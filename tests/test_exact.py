@@ -1,5 +1,5 @@
 """The kernel against exact pixel integrals: image and gradients within their statistical error, and the error falls with the
-number of samples as the theory says. The oracle (edgegrad/report/exact.py) has no sampling error.
+number of samples as the theory says. The oracle (tests/oracles/exact.py) has no sampling error.
 
 The statistical error is measured, not assumed: S estimates with seeds of their own give a mean and its standard error for
 each component, and z = (mean − exact) / standard error follows Student's t with S − 1 degrees of freedom if there is no bias.
@@ -13,11 +13,11 @@ from functools import partial
 
 import pytest
 import torch
+from oracles.exact import exact_image
 from scenes import front_camera, icosphere, occluded_triangle, one_triangle, random_slivers, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report.exact import exact_image
 
 SIZE = 64
 SEEDS = 16

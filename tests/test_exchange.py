@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from IPython.core.formatters import PNGFormatter
 from PIL import Image
 from scenes import cube
 
 import edgegrad as eg
+from edgegrad import notebook
 from edgegrad.preview import framing, under_headlight
+from edgegrad.scene.tree import named_tensors
 
 VERTS, FACES = cube().verts.float(), cube().faces
 COLORS = torch.rand(8, 3, generator=torch.Generator().manual_seed(0))
@@ -54,22 +57,22 @@ def close(a: eg.Mesh, b: eg.Mesh, linear: bool = False) -> None:
 @pytest.mark.parametrize("look", LOOKS)
 def test_to_trimesh_and_back(look: str) -> None:
     mesh = eg.Mesh(VERTS, FACES, **LOOKS[look])
-    close(eg.Mesh.from_trimesh(mesh.to_trimesh()), mesh)
+    close(eg.io.from_trimesh(eg.io.to_trimesh(mesh)), mesh)
 
 
 def test_trimesh_itself() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=2)
-    mesh = eg.Mesh.from_trimesh(sphere)
+    mesh = eg.io.from_trimesh(sphere)
     assert mesh.verts.shape == sphere.vertices.shape and mesh.channels is None
-    assert mesh.to_trimesh().volume == pytest.approx(sphere.volume, rel=1e-5)
+    assert eg.io.to_trimesh(mesh).volume == pytest.approx(sphere.volume, rel=1e-5)
     sphere.visual.face_colors = [255, 0, 0, 255]
-    assert eg.Mesh.from_trimesh(sphere).face_colors[5].tolist() == [1.0, 0.0, 0.0]
+    assert eg.io.from_trimesh(sphere).face_colors[5].tolist() == [1.0, 0.0, 0.0]
     with pytest.raises(TypeError, match=r"expected a trimesh\.Trimesh, got a Scene; take scene\.to_mesh"):
-        eg.Mesh.from_trimesh(trimesh.Scene([sphere]))
+        eg.io.from_trimesh(trimesh.Scene([sphere]))
     with pytest.raises(TypeError, match="got Mesh"):
-        eg.Mesh.from_trimesh(mesh)
+        eg.io.from_trimesh(mesh)
     with pytest.raises(ValueError, match="expected 1 or 3 channels, got 5"):
-        eg.Mesh(VERTS, FACES, colors=torch.rand(8, 5)).to_trimesh()
+        eg.io.to_trimesh(eg.Mesh(VERTS, FACES, colors=torch.rand(8, 5)))
 
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "glb"])
@@ -129,29 +132,71 @@ def test_parts_keep_their_names(tmp_path: Path) -> None:
     assert eg.load_mesh(tmp_path / "a.glb").name is None
 
 
-def test_torch_load_with_weights_only(tmp_path: Path) -> None:
+def test_a_state_dict_holds_all_of_a_scene(tmp_path: Path) -> None:
     mesh = eg.Mesh(VERTS, FACES, colors=COLORS.requires_grad_(), material=eg.Material(roughness=eg.Texture(torch.rand(2, 2, 1))),
                    uvs=COLORS[:, :2], uv_faces=FACES)  # fmt: skip
     camera = eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(8, 8))
     lights = [
         eg.DirectionalLight((0, 0, -1)), eg.PointLight((0, 0, 4)), eg.SpotLight((0, 0, 4), (0, 0, -1)),
-        eg.Environment(torch.ones(3)), eg.AreaLight.disc((0, 3, 0), (1, 0, 0), (0, 0, 1), 2.0),
+        eg.Environment(torch.ones(3)), eg.SphericalHarmonics(torch.ones(9, 3)),
+        eg.AreaLight.disc((0, 3, 0), (1, 0, 0), (0, 0, 1), 2.0),
     ]  # fmt: skip
-    scene = eg.Scene([mesh], lights=lights)
-    image = eg.render(scene, camera, spp=1)
-    torch.save({"scene": scene, "camera": camera}, tmp_path / "a.pt")
+    scene = eg.Scene([mesh], (0.1, 0.2, 0.3), lights)
+    torch.save({"scene": scene.state_dict(), "camera": camera.state_dict()}, tmp_path / "a.pt")
     loaded = torch.load(tmp_path / "a.pt", weights_only=True)
-    assert torch.equal(eg.render(loaded["scene"], loaded["camera"], spp=1), image)
-    assert loaded["scene"].meshes[0].colors.requires_grad
+    again, view = eg.Scene.from_state_dict(loaded["scene"]), eg.Camera.from_state_dict(loaded["camera"])
+    assert torch.equal(eg.render(again, view, spp=1), eg.render(scene, camera, spp=1))
+    assert repr(again) == repr(scene) and repr(view) == repr(camera)
+    before, after = dict(named_tensors(scene)), dict(named_tensors(again))
+    assert before.keys() == after.keys()
+    for name, tensor in after.items():
+        assert tensor.dtype == before[name].dtype and torch.equal(tensor, before[name]) and not tensor.requires_grad
+
+
+class Own(eg.lights.PointLight):
+    """A light of a class of its own."""
+
+
+def changed(**keys: object) -> dict[str, object]:
+    state = eg.Scene([eg.Mesh(VERTS, FACES, material=eg.Material(0.5))]).state_dict()
+    for key, value in keys.items():
+        at = state if key in ("version", "type") else state["meshes"][0]
+        at.pop(key) if value is None else at.update({key: value})
+    return state
+
+
+@pytest.mark.parametrize("state, kind, message", [
+    (lambda: 3, TypeError, r"state: expected a dictionary of Scene\.state_dict\(\), got int"),
+    (lambda: changed(version=2), ValueError, "state: expected version 1, got 2"),
+    (lambda: {}, ValueError, "state: expected version 1, got None"),
+    (lambda: changed(type="Camera"), ValueError, "state: expected the type Scene, got 'Camera'"),
+    (lambda: changed(verts=None), ValueError, r"state\.meshes\[0\]: expected the keys of a Mesh, missing: verts"),
+    (lambda: changed(vertices=VERTS), ValueError, r"state\.meshes\[0\]: .* unexpected: vertices"),
+    (lambda: changed(material={"type": "os.system"}), ValueError, r"state\.meshes\[0\]\.material: expected a type among"),
+    (lambda: changed(faces=FACES + 1), ValueError, "faces: expected indices"),
+])  # fmt: skip
+def test_faults_of_a_state_dict_are_named(state, kind, message) -> None:
+    with pytest.raises(kind, match=message):
+        eg.Scene.from_state_dict(state())
+
+
+def test_a_light_of_ones_own_has_no_state() -> None:
+    scene = eg.Scene([eg.Mesh(VERTS, FACES, material=eg.Material())], lights=[Own((0, 0, 4))])
+    with pytest.raises(
+        TypeError, match=r"state\.lights\[0\]: expected one of .*, got Own; torch\.save\(\) of the whole"
+    ):
+        scene.state_dict()
 
 
 def test_notebooks_show_a_picture(tmp_path: Path) -> None:
+    shown = PNGFormatter()
+    notebook.register(shown)
     for mesh in (eg.Mesh(VERTS, FACES), eg.Mesh(VERTS, FACES, colors=COLORS.requires_grad_())):
-        (tmp_path / "a.png").write_bytes(mesh._repr_png_())
+        (tmp_path / "a.png").write_bytes(shown(mesh))
         picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"))
         assert picture.shape == (256, 256, 3) and len(np.unique(picture[100:156, 100:156])) > 1
-    assert eg.Mesh(VERTS, FACES, colors=torch.rand(8, 5))._repr_png_() is not None
-    assert eg.Scene([eg.Mesh(VERTS, FACES)], torch.rand(4, 4, 3))._repr_png_() is not None
+    assert shown(eg.Mesh(VERTS, FACES, colors=torch.rand(8, 5))) is not None
+    assert shown(eg.Scene([eg.Mesh(VERTS, FACES)], torch.rand(4, 4, 3))) is not None
 
 
 def test_a_headlight_shines_only_where_nothing_says_a_look() -> None:
@@ -171,7 +216,7 @@ def test_a_headlight_shines_only_where_nothing_says_a_look() -> None:
 
 def test_a_trimesh_without_faces_is_named() -> None:
     with pytest.raises(ValueError, match=r"mesh: expected a trimesh\.Trimesh with faces"):
-        eg.Mesh.from_trimesh(trimesh.Trimesh())
+        eg.io.from_trimesh(trimesh.Trimesh())
 
 
 def test_two_textured_objs_in_one_folder(tmp_path):

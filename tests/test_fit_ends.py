@@ -1,4 +1,4 @@
-"""Fits end when nothing more is to be had, and say rightly whether they are right."""
+"""Fits end when steps lead no further, and say rightly whether they are right."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from small_fits import RIGHT, WRONG
 
 from edgegrad.fit.descent.adam import Adam
-from edgegrad.fit.descent.falls import LEAST, PARTS, Falls, _in_parts
+from edgegrad.fit.descent.convergence import MAX_PARTS, MIN_BLOCKS, ConvergenceMonitor, _in_parts
 from edgegrad.fit.ending import Ending, reason_of
 from edgegrad.fit.options import Options
 
@@ -69,85 +69,89 @@ def test_no_wrong_answer_is_converged(problem, method, seed):
     assert not fit.converged and fit.reason.split(":")[0] in said, fit.reason
 
 
-# -- what tells whether steps lead down -------------------------------------------------------------------------------
+# -- the convergence monitor ------------------------------------------------------------------------------------------
 
 
-def falls_of(gradient, steps, start=3.0, rate=0.1, noise=0.0):
-    """Of steps of gradient descent in three numbers; gradients have noise."""
+def monitored(gradient, steps, start=3.0, rate=0.1, noise=0.0):
+    """Monitor steps of gradient descent in three numbers, whose gradients have noise."""
     x = torch.full((3,), start, dtype=torch.float64)
-    falls, generator = Falls({"x": x}), torch.Generator().manual_seed(0)
+    monitor, generator = ConvergenceMonitor({"x": x}), torch.Generator().manual_seed(0)
     for _ in range(steps):
         g = gradient(x) + noise * torch.randn(3, generator=generator).double()
-        falls.observe(float(0.5 * x.square().sum()), {"x": g})
-        falls.note()
+        monitor.end_step(float(0.5 * x.square().sum()), {"x": g})
+        monitor.begin_step()
         x -= rate * g
-    return falls
+    return monitor
 
 
-def test_the_promise_is_what_steps_fall_by():
-    """Of a plane, without noise: g·Δx each, in all three numbers."""
-    falls = falls_of(lambda x: torch.tensor([1.0, -2.0, 0.5]).double(), 20)
-    assert falls.promise(40) == pytest.approx(40 * 0.1 * (1.0 + 4.0 + 0.25))
+def test_predicted_decrease_equals_that_of_steps_on_a_plane():
+    """Without noise each step lowers the loss by g·Δx, over all three numbers."""
+    monitor = monitored(lambda x: torch.tensor([1.0, -2.0, 0.5]).double(), 20)
+    assert monitor.predicted_decrease(40) == pytest.approx(40 * 0.1 * (1.0 + 4.0 + 0.25))
 
 
-def test_steps_to_and_fro_promise_nothing():
-    """A rate so long that each step lands on the other side, and no farther off."""
-    assert falls_of(lambda x: x, 20, rate=2.0).promise(40) == 0.0
-    down = falls_of(lambda x: x, 20)
-    assert down.promise(40) > down.least(Options())
+def test_oscillating_steps_predict_no_decrease():
+    """With so long a rate each step lands on the other side of the minimum, as far off."""
+    assert monitored(lambda x: x, 20, rate=2.0).predicted_decrease(40) == 0.0
+    down = monitored(lambda x: x, 20)
+    assert down.predicted_decrease(40) > down.least_decrease(Options())
 
 
-def test_what_steps_cost_that_shake_does_not_hide_the_way_down():
-    """A slope of 1 in one number, beside another that Adam's steps, by the noise of its gradient, shake about a minimum."""
+def test_shaking_steps_do_not_hide_a_slope():
+    """One number has a slope of 1. Adam shakes the other about its minimum, by the noise of its gradient."""
     x = torch.tensor([0.0, 0.0], dtype=torch.float64)
-    falls, adam, generator = Falls({"x": x}), Adam({"x": x}, {"x": 0.01}), torch.Generator().manual_seed(0)
+    monitor, adam, generator = (
+        ConvergenceMonitor({"x": x}),
+        Adam({"x": x}, {"x": 0.01}),
+        torch.Generator().manual_seed(0),
+    )
     ends = []
     for _ in range(600):
         g = torch.tensor([1.0, 0.0]).double() + torch.tensor([0.0, 1.0]).double() * (
             30_000.0 * x + 30.0 * torch.randn(2, generator=generator).double()
         )
-        falls.observe(float(x[0] + 15_000.0 * x[1] ** 2), {"x": g})
-        if falls._before is not None:
-            ends.append(-float((g * (x - falls._before["x"])).sum()))
-        falls.note()
+        monitor.end_step(float(x[0] + 15_000.0 * x[1] ** 2), {"x": g})
+        if monitor._before is not None:
+            ends.append(-float((g * (x - monitor._before["x"])).sum()))
+        monitor.begin_step()
         adam.step({"x": g})
     assert sum(ends[300:]) < 0.0  # what the ends of the steps tell
-    assert falls.promise(1) == pytest.approx(0.01, rel=0.15)
+    assert monitor.predicted_decrease(1) == pytest.approx(0.01, rel=0.15)
 
 
-def test_large_tensors_count_in_parts():
-    numbers = torch.arange(2.0 * PARTS + 3)
+def test_large_tensors_are_summed_in_parts():
+    numbers = torch.arange(2.0 * MAX_PARTS + 3)
     parts = _in_parts(numbers)
-    assert len(parts) <= PARTS and torch.equal(parts[:2], torch.tensor([3.0, 12.0]))
+    assert len(parts) <= MAX_PARTS and torch.equal(parts[:2], torch.tensor([3.0, 12.0]))
     assert float(parts.double().sum()) == float(numbers.double().sum())
     assert torch.equal(_in_parts(numbers[:10]), numbers[:10])
 
 
-def test_one_number_that_falls_is_not_hidden_by_others_to_and_fro():
+def test_one_falling_number_is_not_hidden_by_oscillating_ones():
     gradient = lambda x: torch.stack([20.0 * x[0], 20.0 * x[1], torch.ones((), dtype=torch.float64)])  # noqa: E731
-    assert falls_of(gradient, 20).promise(10) == pytest.approx(10 * 0.1)
+    assert monitored(gradient, 20).predicted_decrease(10) == pytest.approx(10 * 0.1)
 
 
-def test_noise_alone_promises_less_than_can_be_told():
-    """About the minimum; and on a slope that the noise of each step hides, in the mean it does not."""
-    still = falls_of(lambda x: torch.zeros_like(x), 40, rate=0.01, noise=1.0)
-    assert still.promise(40) < 0.3 * 40 * 0.01 * 3.0
-    slope = falls_of(lambda x: torch.ones_like(x), 4000, rate=0.01, noise=3.0)
-    assert slope.promise(1) == pytest.approx(0.01 * 3.0, rel=0.4)
+def test_noise_alone_predicts_less_than_its_own_size():
+    """This holds about the minimum. A slope hidden in each step's noise shows in the mean."""
+    still = monitored(lambda x: torch.zeros_like(x), 40, rate=0.01, noise=1.0)
+    assert still.predicted_decrease(40) < 0.3 * 40 * 0.01 * 3.0
+    slope = monitored(lambda x: torch.ones_like(x), 4000, rate=0.01, noise=3.0)
+    assert slope.predicted_decrease(1) == pytest.approx(0.01 * 3.0, rel=0.4)
 
 
-def test_too_few_steps_tell_nothing():
-    falls = falls_of(lambda x: x, LEAST + 1)
-    assert falls.promise(1) == math.inf and not falls.tell
-    assert falls_of(lambda x: x, LEAST + 2).tell
+def test_too_few_steps_predict_nothing():
+    monitor = monitored(lambda x: x, MIN_BLOCKS + 1)
+    assert monitor.predicted_decrease(1) == math.inf and not monitor.is_ready
+    assert monitored(lambda x: x, MIN_BLOCKS + 2).is_ready
 
 
-def test_the_share_is_of_what_the_loss_has_fallen_by():
-    """Where most of it is what no step can mend."""
-    falls = Falls({"x": torch.zeros(1)})
+def test_tolerance_is_relative_to_the_decrease_so_far():
+    """Most of this loss is a part that no step can lower."""
+    monitor = ConvergenceMonitor({"x": torch.zeros(1)})
     for k in range(40):
-        falls.observe(10.0 + 0.5**k, {})
-    assert falls.least(Options(tolerance=0.01)) == pytest.approx(0.01 * 1.0, rel=0.05)
+        monitor.end_step(10.0 + 0.5**k, {})
+    assert monitor.least_decrease(Options(tolerance=0.01)) == pytest.approx(0.01 * 1.0, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -161,5 +165,5 @@ def test_the_share_is_of_what_the_loss_has_fallen_by():
         (Ending.INTERRUPTED, 0.9, "interrupted"),
     ],
 )
-def test_reasons(ending, explained, reason):
+def test_reason_names_the_cause_and_the_remedy(ending, explained, reason):
     assert reason_of(ending, explained).startswith(reason)

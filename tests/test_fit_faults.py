@@ -16,7 +16,7 @@ import trimesh
 from test_fit import START, bracket, camera, picture
 
 import edgegrad.fit
-import edgegrad_cli as cli
+from edgegrad import cli
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, write_image
 from edgegrad.fit import PoseFit

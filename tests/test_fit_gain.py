@@ -12,12 +12,12 @@ from test_fit_photo import clutter
 import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import PoseFit, PoseParameter, fit_pose, fit_scene
+from edgegrad.fit.edge_support import edge_support
 from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.robust import Comparison
 from edgegrad.fit.pose.task import Lens, PoseTask
-from edgegrad.fit.verdict import explained
-from edgegrad.fit.views import has_levels, white_of
+from edgegrad.fit.views import has_levels, white_level
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_stronger_edges_are_not_those_of_the_render(gain: float, share: float) -
     view = camera(48)
     with torch.no_grad():
         one, other = (eg.render(eg.Scene([bracket()], BACKGROUND), view, 64, seed) for seed in (1, 2))
-    assert explained([(one, other, gain * one, None)]) == pytest.approx(share, rel=0.03)
+    assert edge_support([(one, other, gain * one, None)]) == pytest.approx(share, rel=0.03)
 
 
 @pytest.mark.parametrize("noise", [0.03, 0.1])
@@ -84,7 +84,7 @@ def test_noise_makes_no_edge_stronger(noise: float) -> None:
     with torch.no_grad():
         one, other = (eg.render(eg.Scene([bracket()], BACKGROUND), view, 64, seed) for seed in (1, 2))
     noisy = one + noise * torch.randn(one.shape, generator=torch.Generator().manual_seed(0))
-    assert explained([(one, other, noisy, None)]) > 0.95
+    assert edge_support([(one, other, noisy, None)]) > 0.95
 
 
 @pytest.mark.parametrize("gain", [1.0, 2.5])
@@ -127,8 +127,8 @@ def test_the_white_of_a_picture() -> None:
     levels = torch.randint(0, 40, (32, 32, 3), generator=torch.Generator().manual_seed(0))
     dark = srgb_to_linear(levels / 255.0)
     assert has_levels(dark) and not has_levels(0.5 * dark) and not has_levels(2.0 * picture(camera(32)))
-    assert white_of((7.0 * dark).flatten(0, 1)) == pytest.approx(7.0 * white_of(dark.flatten(0, 1)), rel=1e-5)
-    assert white_of(torch.zeros(5, 3)) == 1.0
+    assert white_level((7.0 * dark).flatten(0, 1)) == pytest.approx(7.0 * white_level(dark.flatten(0, 1)), rel=1e-5)
+    assert white_level(torch.zeros(5, 3)) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Gauss-Newton steps of fit_scene: the curvature, the damping, bounds, and what they refuse."""
+"""Gauss-Newton steps of fit_scene: curvature, damping, bounds, and errors."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from test_fit import BACKGROUND, bracket, camera, rotation
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses
 from edgegrad.fit.descent import gauss_newton
-from edgegrad.fit.descent.building import builder
 from edgegrad.fit.descent.curvature import curvature, weights_of
-from edgegrad.fit.descent.gauss_newton import GaussNewtonSteps
+from edgegrad.fit.descent.gauss_newton import GaussNewtonOptimizer
 from edgegrad.fit.descent.objective import Objective
+from edgegrad.fit.descent.scene_builder import builder
 from edgegrad.fit.options import Options
 from edgegrad.fit.placement import Coordinates
 from edgegrad.fit.views import views_of
@@ -24,7 +24,7 @@ QUIET = {"progress": False, "spp": 4}
 
 
 def views(sizes=(32, 32, 24)):
-    """Of which two are rendered as one batch."""
+    """Return views of which two are rendered as one batch."""
     return [camera(size, distance) for size, distance in zip(sizes, (4.5, 5.5, 4.0), strict=True)]
 
 
@@ -80,8 +80,8 @@ def test_curvature_of_a_pose_is_that_of_its_loss():
 
 
 @pytest.mark.parametrize("name", ["l1", "l2", "huber", "robust"])
-def test_weights_are_those_of_the_loss(name):
-    """ρ′(r) / r, divided by the count of numbers."""
+def test_weights_equal_the_slope_over_the_residual(name):
+    """They are ρ′(r) / r, divided by the count of numbers."""
     view, target = camera(8), torch.zeros(8, 8, 3)
     objective, _ = objective_of(
         bracket(), [view], [target + 0.5], {"verts": Parameter(0.1, bracket().verts)}, loss=name
@@ -97,7 +97,7 @@ def test_weights_are_those_of_the_loss(name):
 
 
 def test_curvature_of_a_regularizer():
-    """Of (b − 1)⁴ and what b has no part in; of a saddle without the way down."""
+    """The regularizers are (b − 1)⁴, one on which b has no influence, and a saddle, whose way down is left out."""
     scene, view = eg.Scene([bracket()], BACKGROUND), camera(16)
     target = torch.zeros(16, 16, 3)
     parameters = {"background": Parameter(0.1, torch.tensor([0.0, 2.0, 1.5]))}
@@ -139,57 +139,57 @@ def valley(monkeypatch):
         monkeypatch.setattr(gauss_newton, "curvature", lambda *_: curvature * torch.eye(2, dtype=F64))
         monkeypatch.setattr(gauss_newton, "check_pointwise", lambda objective: None)
         x = Parameter(lr, torch.tensor(start, dtype=F64), **bounds)
-        return GaussNewtonSteps({"x": x}, Options()), Valley()
+        return GaussNewtonOptimizer({"x": x}, Options()), Valley()
 
     return made
 
 
 def test_a_step_that_raises_the_loss_is_taken_back(valley):
-    """By a curvature that is far too small, each step would land far beyond."""
-    way, objective = valley(0.003, start=(3.0, 0.0))
+    """The curvature is far too small, so each step would land far beyond the minimum."""
+    optimizer, objective = valley(0.003, start=(3.0, 0.0))
     start = math.log1p(2.0)
     for _ in range(40):
-        way.advance(objective)
-        assert way.loss < start + 0.01  # of each accepted point
-    assert max(record.loss for record in way.history) > start + 0.1  # of some that were not
-    assert way.accepted < way.step - 3
-    assert float((way.best["x"] - objective.bottom).norm()) < 0.3
+        optimizer.advance(objective)
+        assert optimizer.loss < start + 0.01  # of each accepted point
+    assert max(record.loss for record in optimizer.history) > start + 0.1  # of some that were not
+    assert optimizer.accepted < optimizer.step - 3
+    assert float((optimizer.best["x"] - objective.bottom).norm()) < 0.3
 
 
 def test_a_right_curvature_needs_few_steps_and_then_ends(valley):
-    way, objective = valley(0.5, start=(1.6, -2.5))
+    optimizer, objective = valley(0.5, start=(1.6, -2.5))
     for _ in range(60):
-        way.advance(objective)
-        if way.flat:
+        optimizer.advance(objective)
+        if optimizer.flat:
             break
-    assert way.flat and way.step < 30
-    assert float((way.best["x"] - objective.bottom).norm()) < 0.05
+    assert optimizer.flat and optimizer.step < 30
+    assert float((optimizer.best["x"] - objective.bottom).norm()) < 0.05
 
 
 def test_no_number_moves_by_more_than_ten_rates(valley):
-    way, objective = valley(1e-6, lr=0.01)
-    way.advance(objective)
-    assert float((way.values["x"].detach() - 5.0).abs().max()) == pytest.approx(0.1)
+    optimizer, objective = valley(1e-6, lr=0.01)
+    optimizer.advance(objective)
+    assert float((optimizer.values["x"].detach() - 5.0).abs().max()) == pytest.approx(0.1)
 
 
 def test_bounds_hold_and_the_others_go_on(valley):
-    way, objective = valley(0.5, start=(1.6, -1.0), low=torch.tensor([1.3, -9.0], dtype=F64))
+    optimizer, objective = valley(0.5, start=(1.6, -1.0), low=torch.tensor([1.3, -9.0], dtype=F64))
     for _ in range(60):
-        way.advance(objective)
-        assert float(way.values["x"].detach()[0]) >= 1.3
-        if way.flat:
+        optimizer.advance(objective)
+        assert float(optimizer.values["x"].detach()[0]) >= 1.3
+        if optimizer.flat:
             break
-    assert float(way.best["x"][0]) == pytest.approx(1.3)
-    assert float(way.best["x"][1]) == pytest.approx(-2.0, abs=0.05)
+    assert float(optimizer.best["x"][0]) == pytest.approx(1.3)
+    assert float(optimizer.best["x"][1]) == pytest.approx(-2.0, abs=0.05)
 
 
-def test_a_loss_without_a_number_is_taken_back(valley):
-    way, objective = valley(0.5, start=(1.6, -2.5))
-    way.advance(objective)
-    here = way.here.clone()
+def test_a_step_to_a_nan_loss_is_taken_back(valley):
+    optimizer, objective = valley(0.5, start=(1.6, -2.5))
+    optimizer.advance(objective)
+    here = optimizer.here.clone()
     objective.bottom = objective.bottom * math.nan
-    way.advance(objective)
-    assert torch.equal(way.here, here) and torch.isfinite(way.values["x"]).all()
+    optimizer.advance(objective)
+    assert torch.equal(optimizer.here, here) and torch.isfinite(optimizer.values["x"]).all()
 
 
 def test_is_far_quicker_than_adam_by_steps():

@@ -15,6 +15,7 @@ import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import fit_camera, fit_pose
+from edgegrad.fit.contour_colors import CONTOUR_BLURS, PIXEL_NOISE, ContourColors, blur_losses, mask_noise
 from edgegrad.fit.pose.fit_pose import looks_alike
 from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.jacobian import Motion, Rendered
@@ -29,7 +30,6 @@ from edgegrad.fit.pose.photo.surface import AOVS, Surface
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.task import Lens, PoseTask, is_clutter
 from edgegrad.fit.region import OUTLIERS, Windows, palette, posterior, smoothed
-from edgegrad.fit.sides import BLURS, NOISE, Sides, blur_losses, noise_of_mask
 from edgegrad.fit.views import area_mean
 
 CENTER = torch.tensor([1.0, 0.75, 0.4]).double()
@@ -215,11 +215,11 @@ def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle, front, behind):
     near, at = torch.ones(n, n), 0.0
     for _ in range(4):
         tangents = -torch.exp(-0.5 * ((along - middle - at) / 0.9).square()) / (0.9 * math.sqrt(2 * math.pi))
-        sides = Sides.of(picture.display, alpha(middle + at), near)
+        sides = ContourColors.from_image(picture.display, alpha(middle + at), near)
         normal = contour_term(picture, sides, tangents[None])
         at -= float(normal.gradient / normal.curvature)
     assert at == pytest.approx(shift, abs=0.02)
-    assert contour_term(picture, Sides.of(picture.display, alpha(1e3), near), tangents[None]) is None
+    assert contour_term(picture, ContourColors.from_image(picture.display, alpha(1e3), near), tangents[None]) is None
 
 
 def test_the_noise_of_a_mask_is_that_of_its_pixels():
@@ -231,8 +231,8 @@ def test_the_noise_of_a_mask_is_that_of_its_pixels():
     for factor, size in ((1.0, n), (1 / 3, n // 3)):
         right, seen = (area_mean(one[..., None], (size, size))[..., 0] for one in (exact, hard))
         off = (seen - right)[(right > 0.02) & (right < 0.98)].square().mean().sqrt()
-        assert noise_of_mask(hard, factor) == pytest.approx(float(off), rel=0.3), factor
-    assert noise_of_mask(exact, 1.0) == noise_of_mask(smoothed(hard[None], 0.7)[0], 1.0) == NOISE
+        assert mask_noise(hard, factor) == pytest.approx(float(off), rel=0.3), factor
+    assert mask_noise(exact, 1.0) == mask_noise(smoothed(hard[None], 0.7)[0], 1.0) == PIXEL_NOISE
 
 
 def test_a_pose_that_looks_alike_may_be_elsewhere(taken):
@@ -246,7 +246,7 @@ def test_a_pose_that_looks_alike_may_be_elsewhere(taken):
         assert words in said and bool(said) == bool(words)
 
 
-@pytest.mark.parametrize("blur", BLURS)
+@pytest.mark.parametrize("blur", CONTOUR_BLURS)
 def test_how_sharp_a_contour_is(blur):
     """A disc before something dark, noisy: the blur that it was taken with leaves the least."""
     view, n = camera(64), 64
@@ -256,9 +256,9 @@ def test_how_sharp_a_contour_is(blur):
     mixed = smoothed(alpha[None], blur)[0][..., None]
     noise = 0.02 * torch.randn(n, n, 3, generator=torch.Generator().manual_seed(0))
     picture = shown(view, srgb_to_linear(linear_to_srgb(mixed * front + (1 - mixed) * behind) + noise))
-    sides = Sides.of(picture.display, smoothed(alpha[None], max(BLURS))[0], torch.ones(n, n))
+    sides = ContourColors.from_image(picture.display, smoothed(alpha[None], max(CONTOUR_BLURS))[0], torch.ones(n, n))
     losses = blur_losses(sides, picture.display, picture.weight, alpha)
-    assert BLURS[int(losses.argmin())] == blur, losses
+    assert CONTOUR_BLURS[int(losses.argmin())] == blur, losses
 
 
 # The depth term

@@ -15,6 +15,7 @@ from test_fit_photo import clutter
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
+from edgegrad.cli import main
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import PoseFit, fit_pose, fit_poses
 from edgegrad.fit.pose.given import Names
@@ -29,7 +30,6 @@ from edgegrad.fit.pose.photo.surface import AOVS, Surface
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.task import Lens, PoseTask
 from edgegrad.fit.region import OUTLIERS, smoothed
-from edgegrad_cli import main
 
 MIDDLE = torch.tensor([1.0, 0.75, 0.4]).double()
 BESIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which covers a part of the bracket

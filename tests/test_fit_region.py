@@ -1,4 +1,4 @@
-"""fit_scene(loss="region"): shapes, poses and cameras from photographs without a mask, in light that the fit does not know."""
+"""fit_scene(loss="region") finds shapes, poses and cameras from photographs without a mask, in unknown light."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from test_fit_photo import clutter, photograph
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, fit_shape, fit_texture, losses
-from edgegrad.fit.descent.regions import EVERY, Regions
+from edgegrad.fit.contour_colors import CONTOUR_BLURS, ContourColors
+from edgegrad.fit.descent.region_loss import RENEWAL_STEPS, RegionLoss
 from edgegrad.fit.region import OUTLIERS, Palette, smoothed
-from edgegrad.fit.sides import BLURS, Sides
-from edgegrad.fit.views import outlined_views, views_of
+from edgegrad.fit.views import region_views, views_of
 
 RADII = torch.tensor([0.55, 0.75, 0.35, 0.5])
 AROUND = 24
@@ -24,7 +24,7 @@ VIEW = eg.Camera.look_at((0.3, 1.4, 4.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(96,
 
 
 def vase(radii):
-    """A solid of revolution about the y axis."""
+    """Return a solid of revolution about the y axis."""
     angle = torch.arange(AROUND) * (2.0 * math.pi / AROUND)
     r = torch.cat([torch.full((1,), 1e-3), radii, torch.full((1,), 1e-3)])
     y = torch.tensor([-0.9, -0.9, -0.3, 0.3, 0.9, 0.9])
@@ -38,7 +38,7 @@ def vase(radii):
 
 
 def picture(light_samples=1):
-    """Of the vase, in a light, before clutter, compressed."""
+    """Render the vase in a light, in front of clutter, and compress it."""
     mesh = vase(RADII)
     colors = 0.45 + 0.25 * torch.sin(3.0 * mesh.verts)
     return photograph(VIEW, mesh.replace(colors=colors), seed=7, light_samples=light_samples)
@@ -49,8 +49,8 @@ def taken():
     return picture()
 
 
-def test_a_shape_and_its_place():
-    """The radii of a vase start 20 % off, and its place 3 % of its size."""
+def test_finds_a_shape_and_its_translation():
+    """The radii of a vase start 20 % off, and its translation 3 % of its size."""
     start = Pose(torch.eye(3), torch.tensor([0.06, -0.04, 0.0]))
     given = {
         "radii": Parameter(0.01, RADII * torch.tensor([1.2, 0.8, 1.2, 0.8]), low=0.05),
@@ -69,8 +69,8 @@ def test_a_shape_and_its_place():
 
 
 @pytest.mark.parametrize("method", [pytest.param("adam", marks=pytest.mark.slow), "gauss-newton"])
-def test_a_pose(method):
-    """Of a bracket without colours, 12.3° and 8.4 % of its size off."""
+def test_finds_a_pose(method):
+    """A bracket without colours starts 12.3° and 8.4 % of its size off."""
     view = camera(128)
     given = {"pose": PoseParameter(Pose(START[:3, :3], START[:3, 3]))}
     image = photograph(view, seed=2, light_samples=16)
@@ -79,8 +79,8 @@ def test_a_pose(method):
     assert degrees < 2.0 and percent < 2.0 and fit.converged, (degrees, percent, fit.reason)
 
 
-def test_a_camera(taken):
-    """Shifted before a vase that stays."""
+def test_finds_a_camera(taken):
+    """The camera starts shifted, and the vase stays."""
     moved = VIEW.replace(
         world_to_camera=VIEW.world_to_camera + torch.tensor([[0.0, 0.0, 0.0, 0.15]] * 2 + [[0.0] * 4] * 2)
     )
@@ -93,7 +93,7 @@ def test_a_camera(taken):
 
 
 @pytest.mark.slow
-def test_a_shape_from_views():
+def test_finds_a_shape_from_several_views():
     """A sphere becomes a bumpy ellipsoid, without a mask."""
 
     def sphere(subdivisions):
@@ -117,11 +117,11 @@ def test_a_shape_from_views():
 
 
 def test_loss_and_curvature_are_those_of_the_likelihood(taken):
-    regions = Regions(outlined_views(views_of(VIEW, taken)), 0)
+    regions = RegionLoss(region_views(views_of(VIEW, taken)), 0)
     alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=16)["alpha"]
     regions.renew(0, alpha)
     sharp = regions.blur  # what the picture shows
-    assert sharp in BLURS
+    assert sharp in CONTOUR_BLURS
     P, near = regions.posteriors[0].double(), regions.near[0].double() / regions.near[0].sum()
     inside, outside = (
         float(P[(alpha[..., 0] > 0.99) == side][near[(alpha[..., 0] > 0.99) == side] > 0].mean())
@@ -133,7 +133,7 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
     def of_regions(soft):
         return -(near * (soft * P + (1 - soft) * (1 - P) + OUTLIERS).log())
 
-    sides = Sides.of(regions.displays[0], smoothed(alpha[None, ..., 0], 0.9)[0], regions.near[0])
+    sides = ContourColors.from_image(regions.displays[0], smoothed(alpha[None, ..., 0], 0.9)[0], regions.near[0])
     assert 200 < int(sides.band.sum()) < 2000
 
     def off(soft):
@@ -145,7 +145,11 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
         squares = off(soft).square().sum(-1)
         return near * sides.band * 0.5 * squares / (1 + squares / 12.0)
 
-    for step, blur in ((0, 3.0), (EVERY, 1.8), (5 * EVERY, sharp)):  # the contour counts where alpha is sharp
+    for step, blur in (
+        (0, 3.0),
+        (RENEWAL_STEPS, 1.8),
+        (5 * RENEWAL_STEPS, sharp),
+    ):  # the contour counts where alpha is sharp
         regions.renew(0, alpha, step)
         soft = smoothed(moving[None, ..., 0], blur)[0].double()
         parts = [of_regions(soft)] + [of_contour(soft)] * (blur == sharp)
@@ -164,8 +168,8 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
 
 
 def test_colours_are_counted_anew_where_the_object_has_moved(taken):
-    """And stay where it has left the picture."""
-    regions = Regions(outlined_views(views_of(VIEW, taken)), 0)
+    """They stay if the object has left the picture."""
+    regions = RegionLoss(region_views(views_of(VIEW, taken)), 0)
     alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
     regions.renew(0, alpha)
     first = regions.posteriors[0]
@@ -183,8 +187,8 @@ def test_weights_leave_pixels_out(taken):
     alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
     found = []
     for image in (taken, spoilt):
-        views = outlined_views(views_of(VIEW, image, None, weights))
-        regions = Regions(views, 0)
+        views = region_views(views_of(VIEW, image, None, weights))
+        regions = RegionLoss(views, 0)
         regions.palettes = [Palette(torch.rand(64, 3, generator=torch.Generator().manual_seed(1)))]
         regions.labels = [regions.palettes[0].labels(regions.displays[0])]
         regions.renew(0, alpha)
@@ -196,15 +200,15 @@ def test_radiance_and_weights_of_any_unit(taken):
     alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
     found = []
     for unit, weight in ((1.0, 1.0), (40.0, 0.01)):
-        regions = Regions(outlined_views(views_of(VIEW, unit * taken, None, torch.full((96, 96), weight))), 0)
+        regions = RegionLoss(region_views(views_of(VIEW, unit * taken, None, torch.full((96, 96), weight))), 0)
         regions.renew(0, alpha)
-        found.append(regions.explained([alpha]))
+        found.append(regions.edge_support([alpha]))
     assert found[1] == pytest.approx(found[0], abs=0.05) and found[0] > 0.5
 
 
 @pytest.mark.parametrize("method", ["adam", "gauss-newton"])
 def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, method, tmp_path):
-    """Also between two counts of the colours."""
+    """It may stop between two counts of the colours."""
     given = {"pose": PoseParameter(Pose(torch.eye(3), torch.tensor([0.1, 0.0, 0.0])))}
     told = {"loss": "region", "method": method, "spp": 4, "steps": 8, "progress": False}
     expected = fit_scene(vase(RADII), VIEW, taken, given, **told)
@@ -219,14 +223,14 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, method, tmp_path):
     assert found.loss == expected.loss and torch.equal(found.values["pose"], expected.values["pose"])
 
 
-def test_what_is_not_there_is_not_explained():
+def test_edge_support_is_low_without_the_object():
     fit = fit_scene(
         vase(RADII), VIEW, clutter(96, 3), {"pose": PoseParameter()}, loss="region", spp=4, steps=30, progress=False
     )
     assert not fit.converged and fit.explained < 0.5
 
 
-def test_pictures_of_it(taken):
+def test_plot_draws_contours_into_the_picture(taken):
     fit = fit_scene(vase(RADII), VIEW, taken, {"pose": PoseParameter()}, loss="region", spp=4, steps=2, progress=False)
     assert fit.render().shape == (96, 96, 1) and len(fit.plot().axes) == 3  # target, start, fit; no difference
 
@@ -248,13 +252,13 @@ FIRST = {"pose": PoseParameter()}
         (MESH.transformed(scale=9.0), {}, ValueError, r"scene: .* that fills picture 0 at the start; leave out ground and walls"),
     ],
 )  # fmt: skip
-def test_errors(taken, scene, given, error, message):
+def test_errors_name_the_argument(taken, scene, given, error, message):
     whole = {"images": taken, "parameters": FIRST, "loss": "region", "progress": False, **given}
     with pytest.raises(error, match=message):
         fit_scene(scene, VIEW, **whole)
 
 
-def test_errors_of_other_fits(taken):
+def test_other_fits_refuse_the_region_loss(taken):
     with pytest.raises(ValueError, match=r"loss: expected .* got 'region'"):
         fit_texture(
             MESH.replace(uvs=torch.rand(6 * AROUND, 2), uv_faces=MESH.faces, colors=None),

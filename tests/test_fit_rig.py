@@ -102,7 +102,7 @@ def test_a_pose_from_photographs_without_masks() -> None:
     start = {"rotations": 0.5 * TRUTH}
     found = fit_rig(rig, cameras, photos, loss="region", start=start, coarsest=24, progress=False)
     assert degrees(0.5 * TRUTH, TRUTH) > 15.0 and degrees(found.values["rotations"], TRUTH) < 5.0
-    assert found.converged and all(view.outlined for view in found.fit.views)
+    assert found.converged and all(view.by_region for view in found.fit.views)
     far = {"translation": [50.0, 0.0, 0.0]}
     with pytest.raises(ValueError, match="expected an object that the pictures show at the start"):
         fit_rig(rig, cameras, photos, loss="region", start=far, progress=False)
@@ -248,7 +248,7 @@ def test_it_goes_on_where_it_stopped(tmp_path) -> None:
 def test_the_command_line(tmp_path, capsys) -> None:
     from rig_files import simple_skin
 
-    import edgegrad_cli
+    from edgegrad import cli
 
     rig = eg.load_rig(simple_skin().write(tmp_path))
     camera = eg.Camera.look_at((0.5, 1.0, 4.0), (0.5, 1.0, 0.0), up=(0, 1, 0), fov_y=40, size=(24, 24))
@@ -265,7 +265,7 @@ def test_the_command_line(tmp_path, capsys) -> None:
         "upper",
     ]
     told += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
-    assert edgegrad_cli.main([str(word) for word in told]) == 0
+    assert cli.main([str(word) for word in told]) == 0
     assert "wrote pose.json, joints.json, posed.glb" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "pose.json").read_text())["rotations"]
     assert abs(found[-1][2] - 0.4) < 0.15 and found[0] == [0.0, 0.0, 0.0]

@@ -20,7 +20,7 @@ from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.robust import Comparison
 from edgegrad.fit.pose.soft import softness
 from edgegrad.fit.pose.task import PARTS, Lens, PoseTask, blurred, is_clutter
-from edgegrad.fit.views import before_black
+from edgegrad.fit.views import over_black
 
 
 def covered(view, image):
@@ -59,7 +59,7 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
         return aside[0], True
 
     monkeypatch.setattr(search.Search, "_down", ends_aside)
-    monkeypatch.setattr(search, "ENOUGH", 0.0)  # all ends are taken for right
+    monkeypatch.setattr(search, "MIN_EDGE_SUPPORT", 0.0)  # all ends are taken for right
     if not looks:
         monkeypatch.setattr(search, "APART", math.inf)
     fit = fit_pose(bracket(), image, view, init=START, background=BACKGROUND, steps=24, progress=False)
@@ -501,11 +501,11 @@ def test_what_a_picture_holds_at_a_soft_mask_does_not_matter(kind):
 def test_the_object_before_black():
     mask = torch.tensor([0.0, 0.0, 0.3, 0.6, 1.0, 1.0, 1.0, 0.5])[None, :, None]
     inside = torch.tensor([9.0, 9.0, 9.0, 9.0, 2.0, 3.0, 4.0, 9.0])[None, :, None]
-    image, sure = before_black(inside, mask)
+    image, sure = over_black(inside, mask)
     torch.testing.assert_close(image.flatten(), torch.tensor([0.0, 0.0, 0.6, 1.2, 2.0, 3.0, 4.0, 2.0]))
     assert sure.flatten().tolist() == [1, 1, 0, 0, 1, 1, 1, 0]
     for same in (mask.round(), 0.5 * mask):  # nothing between, nothing full
-        image, sure = before_black(inside, same)
+        image, sure = over_black(inside, same)
         assert torch.equal(image, inside * same) and sure is None
 
 

@@ -1,4 +1,4 @@
-"""The frame of fits by descent, on scenes of a few faces: it finds, stops, stops claiming, resumes, saves."""
+"""Fits by descent on scenes of a few faces: they find, stop, stop claiming, resume and save."""
 
 import json
 import math
@@ -8,11 +8,11 @@ import torch
 from test_fit import BACKGROUND, bracket, camera
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_scene, fit_shape, fit_texture, losses, regularizers, verdict
+from edgegrad.fit import Parameter, fit_scene, fit_shape, fit_texture, losses, regularizers
 from edgegrad.fit.descent.adam import Adam
+from edgegrad.fit.edge_support import _gradient, edge_support, picture_noise
 from edgegrad.fit.ending import Ending
-from edgegrad.fit.smooth import Smooth
-from edgegrad.fit.verdict import explained, picture_noise
+from edgegrad.fit.laplacian import LaplacianSolver
 
 QUIET = {"progress": False, "spp": 4}
 
@@ -31,7 +31,7 @@ def pictures(scene, cameras):
 # -- losses and regularizers ------------------------------------------------------------------------------------------
 
 
-def test_losses_are_what_their_formulas_say():
+def test_losses_equal_their_formulas():
     a, b = torch.tensor([[[0.5, 0.0]]]), torch.tensor([[[0.2, 0.4]]])  # 1 pixel, 2 channels: r = 0.3, −0.4
     assert float(losses.l1(a, b)) == pytest.approx(0.35)
     assert float(losses.l2(a, b)) == pytest.approx(0.125)
@@ -65,7 +65,7 @@ def test_losses_vanish_at_the_target_and_heed_weights(name):
 
 
 def test_a_multiscale_loss_sees_further_than_a_pixel():
-    """Two dots that do not touch: only coarse levels see that one of them is nearer."""
+    """The two dots do not touch, so only coarse levels see that one of them is nearer."""
     x = torch.arange(32.0)
 
     def dot(at):
@@ -79,7 +79,7 @@ def test_a_multiscale_loss_sees_further_than_a_pixel():
     )
 
 
-def test_regularizers():
+def test_regularizers_equal_their_formulas():
     flat = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]).double()
     faces = torch.tensor([[0, 1, 2], [1, 3, 2]])
     assert float(regularizers.normal_consistency(flat, faces)) == pytest.approx(0.0, abs=1e-12)
@@ -101,7 +101,7 @@ def test_regularizers():
 # -- the loop ---------------------------------------------------------------------------------------------------------
 
 
-def test_steps_are_those_of_adam():
+def test_steps_equal_those_of_torch_adam():
     start = torch.randn(5, 3, generator=torch.Generator().manual_seed(0)).double()
     mine, theirs = (start.clone().requires_grad_() for _ in range(2))
     ours, torchs = Adam({"x": mine}, {"x": 0.1}), torch.optim.Adam([theirs], lr=0.1)
@@ -122,8 +122,8 @@ def test_uniform_steps_keep_the_gradients_direction():
 
 def test_smooth_coordinates_have_their_gradient():
     mesh = bracket()
-    smooth = Smooth(mesh.faces, len(mesh.verts), 3.0)
-    u = smooth.times(mesh.verts).requires_grad_()
+    smooth = LaplacianSolver(mesh.faces, len(mesh.verts), 3.0)
+    u = smooth.to_differential(mesh.verts).requires_grad_()
     torch.testing.assert_close(smooth(u.detach()), mesh.verts)
     assert torch.autograd.gradcheck(smooth, (u,))
 
@@ -146,7 +146,7 @@ def test_finds_named_tensors_each_at_its_rate():
     assert fit.loss < 0.01 * seen[0].loss
 
 
-def test_finds_what_a_function_makes_a_scene_of():
+def test_finds_the_values_of_a_function_that_makes_the_scene():
     mesh, cameras = bracket(), views(2)
     target = pictures(mesh.transformed(t=torch.tensor([0.1, 0.0, 0.0]).double()), cameras)
     fit = fit_scene(
@@ -166,7 +166,7 @@ def test_finds_a_camera_by_name():
 
 
 @pytest.mark.parametrize("how", ["weights", "robust"])
-def test_what_covers_the_object_need_not_count(how):
+def test_weights_exclude_what_covers_the_object(how):
     mesh, (view,) = bracket(), views(1)
     mesh = mesh.replace(face_colors=torch.tensor([[0.3, 0.6, 0.2]]).repeat(20, 1))
     (target,) = pictures(eg.Scene([mesh], BACKGROUND), [view])
@@ -395,7 +395,7 @@ def test_picture_noise_is_that_of_the_picture():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
-def test_explained_falls_with_misplacement(noise):
+def test_edge_support_decreases_with_misplacement(noise):
     view, g = camera(96), torch.Generator().manual_seed(0)
     scene = eg.Scene([bracket()], BACKGROUND)
     a, b = (eg.render(scene, view, spp=64, seed=s) for s in (1, 2))
@@ -404,22 +404,22 @@ def test_explained_falls_with_misplacement(noise):
         K = view.K.clone()
         K[:2, 2] += pixels
         picture = eg.render(scene, view.replace(K=K), spp=64, seed=3)
-        return explained([(a, b, picture + noise * torch.randn(picture.shape, generator=g), None)])
+        return edge_support([(a, b, picture + noise * torch.randn(picture.shape, generator=g), None)])
 
     shares = [share(pixels) for pixels in (0.0, 0.5, 2.0, 8.0)]
     assert shares[0] > 0.95 and shares == sorted(shares, reverse=True) and shares[1] > 0.6 and shares[2] < 0.5, shares
 
 
-def test_a_channel_of_which_the_picture_shows_little_counts_by_what_the_render_has():
-    """As where the one blue thing is covered: that edge is missing, and the others are not."""
+def test_a_channel_missing_in_the_picture_counts_by_the_edges_of_the_render():
+    """If the only blue object is covered, its edge is missing and the others are not."""
     render = torch.zeros(32, 32, 3)
     render[8:24, 8:24, :2] = 1.0
     render[12:14, 12:14, 2] = 1.0
     picture = render.clone()
     picture[10:16, 10:16] = torch.tensor([1.0, 1.0, 0.0])
     picture[0, 0, 2] = 1e-3  # that nothing else of the channel is there does not make it larger
-    share = explained([(render, render, picture, None)])
-    edges = [float(verdict._gradient(render[..., k : k + 1]).norm(dim=0).sum()) for k in range(3)]
+    share = edge_support([(render, render, picture, None)])
+    edges = [float(_gradient(render[..., k : k + 1]).norm(dim=0).sum()) for k in range(3)]
     assert share == pytest.approx((edges[0] + edges[1]) / sum(edges), abs=1e-3) and share > 0.8
 
 

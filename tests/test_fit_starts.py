@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from objects import pebble
 from test_fit import bracket
 from torch import Tensor
 
 import edgegrad as eg
+from benchmarks import photo_cases
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import fit_pose
 from edgegrad.fit.pose.given import Names
@@ -21,10 +21,6 @@ from edgegrad.fit.pose.photo.nearby import EVERYWHERE, comparable, nearby
 from edgegrad.fit.pose.photo.views import Views, all_sides, ball, pose_at, seen_at, spread
 from edgegrad.fit.pose.pose import Pose, angle, pose_from_matrix
 from edgegrad.fit.pose.task import Lens, PoseTask
-
-sys.path += [str(Path(__file__).parents[1] / folder) for folder in ("benchmarks", "examples")]
-import photo_cases
-from objects import pebble
 
 CENTER = torch.tensor([1.0, 0.75, 0.4])
 SIZE = 96

@@ -8,13 +8,13 @@ import pytest
 import torch
 from combinations import diagonal
 from finite_differences import Estimate, estimate
+from oracles.exact import exact_image
 from scenes import cube, front_camera, icosphere, one_triangle, smooth_adjoint, smooth_colors
 from torch import Tensor
 from torch.autograd import forward_ad
 
 import edgegrad as eg
 from edgegrad.kernel import memory, operators
-from edgegrad.report.exact import exact_image
 
 F64 = torch.float64
 SIZE = 20

@@ -18,12 +18,12 @@ from scipy.stats import t as student
 from torch import Tensor
 
 import edgegrad as eg
+from benchmarks.stability.cases.case import Parts, Problem
+from benchmarks.stability.cases.glossy import GLOSSY, LAMPS
+from benchmarks.stability.cases.measure import Effort as Seeds
+from benchmarks.stability.cases.measure import Running, differences
+from benchmarks.stability.statistics import holm
 from edgegrad.kernel.request import make_request
-from edgegrad.report.stability.cases.case import Parts, Problem
-from edgegrad.report.stability.cases.glossy import GLOSSY, LAMPS
-from edgegrad.report.stability.cases.measure import Effort as Seeds
-from edgegrad.report.stability.cases.measure import Running, differences
-from edgegrad.report.stability.statistics import holm
 from edgegrad.shader import Effort, render_shaded
 
 F64 = torch.float64

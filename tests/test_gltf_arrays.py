@@ -6,8 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from lit_gltf import CORNERS, TURN, file
-from mesh_files import SQUARE, TEXELS, TRIANGLES, glb, square_glb
-from test_bad_files import changed
+from mesh_files import SQUARE, TEXELS, TRIANGLES, changed, glb, square_glb
 
 import edgegrad as eg
 

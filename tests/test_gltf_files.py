@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 import torch
-from mesh_files import SQUARE, TEXELS, linear, png_bytes, square_glb, texel_at
+from mesh_files import SQUARE, TEXELS, linear, saved, square_glb, texel_at
 from PIL import Image
 
 import edgegrad as eg
@@ -22,7 +22,7 @@ def test_glb_with_an_embedded_texture(tmp_path):
     path = tmp_path / "square.glb"
     more = {"images": [{"bufferView": 3, "mimeType": "image/png"}], "textures": [{"source": 0}]}
     base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.5, 1.0, 0.125, 1.0]}
-    path.write_bytes(square_glb({"pbrMetallicRoughness": base}, uv=True, extra=[png_bytes()], **more))
+    path.write_bytes(square_glb({"pbrMetallicRoughness": base}, uv=True, extra=[saved("PNG")], **more))
     mesh = load_mesh(path)
     expected = linear(TEXELS) * [0.5, 1.0, 0.125]
     np.testing.assert_allclose(mesh.texture.numpy(), expected, atol=1e-6)
@@ -221,7 +221,7 @@ def test_gltf_with_files_beside_it(tmp_path):
 def test_gltf_vertex_colours_beside_a_texture(tmp_path):
     """Multiplied where they are all one. Others need a lit mesh, or the texture left out."""
     base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.5, 1.0, 0.2, 1.0]}
-    given = dict(uv=True, extra=[png_bytes()], textures=[{"source": 0}], images=[{"bufferView": 4}])
+    given = dict(uv=True, extra=[saved("PNG")], textures=[{"source": 0}], images=[{"bufferView": 4}])
     file, colors = tmp_path / "t.glb", np.array([[0.5, 0.25, 1.0, 1.0]] * 4, "<f4")
 
     def save(colors, **material):

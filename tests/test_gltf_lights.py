@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 from lit_gltf import TURN, file, loaded
-from mesh_files import SQUARE, TRIANGLES, glb
-from test_bad_files import changed
+from mesh_files import SQUARE, TRIANGLES, changed, glb
 
 import edgegrad as eg
 

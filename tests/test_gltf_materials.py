@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 from lit_gltf import CORNERS, file, loaded, shown
-from mesh_files import SQUARE, TEXELS, linear
-from test_bad_files import changed
+from mesh_files import SQUARE, TEXELS, changed, linear
 
 import edgegrad as eg
 from edgegrad.scene.appearance import OnMesh

@@ -1,4 +1,4 @@
-"""Visual hulls, even triangles and texture coordinates: what fits of shapes and textures start from."""
+"""Visual hulls, remeshing and texture coordinates, from which fits of shapes and textures start."""
 
 import math
 
@@ -19,7 +19,7 @@ def torus(shift=(0.4, -0.2, 0.3)):
 
 
 def around(mesh, count, size=64, distance=6.0, **options):
-    """Cameras on a spiral."""
+    """Return cameras on a spiral."""
     middle = mesh.verts.mean(0)
     found = []
     for k in range(count):
@@ -40,7 +40,7 @@ def volume(mesh):
 
 
 def holes(mesh):
-    """By Euler's formula, of a closed surface in one piece."""
+    """Count holes by Euler's formula for a closed surface in one piece."""
     return 1 - (len(mesh.verts) - len(regularizers.edges(mesh.faces)) + len(mesh.faces)) // 2
 
 
@@ -71,7 +71,7 @@ def test_orthographic_cameras_and_a_box_of_ones_own():
 
 
 def test_an_object_that_goes_on_beyond_an_image():
-    """Where it touches the rim nothing is cut away; where it does not, nothing is beyond."""
+    """Beyond a side that the mask touches nothing is cut away; beyond the others there is nothing."""
     egg = ball(3)
     cameras = around(egg, 12)
     near = [
@@ -94,7 +94,7 @@ def test_small_pieces_are_left_out():
     assert holes(visual_hull(cameras, specks, 40)) == 0  # one piece
 
 
-def test_faults_of_hulls():
+def test_hull_errors_name_the_argument():
     egg = ball(2)
     cameras = around(egg, 4, 32)
     masks = silhouettes(egg, cameras)
@@ -116,8 +116,8 @@ def test_faults_of_hulls():
             call()
 
 
-def test_the_smallest_surface():
-    """The area of a unit sphere in squared diagonals of its box, and how it falls."""
+def test_area_regularizer_shrinks_a_sphere():
+    """The area is that of a unit sphere in squared diagonals of its box."""
     sphere = ball(4)
     assert float(regularizers.area(sphere.verts, sphere.faces)) == pytest.approx(4 * math.pi / 12, rel=0.01)
     verts = sphere.verts.clone().requires_grad_()
@@ -164,7 +164,7 @@ def test_a_texture_on_an_unwrapped_mesh():
     assert -10.0 * math.log10(float(apart.square().mean())) > 28.0
 
 
-def test_faults_of_unwrapping():
+def test_unwrapping_errors_name_the_argument():
     pytest.importorskip("xatlas")
     with pytest.raises(TypeError, match="mesh: expected a Mesh, got int"):
         eg.unwrap(3)

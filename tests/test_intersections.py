@@ -1,5 +1,5 @@
 """Lines where faces pass through each other: which there are, against exhaustion, and gradients along them, against exact
-images of the faces cut apart (edgegrad/report/stability/crossing.py) and against finite differences."""
+images of the faces cut apart (tests/oracles/cut_apart.py) and against finite differences."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import pytest
 import torch
 from combinations import diagonal
 from finite_differences import check, check_ratio, estimate, rotation
+from oracles.cut_apart import cut_apart, faces_that_cross
+from oracles.exact import exact_image
 from scenes import cube, front_camera, icosphere, smooth_adjoint, smooth_colors, soup
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.library import core
-from edgegrad.report.exact import exact_image
-from edgegrad.report.stability.crossing import cut_apart, faces_that_cross
 
 F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)

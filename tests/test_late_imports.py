@@ -1,4 +1,4 @@
-"""Libraries that files need are imported late, and missed by name."""
+"""Names of the package, and libraries that files need, are imported late, and missed by name."""
 
 import os
 import subprocess
@@ -24,6 +24,50 @@ def test_libraries_that_are_missing_are_named(tmp_path, monkeypatch):
         read_image(tmp_path / "a.png")
     with pytest.raises(ImportError, match="pip install trimesh"):
         save_mesh(tmp_path / "a.ply", mesh)
+
+
+LAZY = """
+import pickle, sys
+import edgegrad as eg
+assert not {"torch", "numpy", "edgegrad._core"} & set(sys.modules)
+assert {"render", "Mesh", "fit", "io"} <= set(dir(eg)) and set(eg.__all__) == set(dir(eg))
+for wrong in ("rendr", "fit.fit_pos"):
+    try: eval(f"eg.{wrong}")
+    except AttributeError as error: assert wrong.split(".")[-1] in str(error) and error.obj is not None
+assert "torch" not in sys.modules
+import edgegrad.render
+assert callable(eg.render) and callable(eg.plan) and callable(eg.profile) and callable(eg.bake)
+assert "edgegrad.fit.rig" not in sys.modules and callable(eg.fit.fit_pose)
+assert pickle.loads(pickle.dumps(eg.Camera)) is eg.Camera
+from edgegrad import *
+from edgegrad.fit import *
+assert render is eg.render and fit_rig is eg.fit.fit_rig
+assert all(hasattr(eg, name) for name in eg.__all__) and all(hasattr(eg.fit, name) for name in eg.fit.__all__)
+"""
+
+
+def alone(code: str) -> subprocess.CompletedProcess[str]:
+    """The code in a process of its own."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, env=env)
+
+
+def test_names_are_imported_on_first_use() -> None:
+    done = alone(LAZY)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_wrong_name_is_corrected() -> None:
+    assert "Did you mean: 'render'?" in alone("import edgegrad; edgegrad.rendr").stderr
+
+
+def test_ipython_knows_the_pictures_of_meshes_and_scenes() -> None:
+    done = alone(
+        "import sys; from IPython.core.interactiveshell import InteractiveShell as Shell; shell = Shell.instance()\n"
+        "import edgegrad; known = shell.display_formatter.formatters['image/png'].deferred_printers\n"
+        "assert {name for _, name in known} >= {'Mesh', 'Scene'} and 'torch' not in sys.modules"
+    )
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from oracles.exact import exact_image
 from scenes import cube, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report.exact import exact_image
 
 F64 = torch.float64
 SIZE = (24, 24)

@@ -19,7 +19,7 @@ from scenes import icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.camera.lens import bend
+from edgegrad.camera.lens import distort
 from edgegrad.kernel.operators import kernel_camera
 from edgegrad.kernel.request import pack_camera
 from edgegrad.library import core
@@ -89,7 +89,7 @@ def test_boxes_hold_what_they_say(lens: str) -> None:
         middle, half = rng.uniform(-30, 80, 2), rng.uniform(0, 20, 2) ** 2 / 10
         low, high = core.for_tests.image_box(kernel, middle - half, middle + half)
         for u in rng.uniform(middle - half, middle + half, (30, 2)):
-            x, area_scale, _ = core.for_tests.bend(kernel, u, [0.0, 0.0])
+            x, area_scale, _ = core.for_tests.distort(kernel, u, [0.0, 0.0])
             if area_scale > 0 and (np.array(x) > -1).all() and x[0] < SIZE[1] + 1 and x[1] < SIZE[0] + 1:
                 assert (np.array(x) >= np.array(low) - 1e-9).all() and (np.array(x) <= np.array(high) + 1e-9).all()
 
@@ -160,7 +160,7 @@ def straightened(view: eg.Camera, x: Tensor) -> Tensor:
     n = m.detach()
     for _ in range(30):
         n = n.detach().requires_grad_()
-        bent = bend(view.projection, torch.cat([n, torch.ones_like(n[:, :1])], 1), view.coefficients)
+        bent = distort(view.projection, torch.cat([n, torch.ones_like(n[:, :1])], 1), view.coefficients)
         rows = [torch.autograd.grad(bent[:, i].sum(), n, retain_graph=True)[0] for i in (0, 1)]
         n = n.detach() + torch.linalg.solve(torch.stack(rows, 1), (m - bent)[..., None])[..., 0]
     return n
@@ -436,7 +436,7 @@ def test_rays_of_pixels_come_back_to_where_they_were_drawn(lens: str, focal: flo
     n = torch.from_numpy(normalised_places(view, pixels, places))
     seen = n.isfinite().all(-1)
     assert bool(seen[len(seen) // 2].all())
-    m = bend(projection, torch.cat([n, torch.ones_like(n[..., :1])], -1), distortion)
+    m = distort(projection, torch.cat([n, torch.ones_like(n[..., :1])], -1), distortion)
     x = m @ K[:2, :2].T + K[:2, 2]
     expected = torch.tensor(pixels, dtype=F64)[:, None] + torch.from_numpy(places)
     torch.testing.assert_close(x[seen], expected[seen], rtol=0, atol=1e-11 * max(focal, 100.0))
@@ -457,7 +457,7 @@ def test_each_camera_has_a_table_of_its_own() -> None:
     found = [normalised_places(view, pixels, places) for view in others]
     for view, n in zip(others, found, strict=True):
         q = torch.from_numpy(np.concatenate([n, np.ones_like(n[..., :1])], -1))
-        x = bend(view.projection, q, view.coefficients) @ view.K[:2, :2].T + view.K[:2, 2]
+        x = distort(view.projection, q, view.coefficients) @ view.K[:2, :2].T + view.K[:2, 2]
         np.testing.assert_allclose(x.numpy(), np.array(pixels)[:, None] + places, rtol=0, atol=1e-8)
     # Many more than are remembered.
     for step in range(100):

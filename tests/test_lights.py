@@ -27,7 +27,6 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 import edgegrad as eg
-import edgegrad.reference
 from edgegrad.scene.lights import harmonics
 
 WHITE = eg.Material(base_color=1.0)

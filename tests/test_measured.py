@@ -1,4 +1,4 @@
-"""Depth, normal and position pictures in fits: what is compared, and what they find that masks do not."""
+"""Measured depths, normals and positions in fits: how they are compared, and what they find that masks do not."""
 
 import math
 
@@ -113,7 +113,7 @@ GOOD = torch.full((4, 6), 3.0)
         (
             {"depths": Measured([None], weights=GOOD)},
             ValueError,
-            "depths: expected a picture beside its weights, got None",
+            "depths: expected a picture with its weights, got None",
         ),
         ({"normals": GOOD}, ValueError, r"normals: expected shape \(4, 6, 3\)"),
         (
@@ -124,12 +124,12 @@ GOOD = torch.full((4, 6), 3.0)
         ({"positions": GOOD[..., None]}, ValueError, r"positions: expected shape \(4, 6, 3\)"),
     ],
 )
-def test_faults_are_named(given, error, message):
+def test_errors_name_the_argument(given, error, message):
     with pytest.raises(error, match=message):
         fit_shape(ball(1), CAMERA, levels=1, **given)
 
 
-def test_faults_of_trust_and_of_views_without_anything():
+def test_errors_of_weights_and_of_views_without_pictures():
     with pytest.raises(ValueError, match="scale: expected a number from"):
         Measured(GOOD, scale=0.0)
     with pytest.raises(ValueError, match="factor: expected a number from"):
@@ -142,7 +142,7 @@ def test_faults_of_trust_and_of_views_without_anything():
 
 
 def radius(direction):
-    """(V,) of a ball with a dent that no silhouette shows."""
+    """Return the radius (V,) of a ball with a dent that no silhouette shows."""
     x, y, z = direction.unbind(1)
     return 1.0 - 0.4 * torch.exp(-((x - 0.3) ** 2 + y**2) / 0.12) * (z > 0)
 
@@ -159,14 +159,14 @@ def seen(size=40):
 
 
 def error(found):
-    """How far vertices in the dent are from the surface along their rays from the middle, in the mean."""
+    """Return the mean distance of vertices in the dent from the surface, along their rays from the middle."""
     far = found.verts.norm(dim=1)
     true = radius(found.verts / far[:, None])
     return float((far - true)[true < 0.9].abs().mean())
 
 
 def covered(views, name):
-    """As a sensor has it: nothing where the object is not all of the pixel."""
+    """Keep what a sensor measures: nothing where the object does not fill the pixel."""
     return [torch.where(v["alpha"] > 0.999, v[name], nan) for v in views]
 
 
@@ -180,7 +180,7 @@ OPTIONS = {"levels": 2, "faces": 1600, "steps": 60, **QUIET}
 
 
 @pytest.mark.slow
-def test_a_dent_that_masks_do_not_tell(dent):
+def test_depths_find_a_dent_that_masks_do_not_show(dent):
     cameras, views = dent
     masks = [v["alpha"] for v in views]
     start = ball(2).replace(verts=1.15 * ball(2).verts)
@@ -192,7 +192,7 @@ def test_a_dent_that_masks_do_not_tell(dent):
 
 @pytest.mark.slow
 def test_a_sensor_with_holes_noise_and_mixed_pixels(dent):
-    """From its pictures alone: positions in five views, of which two come as depths."""
+    """The fit has only its pictures: positions in five views, two of them given as depths."""
     cameras, views = dent
     g = torch.Generator().manual_seed(0)
     depths, positions = [], []
@@ -214,7 +214,7 @@ def test_a_sensor_with_holes_noise_and_mixed_pixels(dent):
 
 
 def test_views_that_have_only_some_of_it(dent, tmp_path):
-    """A sensor beside the camera is a camera of its own; checkpoints know what was measured."""
+    """A sensor next to the camera is a camera of its own. Checkpoints hold what was measured."""
     cameras, views = dent
     masks = [views[0]["alpha"], None, *(v["alpha"] for v in views[2:])]
     depths = [None, *covered(views, "depth")[1:3], None, None]

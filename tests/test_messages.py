@@ -551,7 +551,7 @@ def distribution(name):
 importlib.metadata.distribution = distribution
 messages = []
 for path in json.loads(sys.argv[1]):
-    try: import edgegrad
+    try: from edgegrad import render
     except ImportError as error: messages.append(str(error))
     for name in [n for n in sys.modules if n.startswith("edgegrad")]: del sys.modules[name]
 print(json.dumps(messages))

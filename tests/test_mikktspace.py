@@ -27,7 +27,7 @@ NOTHING = (1.0, 0.0, 0.0, -1.0)  # what MikkTSpace gives where there is no tange
 
 def fans_of(*corners: np.ndarray) -> Fans:
     index = np.arange(3 * len(corners[0])).reshape(-1, 3)
-    return Fans.of(*((part.reshape(3 * len(part), -1), index) for part in corners))
+    return Fans.from_corners(*((part.reshape(3 * len(part), -1), index) for part in corners))
 
 
 @pytest.mark.parametrize("name", ["mirrored", "creased", "collapsed"])
@@ -46,9 +46,9 @@ def test_rows_that_no_corner_has_change_nothing() -> None:
     verts, faces, normals = (part.numpy() for part in bowl(5))
     uvs, more = np.abs(verts[:, :2]), np.ones((1, 3))
     own = [fans.of_corner for fans in (
-        Fans.of((verts, faces), (normals, faces), (uvs, faces)),
-        Fans.of((verts, faces), (np.concatenate([normals, more]), faces), (uvs, faces)),
-        Fans.of((verts, faces), (np.concatenate([more, normals]), faces + 1), (uvs, faces)),
+        Fans.from_corners((verts, faces), (normals, faces), (uvs, faces)),
+        Fans.from_corners((verts, faces), (np.concatenate([normals, more]), faces), (uvs, faces)),
+        Fans.from_corners((verts, faces), (np.concatenate([more, normals]), faces + 1), (uvs, faces)),
         fans_of(verts[faces], normals[faces], uvs[faces]),
     )]  # fmt: skip
     assert len(verts) < int(own[0].max()) + 1 < 3 * len(faces)

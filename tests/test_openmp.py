@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-import edgegrad_cli as cli
+from edgegrad import cli
 
 TESTS = Path(__file__).parent
 

@@ -1,34 +1,25 @@
 """The oracles checked without the kernel: exact pixel integrals against analytic ones, their gradient against finite
-differences, and the sampled twin (edgegrad.reference) against both."""
+differences, and the sampled twin (oracles.reference) against both."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
 from combinations import diagonal
+from oracles import reference
+from oracles.exact import exact_image, gauss_triangle
 from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangle, random_slivers
 from torch import Tensor
 
-from edgegrad import reference
 from edgegrad.camera.camera import Camera
-from edgegrad.report.exact import exact_image, gauss_triangle
 from edgegrad.scene.mesh import PLAIN, Mesh
 from edgegrad.scene.scene import Scene
 
 PROJECTIONS = ("perspective", "orthographic")
 KINDS = ("plain", "colors", "face_colors", "corner_colors", "texture")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """The oracles are many small operations; on a busy machine, waiting for a second thread gains nothing."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def pixel_camera(height: int, width: int) -> Camera:

@@ -59,7 +59,7 @@ def directions(view: eg.Camera, x: np.ndarray) -> np.ndarray:
 
 
 def windows(view: eg.Camera, reach: float = 0.0) -> list:
-    return core.for_tests.windows(kernel_camera(pack_camera(view)), reach)
+    return core.for_tests.sub_cameras(kernel_camera(pack_camera(view)), reach)
 
 
 def seen_through(window, turn: list, q: np.ndarray) -> np.ndarray | None:

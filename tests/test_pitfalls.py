@@ -9,11 +9,11 @@ import math
 import pytest
 import torch
 from finite_differences import Estimate, check_ratio, finite_difference, gradient, right_ratio, rotation
+from oracles.exact import exact_image
 from scenes import cube, default_samples, front_camera, icosphere, smooth_adjoint, smooth_colors, soup
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.report.exact import exact_image
 
 F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)

@@ -1,4 +1,4 @@
-"""hits.light_points(light, by="material"): the points of render(), for shaders written in PyTorch."""
+"""hits.light_points(light, by=points_by_material): the points of render(), for shaders written in PyTorch."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_shader_of_its_own_gives_what_render_gives():
                 of_mesh = torch.zeros((len(rows), 3), dtype=F64)
                 scattering = Scattering(base[None], *(None if x is None else x[None] for x in (metallic, roughness)))
                 for light in some.lights:
-                    points = some.light_points(light, by="material")
+                    points = some.light_points(light, by=eg.lights.points_by_material)
                     l = light.incident(points, some.position)
                     cosine = (n * l).sum(1, keepdim=True)
                     seen = (
@@ -102,8 +102,8 @@ def test_a_shader_of_its_own_gives_what_render_gives():
 
 def test_arguments():
     hits = eg.trace(scene(**leaves()), vector(0, 0, 3)[None], vector(0, 0, -1))
-    with pytest.raises(ValueError, match='by: expected "light" or "material"'):
+    with pytest.raises(TypeError, match=r"by: expected a function such as eg\.lights\.points_by_material"):
         hits.light_points(hits.lights[0], by="lobe")
     with pytest.raises(ValueError, match="sample: expected a number from 0 to 1"):
         hits.light_points(hits.lights[0], 2, 2)
-    assert len(hits.light_points(hits.lights[1], 1, 2, by="material").index) == 1
+    assert len(hits.light_points(hits.lights[1], 1, 2, by=eg.lights.points_by_material).index) == 1

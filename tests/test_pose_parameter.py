@@ -1,4 +1,4 @@
-"""A pose among the parameters of fit_scene: what it is, by which names, and in all that a fit writes."""
+"""Poses among the parameters of fit_scene: coordinates, names, and all that a fit writes."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_finds_a_pose_by_name():
 
 
 def test_turns_of_more_than_a_half_circle_are_rotations():
-    """Steps add up in a rotation vector; what it makes is a rotation all the same."""
+    """Steps add up in a rotation vector of any length, which still makes a rotation."""
     placement = PoseParameter(START, bracket()).placed("pose")
     for turn in (3.5, 6.0, 20.0):
         at = {"rotation": torch.tensor([0.0, turn, 0.3], dtype=F64), "shift": torch.zeros(3, dtype=F64)}
@@ -100,7 +100,7 @@ def test_turns_of_more_than_a_half_circle_are_rotations():
 
 
 def test_the_pose_of_a_mesh_and_what_else_is_sought_of_it():
-    """Vertices are moved with it; so is a scene's second mesh alone."""
+    """Its vertices are moved with it; a scene's second mesh moves alone."""
     mesh, view = bracket(), camera(16)
     pose = Pose(START.R, START.t)
     fit = fit_scene(mesh, view, target(view), {"pose": PoseParameter(pose), "verts": 1e-3}, steps=2, **QUIET)

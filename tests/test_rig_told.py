@@ -80,7 +80,7 @@ def test_curvature_of_views_in_one_call(monkeypatch) -> None:
     assert images.shape == of_slope["alpha"].shape and slopes[0].shape == (6, 32, 32, 1)
     assert float((images - of_slope["alpha"]).abs().max()) < 0.3  # the same views in the same order
     together = curvature(judged, values, 0)
-    monkeypatch.setattr("edgegrad.fit.descent.curvature.ROOM", 0)
+    monkeypatch.setattr("edgegrad.fit.descent.curvature.MAX_DERIVATIVES", 0)
     alone = curvature(judged, values, 0)
     off = float((together - alone).norm() / alone.norm())
     assert off < 0.02 < float((1.05 * together - alone).norm() / alone.norm())

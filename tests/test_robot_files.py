@@ -160,7 +160,7 @@ def test_materials_of_trimesh_have_their_colours() -> None:
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[204, 51, 102, 255])
     given = trimesh.creation.box()
     given.visual = trimesh.visual.TextureVisuals(material=material)
-    assert torch.allclose(eg.Mesh.from_trimesh(given).face_colors, torch.tensor([0.8, 0.2, 0.4]))
+    assert torch.allclose(eg.io.from_trimesh(given).face_colors, torch.tensor([0.8, 0.2, 0.4]))
 
 
 def test_an_obj_of_two_textures_shows_both(tmp_path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from oracles import reference
 from scenes import one_triangle
 from torch import Tensor
 from torch_scenes import (
@@ -21,7 +22,6 @@ from torch_scenes import (
 )
 
 import edgegrad as eg
-from edgegrad import reference
 from edgegrad.kernel.flat import flatten
 from edgegrad.kernel.operators import Hits, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad.kernel.request import make_request, pack_camera

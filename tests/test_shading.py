@@ -10,12 +10,12 @@ import math
 
 import pytest
 import torch
+from oracles import reference
 from scenes import cube, front_camera, smooth_colors
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 import edgegrad as eg
-from edgegrad import reference
 from edgegrad.kernel.flat import flatten
 from edgegrad.kernel.operators import kernel_camera, kernel_scene
 from edgegrad.kernel.request import FILTERS, PackedCamera, pack_camera

@@ -1,13 +1,12 @@
 """Extreme cases: image and gradient against independent references, and the report that measures them.
 
-The cases are those of `edgegrad report stability`. Here each must have its verdict from few seeds, and in `make test-slow`
+The cases are those of `python -m benchmarks.stability`. Here each must have its verdict from few seeds, and in `make test-slow`
 from as many as the report takes.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import json
 import math
 
@@ -17,15 +16,16 @@ from PIL import Image
 from scenes import cube, front_camera, one_triangle
 
 import edgegrad as eg
-import edgegrad_cli as cli
-from edgegrad.fit.smooth import Smooth
-from edgegrad.report.stability import fits, statistics, steps
-from edgegrad.report.stability.cases import CASES, bounced, measure
-from edgegrad.report.stability.cases.case import Case, Problem, everything
-from edgegrad.report.stability.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WRONG, Effort
-from edgegrad.report.stability.painted import PAINTED
+from benchmarks.command import INTERRUPTED
+from benchmarks.stability import fits, statistics, steps
+from benchmarks.stability import run as stability
+from benchmarks.stability.__main__ import main
+from benchmarks.stability.cases import CASES, bounced, measure
+from benchmarks.stability.cases.case import Case, Problem, everything
+from benchmarks.stability.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WRONG, Effort
+from benchmarks.stability.painted import PAINTED
+from edgegrad.fit.laplacian import LaplacianSolver
 
-stability = importlib.import_module("edgegrad.report.stability.run")  # the package has a function of this name
 FAST = [name for name, case in CASES.items() if not case.slow and case.group not in ("light", "bounces")]
 # Of each there is another that is more extreme, or differs in one thing.
 LIKE_OTHERS = {
@@ -304,7 +304,7 @@ def test_a_squared_loss_has_no_bias_in_the_gradient_for_what_moves():
 
 def test_smoothing_solves():
     mesh = cube(1.0)
-    solve = Smooth(mesh.faces, len(mesh.verts), fits.SMOOTHNESS)
+    solve = LaplacianSolver(mesh.faces, len(mesh.verts), fits.SMOOTHNESS)
     x = torch.randn((8, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(solve(solve.times(x)), x)
     ones = torch.ones((8, 3), dtype=torch.float64)
@@ -351,7 +351,7 @@ def test_painted_problems(name):
 
 
 def run(*arguments):
-    return cli.main(["report", "stability", *[str(argument) for argument in arguments]])
+    return main([str(argument) for argument in arguments])
 
 
 def test_command(tmp_path, capsys, monkeypatch):
@@ -392,7 +392,7 @@ def test_ctrl_c_keeps_what_is_measured(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setitem(CASES, "orthographic", dataclasses.replace(CASES["orthographic"], build=interrupt))
-    assert run("--case", "crop", "orthographic", "--quick", "--out", tmp_path) == cli.INTERRUPTED
+    assert run("--case", "crop", "orthographic", "--quick", "--out", tmp_path) == INTERRUPTED
     document = json.loads((tmp_path / "stability.json").read_text())
     assert [row["name"] for row in document["cases"]] == ["crop"]
     assert (tmp_path / "stability.md").exists() and (tmp_path / "stability.png").exists()
@@ -407,7 +407,7 @@ def test_unknown_case(tmp_path, capsys):
 def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(stability.NEEDS, "fits", ["no_such_package"])
     assert run("--case", "fits", "--out", tmp_path) == 2
-    assert "fits needs no_such_package; install with: pip install 'edgegrad[report]'" in capsys.readouterr().err
+    assert "fits needs no_such_package; install with: pip install 'edgegrad[fit]'" in capsys.readouterr().err
 
 
 LIT = [name for name, case in CASES.items() if case.group == "light" and not case.slow]

@@ -7,13 +7,13 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from cut_outs import F64, checkerboard, disc, quad
+from alpha_masks import F64, checkerboard, disc, quad
 from finite_differences import Case, check_ratio, estimate, gradient, loss, right_ratio, rotation
+from oracles import reference
 from scenes import cube, front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad import reference
 from edgegrad.plan import Term
 
 SIZE = 32
@@ -351,7 +351,7 @@ def test_plan_says_what_is_looked_for():
     assert not of(cut(), "face_colors").on
     assert not of(cut().replace(alpha=None), "verts").on
     assert not of(board().replace(filter="linear"), "verts").on
-    assert eg.plan(cut(), CAMERA)["cut-outs"].on and not eg.plan(board(), CAMERA)["cut-outs"].on
+    assert eg.plan(cut(), CAMERA)["alpha masks"].on and not eg.plan(board(), CAMERA)["alpha masks"].on
 
 
 @pytest.mark.parametrize(

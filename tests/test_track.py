@@ -13,9 +13,9 @@ from PIL import Image
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation
+from edgegrad.cli import main
 from edgegrad.fit import track
 from edgegrad.fit.pose.result import pose_from_json
-from edgegrad_cli import main
 
 pytest_plugins = "film_fixtures"
 SIZE, COUNT = 80, 7  # of its film

@@ -12,9 +12,9 @@ import torch
 from moving import errors
 
 import edgegrad as eg
+from edgegrad.cli import films, main
+from edgegrad.cli.films import read_film, upright
 from edgegrad.files.image import linear_to_srgb
-from edgegrad_cli import films, main
-from edgegrad_cli.films import read_film, upright
 
 av = pytest.importorskip("av", reason="videos need the extra edgegrad[video]")
 

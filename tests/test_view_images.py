@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 
 import edgegrad as eg
+from edgegrad.cli.inputs import seen_by
 from edgegrad.files.image import linear_to_srgb
-from edgegrad_cli.inputs import seen_by
 
 TRIANGLE = eg.Mesh(
     torch.tensor([[-0.9, -0.5, 0], [0.8, -0.7, 0], [0.3, 0.9, 0]]),

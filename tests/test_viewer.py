@@ -1,4 +1,4 @@
-"""The live view without a browser: what its server holds, and how it pauses, stops and keeps out of the way."""
+"""The live view without a browser: what its server holds, how it pauses and stops, and how little time it takes."""
 
 import io
 import json
@@ -16,12 +16,12 @@ from test_fit import BACKGROUND, START, bracket, camera, picture
 from test_fit_scene import pictures, views
 
 import edgegrad as eg
-import edgegrad_cli as cli
+from edgegrad import cli
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, write_image
 from edgegrad.fit import Parameter, fit_camera, fit_pose, fit_rig, fit_scene, fit_shape, fit_texture
-from edgegrad.fit.views import white_of
-from edgegrad.live import frame, view
+from edgegrad.fit.views import white_level
+from edgegrad.live import snapshot, view
 from edgegrad.live.browser import Browser
 
 viser = pytest.importorskip("viser", reason="the live view needs edgegrad[view]")
@@ -39,7 +39,7 @@ def page(viewer) -> Browser:
 
 
 def vertices(handle):
-    """World positions of what the server shows."""
+    """Return world positions of what the server shows."""
     if isinstance(handle, viser.MeshHandle):
         points = handle.vertices
     else:
@@ -71,7 +71,7 @@ def test_a_pose_moves_the_mesh_and_keeps_the_camera(viewer):
     assert np.degrees(frustum.fov) == pytest.approx(float(at.fov_y)) and frustum.aspect == pytest.approx(1.0)
     assert frustum.image.shape == (32, 32, 3)
     target, _, apart = np.split(page(viewer).picture.image.astype(int), 3, axis=1)
-    seen = picture(at) / white_of(picture(at).flatten(0, 1))  # in units of its white, as it is compared
+    seen = picture(at) / white_level(picture(at).flatten(0, 1))  # in units of its white, as it is compared
     np.testing.assert_array_equal(target, (linear_to_srgb(seen.clamp(0, 1)) * 255).round().numpy())
     assert apart.mean() < 25  # four times the difference
     assert len(viewer._losses) == fit.steps - 1 and len(page(viewer).curve.data[0]) == fit.steps - 1
@@ -92,11 +92,11 @@ def test_a_camera_moves_before_a_scene_at_rest(viewer):
     assert float((fit.camera.eye - at.eye).norm()) < 0.02  # of 0.1; over seeds up to 0.009
 
 
-def test_the_skeleton_of_what_bends(viewer, monkeypatch):
+def test_the_skeleton_of_a_rig_is_drawn(viewer, monkeypatch):
     from test_fit_rig import arm, shown
     from test_fit_rig import views as around
 
-    monkeypatch.setattr(view, "SHORTEST", 0.0)
+    monkeypatch.setattr(view, "MIN_INTERVAL", 0.0)
     rig, cameras = arm(3), around(24, 2)
     masks = shown(rig.posed({"bone 1": [0.0, 0.0, 0.6]}), cameras)
     seen = []
@@ -111,9 +111,9 @@ def test_the_skeleton_of_what_bends(viewer, monkeypatch):
     joints = rig.shape({"rotations": fit.values["rotations"]}, translation=fit.values["translation"]).joints
     np.testing.assert_allclose(page(viewer)._bones.points, torch.stack([joints[:2], joints[1:]], 1), atol=1e-6)
     assert page(viewer)._meshes[0].handle.opacity < 1.0
-    _, render, _ = frame.frame_of(fit).panel(0)
+    _, render, _ = snapshot.snapshot_from_fit(fit).panel(0)
     x, y = cameras[0].project(joints.mean(0, keepdim=True).float())[0].long().tolist()
-    orange = (render == frame.as_bytes(torch.tensor(frame.BONE))).all(-1)
+    orange = (render == snapshot.as_bytes(torch.tensor(snapshot.BONE))).all(-1)
     assert orange[y - 2 : y + 3, x - 2 : x + 3].any() and not orange[:, 0].any()
 
 
@@ -126,7 +126,7 @@ def test_shapes_are_shown_as_they_move_also_after_remeshing(viewer, monkeypatch)
     ball.vertices += [1.0, 0.75, 0.4]
     start = eg.Mesh(torch.tensor(ball.vertices).float(), torch.tensor(ball.faces))
     seen = []
-    monkeypatch.setattr(view, "SHORTEST", 0.0)
+    monkeypatch.setattr(view, "MIN_INTERVAL", 0.0)
 
     def look(progress):
         viewer(progress)
@@ -166,8 +166,8 @@ def test_textures_and_colours_are_those_of_the_mesh(viewer, tmp_path):
 
 
 def test_materials_are_those_of_the_mesh(viewer, tmp_path, monkeypatch):
-    """Shown as a GLB, which holds all of them; one matt colour as a mesh whose vertices may move."""
-    monkeypatch.setattr(view, "SHORTEST", 0.0)
+    """A GLB holds all materials; a mesh of one matt colour is drawn as vertices that may move."""
+    monkeypatch.setattr(view, "MIN_INTERVAL", 0.0)
     viewer._next = 0.0
     verts, faces = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
     square = eg.Mesh(verts, faces, uvs=verts[:, :2], uv_faces=faces)
@@ -208,13 +208,13 @@ def test_materials_are_those_of_the_mesh(viewer, tmp_path, monkeypatch):
 
 
 def shown(viewer, folder):
-    """The GLB that the page has, as load_mesh reads it."""
+    """Read the page's GLB by load_mesh."""
     (folder / "shown.glb").write_bytes(page(viewer)._meshes[0].handle.glb_data)
     return eg.load_mesh(folder / "shown.glb", lit=True)
 
 
-def test_a_loop_of_ones_own(viewer, monkeypatch):
-    monkeypatch.setattr(view, "SHORTEST", 0.0)
+def test_update_in_a_loop_of_ones_own(viewer, monkeypatch):
+    monkeypatch.setattr(view, "MIN_INTERVAL", 0.0)
     at = eg.Camera.stack(views(2))
     mesh = bracket()
     images = torch.stack(pictures(mesh, list(at)))
@@ -224,7 +224,7 @@ def test_a_loop_of_ones_own(viewer, monkeypatch):
     held = vertices(page(viewer)._meshes[0].handle)
     with torch.no_grad():
         verts += 1.0  # in place: what is shown stays as it was
-    viewer._look(1)
+    viewer._select_camera(1)
     np.testing.assert_allclose(vertices(page(viewer)._meshes[0].handle), held)
     target, render, _ = np.split(page(viewer).picture.image.astype(int), 3, axis=1)
     np.testing.assert_array_equal(target, (linear_to_srgb(images[1].clamp(0, 1)) * 255).round().numpy())
@@ -323,9 +323,11 @@ def test_drawing_takes_no_more_than_its_share_of_the_time(monkeypatch):
 
 
 def test_scenes_are_made_only_where_they_are_drawn(viewer, monkeypatch):
-    monkeypatch.setattr(view, "SHORTEST", 1e9)
+    monkeypatch.setattr(view, "MIN_INTERVAL", 1e9)
     made = []
-    monkeypatch.setattr(frame, "frame_of_scene", lambda *a, of=frame.frame_of_scene: made.append(1) or of(*a))
+    monkeypatch.setattr(
+        snapshot, "snapshot_from_scene", lambda *a, of=snapshot.snapshot_from_scene: made.append(1) or of(*a)
+    )
     for _ in range(5):
         viewer.update(bracket())
     assert len(made) == 1 and viewer._steps == 5
@@ -372,7 +374,7 @@ def test_a_figure_where_there_is_no_server(monkeypatch):
 # -- faults -----------------------------------------------------------------------------------------------------------
 
 
-def test_faults_name_the_argument(viewer):
+def test_errors_name_the_argument(viewer):
     for options, error, text in [
         ({"port": -1}, ValueError, "port: expected"), ({"port": "x"}, TypeError, "port: expected"),
         ({"host": 3}, TypeError, "host: expected a str"), ({"server": 1}, TypeError, "server: expected True"),
@@ -409,7 +411,7 @@ def test_the_command_line_opens_it_and_saves_before_it_waits(tmp_path, monkeypat
 
     def wait(viewer):
         saved = json.loads((out / "pose.json").read_text())["mesh_to_world"]
-        shown = viewer._frame.matrix
+        shown = viewer._snapshot.matrix
         waited.append(np.allclose(saved, shown) and (out / "fit.png").exists())
 
     monkeypatch.setattr(view.Viewer, "wait", wait)
@@ -433,7 +435,7 @@ def test_the_command_line_opens_it_and_saves_before_it_waits(tmp_path, monkeypat
 
 
 def press(button):
-    """As the server does for a click in the page."""
+    """Call a button's callback, as the server does for a click in the page."""
     for callback in button._impl.update_cb:
         callback(None)
 

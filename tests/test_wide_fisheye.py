@@ -106,7 +106,7 @@ def directions(view: eg.Camera, x: np.ndarray) -> np.ndarray:
 
 
 def windows(view: eg.Camera, reach: float = 0.0) -> list:
-    return core.for_tests.windows(kernel_camera(pack_camera(view)), reach)
+    return core.for_tests.sub_cameras(kernel_camera(pack_camera(view)), reach)
 
 
 # -- positions ----------------------------------------------------------------------------------------------------------
@@ -126,7 +126,7 @@ def test_points_agree_with_the_formula(view: eg.Camera) -> None:
             x, y, z = np.array(turn) @ q
             if z > 0 and max(abs(x), abs(y)) <= z:
                 found.append(core.for_tests.project(window, [x, y, z]))
-                seen = core.for_tests.bend(window, core.for_tests.project_straight(window, [x, y, z]), [0.0, 0.0])[1]
+                seen = core.for_tests.distort(window, core.for_tests.project_straight(window, [x, y, z]), [0.0, 0.0])[1]
                 assert (seen > 0) == (math.atan2(math.hypot(q[0], q[1]), q[2]) < end)
         inside = 0 < expected[0] < W and 0 < expected[1] < H and math.atan2(math.hypot(q[0], q[1]), q[2]) < end
         assert len(found) == 1 or not inside

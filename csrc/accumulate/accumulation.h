@@ -1,4 +1,4 @@
-// The contractions of samples: reverse mode, forward mode, the gradient by places in the image, and the samples
+// The accumulations of samples: reverse mode, forward mode, the gradient by places in the image, and the samples
 // themselves, for whoever contracts them elsewhere (records.h). What each does with a sample inside a face stands in
 // interior/accumulation.cpp, with one on a curve in boundary/accumulation.cpp.
 #pragma once
@@ -21,6 +21,6 @@ struct Forward {
 // To the gradient by the places of what is seen, two numbers a pixel.
 struct Screen {};
 
-using Contraction = std::variant<Reverse, Forward, Screen, Record>;
+using Accumulation = std::variant<Reverse, Forward, Screen, Record>;
 
 }  // namespace edgegrad

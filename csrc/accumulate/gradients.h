@@ -52,7 +52,7 @@ inline constexpr GradientSlot<T> gradient_slots[] = {
     {"texels", &Gradients::texels, &Tangents::texels,
      [](const SceneView<T>& s, int64_t) { return s.radiance * s.n_texels; }},
     {"alphas", &Gradients::alphas, &Tangents::alphas,
-     [](const SceneView<T>& s, int64_t) { return s.cut_outs.n_alphas; }},
+     [](const SceneView<T>& s, int64_t) { return s.alpha_masks.n_alphas; }},
     {"vertex_attributes", &Gradients::vertex_attributes, &Tangents::vertex_attributes,
      [](const SceneView<T>& s, int64_t) { return s.attributes.vertex_width * s.n_verts; }},
     {"face_attributes", &Gradients::face_attributes, &Tangents::face_attributes,

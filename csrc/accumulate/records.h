@@ -17,7 +17,7 @@
 
 namespace edgegrad {
 
-// The contraction that keeps samples (accumulation.h).
+// The accumulation that keeps samples (accumulation.h).
 struct Record {
     bool intrinsics = true;  // whether derivatives by them are kept: else those arrays are empty
 };
@@ -63,9 +63,9 @@ struct CurveRecords {
     std::vector<int64_t> alpha;         // (Q,)
     std::vector<double> by_alpha;       // (Q,)
     // Of what is seen through faces: rows by these.
-    std::vector<int64_t> pane_row_of;  // the sample of each row
-    std::vector<int32_t> pane;         // the face
-    std::vector<double> pane_b;        // (2) where on it
+    std::vector<int64_t> transparent_row_of;  // the sample of each row
+    std::vector<int32_t> transparent;         // the face
+    std::vector<double> transparent_b;        // (2) where on it
     // Of borders of shadows, a row a sample: the point of the light, and the velocity by its place in camera
     // coordinates, or by the direction towards it. The first surface is that in the light, the second that in the
     // shadow.
@@ -122,16 +122,16 @@ void append(std::vector<T>& to, std::initializer_list<T> from) {
 }
 
 // A cotangent of a window's intrinsics as one of the camera's.
-inline void append_intrinsics(std::vector<double>& to, const Camera& window, const IntrinsicsGrad& bar) {
+inline void append_intrinsics(std::vector<double>& to, const Camera& sub_camera, const IntrinsicsGrad& bar) {
     double of_camera[intrinsics_width] = {};
-    add_intrinsics(window, bar, of_camera, of_camera + 6);
+    add_intrinsics(sub_camera, bar, of_camera, of_camera + 6);
     to.insert(to.end(), of_camera, of_camera + intrinsics_width);
 }
 
 // Appends the ray that goes to n in a window's image: in the frame of the camera, with its derivatives at fixed x.
-inline void append_ray(const Camera& window, Vec2 n, std::vector<double>& along, std::vector<double>* along_by_k,
+inline void append_ray(const Camera& sub_camera, Vec2 n, std::vector<double>& along, std::vector<double>* along_by_k,
                        std::vector<double>* along_by_x = nullptr) {
-    const Mat3& turn = window.turn;
+    const Mat3& turn = sub_camera.turn;
     const Vec3 direction = transposed_times(turn, {n.x, n.y, 1});
     append(along, {direction.x, direction.y, direction.z});
     if (!along_by_k && !along_by_x) return;
@@ -139,11 +139,11 @@ inline void append_ray(const Camera& window, Vec2 n, std::vector<double>& along,
          {Vec2{turn.row[0].x, turn.row[1].x}, Vec2{turn.row[0].y, turn.row[1].y}, Vec2{turn.row[0].z, turn.row[1].z}}) {
         if (along_by_k) {
             IntrinsicsGrad bar;
-            normalised_vjp(window, n, by_n, bar);
-            append_intrinsics(*along_by_k, window, bar);
+            normalised_vjp(sub_camera, n, by_n, bar);
+            append_intrinsics(*along_by_k, sub_camera, bar);
         }
         if (!along_by_x) continue;
-        const Vec2 by_x = pixel_vjp(window, n, by_n);
+        const Vec2 by_x = pixel_vjp(sub_camera, n, by_n);
         append(*along_by_x, {by_x.x, by_x.y});
     }
 }

@@ -7,22 +7,23 @@ namespace edgegrad {
 // The rows of both, and their width.
 constexpr int as_radiance = 0, as_pixels = -1, as_vertex_attributes = -2, as_face_attributes = -3;
 struct RowSlot {
-    RowBuffer ChunkGrad::* rows;
-    double* Destination::* to;
+    RowBuffer LocalGradients::* rows;
+    double* GradientSink::* to;
     int width;
 };
 
 namespace {
 
-constexpr RowSlot row_slots[] = {{&ChunkGrad::q, &Destination::q, 3},
-                                 {&ChunkGrad::x, &Destination::x, 2},
-                                 {&ChunkGrad::colors, &Destination::colors, as_radiance},
-                                 {&ChunkGrad::uvs, &Destination::uvs, 2},
-                                 {&ChunkGrad::texels, &Destination::texels, as_radiance},
-                                 {&ChunkGrad::alphas, &Destination::alphas, 1},
-                                 {&ChunkGrad::vertex_attributes, &Destination::vertex_attributes, as_vertex_attributes},
-                                 {&ChunkGrad::face_attributes, &Destination::face_attributes, as_face_attributes},
-                                 {&ChunkGrad::pixels, &Destination::pixels, as_pixels}};
+constexpr RowSlot row_slots[] = {
+    {&LocalGradients::q, &GradientSink::q, 3},
+    {&LocalGradients::x, &GradientSink::x, 2},
+    {&LocalGradients::colors, &GradientSink::colors, as_radiance},
+    {&LocalGradients::uvs, &GradientSink::uvs, 2},
+    {&LocalGradients::texels, &GradientSink::texels, as_radiance},
+    {&LocalGradients::alphas, &GradientSink::alphas, 1},
+    {&LocalGradients::vertex_attributes, &GradientSink::vertex_attributes, as_vertex_attributes},
+    {&LocalGradients::face_attributes, &GradientSink::face_attributes, as_face_attributes},
+    {&LocalGradients::pixels, &GradientSink::pixels, as_pixels}};
 
 }  // namespace
 
@@ -37,14 +38,14 @@ int64_t RowBuffer::bytes(const Load& load, int threads) {
            chunks * (owners * int64_t(sizeof(Rows)) + n_recent * int64_t(sizeof(Recent)));
 }
 
-void Scatter::add(int64_t n, Destination& to, double (&seconds)[2], const Body& body) {
+void Scatter::add(int64_t n, GradientSink& to, double (&seconds)[2], const Body& body) {
     scatter_in_waves(
-        team_, n, grads_, [&](ChunkGrad& g, int owners) { prepare(g, to, owners); }, body,
-        [&](const ChunkGrad& g, int owner) {
+        team_, n, grads_, [&](LocalGradients& g, int owners) { prepare(g, to, owners); }, body,
+        [&](const LocalGradients& g, int owner) {
             for (const RowSlot& slot : row_slots)
                 if (double* const there = to.*slot.to) (g.*slot.rows).add_to(there, owner);
         },
-        [&](ChunkGrad& g) {
+        [&](LocalGradients& g) {
             to.k += g.k;
             if (!to.records) return;
             to.records->surface.push_back(std::exchange(g.records.surface, {}));
@@ -54,7 +55,7 @@ void Scatter::add(int64_t n, Destination& to, double (&seconds)[2], const Body& 
 }
 
 // Empties a chunk's buffers, and makes those that are wanted.
-void Scatter::prepare(ChunkGrad& g, const Destination& to, int owners) const {
+void Scatter::prepare(LocalGradients& g, const GradientSink& to, int owners) const {
     for (const RowSlot& slot : row_slots) {
         RowBuffer& rows = g.*slot.rows;
         const int width = width_of(slot, to);
@@ -64,7 +65,7 @@ void Scatter::prepare(ChunkGrad& g, const Destination& to, int owners) const {
     g.k = {};
 }
 
-int Scatter::width_of(const RowSlot& slot, const Destination& to) const {
+int Scatter::width_of(const RowSlot& slot, const GradientSink& to) const {
     switch (slot.width) {
         case as_radiance:
             return widths_.radiance;

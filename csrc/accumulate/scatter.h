@@ -111,7 +111,7 @@ struct LightMotion {
 };
 
 // What the samples of one chunk give.
-struct ChunkGrad {
+struct LocalGradients {
     RowBuffer q, x, colors, uvs, texels, alphas;  // vertices: q in camera coordinates, x in the image
     RowBuffer vertex_attributes, face_attributes;
     RowBuffer pixels;  // of what has the size of the image
@@ -121,7 +121,7 @@ struct ChunkGrad {
 };
 
 // Where it goes; null where none is wanted.
-struct Destination {
+struct GradientSink {
     double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *alphas = nullptr;
     double *vertex_attributes = nullptr, *face_attributes = nullptr, *pixels = nullptr;
     int pixel_width = 0;  // numbers a pixel
@@ -173,16 +173,16 @@ class Scatter {
 
     // Calls body(first, last, grad) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
     // samples and of the adding.
-    using Body = std::function<void(int64_t first, int64_t last, ChunkGrad& grad)>;
-    void add(int64_t n, Destination& to, double (&seconds)[2], const Body& body);
+    using Body = std::function<void(int64_t first, int64_t last, LocalGradients& grad)>;
+    void add(int64_t n, GradientSink& to, double (&seconds)[2], const Body& body);
 
    private:
-    void prepare(ChunkGrad& g, const Destination& to, int owners) const;
-    int width_of(const RowSlot& slot, const Destination& to) const;
+    void prepare(LocalGradients& g, const GradientSink& to, int owners) const;
+    int width_of(const RowSlot& slot, const GradientSink& to) const;
 
     Team& team_;
     const Widths widths_;
-    std::vector<ChunkGrad> grads_;
+    std::vector<LocalGradients> grads_;
 };
 
 }  // namespace edgegrad

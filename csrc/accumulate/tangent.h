@@ -23,22 +23,22 @@ struct Direction {
 };
 
 // q = R p + t: q̇ = R ṗ + Ṙ p + ṫ.
-inline Direction make_direction(const Tangents& tangents, const Camera& window, const double* verts, int64_t n_verts,
-                                Team& team) {
+inline Direction make_direction(const Tangents& tangents, const Camera& sub_camera, const double* verts,
+                                int64_t n_verts, Team& team) {
     Direction out{.tangents = tangents};
     if (!tangents.geometry()) return out;
-    out.intrinsics = window_intrinsics(window, tangents.K, tangents.distortion);
+    out.intrinsics = sub_camera_intrinsics(sub_camera, tangents.K, tangents.distortion);
     out.q = Array<Vec3>(n_verts);
     const auto at = [](const double* a) { return Vec3{a[0], a[1], a[2]}; };
     team.each_block(n_verts, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
             Vec3 q_dot;
-            if (const double* dot = tangents.verts) q_dot += window.R * at(dot + 3 * v);
+            if (const double* dot = tangents.verts) q_dot += sub_camera.R * at(dot + 3 * v);
             if (const double* dot = tangents.world_to_camera) {
                 const Vec3 p = at(verts + 3 * v);
-                q_dot += window.turn * Vec3{dot[0] * p.x + dot[1] * p.y + dot[2] * p.z + dot[3],
-                                            dot[4] * p.x + dot[5] * p.y + dot[6] * p.z + dot[7],
-                                            dot[8] * p.x + dot[9] * p.y + dot[10] * p.z + dot[11]};
+                q_dot += sub_camera.turn * Vec3{dot[0] * p.x + dot[1] * p.y + dot[2] * p.z + dot[3],
+                                                dot[4] * p.x + dot[5] * p.y + dot[6] * p.z + dot[7],
+                                                dot[8] * p.x + dot[9] * p.y + dot[10] * p.z + dot[11]};
             }
             out.q[v] = q_dot;
         }

@@ -52,8 +52,8 @@ struct Terms {
     bool motion;      // inside faces, of what moves them
     bool appearance;  // inside faces, of colours and textures
     bool boundary;
-    bool rim;    // of what a lens shows, beside the boundary
-    bool steps;  // within faces
+    bool lens_boundary;  // of the lens, besides the other curves
+    bool steps;          // within faces
 
     bool interior() const { return motion || appearance; }
     bool any() const { return interior() || boundary || steps; }
@@ -65,7 +65,7 @@ Terms terms_of(const Slots<Number>& slots, const GradientOptions& o) {
     return {.motion = moves && o.interior_geometry,
             .appearance = slots.appearance(),
             .boundary = moves && o.boundary,
-            .rim = (slots.K || slots.distortion) && o.boundary && o.intrinsics,
+            .lens_boundary = (slots.K || slots.distortion) && o.boundary && o.intrinsics,
             .steps = slots.steps() && o.steps};
 }
 
@@ -74,11 +74,11 @@ Terms all_motion(const GradientOptions& o) {
     return {.motion = o.interior_geometry,
             .appearance = false,
             .boundary = o.boundary,
-            .rim = o.boundary && o.intrinsics,
+            .lens_boundary = o.boundary && o.intrinsics,
             .steps = o.steps};
 }
 
-// What the image and its adjoint say, through whichever window of the camera one looks.
+// What the image and its adjoint say, through whichever sub-camera.
 template <class T>
 struct InImage {
     FilteredAdjoint<T> filtered;
@@ -87,9 +87,10 @@ struct InImage {
 
     InImage(const BackwardInput<T>& input, Team& team)
         : filtered(input.adjoint, input.scene, input.image.filter, input.camera.width, input.camera.height),
-          importance(input.looks ? input.looks : input.adjoint, input.camera.width, input.camera.height,
-                     input.looks ? 1 : input.scene.channels, margin_of(input.image), team, !input.looks),
-          occlusion(input.panes ? nullptr : input.hits.depth, input.camera.width, input.camera.height, team) {}
+          importance(input.importance_map ? input.importance_map : input.adjoint, input.camera.width,
+                     input.camera.height, input.importance_map ? 1 : input.scene.channels, margin_of(input.image), team,
+                     !input.importance_map),
+          occlusion(input.transparent ? nullptr : input.hits.depth, input.camera.width, input.camera.height, team) {}
 
     // By which the pixel filter reaches beyond the image.
     static double margin_of(const ImageOptions& image) { return image.filter.radius() - 0.5; }
@@ -98,17 +99,17 @@ struct InImage {
 template <class T>
 using ViewBody = std::function<void(const BackwardView<T>&)>;
 
-// Calls body(view) with what all terms look at through one window.
+// Calls body(view) with what all terms look at through one sub-camera.
 template <class T>
 void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
                const GradientOptions& o, const Terms& terms, Team& team, const ViewBody<T>& body) {
-    const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed, panes, looks] = input;
+    const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed, transparent, importance_map] = input;
     const auto& [filtered, importance, occlusion] = in_image;
     const ViewVolume volume(camera, InImage<T>::margin_of(image));
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
-    std::optional<CutOuts<T>> cut_outs;
-    if (scene.cut_outs.face) cut_outs.emplace(scene, camera, vertices.q.data());
-    const SeenThrough* through = cut_outs ? &*cut_outs : nullptr;
+    std::optional<AlphaMasks<T>> alpha_masks;
+    if (scene.alpha_masks.face) alpha_masks.emplace(scene, camera, vertices.q.data());
+    const AlphaTest* through = alpha_masks ? &*alpha_masks : nullptr;
     const CameraFrame frame(geometry.caster(), camera, through);
     Scatter scatter(team, {scene.radiance, scene.attributes.vertex_width, scene.attributes.face_width});
     // What the controls need, of faces and of creases.
@@ -116,7 +117,7 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
     std::optional<ImageHits> hits;
     if (!o.pixel_spp && (terms.interior() || creases))
         hits.emplace(scene, camera, vertices, occlusion, geometry.parts(), hit_buffers.seen, team);
-    const bool controls = hits && terms.interior() && o.controls && camera.is_straight();
+    const bool controls = hits && terms.interior() && o.controls && camera.is_undistorted();
     const Array<T> vertex_adjoint =
         controls ? adjoint_at_vertices(filtered, vertices, *hits, scene.channels, team) : Array<T>(0);
     body(BackwardView<T>{.scene = scene,
@@ -131,8 +132,8 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
                          .team = team,
                          .scatter = scatter,
                          .frame = frame,
-                         .cut_outs = through,
-                         .panes = panes,
+                         .alpha_masks = through,
+                         .transparent = transparent,
                          .occlusion = occlusion,
                          .hits = hits ? &*hits : nullptr,
                          .detailed = detailed,
@@ -151,7 +152,7 @@ struct Measured {
 };
 
 template <class T>
-Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Destination& to, BackwardProfile& profile) {
+Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, GradientSink& to, BackwardProfile& profile) {
     const GradientOptions& o = view.options;
     Stopwatch watch;
     Measured<T> out;
@@ -164,10 +165,10 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Desti
     }
     if (terms.boundary) {
         if (!terms.interior()) facing = facing_of_faces(view);
-        const Curves<T>& curves = out.curves.emplace(measure_curves(view, std::move(facing), terms.rim));
+        const Curves<T>& curves = out.curves.emplace(measure_curves(view, std::move(facing), terms.lens_boundary));
         out.wanted.edge = profile.edge_wanted = curves.wanted(o);
         profile.silhouettes = curves.silhouettes, profile.creases = curves.creases;
-        profile.intersections = curves.intersections, profile.rim = curves.rim;
+        profile.intersections = curves.intersections, profile.lens_boundary = curves.lens_boundary;
         profile.curves = watch.lap();
     }
     return out;
@@ -187,41 +188,41 @@ SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions&
 // Measures what the terms sample, draws the samples and contracts them.
 template <class T>
 void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const Terms& terms,
-               const Contraction& contraction, Destination& to, BackwardProfile& profile) {
+               const Accumulation& accumulation, GradientSink& to, BackwardProfile& profile) {
     const GradientOptions& o = view.options;
     if (o.pixel_spp) {
         std::vector<int64_t> all(int64_t(view.camera.width) * view.camera.height);
         std::iota(all.begin(), all.end(), 0);
-        add_pixel_samples(view, {all, o.pixel_spp, o.seed, nullptr}, contraction, to, profile.surface);
+        add_pixel_samples(view, {all, o.pixel_spp, o.seed, nullptr}, accumulation, to, profile.surface);
         return;
     }
     // Both terms are measured before samples are drawn, since they share a budget.
     Measured<T> measured = measure_terms(view, terms, to, profile);
     const SampleCounts n = within_budget(input, o, measured.wanted, view.team);
-    if (measured.surface) add_interior(view, *measured.surface, n.surface, contraction, to, profile);
+    if (measured.surface) add_interior(view, *measured.surface, n.surface, accumulation, to, profile);
     if (Curves<T>* curves = measured.curves ? &*measured.curves : nullptr) {
-        add_boundary(view, *curves, n.edge, contraction, to, profile);
+        add_boundary(view, *curves, n.edge, accumulation, to, profile);
         if (!curves->x_bar.empty()) add_places(view, curves->x_bar, to);
     }
-    if (terms.steps) add_steps(view, contraction, to, profile);
+    if (terms.steps) add_steps(view, accumulation, to, profile);
 }
 
-// The options for each of several windows: samples in proportion to what each wants, as many as one image would get.
-// Where one wants any it gets some, for it alone shows what it shows.
+// The options for each of several sub-cameras: samples in proportion to what each wants, as many as one image would
+// get. Where one wants any it gets some, for it alone shows what it shows.
 template <class T>
-std::vector<GradientOptions> options_of_windows(const BackwardInput<T>& input, const std::vector<Camera>& windows,
-                                                const InImage<T>& in_image, const GradientOptions& o,
-                                                const Terms& terms, Team& team) {
-    std::vector<GradientOptions> options(windows.size(), o);
-    for (size_t k = 1; k < windows.size(); ++k) options[k].seed = hash(o.seed, k, gradient_stream + 1);
-    if (windows.size() == 1 || o.pixel_spp) return options;
+std::vector<GradientOptions> options_of_sub_cameras(const BackwardInput<T>& input,
+                                                    const std::vector<Camera>& sub_cameras, const InImage<T>& in_image,
+                                                    const GradientOptions& o, const Terms& terms, Team& team) {
+    std::vector<GradientOptions> options(sub_cameras.size(), o);
+    for (size_t k = 1; k < sub_cameras.size(); ++k) options[k].seed = hash(o.seed, k, gradient_stream + 1);
+    if (sub_cameras.size() == 1 || o.pixel_spp) return options;
     GradientOptions counted = o;
     counted.surface_samples = counted.edge_samples = -1;
-    std::vector<SampleCounts> wanted(windows.size());
+    std::vector<SampleCounts> wanted(sub_cameras.size());
     SampleCounts all;
-    for (size_t k = 0; k < windows.size(); ++k)
-        with_view<T>(input, windows[k], in_image, counted, terms, team, [&](const BackwardView<T>& view) {
-            Destination none;
+    for (size_t k = 0; k < sub_cameras.size(); ++k)
+        with_view<T>(input, sub_cameras[k], in_image, counted, terms, team, [&](const BackwardView<T>& view) {
+            GradientSink none;
             BackwardProfile profile;
             measure_terms(view, terms, none, profile);
             wanted[k] = {profile.surface_wanted, profile.edge_wanted};
@@ -233,29 +234,30 @@ std::vector<GradientOptions> options_of_windows(const BackwardInput<T>& input, c
     const auto share = [](int64_t n, int64_t wanted, int64_t all) {
         return wanted ? std::max<int64_t>(1, std::llround(double(n) * (double(wanted) / double(all)))) : 0;
     };
-    for (size_t k = 0; k < windows.size(); ++k) {
+    for (size_t k = 0; k < sub_cameras.size(); ++k) {
         options[k].surface_samples = share(n.surface, wanted[k].surface, all.surface);
         options[k].edge_samples = share(n.edge, wanted[k].edge, all.edge);
     }
     return options;
 }
 
-// Calls body(view) for each window of the camera.
+// Calls body(view) for each sub-camera of the camera.
 template <class T>
 void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, Team& team,
                const std::type_identity_t<ViewBody<T>>& body) {
-    const std::vector<Camera> windows = windows_of(input.camera, InImage<T>::margin_of(input.image));
+    const std::vector<Camera> sub_cameras = sub_cameras_of(input.camera, InImage<T>::margin_of(input.image));
     const InImage<T> in_image(input, team);
-    const std::vector<GradientOptions> options = options_of_windows(input, windows, in_image, o, terms, team);
-    for (size_t k = 0; k < windows.size(); ++k) with_view(input, windows[k], in_image, options[k], terms, team, body);
+    const std::vector<GradientOptions> options = options_of_sub_cameras(input, sub_cameras, in_image, o, terms, team);
+    for (size_t k = 0; k < sub_cameras.size(); ++k)
+        with_view(input, sub_cameras[k], in_image, options[k], terms, team, body);
 }
 
-// The same for one window, where none shows more of what is looked for than another.
+// The same for one sub-camera, where none shows more of what is looked for than another.
 template <class T>
-void with_any_window(const BackwardInput<T>& input, const GradientOptions& o, Team& team,
-                     const std::type_identity_t<ViewBody<T>>& body) {
-    const Camera window = windows_of(input.camera, InImage<T>::margin_of(input.image)).front();
-    with_view<T>(input, window, InImage<T>(input, team), o, Terms{}, team, body);
+void with_any_sub_camera(const BackwardInput<T>& input, const GradientOptions& o, Team& team,
+                         const std::type_identity_t<ViewBody<T>>& body) {
+    const Camera sub_camera = sub_cameras_of(input.camera, InImage<T>::margin_of(input.image)).front();
+    with_view<T>(input, sub_camera, InImage<T>(input, team), o, Terms{}, team, body);
 }
 
 // δI = (1 − coverage) δbackground of direction d, for pixels (H, W, D, C).
@@ -279,14 +281,15 @@ void add_background_tangent(const BackwardInput<T>& input, const std::vector<Tan
 BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
     surface_samples += o.surface_samples, edge_samples += o.edge_samples;
     surface_wanted += o.surface_wanted, edge_wanted += o.edge_wanted;
-    silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections, rim += o.rim;
+    silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections,
+        lens_boundary += o.lens_boundary;
     measure += o.measure, curves += o.curves, view += o.view, world += o.world;
     step_lines += o.step_lines, shadow_samples += o.shadow_samples;
     for (int i = 0; i < 2; ++i) surface[i] += o.surface[i], edge[i] += o.edge[i], step[i] += o.step[i];
     return *this;
 }
 
-void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,
+void add_world(const Camera& sub_camera, const double* verts, const Array<double>& q_bar, Team& team,
                const Gradients& grad) {
     const auto parts = team.of_blocks(q_bar.size() / 3, [&](int64_t first, int64_t last) {
         std::array<double, 12> sum{};
@@ -294,7 +297,7 @@ void add_world(const Camera& window, const double* verts, const Array<double>& q
             const double *q = q_bar.data() + 3 * v, *p = verts + 3 * v;
             if (q[0] == 0 && q[1] == 0 && q[2] == 0) continue;
             if (grad.verts) {
-                const Vec3 p_bar = transposed_times(window.R, {q[0], q[1], q[2]});
+                const Vec3 p_bar = transposed_times(sub_camera.R, {q[0], q[1], q[2]});
                 grad.verts[3 * v] += p_bar.x, grad.verts[3 * v + 1] += p_bar.y, grad.verts[3 * v + 2] += p_bar.z;
             }
             if (grad.world_to_camera)
@@ -309,7 +312,7 @@ void add_world(const Camera& window, const double* verts, const Array<double>& q
         for (const auto& sum : parts)
             for (int j = 0; j < 4; ++j) {
                 const double* column = sum.data() + j;
-                const Vec3 m = transposed_times(window.turn, {column[0], column[4], column[8]});
+                const Vec3 m = transposed_times(sub_camera.turn, {column[0], column[4], column[8]});
                 double* to = grad.world_to_camera + j;
                 to[0] += m.x, to[4] += m.y, to[8] += m.z;
             }
@@ -318,7 +321,7 @@ void add_world(const Camera& window, const double* verts, const Array<double>& q
 template <class T>
 BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& o, Team& team,
                                 const Gradients& grad) {
-    const auto& [scene, camera, geometry, image, adjoint, hits, detailed, panes, looks] = input;
+    const auto& [scene, camera, geometry, image, adjoint, hits, detailed, transparent, importance_map] = input;
     BackwardProfile profile;
     Stopwatch watch;
     if (grad.background)
@@ -328,7 +331,7 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
     each_view(input, o, terms, team, [&](const BackwardView<T>& view) {
         BackwardProfile own{.view = watch.lap()};
         Array<double> q_bar = zeros(grad.geometry() ? 3 * scene.n_verts : 0, team);
-        Destination to;
+        GradientSink to;
         to.want_k = grad.K || grad.distortion;
         to.q = grad.geometry() ? q_bar.data() : nullptr;
         to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels, to.alphas = grad.alphas;
@@ -351,12 +354,12 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& tea
     for (const Tangents& t : tangents) {
         const Terms own = terms_of(t, o);
         terms.motion |= own.motion, terms.appearance |= own.appearance;
-        terms.boundary |= own.boundary, terms.rim |= own.rim, terms.steps |= own.steps;
+        terms.boundary |= own.boundary, terms.lens_boundary |= own.lens_boundary, terms.steps |= own.steps;
     }
     add_background_tangent(input, tangents, team, image_dot);
     if (!terms.any()) return;
     o.controls = false;
-    Destination to;
+    GradientSink to;
     to.pixels = image_dot, to.pixel_width = int(tangents.size()) * scene.channels;
     BackwardProfile profile;
     each_view(input, o, terms, team, [&](const BackwardView<T>& view) {
@@ -372,7 +375,7 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Te
     const Terms terms = all_motion(o);
     if (!terms.any()) return;
     o.controls = false;
-    Destination to;
+    GradientSink to;
     to.pixels = gradient, to.pixel_width = 2;
     BackwardProfile profile;
     each_view(input, o, terms, team,
@@ -385,7 +388,7 @@ RecordList record_samples(const BackwardInput<T>& input, GradientOptions o, Team
     const Terms terms = all_motion(o);
     if (!terms.any()) return records;
     o.controls = false;
-    Destination to;
+    GradientSink to;
     to.records = &records;
     BackwardProfile profile;
     each_view(input, o, terms, team,
@@ -398,7 +401,7 @@ std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const Sc
                                          const GradientOptions& o, const LightParts& light, int64_t samples,
                                          Team& team) {
     RecordList records;
-    Destination to;
+    GradientSink to;
     to.records = &records;
     BackwardProfile profile;
     each_view(input, o, Terms{}, team, [&](const BackwardView<T>& view) {
@@ -408,61 +411,61 @@ std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const Sc
 }
 
 template <class T>
-std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                         const GradientOptions& o, const LitPaths& paths, int64_t samples, Team& team,
-                                         BounceSamples& out) {
+std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                 const GradientOptions& o, const LitPaths& paths, int64_t samples,
+                                                 Team& team, SecondaryEdgeSamples& out) {
     RecordList records;
-    Destination to;
+    GradientSink to;
     to.records = &records;
     const auto add = [&](const BackwardView<T>& view) {
-        add_bounces(view, casters, paths, samples, Record{o.intrinsics}, to, out);
+        add_secondary_edges(view, casters, paths, samples, Record{o.intrinsics}, to, out);
     };
     if (paths.seen) each_view(input, o, Terms{}, team, add);
-    else with_any_window<T>(input, o, team, add);
+    else with_any_sub_camera<T>(input, o, team, add);
     return std::move(records.curves);
 }
 
 template <class T>
-std::vector<CurveRecords> record_surface_borders(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                                 const GradientOptions& o, const LitPaths& paths, MovingBorders moving,
-                                                 int64_t samples, Team& team, BounceSamples& out) {
+std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                               const GradientOptions& o, const LitPaths& paths, MovingEdges moving,
+                                               int64_t samples, Team& team, SecondaryEdgeSamples& out) {
     RecordList records;
-    Destination to;
+    GradientSink to;
     to.records = &records;
-    with_any_window<T>(input, o, team, [&](const BackwardView<T>& view) {
-        add_surface_borders(view, casters, paths, moving, samples, to, out);
+    with_any_sub_camera<T>(input, o, team, [&](const BackwardView<T>& view) {
+        add_surface_edges(view, casters, paths, moving, samples, to, out);
     });
     return std::move(records.curves);
 }
 
 template <class T>
-std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                                const GradientOptions& o, const LightParts& light, int64_t samples,
-                                                Team& team) {
+std::vector<CurveRecords> record_indirect_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                  const GradientOptions& o, const LightParts& light, int64_t samples,
+                                                  Team& team) {
     RecordList records;
-    Destination to;
+    GradientSink to;
     to.records = &records;
-    with_any_window<T>(input, o, team,
-                       [&](const BackwardView<T>& view) { add_unseen_shadows(view, casters, light, samples, to); });
+    with_any_sub_camera<T>(
+        input, o, team, [&](const BackwardView<T>& view) { add_indirect_shadows(view, casters, light, samples, to); });
     return std::move(records.curves);
 }
 
-#define EDGEGRAD_INSTANTIATE(T)                                                                                       \
-    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,                  \
-                                             const Gradients&);                                                       \
-    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,      \
-                                  double*);                                                                           \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);                   \
-    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                              \
-    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,                   \
-                                                      const GradientOptions&, const LightParts&, int64_t, Team&);     \
-    template std::vector<CurveRecords> record_bounces(const BackwardInput<T>&, const SceneView<T>&,                   \
-                                                      const GradientOptions&, const LitPaths&, int64_t, Team&,        \
-                                                      BounceSamples&);                                                \
-    template std::vector<CurveRecords> record_surface_borders(const BackwardInput<T>&, const SceneView<T>&,           \
-                                                              const GradientOptions&, const LitPaths&, MovingBorders, \
-                                                              int64_t, Team&, BounceSamples&);                        \
-    template std::vector<CurveRecords> record_unseen_shadows(                                                         \
+#define EDGEGRAD_INSTANTIATE(T)                                                                                        \
+    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,                   \
+                                             const Gradients&);                                                        \
+    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,       \
+                                  double*);                                                                            \
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);                    \
+    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                               \
+    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,                    \
+                                                      const GradientOptions&, const LightParts&, int64_t, Team&);      \
+    template std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>&, const SceneView<T>&,            \
+                                                              const GradientOptions&, const LitPaths&, int64_t, Team&, \
+                                                              SecondaryEdgeSamples&);                                  \
+    template std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>&, const SceneView<T>&,              \
+                                                            const GradientOptions&, const LitPaths&, MovingEdges,      \
+                                                            int64_t, Team&, SecondaryEdgeSamples&);                    \
+    template std::vector<CurveRecords> record_indirect_shadows(                                                        \
         const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)

@@ -12,8 +12,8 @@
 namespace edgegrad {
 
 struct LitPaths;  // secondary/secondary_edges.h
-struct BounceSamples;
-struct MovingBorders;
+struct SecondaryEdgeSamples;
+struct MovingEdges;
 
 // Adds the gradient to what `grad` points to.
 template <class T>
@@ -42,23 +42,25 @@ std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const Sc
                                          Team& team);
 // So many on those that lie on surfaces, seen or not (secondary/indirect_shadows.h).
 template <class T>
-std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                                const GradientOptions& options, const LightParts& light,
-                                                int64_t samples, Team& team);
+std::vector<CurveRecords> record_indirect_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                  const GradientOptions& options, const LightParts& light,
+                                                  int64_t samples, Team& team);
 
 // The samples on the borders of what surfaces of paths of light see of one another (secondary/secondary_edges.h).
 template <class T>
-std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                         const GradientOptions& options, const LitPaths& paths, int64_t samples,
-                                         Team& team, BounceSamples& out);
+std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                 const GradientOptions& options, const LitPaths& paths, int64_t samples,
+                                                 Team& team, SecondaryEdgeSamples& out);
 // Those on curves at which surfaces begin to send light (secondary/surface_edges.h).
 template <class T>
-std::vector<CurveRecords> record_surface_borders(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                                 const GradientOptions& options, const LitPaths& paths,
-                                                 MovingBorders moving, int64_t samples, Team& team, BounceSamples& out);
+std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                               const GradientOptions& options, const LitPaths& paths,
+                                               MovingEdges moving, int64_t samples, Team& team,
+                                               SecondaryEdgeSamples& out);
 
-// q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
-void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,
+// q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a
+// sub-camera.
+void add_world(const Camera& sub_camera, const double* verts, const Array<double>& q_bar, Team& team,
                const Gradients& grad);
 
 }  // namespace edgegrad

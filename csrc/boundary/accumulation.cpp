@@ -46,9 +46,9 @@ class AdjointRadiance {
 };
 
 template <int N, class T>
-class ReverseBoundary final : public CurveContraction {
+class ReverseBoundary final : public CurveAccumulation {
    public:
-    ReverseBoundary(const BackwardView<T>& view, ChunkGrad& grad) : radiance_(view), grad_(grad) {}
+    ReverseBoundary(const BackwardView<T>& view, LocalGradients& grad) : radiance_(view), grad_(grad) {}
 
     bool wants(int i, Vec2 x) override { return radiance_.wants(i, x); }
 
@@ -56,13 +56,13 @@ class ReverseBoundary final : public CurveContraction {
     void contract(int i, MovingSample& sample) override { sample.add_motion(radiance_.jumps(i, sample), grad_); }
 
     AdjointRadiance<N, T> radiance_;
-    ChunkGrad& grad_;
+    LocalGradients& grad_;
 };
 
 template <class T>
-class ForwardBoundary final : public CurveContraction {
+class ForwardBoundary final : public CurveAccumulation {
    public:
-    ForwardBoundary(const BackwardView<T>& view, Directions directions, ChunkGrad& grad)
+    ForwardBoundary(const BackwardView<T>& view, Directions directions, LocalGradients& grad)
         : view_(view),
           directions_(directions),
           C_(view.scene.channels),
@@ -101,16 +101,16 @@ class ForwardBoundary final : public CurveContraction {
     const Directions directions_;
     const int C_;
     const FilteredPixels pixels_;
-    ChunkGrad& grad_;
+    LocalGradients& grad_;
     std::vector<double> radiance_;  // (3, C) of the surfaces
     std::vector<CurveJumps> velocity_;
     std::vector<double> values_;  // (D, C)
 };
 
 template <class T>
-class ScreenBoundary final : public CurveContraction {
+class ScreenBoundary final : public CurveAccumulation {
    public:
-    ScreenBoundary(const BackwardView<T>& view, ChunkGrad& grad) : view_(view), radiance_(view), grad_(grad) {}
+    ScreenBoundary(const BackwardView<T>& view, LocalGradients& grad) : view_(view), radiance_(view), grad_(grad) {}
 
     bool wants(int i, Vec2 x) override { return radiance_.wants(i, x); }
 
@@ -123,13 +123,13 @@ class ScreenBoundary final : public CurveContraction {
 
     const BackwardView<T>& view_;
     AdjointRadiance<0, T> radiance_;
-    ChunkGrad& grad_;
+    LocalGradients& grad_;
 };
 
 template <class T>
-class RecordBoundary final : public CurveContraction {
+class BoundaryRecorder final : public CurveAccumulation {
    public:
-    RecordBoundary(const BackwardView<T>& view, const Record& kept, CurveRecords& records)
+    BoundaryRecorder(const BackwardView<T>& view, const Record& kept, CurveRecords& records)
         : view_(view), kept_(kept), camera_(view.camera), records_(records) {
         form_.q.prepare(3, 1), form_.uvs.prepare(2, 1), form_.alphas.prepare(1, 1);
         records_.reserve(scatter_chunk);
@@ -162,7 +162,7 @@ class RecordBoundary final : public CurveContraction {
         const int64_t sample_index = records_.size();
         append(records_.x, {sample.x().x, sample.x().y});
         const CurveSample* sides = sample.on_surfaces();
-        const Vec2 normal = sides ? in_straight_image(sample.normal(), sides->n) : Vec2();
+        const Vec2 normal = sides ? in_undistorted_image(sample.normal(), sides->n) : Vec2();
         for (int k = 0; k < CurveRecords::surfaces; ++k) {
             const SurfacePoint p = k < surfaces.count ? surfaces.at[k] : SurfacePoint();
             records_.face.push_back(k < surfaces.count ? int32_t(p.face) : -2);
@@ -176,7 +176,7 @@ class RecordBoundary final : public CurveContraction {
             if (by_q[0] == 0 && by_q[1] == 0 && by_q[2] == 0) return;
             records_.row_of.push_back(sample_index);
             records_.vertex.push_back(int32_t(vertex));
-            // From the frame of the window to that of the camera.
+            // From the frame of the sub-camera to that of the camera.
             const Vec3 q = transposed_times(camera_.turn, {by_q[0], by_q[1], by_q[2]});
             append(records_.by_q, {q.x, q.y, q.z});
         });
@@ -189,10 +189,10 @@ class RecordBoundary final : public CurveContraction {
             records_.by_alpha.push_back(*by_alpha);
         });
         if (sides)
-            for (const int32_t pane : sides->panes) {
-                const Barycentrics b = barycentrics_of_hit(face_map(camera_, corners_of(view_, pane).data()), sides->n);
-                records_.pane_row_of.push_back(sample_index), records_.pane.push_back(pane);
-                append(records_.pane_b, {b.u, b.v});
+            for (const int32_t face : sides->transparent) {
+                const Barycentrics b = barycentrics_of_hit(face_map(camera_, corners_of(view_, face).data()), sides->n);
+                records_.transparent_row_of.push_back(sample_index), records_.transparent.push_back(face);
+                append(records_.transparent_b, {b.u, b.v});
             }
         if (const LightMotion& light = form_.light; light.part >= 0) {
             records_.light.push_back(light.part), append(records_.light_uv, {light.uv.x, light.uv.y});
@@ -202,9 +202,9 @@ class RecordBoundary final : public CurveContraction {
     }
 
     // (∂x/∂u)ᵀ x̄.
-    Vec2 in_straight_image(Vec2 x_bar, Vec2 n) const {
+    Vec2 in_undistorted_image(Vec2 x_bar, Vec2 n) const {
         const auto along = [&](Vec2 u) {
-            const Vec2 x = bend_jvp(camera_, n, u);
+            const Vec2 x = distort_jvp(camera_, n, u);
             return x.x * x_bar.x + x.y * x_bar.y;
         };
         return {along({1, 0}), along({0, 1})};
@@ -230,26 +230,28 @@ class RecordBoundary final : public CurveContraction {
     const Record kept_;
     const Camera& camera_;
     CurveRecords& records_;
-    ChunkGrad form_;
+    LocalGradients form_;
 };
 
 }  // namespace
 
 template <class T>
-std::unique_ptr<CurveContraction> contract_curves(const BackwardView<T>& view, const Contraction& contraction,
-                                                  ChunkGrad& grad) {
-    using Made = std::unique_ptr<CurveContraction>;
-    if (std::holds_alternative<Reverse>(contraction))
+std::unique_ptr<CurveAccumulation> accumulate_curves(const BackwardView<T>& view, const Accumulation& accumulation,
+                                                     LocalGradients& grad) {
+    using Made = std::unique_ptr<CurveAccumulation>;
+    if (std::holds_alternative<Reverse>(accumulation))
         return dispatch_channels(view.scene.channels, view.scene.channels > view.scene.radiance,
                                  [&]<int N>() -> Made { return std::make_unique<ReverseBoundary<N, T>>(view, grad); });
-    if (const Forward* c = std::get_if<Forward>(&contraction))
+    if (const Forward* c = std::get_if<Forward>(&accumulation))
         return std::make_unique<ForwardBoundary<T>>(view, c->directions, grad);
-    if (const Record* c = std::get_if<Record>(&contraction))
-        return std::make_unique<RecordBoundary<T>>(view, *c, grad.records.curves);
+    if (const Record* c = std::get_if<Record>(&accumulation))
+        return std::make_unique<BoundaryRecorder<T>>(view, *c, grad.records.curves);
     return std::make_unique<ScreenBoundary<T>>(view, grad);
 }
 
-template std::unique_ptr<CurveContraction> contract_curves(const BackwardView<float>&, const Contraction&, ChunkGrad&);
-template std::unique_ptr<CurveContraction> contract_curves(const BackwardView<double>&, const Contraction&, ChunkGrad&);
+template std::unique_ptr<CurveAccumulation> accumulate_curves(const BackwardView<float>&, const Accumulation&,
+                                                              LocalGradients&);
+template std::unique_ptr<CurveAccumulation> accumulate_curves(const BackwardView<double>&, const Accumulation&,
+                                                              LocalGradients&);
 
 }  // namespace edgegrad

@@ -1,7 +1,7 @@
 // What becomes of a sample on a curve, given the surfaces on its sides: in reverse mode cotangents of what the curve
 // moves with, in forward mode a derivative of the pixels around it, or the gradient by its place in the image.
 //
-// Contractions are compiled once for each type of image and number of channels, sources of curves without either: a
+// Accumulations are compiled once for each type of image and number of channels, sources of curves without either: a
 // sample is handed over through an interface.
 #pragma once
 
@@ -18,13 +18,13 @@ namespace edgegrad {
 class MovingSample {
    public:
     virtual Vec2 x() const = 0;
-    virtual const CurveSample* on_surfaces() const = 0;  // null along the rim of a lens, where there is one side
+    virtual const CurveSample* on_surfaces() const = 0;  // null along the border of a lens, where there is one side
     virtual SampleSurfaces surfaces() = 0;
     virtual CurveJumps jumps(const double* radiance) const = 0;
     virtual CurveJumps velocities(const Direction& direction) const = 0;
     virtual Vec2 normal() const = 0;
-    virtual void add_motion(CurveJumps jumps, ChunkGrad& grad) = 0;
-    virtual void finish(ChunkGrad& grad) = 0;
+    virtual void add_motion(CurveJumps jumps, LocalGradients& grad) = 0;
+    virtual void finish(LocalGradients& grad) = 0;
 
    protected:
     ~MovingSample() = default;
@@ -44,17 +44,17 @@ class SampleOf final : public MovingSample {
     CurveJumps jumps(const double* radiance) const override { return source_.jumps(sample_, radiance); }
     CurveJumps velocities(const Direction& direction) const override { return source_.velocities(sample_, direction); }
     Vec2 normal() const override { return source_.normal(sample_); }
-    void add_motion(CurveJumps jumps, ChunkGrad& grad) override { source_.add_motion(sample_, jumps, grad); }
-    void finish(ChunkGrad& grad) override { source_.finish(grad); }
+    void add_motion(CurveJumps jumps, LocalGradients& grad) override { source_.add_motion(sample_, jumps, grad); }
+    void finish(LocalGradients& grad) override { source_.finish(grad); }
 
    private:
     Source& source_;
     typename Source::Sample& sample_;
 };
 
-class CurveContraction {
+class CurveAccumulation {
    public:
-    virtual ~CurveContraction() = default;
+    virtual ~CurveAccumulation() = default;
 
     // False if nothing could come of a sample at the pixel position x; i tells the samples of a batch apart.
     virtual bool wants(int i, Vec2 x) = 0;
@@ -72,7 +72,7 @@ class CurveContraction {
 
 // Of the samples of one chunk.
 template <class T>
-std::unique_ptr<CurveContraction> contract_curves(const BackwardView<T>& view, const Contraction& contraction,
-                                                  ChunkGrad& grad);
+std::unique_ptr<CurveAccumulation> accumulate_curves(const BackwardView<T>& view, const Accumulation& accumulation,
+                                                     LocalGradients& grad);
 
 }  // namespace edgegrad

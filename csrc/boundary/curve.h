@@ -47,9 +47,10 @@ inline Barycentrics at_edge(const HalfEdge& h, double t) {
     return {b[1], b[2]};
 }
 
-// The same a little within the face, where it matters: on the rim itself the nearest texel may be that of a neighbour.
+// The same a little within the face, where it matters: on the border itself the nearest texel may be that of a
+// neighbour.
 template <class T>
-Barycentrics beside_edge(const SceneView<T>& scene, const HalfEdge& h, double t) {
+Barycentrics next_to_edge(const SceneView<T>& scene, const HalfEdge& h, double t) {
     const Barycentrics b = at_edge(h, t);
     constexpr double inward = 0x1p-24;
     if (!takes_nearest(scene, h.face)) return b;
@@ -110,13 +111,13 @@ bool lies_between_texels(const SceneView<T>& scene, const HalfEdge& h) {
         return (a.x == b.x && a.x == std::floor(a.x)) || (a.y == b.y && a.y == std::floor(a.y));
     };
     return (is_textured(scene, h.face) && along(texture_of(scene, h.face))) ||
-           (scene.cut_outs.on(h.face) && along(alpha_of(scene, h.face)));
+           (scene.alpha_masks.on(h.face) && along(alpha_of(scene, h.face)));
 }
 
 // Whether one of two faces may be there and the other cut out along the edge they share.
 template <class T>
-bool cut_outs_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
-    const CutOutArrays<T>& c = scene.cut_outs;
+bool alpha_masks_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
+    const AlphaMaskArrays<T>& c = scene.alpha_masks;
     if (!c.on(m.face) && !c.on(p.face)) return false;
     return c.face[m.face] != c.face[p.face] || lies_between_texels(scene, m) || uvs_jump(scene, m, p);
 }
@@ -133,7 +134,7 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
         return textured ? rows_differ(scene.uvs, 2, i, j) : rows_differ(scene.colors, scene.radiance, i, j);
     };
     return differ(m.first(), p.first()) || differ(m.second(), p.second()) ||
-           (scene.channels > scene.radiance && attributes_jump(scene, m, p)) || cut_outs_jump(scene, m, p);
+           (scene.channels > scene.radiance && attributes_jump(scene, m, p)) || alpha_masks_jump(scene, m, p);
 }
 
 // Whether neighbouring faces may differ at their common edge. Attributes that are indexed like the vertices
@@ -142,14 +143,14 @@ template <class T>
 bool may_jump(const SceneView<T>& scene, const Topology& topology) {
     const Attributes& a = scene.attributes;
     return scene.corners != scene.faces || topology.welds() || a.face_width > 0 || a.barycentrics || a.uv ||
-           scene.cut_outs.face;
+           scene.alpha_masks.face;
 }
 
 // The scene without the first of its channels if these are the same on both sides of an edge: what is interpolated from
-// vertices, unless copies are joined, and alpha where nothing is cut out.
+// vertices, unless copies are joined, and alpha where nothing is alpha-tested.
 template <class T>
 SceneView<T> without_continuous(SceneView<T> scene, const Topology& topology) {
-    if (scene.corners != scene.faces || topology.welds() || scene.face_texture || scene.cut_outs.face) return scene;
+    if (scene.corners != scene.faces || topology.welds() || scene.face_texture || scene.alpha_masks.face) return scene;
     Attributes& a = scene.attributes;
     a.alpha = false, a.vertex_width = 0, a.unit = -1;
     scene.radiance = 0, scene.channels = a.channels();
@@ -207,12 +208,12 @@ class CurveFinder {
 
     // What is known of an edge at which a surface goes on: that there is no curve, or nothing more to do; that the
     // faces differ along it; nothing.
-    enum class Glance { done, differs, unknown };
+    enum class EarlyOut { done, differs, unknown };
 
     // Calls body(edge) for those of the edges first … last − 1 that may have a curve. Most have one face on each side:
     // there glance(edge, face, face) tells whether to look any further, so that little of memory is read for them.
     template <class See, class Body>
-    void each(int64_t first, int64_t last, See glance, Body body) const {
+    void each(int64_t first, int64_t last, See early_out, Body body) const {
         const Topology& topology = view_.geometry.topology();
         const int8_t* const facing = facing_.data();
         const int32_t* face = topology.faces(first).data();
@@ -220,14 +221,14 @@ class CurveFinder {
         const int32_t* const end =
             last < topology.n_edges() ? topology.faces(last).data() : topology.faces(last - 1).data();
         for (int64_t e = first; e < last; ++e) {
-            if (face + 2 * far < end) glance.prefetch(face[2 * far]), glance.prefetch(face[2 * far + 1]);
+            if (face + 2 * far < end) early_out.prefetch(face[2 * far]), early_out.prefetch(face[2 * far + 1]);
             if (topology.joins_two(e)) [[likely]] {
                 const int32_t one = face[0], other = face[1];
                 face += 2;
                 if (facing[one] * facing[other] > 0) {
-                    const Glance seen = jumps_ ? glance(e, one, other) : Glance::done;
-                    if (seen == Glance::unknown) joins.push_back(e);
-                    if (seen != Glance::differs) continue;
+                    const EarlyOut seen = jumps_ ? early_out(e, one, other) : EarlyOut::done;
+                    if (seen == EarlyOut::unknown) joins.push_back(e);
+                    if (seen != EarlyOut::differs) continue;
                 }
             } else {
                 face += topology.faces(e).size();
@@ -260,7 +261,7 @@ class CurveFinder {
 
     // Where edges between two faces are seen only if they are silhouettes.
     struct NoCreases {
-        Glance operator()(int64_t, int32_t, int32_t) const { return Glance::done; }
+        EarlyOut operator()(int64_t, int32_t, int32_t) const { return EarlyOut::done; }
         void prefetch(int32_t) const {}
     };
 

@@ -11,22 +11,22 @@
 
 namespace edgegrad {
 
-// Samples of one source, in batches of rays. The contraction is a CurveContraction, or offers the same.
-template <class Contraction, class T, CurveSource Source>
+// Samples of one source, in batches of rays. The accumulation is a CurveAccumulation, or offers the same.
+template <class Accumulation, class T, CurveSource Source>
 class CurveSamples {
    public:
-    CurveSamples(const BackwardView<T>& view, Source& source, Contraction& contraction)
-        : view_(view), visibility_(view), source_(source), contraction_(contraction), rays_(view.frame) {}
+    CurveSamples(const BackwardView<T>& view, Source& source, Accumulation& accumulation)
+        : view_(view), visibility_(view), source_(source), accumulation_(accumulation), rays_(view.frame) {}
 
     // The point at the fraction s of the curve.
     void add(const typename Source::Curve& curve, double s, double weight) {
         const int i = rays_.count;
         const Vec2 u = source_.position(curve, s);
-        const auto [x, area_scale] = bend(view_.camera, u);
-        if (area_scale == 0 || !contraction_.wants(i, x)) return;
+        const auto [x, area_scale] = distort(view_.camera, u);
+        if (area_scale == 0 || !accumulation_.wants(i, x)) return;
         typename Source::Sample& sample = sample_[i];
         sample.u = u, sample.n = normalised(view_.camera, u), sample.weight = weight;
-        sample.x = x, sample.area_scale = area_scale, sample.panes.clear();
+        sample.x = x, sample.area_scale = area_scale, sample.transparent.clear();
         sample.sight = sample.n;
         if (!source_.place(curve, s, sample)) return;
         rays_.n_x[i] = sample.sight.x, rays_.n_y[i] = sample.sight.y;
@@ -34,7 +34,7 @@ class CurveSamples {
         if (++rays_.count == RayBatch::size) cast();
     }
 
-    void finish(ChunkGrad& grad) {
+    void finish(LocalGradients& grad) {
         cast();
         source_.finish(grad);
     }
@@ -45,7 +45,7 @@ class CurveSamples {
         for (int i = 0; i < rays_.count; ++i) {
             typename Source::Sample& sample = sample_[i];
             const int32_t hit = hiding(sample, rays_.face[i]);
-            if (hit < 0 || (view_.panes && is_seen_through(hit, sample))) contraction_.add(i, source_, sample);
+            if (hit < 0 || (view_.transparent && is_seen_through(hit, sample))) accumulation_.add(i, source_, sample);
         }
         rays_.count = 0;
         source_.cast();
@@ -64,8 +64,8 @@ class CurveSamples {
         const auto own = sample.ignored;
         std::vector<int32_t> ignored(own.begin(), own.end());
         std::sort(ignored.begin(), ignored.end());
-        while (hit >= 0 && view_.panes[hit] && sample.panes.size() < most) {
-            sample.panes.push_back(hit);
+        while (hit >= 0 && view_.transparent[hit] && sample.transparent.size() < most) {
+            sample.transparent.push_back(hit);
             ignored.insert(std::upper_bound(ignored.begin(), ignored.end(), hit), hit);
             sample.ignored = ignored;
             CameraRays ray(view_.frame);
@@ -81,7 +81,7 @@ class CurveSamples {
     const BackwardView<T>& view_;
     const Visibility<T> visibility_;
     Source& source_;
-    Contraction& contraction_;
+    Accumulation& accumulation_;
 
     CameraRays rays_;
     typename Source::Sample sample_[RayBatch::size];

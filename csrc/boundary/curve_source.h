@@ -46,10 +46,10 @@ struct CurveFaces {
 };
 
 struct CurveSample {
-    Vec2 u, n;              // the place in the straight image, and its normalised coordinates
+    Vec2 u, n;              // the place in the undistorted image, and its normalised coordinates
     Vec2 sight;             // the normalised coordinates at which the camera's ray asks what hides the point
     Vec2 x;                 // the pixel position
-    double area_scale = 1;  // how much larger an area is there than in the straight image
+    double area_scale = 1;  // how much larger an area is there than in the undistorted image
     Vec3 point;             // camera coordinates
     double weight = 0;      // inverse of the density of samples along the curve's fraction s
     SurfacePoint behind = {};
@@ -58,7 +58,7 @@ struct CurveSample {
     // elsewhere.
     std::span<const int32_t> ignored;
     std::vector<int32_t> gathered;
-    std::vector<int32_t> panes;  // before it, through which it is seen
+    std::vector<int32_t> transparent;  // before it, through which it is seen
 };
 
 // The surfaces of which a sample needs the radiance: minus, plus, and at most one more.
@@ -74,13 +74,13 @@ struct CurveJumps {
     double first = 0, second = 0;
 };
 
-// What a contraction asks of a curve on which a sample lies, at the pixel position `sample.x`. `jumps` takes one
+// What a accumulation asks of a curve on which a sample lies, at the pixel position `sample.x`. `jumps` takes one
 // number, linear in the radiance, of each of the surfaces. `add_motion` takes the jumps of the loss; `velocities` is
 // what it is the adjoint of, in one direction, and `normal` that of places x in the image. `finish` adds what was
 // summed for the latest curve.
 template <class S>
 concept MovingCurve = requires(S& source, const S& known, typename S::Sample& sample, const double* radiance,
-                               CurveJumps jumps, const Direction& direction, ChunkGrad& grad) {
+                               CurveJumps jumps, const Direction& direction, LocalGradients& grad) {
     { sample.x } -> std::same_as<Vec2&>;
     { source.surfaces(sample) } -> std::same_as<SampleSurfaces>;
     { known.jumps(sample, radiance) } -> std::same_as<CurveJumps>;

@@ -1,4 +1,4 @@
-// Where lines across the image meet steps within a face: the rim of a cut-out, or a border between texels where the
+// Where lines across the image meet steps within a face: an alpha edge, or a border between texels where the
 // nearest one is taken.
 //
 // Along a line in the image the barycentrics of a face are (P_a + t (P_b − P_a)) / w, with P and w affine (FaceMap), so
@@ -18,12 +18,12 @@
 
 namespace edgegrad {
 
-// A line across a face meets a step F = 0 at u in the straight image. F is affine in the texture coordinates near
-// there; a cut-out is there where F > 0.
+// A line across a face meets a step F = 0 at u in the undistorted image. F is affine in the texture coordinates near
+// there; an alpha-tested face is there where F > 0.
 struct StepCrossing {
     int32_t face = -1;
-    bool is_rim = false;    // of a cut-out; else a border of texels
-    bool vertical = false;  // the line
+    bool is_alpha_edge = false;  // of a alpha-tested face; else a border of texels
+    bool vertical = false;       // the line
     Vec2 u;
     Vec2 slope;            // ∂F/∂uv
     double side = 0;       // F on the two sides of a border of texels, ±; 0: F is α less the cutoff
@@ -82,7 +82,7 @@ class StepFinder {
 
     // Whether there may be steps in a face.
     static bool may_step(const SceneView<T>& scene, int64_t face) {
-        return scene.cut_outs.on(face) || takes_nearest(scene, face);
+        return scene.alpha_masks.on(face) || takes_nearest(scene, face);
     }
 
     // From now on.
@@ -94,14 +94,14 @@ class StepFinder {
         front_ = side_of(view_, face) == 1 ? -1 : 1;
     }
 
-    // Calls visit(crossing, weight) for the steps on the segment from a to b, a line of the straight image, as far as
-    // it lies on the face. Of more than `most` cells of a texture so many are looked at, drawn by a random number; they
-    // then stand for all.
+    // Calls visit(crossing, weight) for the steps on the segment from a to b, a line of the undistorted image, as far
+    // as it lies on the face. Of more than `most` cells of a texture so many are looked at, drawn by a random number;
+    // they then stand for all.
     template <class Visit>
     void find(Vec2 a, Vec2 b, bool vertical, int most, uint64_t random, Visit visit) const {
         Segment s;
         if (!clip(a, b, s)) return;
-        StepCrossing crossing{.face = face_, .is_rim = false, .vertical = vertical, .u = {}, .slope = {}};
+        StepCrossing crossing{.face = face_, .is_alpha_edge = false, .vertical = vertical, .u = {}, .slope = {}};
         const auto at = [&](double tau) {
             const double t = tau * s.w[0] / ((1 - tau) * s.w[1] + tau * s.w[0]);
             crossing.u = s.u[0] + t * (s.u[1] - s.u[0]);
@@ -121,8 +121,8 @@ class StepFinder {
                     visit(crossing, border.weight);
                 });
         }
-        if (!scene.cut_outs.on(face_)) return;
-        crossing.is_rim = true;
+        if (!scene.alpha_masks.on(face_)) return;
+        crossing.is_alpha_edge = true;
         const Texture<T> alpha = alpha_of(scene, face_);
         const double cutoff = cutoff_of(scene, face_);
         if (alpha.sampler.filter == TextureFilter::nearest) {

@@ -1,5 +1,5 @@
 // Whether a face hides a point of a curve, decided in double. Embree decides in float which faces a ray meets, and near
-// a curve that is not enough: the ray runs along the border of what it looks for.
+// a curve that is not enough: the ray runs along the border of what it is to find.
 #pragma once
 
 #include <algorithm>
@@ -34,7 +34,7 @@ class Visibility {
     // The face that a ray truly meets, where `face` is what the cast found. Float and double may place the ray on
     // different sides of an edge between two faces that it runs through, and where that edge lies on the curve in the
     // image (the diagonal of a box's front, before an edge of its back) they do so again and again. Then float misses
-    // the neighbour that double would meet; so beside the ray that passes through the refused face go others that are
+    // the neighbour that double would meet; so next to the ray that passes through the refused face go others that are
     // moved off that face: by as much as floats may err, and by less, for the neighbour may be narrower than that.
     int32_t beyond_float(const CurveSample& sample, int32_t face) const {
         const Vec2 n = sample.sight;
@@ -53,7 +53,7 @@ class Visibility {
             }
             const Vec2 error = out_of(face, n);
             ignored.insert(std::upper_bound(ignored.begin(), ignored.end(), face), face);
-            face = each_beside(view_, n, error, ignored, [&](int32_t met) {
+            face = each_near_miss(view_, n, error, ignored, [&](int32_t met) {
                 if (!decide(met)) return;
                 if (const double z = depth_of(view_, met, n); z < depth) nearest = met, depth = z;
             });

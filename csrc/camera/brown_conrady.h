@@ -19,7 +19,7 @@ struct BrownConrady {
     explicit BrownConrady(const double* c)
         : k1(c[0]), k2(c[1]), p1(c[2]), p2(c[3]), k3(c[4]), k4(c[5]), k5(c[6]), k6(c[7]) {}
 
-    Vec2 bend(Vec2 n) const {
+    Vec2 distort(Vec2 n) const {
         const double xx = n.x * n.x, yy = n.y * n.y, s = xx + yy, xy2 = 2 * n.x * n.y, g = above(s) / below(s);
         return {n.x * g + (p1 * xy2 + p2 * (s + 2 * xx)), n.y * g + (p1 * (s + 2 * yy) + p2 * xy2)};
     }
@@ -31,7 +31,7 @@ struct BrownConrady {
                 g + g2 * n.y * n.y + 6 * p1 * n.y + 2 * p2 * n.x};
     }
 
-    void bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
+    void distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
         n_bar += transposed_times(jacobian(n), bar);
         const double xx = n.x * n.x, yy = n.y * n.y, s = xx + yy, xy2 = 2 * n.x * n.y, b = below(s), g = above(s) / b;
         const double g_bar = (bar.x * n.x + bar.y * n.y) / b, b_bar = -g * g_bar;

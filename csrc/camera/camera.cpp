@@ -75,7 +75,7 @@ void Camera::find_lens_view() {
     if (!fisheye || !lens_view.end || lens_view.disc.fold < greatest_radius) return;
     const WideFisheye wide(k, *fisheye);
     lens_view = {};
-    if (wide.ends_in({{-margin, -margin}, {width + margin, height + margin}})) lens_view.end = wide.rim();
+    if (wide.ends_in({{-margin, -margin}, {width + margin, height + margin}})) lens_view.end = wide.lens_boundary();
     lens = wide;
 }
 
@@ -99,7 +99,7 @@ LensView Camera::view_through_lens() const {
     for (int i = 0; i < points && !view.end; ++i) {
         const double s = double(i) / points, w = width + 2 * margin, h = height + 2 * margin;
         for (const Vec2 x : {Vec2{s * w, 0}, Vec2{w, s * h}, Vec2{(1 - s) * w, h}, Vec2{0, (1 - s) * h}}) {
-            const auto n = edgegrad::straighten(lens, view.disc, normalised(*this, x - Vec2{margin, margin}));
+            const auto n = edgegrad::undistort(lens, view.disc, normalised(*this, x - Vec2{margin, margin}));
             if (!n) view.end = std::atan(view.disc.fold);
             else add(to_pixels(*this, *n));
         }
@@ -125,7 +125,7 @@ LensView Camera::view_through_lens() const {
         for (int j = 0; j < angles; ++j) {
             const double r = std::tan(std::atan(radius) * i / radii) * (1 - 1e-12), a = 2 * M_PI * j / angles;
             const Vec2 n{r * std::cos(a), r * std::sin(a)};
-            const Vec2 x = bend_jvp(*this, n, {1, 0}), y = bend_jvp(*this, n, {0, 1});
+            const Vec2 x = distort_jvp(*this, n, {1, 0}), y = distort_jvp(*this, n, {0, 1});
             const auto raise = [](double& most, double value) { most = std::max(most, 1.05 * std::fabs(value)); };
             raise(view.most.xx, x.x), raise(view.most.yx, x.y), raise(view.most.xy, y.x), raise(view.most.yy, y.y);
         }
@@ -148,7 +148,7 @@ double Camera::stretch(Vec2 low, Vec2 high) const {
 
 // By the mean value theorem, from a place of the box, or the nearest that is seen at all.
 std::pair<Vec2, Vec2> Camera::image_box(Vec2 low, Vec2 high) const {
-    if (is_straight()) return {low, high};
+    if (is_undistorted()) return {low, high};
     if (has_sides(lens)) {
         const Box2 n = normalised_box(*this, low, high);
         const Box2 box = with_side_lens(lens, n, [&](const auto& l) { return l.image_box(n); });
@@ -157,7 +157,7 @@ std::pair<Vec2, Vec2> Camera::image_box(Vec2 low, Vec2 high) const {
     Vec2 n = normalised(*this, 0.5 * (low + high));
     const double radius = length(n), fold = lens_view.disc.fold * (1 - 1e-9);
     if (radius > fold) n = (fold / radius) * n;
-    const Vec2 u = to_pixels(*this, n), x = bend(*this, u).x;
+    const Vec2 u = to_pixels(*this, n), x = distort(*this, u).x;
     const Vec2 half{std::max(high.x - u.x, u.x - low.x), std::max(high.y - u.y, u.y - low.y)};
     const Vec2 reach{lens_view.most.xx * half.x + lens_view.most.xy * half.y,
                      lens_view.most.yx * half.x + lens_view.most.yy * half.y};

@@ -21,33 +21,35 @@ class CameraConnections {
    public:
     // reach  how far beyond its borders, px, the image shows something: the pixel filter's
     CameraConnections(const Camera& camera, double reach) {
-        for (const Camera& window : windows_of(camera, reach)) windows_.push_back({window, {window, reach}});
+        for (const Camera& sub_camera : sub_cameras_of(camera, reach))
+            sub_cameras_.push_back({sub_camera, {sub_camera, reach}});
     }
 
     // Calls body(CameraConnection) for each place of the image at which the point y of a face with the sides e1 and e2
     // lies, world coordinates.
     template <class Body>
     void each(Vec3 y, Vec3 e1, Vec3 e2, Body body) const {
-        for (const Window& window : windows_) {
-            const Camera& c = window.camera;
+        for (const SubCamera& sub_camera : sub_cameras_) {
+            const Camera& c = sub_camera.camera;
             const Vec3 q = c.to_camera(y);
-            if (!(c.depth_weight(q) > 0) || window.volume.outcode(q) != 0) continue;
-            const Bent bent = bend(c, project(c, q));
-            if (!(bent.area_scale != 0)) continue;
+            if (!(c.depth_weight(q) > 0) || sub_camera.volume.outcode(q) != 0) continue;
+            const Distorted distorted = distort(c, project(c, q));
+            if (!(distorted.area_scale != 0)) continue;
             const Vec2 u = project_jvp(c, q, c.R * e1, {}), v = project_jvp(c, q, c.R * e2, {});
             const double area = u.x * v.y - u.y * v.x;
             if (!(std::fabs(area) > 0)) continue;  // seen edge-on
-            body(CameraConnection{
-                bent.x, std::fabs(area) / length(cross(e1, e2)), {v.y / area, -u.y / area, -v.x / area, u.x / area}});
+            body(CameraConnection{distorted.x,
+                                  std::fabs(area) / length(cross(e1, e2)),
+                                  {v.y / area, -u.y / area, -v.x / area, u.x / area}});
         }
     }
 
    private:
-    struct Window {
+    struct SubCamera {
         Camera camera;
         ViewVolume volume;
     };
-    std::vector<Window> windows_;
+    std::vector<SubCamera> sub_cameras_;
 };
 
 }  // namespace edgegrad

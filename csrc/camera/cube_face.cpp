@@ -34,7 +34,7 @@ Box2 sector_box(double inner, double outer, double from, double to) {
 }
 
 // Of two sides that share a border each computes the same numbers, but for their signs: so every direction has one.
-std::optional<Vec2> CubeSide::place(Vec3 d) const {
+std::optional<Vec2> CubeFace::place(Vec3 d) const {
     const Vec3 q = turn * d;
     const bool inside =
         closed ? std::fabs(q.x) <= q.z && std::fabs(q.y) <= q.z : q.x >= -q.z && q.x < q.z && std::fabs(q.y) < q.z;
@@ -42,12 +42,12 @@ std::optional<Vec2> CubeSide::place(Vec3 d) const {
     return Vec2{q.x / q.z, q.y / q.z};
 }
 
-double CubeSide::outside(Vec3 d) const {
+double CubeFace::outside(Vec3 d) const {
     const Vec3 q = turn * d;
     return std::max(std::fabs(q.x), std::fabs(q.y)) - q.z;
 }
 
-Box2 CubeSide::angles(Box2 n) const {
+Box2 CubeFace::angles(Box2 n) const {
     const Vec2 low = n.low, high = n.high;
     if (!pole()) {
         const double nearest = std::clamp(0.0, low.x, high.x), farthest = std::max(-low.x, high.x);
@@ -74,7 +74,7 @@ Box2 CubeSide::angles(Box2 n) const {
     return out;
 }
 
-std::optional<Box2> CubeSide::box(Vec2 from, Vec2 to) const {
+std::optional<Box2> CubeFace::box(Vec2 from, Vec2 to) const {
     constexpr double rounding = 1e-12;  // generous
     Box2 out = Box2::empty();
     const auto slope = [](double angle) {

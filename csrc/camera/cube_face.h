@@ -25,7 +25,7 @@ Box2 sector_box(double inner, double outer, double from, double to);
 
 // Directions d have a longitude λ = atan2(d.x, d.z) and a latitude φ = atan2(d.y, hypot(d.x, d.z)); two sides look at
 // the poles, where d.y is all.
-struct CubeSide {
+struct CubeFace {
     Mat3 turn{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};  // of directions to this side's frame
     // Which of its borders are its own: all, or only that at the least n.x.
     bool closed = false;
@@ -46,7 +46,7 @@ struct CubeSide {
 
 // Ahead, right, behind, left; below, above. Signs and exchanges alone, so that sides agree on what lies between them.
 constexpr int most_sides = 6;
-constexpr CubeSide cube_sides[most_sides] = {
+constexpr CubeFace cube_faces[most_sides] = {
     {{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}}, false},   {{{{0, 0, -1}, {0, 1, 0}, {1, 0, 0}}}, false},
     {{{{-1, 0, 0}, {0, 1, 0}, {0, 0, -1}}}, false}, {{{{0, 0, 1}, {0, 1, 0}, {-1, 0, 0}}}, false},
     {{{{1, 0, 0}, {0, 0, -1}, {0, 1, 0}}}, true},   {{{{1, 0, 0}, {0, 0, 1}, {0, -1, 0}}}, true},

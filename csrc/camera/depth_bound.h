@@ -17,9 +17,9 @@ class DepthBound {
         const double low = std::min({q[0].z, q[1].z, q[2].z}), high = camera.greatest_depth(q);
         camera_ = &camera, farthest_ = high;
         // A face whose depth changes by no more than two pixels' width needs no plane: its corners will do. Through a
-        // lens that bends, a pixel is no box in n.
+        // lens that distorts, a pixel is no box in n.
         const double width = 2 / camera.pixels_per_unit;
-        tilted_ = camera.is_straight() && !(high - low <= width * camera.unit_at_depth(low));
+        tilted_ = camera.is_undistorted() && !(high - low <= width * camera.unit_at_depth(low));
         if (!tilted_) return;
         const FaceRows rows{map.row(&Vec3::x), map.row(&Vec3::y), map.row(&Vec3::z)};
         plane_ = camera.projection([&](auto p) { return p.depth_plane(q, rows); });

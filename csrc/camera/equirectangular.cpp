@@ -13,7 +13,7 @@ Vec3 direction_of(Vec2 angles) {
 
 }  // namespace
 
-Equirectangular::Equirectangular(const double* K, const CubeSide& side, const Place& place)
+Equirectangular::Equirectangular(const double* K, const CubeFace& side, const Place& place)
     : side_(side), place_(place) {
     std::copy(K, K + 6, k_);
     const double det = k_[0] * k_[4] - k_[1] * k_[3], size = std::sqrt(std::fabs(det));
@@ -33,7 +33,7 @@ Vec2 Equirectangular::angles_of_pixel(Vec2 x) const {
     return {inverse_[0] * dx + inverse_[1] * dy, inverse_[2] * dx + inverse_[3] * dy};
 }
 
-Vec2 Equirectangular::bend(Vec2 n) const {
+Vec2 Equirectangular::distort(Vec2 n) const {
     const Vec2 a = angles_at(side_.direction(n));
     return {(k_[0] * a.x + k_[1] * a.y + k_[2]) / scale_.x, (k_[3] * a.x + k_[4] * a.y + k_[5]) / scale_.y};
 }
@@ -54,7 +54,7 @@ Mat2 Equirectangular::jacobian(Vec2 n) const {
     return {row(0, 0) / scale_.x, row(0, 1) / scale_.x, row(1, 0) / scale_.y, row(1, 1) / scale_.y};
 }
 
-void Equirectangular::bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) const {
+void Equirectangular::distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) const {
     n_bar += transposed_times(jacobian(n), bar);
     const Vec2 a = angles_at(side_.direction(n));
     const double x = bar.x / scale_.x, y = bar.y / scale_.y;
@@ -62,7 +62,7 @@ void Equirectangular::bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) con
     k_bar[3] += y * a.x, k_bar[4] += y * a.y, k_bar[5] += y;
 }
 
-std::optional<Vec2> Equirectangular::straighten(Vec2 m) const {
+std::optional<Vec2> Equirectangular::undistort(Vec2 m) const {
     const Vec2 a = angles_of_pixel({scale_.x * m.x, scale_.y * m.y}), from = place_.from, to = place_.to;
     if (!(a.x >= from.x && a.x < to.x && a.y >= from.y && a.y < to.y)) return {};
     return side_.place(direction_of(a));
@@ -78,7 +78,7 @@ struct Near {
     double to_angles[4];    // from m − m0
     Vec2 m0, sine, cosine;  // of both angles at m0
     Vec2 from, to;          // the angles, less those at m0, between which this place is
-    CubeSide side;
+    CubeFace side;
 };
 
 // sin δ and cos δ, by their series.
@@ -91,7 +91,7 @@ struct Near {
     return 1 - s * 0.5 * (1 - s * (1.0 / 12) * (1 - s * (1.0 / 30) * (1 - s * (1.0 / 56))));
 }
 
-EDGEGRAD_VECTORIZED void straighten_samples(const Near& p, int k, double* x, double* y) {
+EDGEGRAD_VECTORIZED void undistort_samples(const Near& p, int k, double* x, double* y) {
     const Near l = p;
     const Mat3 turn = l.side.turn;
     const double open = l.side.closed ? 0 : 1;
@@ -107,7 +107,7 @@ EDGEGRAD_VECTORIZED void straighten_samples(const Near& p, int k, double* x, dou
         const double q0 = turn.row[0].x * d0 + turn.row[0].y * d1 + turn.row[0].z * d2;
         const double q1 = turn.row[1].x * d0 + turn.row[1].y * d1 + turn.row[1].z * d2;
         const double q2 = turn.row[2].x * d0 + turn.row[2].y * d1 + turn.row[2].z * d2;
-        // As CubeSide::place.
+        // As CubeFace::place.
         const bool within = (q2 > 0) & (std::fabs(q0) <= q2) & (std::fabs(q1) <= q2);
         const bool foreign = (open > 0) & ((q0 == q2) | (std::fabs(q1) == q2));
         const bool here = (across >= l.from.x) & (across < l.to.x) & (over >= l.from.y) & (over < l.to.y);
@@ -118,7 +118,7 @@ EDGEGRAD_VECTORIZED void straighten_samples(const Near& p, int k, double* x, dou
 
 }  // namespace
 
-void Equirectangular::straighten_near(Vec2 m0, int k, double* x, double* y) const {
+void Equirectangular::undistort_near(Vec2 m0, int k, double* x, double* y) const {
     Near near{{inverse_[0] * scale_.x, inverse_[1] * scale_.y, inverse_[2] * scale_.x, inverse_[3] * scale_.y},
               m0,
               {},
@@ -133,7 +133,7 @@ void Equirectangular::straighten_near(Vec2 m0, int k, double* x, double* y) cons
     if (!(step < small_step)) {
         constexpr double nan = std::numeric_limits<double>::quiet_NaN();
         for (int i = 0; i < k; ++i) {
-            const Vec2 n = straighten({x[i], y[i]}).value_or(Vec2{nan, nan});
+            const Vec2 n = undistort({x[i], y[i]}).value_or(Vec2{nan, nan});
             x[i] = n.x, y[i] = n.y;
         }
         return;
@@ -141,7 +141,7 @@ void Equirectangular::straighten_near(Vec2 m0, int k, double* x, double* y) cons
     const Vec2 a = angles_of_pixel({scale_.x * m0.x, scale_.y * m0.y});
     near.sine = {std::sin(a.x), std::sin(a.y)}, near.cosine = {std::cos(a.x), std::cos(a.y)};
     near.from = place_.from - a, near.to = place_.to - a;
-    straighten_samples(near, k, x, y);
+    undistort_samples(near, k, x, y);
 }
 
 // A step in the angles turns a direction by no more than its length.

@@ -21,7 +21,7 @@ namespace edgegrad {
 // direction has many places: with any integers i and j of one parity λ' = λ + j π, φ' = i π + (−1)ⁱ φ. A lens has one
 // of these.
 //
-// K stands here, in place of coefficients: the camera's own only scales the straight image, so that m = x / scale.
+// K stands here, in place of coefficients: the camera's own only scales the undistorted image, so that m = x / scale.
 class Equirectangular {
    public:
     static constexpr int coefficients = 6;  // the upper two rows of K
@@ -31,25 +31,25 @@ class Equirectangular {
         Vec2 from{-infinite, -infinite}, to{infinite, infinite};
     };
 
-    Equirectangular(const double* K, const CubeSide& side, const Place& place);
+    Equirectangular(const double* K, const CubeFace& side, const Place& place);
 
-    // The focal lengths of the straight image, px: positive areas stay positive.
+    // The focal lengths of the undistorted image, px: positive areas stay positive.
     Vec2 scale() const { return scale_; }
     const double* K() const { return k_; }
-    const CubeSide& side() const { return side_; }
+    const CubeFace& side() const { return side_; }
     Mat3 turn() const { return side_.turn; }  // from the camera's frame to the side's
     // Whether there is a place around which areas grow as 1 / distance.
     bool has_pole() const { return side_.pole(); }
 
-    Vec2 bend(Vec2 n) const;
+    Vec2 distort(Vec2 n) const;
     Mat2 jacobian(Vec2 n) const;
-    void bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) const;
+    void distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) const;
 
     // The n that is seen at m, if it belongs to this side and place.
-    std::optional<Vec2> straighten(Vec2 m) const;
+    std::optional<Vec2> undistort(Vec2 m) const;
 
     // The same for k points near m0, in place; not numbers where there is none.
-    void straighten_near(Vec2 m0, int k, double* x, double* y) const;
+    void undistort_near(Vec2 m0, int k, double* x, double* y) const;
 
     // False if no place within `reach` px of x belongs to this side and place.
     bool may_show(Vec2 x, double reach) const;
@@ -59,7 +59,7 @@ class Equirectangular {
     // A box of n that holds all of this side and place that is seen in a box of pixel positions; none if nothing is.
     std::optional<Box2> side_box(Box2 x) const;
 
-    // How much longer what lies in a box of n is in the image than in the straight image, about and at most, and how
+    // How much longer what lies in a box of n is in the image than in the undistorted image, about and at most, and how
     // much larger its area.
     double stretch(Box2 n) const;
 
@@ -73,7 +73,7 @@ class Equirectangular {
     Vec2 angles_of_pixel(Vec2 x) const;
 
     double k_[6], inverse_[4];
-    CubeSide side_;
+    CubeFace side_;
     Place place_;
     Vec2 scale_;
 };

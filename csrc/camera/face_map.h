@@ -46,8 +46,8 @@ inline bool barycentrics(const FaceMap& m, Vec2 n, Barycentrics& b) {
     return std::isfinite(b.u + b.v);
 }
 
-// Whether the face covers n. One that doubles cannot tell from its rim does: between two faces that share an edge there
-// must be no gap, and each computes that edge in its own way.
+// Whether the face covers n. One that doubles cannot distinguish from its boundary does: between two faces that share
+// an edge there must be no gap, and each computes that edge in its own way.
 inline bool covers(const FaceMap& m, Vec2 n) {
     const Vec3 p = m.times(n);
     const double eps = 16 * std::numeric_limits<double>::epsilon(), x = eps * std::fabs(n.x), y = eps * std::fabs(n.y);
@@ -73,7 +73,8 @@ inline Barycentrics barycentrics_jvp(const FaceMap& m, Vec2 n, Barycentrics b, c
 }
 
 // Embree decides in float which triangle is hit, so the exact ray may pass just outside it. What was seen is the
-// triangle's nearest rim: without this, a triangle seen almost edge-on would extrapolate its colours without bound.
+// triangle's nearest boundary: without this, a triangle seen almost edge-on would extrapolate its colours without
+// bound.
 inline Barycentrics inside(Barycentrics b) {
     b.u = b.u > 0 ? b.u : 0;
     b.v = b.v > 0 ? b.v : 0;

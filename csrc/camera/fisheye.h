@@ -17,7 +17,7 @@ struct Fisheye {
 
     explicit Fisheye(const double* c) : k{c[0], c[1], c[2], c[3]} {}
 
-    Vec2 bend(Vec2 n) const {
+    Vec2 distort(Vec2 n) const {
         const double r = length(n);
         return (r > tiny ? radius(r) / r : 1) * n;
     }
@@ -29,7 +29,7 @@ struct Fisheye {
         return {g + h * n.x * n.x, h * n.x * n.y, h * n.x * n.y, g + h * n.y * n.y};
     }
 
-    void bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
+    void distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
         n_bar += transposed_times(jacobian(n), bar);
         const double r = length(n), angle = std::atan(r);
         double power = r > tiny ? (bar.x * n.x + bar.y * n.y) / r * angle : 0;
@@ -61,7 +61,7 @@ struct Fisheye {
     }
 
    private:
-    static constexpr double tiny = 1e-9;  // below it θ' is r, as far as doubles can tell
+    static constexpr double tiny = 1e-9;  // below it θ' is r, to the precision of doubles
 };
 
 }  // namespace edgegrad

@@ -30,7 +30,7 @@ double least_area_scale(const L& lens, double r) {
 
 // r in [0, fold] with lens.radius(r) = m, or the fold: Newton's steps, with bisection where they leave the bracket.
 template <RadialLens L>
-double straight_radius(const L& lens, double fold, double m) {
+double undistorted_radius(const L& lens, double fold, double m) {
     double low = 0, high = fold, r = std::min(m, fold);
     for (int i = 0; i < 64; ++i) {
         const double error = lens.radius(r) - m;
@@ -46,22 +46,22 @@ double straight_radius(const L& lens, double fold, double m) {
 
 // The solution without what is not radial.
 template <RadialLens L>
-Vec2 straighten_radial(const L& lens, const LensDisc& disc, Vec2 m) {
+Vec2 undistort_radial(const L& lens, const LensDisc& disc, Vec2 m) {
     Vec2 n = m;
-    if (disc.inverse && disc.inverse->straighten(1, &n.x, &n.y)) return n;
+    if (disc.inverse && disc.inverse->undistort(1, &n.x, &n.y)) return n;
     const double size = length(m);
-    return size > 0 ? (straight_radius(lens, disc.fold, size) / size) * m : m;
+    return size > 0 ? (undistorted_radius(lens, disc.fold, size) / size) * m : m;
 }
 
 // Newton's steps from there.
 template <RadialLens L>
-std::optional<Vec2> straighten(const L& lens, const LensDisc& disc, Vec2 m) {
+std::optional<Vec2> undistort(const L& lens, const LensDisc& disc, Vec2 m) {
     const double size = length(m);
     if (size > disc.reach) return {};
-    if (size == 0 && length(lens.bend(m)) == 0) return m;
-    Vec2 n = straighten_radial(lens, disc, m);
+    if (size == 0 && length(lens.distort(m)) == 0) return m;
+    Vec2 n = undistort_radial(lens, disc, m);
     for (int i = 0; i < 32; ++i) {
-        const Vec2 step = solve(lens.jacobian(n), m - lens.bend(n));
+        const Vec2 step = solve(lens.jacobian(n), m - lens.distort(n));
         if (!std::isfinite(step.x + step.y)) return {};
         // Near the fold a step may lead far away.
         const double far = length(step), most = 0.25 * (1 + length(n));
@@ -69,7 +69,7 @@ std::optional<Vec2> straighten(const L& lens, const LensDisc& disc, Vec2 m) {
         if (far <= 1e-14 * (1 + length(n))) break;
     }
     // What has not converged by then lies on the fold, where it is seen infinitely small.
-    if (!(length(lens.bend(n) - m) <= 1e-10 * (1 + size)) || !(length(n) < disc.fold)) return {};
+    if (!(length(lens.distort(n) - m) <= 1e-10 * (1 + size)) || !(length(n) < disc.fold)) return {};
     return n;
 }
 
@@ -87,7 +87,8 @@ constexpr double small_error = 1e-10;
 template <RadialLens L>
 [[gnu::always_inline]] inline bool chord_step(const L lens, const Mat2 inverse, Points& p) {
     for (int i = 0; i < p.count; ++i) {
-        const Vec2 m = lens.bend({p.n_x[i], p.n_y[i]}), error{p.m_x[i] - m.x, p.m_y[i] - m.y}, step = inverse * error;
+        const Vec2 m = lens.distort({p.n_x[i], p.n_y[i]}), error{p.m_x[i] - m.x, p.m_y[i] - m.y},
+                   step = inverse * error;
         p.n_x[i] += step.x, p.n_y[i] += step.y;
         p.error[i] = std::fabs(error.x) + std::fabs(error.y);
     }
@@ -131,8 +132,8 @@ double radius_of_fold(const AnyLens& lens) {
 
 }  // namespace
 
-// The disc is taken one to one, so the rim of its image is that of the disc; and a hundredth for what lies between
-// points of it.
+// The disc is taken one to one, so the lens boundary of its image is that of the disc; and a hundredth for what lies
+// between points of it.
 LensDisc disc_of(const AnyLens& lens) {
     LensDisc disc{radius_of_fold(lens), 0};
     constexpr int points = 64;
@@ -140,7 +141,7 @@ LensDisc disc_of(const AnyLens& lens) {
         const double a = 2 * M_PI * i / points;
         const Vec2 n{disc.fold * std::cos(a), disc.fold * std::sin(a)};
         disc.reach =
-            std::max(disc.reach, 1.01 * length(with_radial_lens(lens, [&](const auto& l) { return l.bend(n); })));
+            std::max(disc.reach, 1.01 * length(with_radial_lens(lens, [&](const auto& l) { return l.distort(n); })));
     }
     return disc;
 }
@@ -153,43 +154,43 @@ Vec2 folding_place(const BrownConrady& lens, const LensDisc& disc) {
     return on_circle(disc.fold, least);
 }
 
-double straight_radius(const AnyLens& lens, double fold, double m) {
-    return with_radial_lens(lens, [&](const auto& l) { return straight_radius(l, fold, m); });
+double undistorted_radius(const AnyLens& lens, double fold, double m) {
+    return with_radial_lens(lens, [&](const auto& l) { return undistorted_radius(l, fold, m); });
 }
 
-std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m) {
+std::optional<Vec2> undistort(const AnyLens& lens, const LensDisc& disc, Vec2 m) {
     if (has_sides(lens))
-        return with_side_lens(lens, std::optional<Vec2>(), [&](const auto& l) { return l.straighten(m); });
-    return with_radial_lens(lens, [&](const auto& l) { return straighten(l, disc, m); });
+        return with_side_lens(lens, std::optional<Vec2>(), [&](const auto& l) { return l.undistort(m); });
+    return with_radial_lens(lens, [&](const auto& l) { return undistort(l, disc, m); });
 }
 
 namespace {
 
 // Returns false unless the lens is radial and its table holds all of the points.
-bool straighten_by_table(const AnyLens& lens, const LensDisc& disc, int k, double* x, double* y) {
+bool undistort_by_table(const AnyLens& lens, const LensDisc& disc, int k, double* x, double* y) {
     if (!disc.inverse || k > Points::size || !with_radial_lens(lens, [](const auto& l) { return l.is_radial(); }))
         return false;
     double n_x[Points::size], n_y[Points::size];
     std::copy(x, x + k, n_x), std::copy(y, y + k, n_y);
-    if (!disc.inverse->straighten(k, n_x, n_y)) return false;
+    if (!disc.inverse->undistort(k, n_x, n_y)) return false;
     std::copy(n_x, n_x + k, x), std::copy(n_y, n_y + k, y);
     return true;
 }
 
 }  // namespace
 
-void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y) {
+void undistort_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y) {
     constexpr double nan = std::numeric_limits<double>::quiet_NaN();
-    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) return panorama->straighten_near(m0, k, x, y);
+    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) return panorama->undistort_near(m0, k, x, y);
     if (const auto* fisheye = std::get_if<WideFisheye>(&lens)) {
         for (int i = 0; i < k; ++i) {
-            const Vec2 n = fisheye->straighten({x[i], y[i]}).value_or(Vec2{nan, nan});
+            const Vec2 n = fisheye->undistort({x[i], y[i]}).value_or(Vec2{nan, nan});
             x[i] = n.x, y[i] = n.y;
         }
         return;
     }
-    if (straighten_by_table(lens, disc, k, x, y)) return;
-    const std::optional<Vec2> n0 = straighten(lens, disc, m0);
+    if (undistort_by_table(lens, disc, k, x, y)) return;
+    const std::optional<Vec2> n0 = undistort(lens, disc, m0);
     const Mat2 inverse =
         edgegrad::inverse(with_radial_lens(lens, [&](const auto& l) { return l.jacobian(n0.value_or(Vec2{})); }));
     constexpr int most_steps = 12;
@@ -208,7 +209,7 @@ void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, 
         for (int i = 0; i < p.count; ++i) {
             Vec2 n{p.n_x[i], p.n_y[i]};
             if (!(p.error[i] < small_error && length(n) < disc.fold)) {
-                n = straighten(lens, disc, {p.m_x[i], p.m_y[i]}).value_or(Vec2{nan, nan});
+                n = undistort(lens, disc, {p.m_x[i], p.m_y[i]}).value_or(Vec2{nan, nan});
             }
             x[first + i] = n.x, y[first + i] = n.y;
         }

@@ -1,6 +1,6 @@
-// What a lens does to the straight image of a pinhole: it bends normalised image coordinates n to m, and K takes m to
-// pixels. What is straight in n is a curve in m; an area grows by det ∂m/∂n. So all that is made of straight lines
-// (faces, edges, the view volume) is worked on in the straight image, K n, and samples alone are bent.
+// What a lens does to the undistorted image of a pinhole: it bends normalised image coordinates n to m, and K takes m
+// to pixels. What is straight in n is a curve in m; an area grows by det ∂m/∂n. So all that is made of straight lines
+// (faces, edges, the view volume) is worked on in the undistorted image, K n, and samples alone are bent.
 #pragma once
 
 #include <cmath>
@@ -20,24 +20,24 @@
 namespace edgegrad {
 
 // A pinhole.
-struct StraightLens {};
+struct PinholeLens {};
 
 template <class L>
 concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_bar) {
     { L::coefficients } -> std::convertible_to<int>;
-    { lens.bend(n) } -> std::same_as<Vec2>;
+    { lens.distort(n) } -> std::same_as<Vec2>;
     { lens.jacobian(n) } -> std::same_as<Mat2>;  // ∂m/∂n
-    lens.bend_vjp(n, n, n_bar, coefficients_bar);
+    lens.distort_vjp(n, n, n_bar, coefficients_bar);
 };
 
-// One that sees through the sides of a cube (cube_face.h), each of which is a window (sub_cameras.h).
+// One that sees through the sides of a cube (cube_face.h), each of which is a sub-camera (sub_cameras.h).
 template <class L>
 concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 box) {
     { lens.scale() } -> std::same_as<Vec2>;
-    { lens.side() } -> std::same_as<const CubeSide&>;
+    { lens.side() } -> std::same_as<const CubeFace&>;
     { lens.turn() } -> std::same_as<Mat3>;
     { lens.has_pole() } -> std::same_as<bool>;
-    { lens.straighten(x) } -> std::same_as<std::optional<Vec2>>;
+    { lens.undistort(x) } -> std::same_as<std::optional<Vec2>>;
     { lens.may_show(x, reach) } -> std::same_as<bool>;
     { lens.image_box(box) } -> std::same_as<Box2>;
     { lens.side_box(box) } -> std::same_as<std::optional<Box2>>;
@@ -57,7 +57,7 @@ concept RadialLens = Lens<L> && requires(const L lens, double r) {
 static_assert(RadialLens<BrownConrady> && RadialLens<Fisheye>);
 
 // A new lens is a file of its own, and a place in this list.
-using AnyLens = std::variant<StraightLens, BrownConrady, Fisheye, Equirectangular, WideFisheye>;
+using AnyLens = std::variant<PinholeLens, BrownConrady, Fisheye, Equirectangular, WideFisheye>;
 constexpr int most_coefficients = 8;  // that a camera is given
 static_assert(BrownConrady::coefficients <= most_coefficients && Fisheye::coefficients <= most_coefficients);
 constexpr int most_parameters = 10;  // of a lens: where it sees through a side, K comes first
@@ -102,12 +102,12 @@ Vec2 folding_place(const BrownConrady& lens, const LensDisc& disc);
 constexpr double greatest_radius = 30;  // 88° from the axis; what shows more sees through sides
 
 // The r in [0, fold] that the radial part of a lens takes to m, or the fold.
-double straight_radius(const AnyLens& lens, double fold, double m);
+double undistorted_radius(const AnyLens& lens, double fold, double m);
 
 // The n in the disc that is bent to m; none if there is none.
-std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m);
+std::optional<Vec2> undistort(const AnyLens& lens, const LensDisc& disc, Vec2 m);
 
 // The same for k points near m0, in place; not numbers where there is none.
-void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y);
+void undistort_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y);
 
 }  // namespace edgegrad

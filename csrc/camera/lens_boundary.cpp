@@ -16,7 +16,7 @@ template <RadialLens L>
 std::array<Vec2, most_coefficients> by_coefficients(const L& lens, Vec2 n) {
     double x[most_coefficients] = {}, y[most_coefficients] = {};
     Vec2 unused;
-    lens.bend_vjp(n, {1, 0}, unused, x), lens.bend_vjp(n, {0, 1}, unused, y);
+    lens.distort_vjp(n, {1, 0}, unused, x), lens.distort_vjp(n, {0, 1}, unused, y);
     std::array<Vec2, most_coefficients> out;
     for (int i = 0; i < most_coefficients; ++i) out[i] = {x[i], y[i]};
     return out;
@@ -42,7 +42,7 @@ std::array<double, most_coefficients> fold_by_coefficients(const L& lens, const 
 
 }  // namespace
 
-Rim::Rim(const Camera& camera) : camera_(camera) {
+LensBoundary::LensBoundary(const Camera& camera) : camera_(camera) {
     if (const auto* lens = std::get_if<BrownConrady>(&camera.lens);
         lens && (lens->p1 != 0 || lens->p2 != 0) && camera.lens_view.disc.fold < greatest_radius)
         fold_by_ = fold_by_coefficients(*lens, camera.lens_view.disc);
@@ -52,26 +52,26 @@ Rim::Rim(const Camera& camera) : camera_(camera) {
     half_ = 0.5 * (all.high - all.low);
 }
 
-Rim::Point Rim::curve_at(double angle) const {
+LensBoundary::Point LensBoundary::curve_at(double angle) const {
     const Vec2 e = direction(angle);
     Vec2 m, m_tangent;
     if (const auto* wide = std::get_if<WideFisheye>(&camera_.lens)) {
-        m = wide->rim_place(e), m_tangent = wide->rim_tangent(e);
+        m = wide->lens_boundary_point(e), m_tangent = wide->lens_boundary_tangent(e);
     } else {
         const Vec2 n = camera_.lens_view.disc.fold * e;
         with_radial_lens(camera_.lens, [&](const auto& lens) {
-            m = lens.bend(n), m_tangent = lens.jacobian(n) * (camera_.lens_view.disc.fold * turned(e));
+            m = lens.distort(n), m_tangent = lens.jacobian(n) * (camera_.lens_view.disc.fold * turned(e));
         });
     }
     return {to_pixels(camera_, m), scaled_to_pixels(camera_, m_tangent), {}};
 }
 
-std::optional<Rim::Point> Rim::at(double angle) const {
+std::optional<LensBoundary::Point> LensBoundary::at(double angle) const {
     Point p = curve_at(angle);
     const Vec2 e = direction(angle);
     p.n = camera_.lens_view.disc.fold * e;
     if (const auto* wide = std::get_if<WideFisheye>(&camera_.lens)) {
-        const std::optional<Vec2> n = wide->side().place(wide->rim_direction(e));
+        const std::optional<Vec2> n = wide->side().place(wide->lens_boundary_direction(e));
         if (!n) return {};
         p.n = *n;
     }
@@ -80,11 +80,11 @@ std::optional<Rim::Point> Rim::at(double angle) const {
 
 // Between two points a curve leaves the chord by no more than |d²x/dθ²| Δ² / 8; of an ellipse that is half the box, and
 // four times as much is generous for what decentring makes of it.
-bool Rim::box(Arc arc, Vec2& low, Vec2& high) const {
+bool LensBoundary::box(Arc arc, Vec2& low, Vec2& high) const {
     const double turn = arc.to - arc.from;
     if (const auto* wide = std::get_if<WideFisheye>(&camera_.lens)) {
         // Half the arc is the farthest that directions lie from the middle one.
-        const Vec3 middle = wide->rim_direction(direction(0.5 * (arc.from + arc.to)));
+        const Vec3 middle = wide->lens_boundary_direction(direction(0.5 * (arc.from + arc.to)));
         if (wide->side().outside(middle) > turn + 1e-9) return false;
     }
     const Vec2 a = place(arc.from), b = place(arc.to), more = 0.5 * turn * turn * half_;
@@ -93,10 +93,10 @@ bool Rim::box(Arc arc, Vec2& low, Vec2& high) const {
     return true;
 }
 
-Vec2 Rim::velocity(const Point& p, const IntrinsicsGrad& of) const {
-    Vec2 m, m_dot = bend_by_coefficients(camera_, p.n, of.distortion);
+Vec2 LensBoundary::velocity(const Point& p, const IntrinsicsGrad& of) const {
+    Vec2 m, m_dot = distort_by_coefficients(camera_, p.n, of.distortion);
     with_lens(camera_.lens, [&](const auto& lens) {
-        m = lens.bend(p.n);
+        m = lens.distort(p.n);
         if (!fold_by_) return;
         double fold_dot = 0;
         for (int i = 0; i < most_coefficients; ++i) fold_dot += (*fold_by_)[i] * of.distortion[i];
@@ -105,11 +105,11 @@ Vec2 Rim::velocity(const Point& p, const IntrinsicsGrad& of) const {
     return scaled_to_pixels(camera_, m_dot) + to_pixels_by_k(m, of.k);
 }
 
-void Rim::velocity_vjp(const Point& p, Vec2 bar, IntrinsicsGrad& intrinsics) const {
+void LensBoundary::velocity_vjp(const Point& p, Vec2 bar, IntrinsicsGrad& intrinsics) const {
     with_lens(camera_.lens, [&](const auto& lens) {
         Vec2 m_bar, n_bar;
-        to_pixels_vjp(camera_, lens.bend(p.n), bar, m_bar, intrinsics.k);
-        lens.bend_vjp(p.n, m_bar, n_bar, intrinsics.distortion);
+        to_pixels_vjp(camera_, lens.distort(p.n), bar, m_bar, intrinsics.k);
+        lens.distort_vjp(p.n, m_bar, n_bar, intrinsics.distortion);
         if (!fold_by_) return;
         const double fold_bar = dot(n_bar, p.n) / length(p.n);
         for (int i = 0; i < most_coefficients; ++i) intrinsics.distortion[i] += fold_bar * (*fold_by_)[i];

@@ -1,4 +1,4 @@
-// The rim of what a lens shows: the closed curve in the image where the lens folds or ends, beyond which there is
+// The lens boundary: the closed curve in the image where the lens folds or ends, beyond which there is
 // background. It moves with K and the coefficients c alone.
 //
 // Of the disc |n| < ρ (lens.h) it is the image of n = ρ e, with e = (cos θ, sin θ):
@@ -10,7 +10,7 @@
 //
 //     δρ = −(∂det/∂c δc) / (∂det/∂ρ)   at n*.
 //
-// A wide fisheye has m = θ' e at the angle θ of its rim. There ∂θ'/∂θ = 0, or θ is π whatever c.
+// A wide fisheye has m = θ' e at the angle θ of its boundary. There ∂θ'/∂θ = 0, or θ is π whatever c.
 #pragma once
 
 #include <array>
@@ -20,22 +20,22 @@
 
 namespace edgegrad {
 
-class Rim {
+class LensBoundary {
    public:
-    // Of a camera, or of one of its windows, with lens_view.end.
-    explicit Rim(const Camera& camera);
+    // Of a camera, or of one of its sub-cameras, with lens_view.end.
+    explicit LensBoundary(const Camera& camera);
 
     struct Point {
         Vec2 x, tangent;  // px, and dx/dθ
         Vec2 n;           // the last that is seen, in normalised image coordinates
     };
-    // None where another window shows it.
+    // None where another sub-camera shows it.
     std::optional<Point> at(double angle) const;
 
     // The pixel position.
     Vec2 place(double angle) const { return curve_at(angle).x; }
 
-    // A box of the curve between two angles; false if another window shows all of that.
+    // A box of the curve between two angles; false if another sub-camera shows all of that.
     struct Arc {
         double from, to;
     };

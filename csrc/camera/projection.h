@@ -40,13 +40,13 @@ struct Perspective {
     static double weight_vjp(double bar) { return bar; }
     static double weight_jvp(Vec3 q_dot) { return q_dot.z; }
 
-    // Direction in which a viewer looks at q.
+    // Direction from the viewer to q.
     static Vec3 view_direction(Vec3 q) { return q; }
 
     // World units that one of n spans at a depth.
     static double unit_at_depth(double z) { return z; }
 
-    // Whether the plane of a face holds the eye, as far as doubles can tell. It is then seen edge-on and covers
+    // Whether the plane of a face holds the eye, to the precision of doubles. It is then seen edge-on and covers
     // nothing, though every ray meets the plane, in the eye.
     static bool passes_through_eye(const Vec3 q[3]) {
         const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0];

@@ -12,7 +12,7 @@ RadialInverse::RadialInverse(const AnyLens& lens, double fold, double farthest) 
     const double most = std::min(farthest, reach);
     cells_per_square_ = cells / (most * most);
     const auto place = [&](int cell, double t) { return std::sqrt((cell + 0.5 * (t + 1)) / cells_per_square_); };
-    const auto h = [&](double m) { return straight_radius(lens, fold, m) / m; };
+    const auto h = [&](double m) { return undistorted_radius(lens, fold, m) / m; };
     std::array<double, terms> node;
     for (int j = 0; j < terms; ++j) node[j] = std::cos(M_PI * (j + 0.5) / terms);  // Chebyshev's
     rows_.back().fill(nan);
@@ -38,7 +38,7 @@ RadialInverse::RadialInverse(const AnyLens& lens, double fold, double farthest) 
     }
 }
 
-EDGEGRAD_VECTORIZED bool RadialInverse::straighten(int k, double* x, double* y) const {
+EDGEGRAD_VECTORIZED bool RadialInverse::undistort(int k, double* x, double* y) const {
     const double scale = cells_per_square_;
     const auto* rows = rows_.data();
     int64_t outside = 0;

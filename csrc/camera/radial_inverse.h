@@ -1,4 +1,4 @@
-// Which place of the straight image a radial lens shows, by a table.
+// Which place of the undistorted image a radial lens shows, by a table.
 #pragma once
 
 #include <array>
@@ -15,7 +15,7 @@ class RadialInverse {
     RadialInverse(const AnyLens& lens, double fold, double farthest);
 
     // Replaces k places m by n. False: some lie outside the table, or near the fold, where h is no polynomial.
-    bool straighten(int k, double* x, double* y) const;
+    bool undistort(int k, double* x, double* y) const;
 
    private:
     static constexpr int cells = 128, terms = 8;

@@ -15,7 +15,7 @@ Box2 frame(const Camera& camera, double reach) {
 }
 
 template <SideLens L>
-Camera window(const Camera& camera, const L& lens, Box2 n) {
+Camera sub_camera(const Camera& camera, const L& lens, Box2 n) {
     Camera out = camera;
     out.turn = lens.turn();
     for (int i = 0; i < 3; ++i) out.R.row[i] = transposed_times(camera.R, out.turn.row[i]);
@@ -50,26 +50,27 @@ std::vector<Camera> sides_of(const Camera& camera) {
     const Box2 whole{{-1, -1}, {1, 1}};
     std::vector<Camera> out;
     if (const Equirectangular* lens = panorama(camera)) {
-        for (const auto& side : cube_sides) out.push_back(window(camera, Equirectangular(lens->K(), side, {}), whole));
+        for (const auto& side : cube_faces)
+            out.push_back(sub_camera(camera, Equirectangular(lens->K(), side, {}), whole));
         return out;
     }
     if (const auto* fisheye = std::get_if<WideFisheye>(&camera.lens)) {
-        for (const auto& side : cube_sides)
+        for (const auto& side : cube_faces)
             if (const WideFisheye lens = fisheye->through(side); lens.side_box(frame(camera, 1)))
-                out.push_back(window(camera, lens, whole));
-        if (out.empty()) out.push_back(window(camera, *fisheye, whole));  // the image lies beyond the rim
+                out.push_back(sub_camera(camera, lens, whole));
+        if (out.empty()) out.push_back(sub_camera(camera, *fisheye, whole));  // the image lies beyond the lens boundary
         return out;
     }
     return {camera};
 }
 
-std::vector<Camera> windows_of(const Camera& camera, double reach) {
+std::vector<Camera> sub_cameras_of(const Camera& camera, double reach) {
     const Box2 image = frame(camera, reach);
     std::vector<Camera> out;
     if (const auto* fisheye = std::get_if<WideFisheye>(&camera.lens)) {
-        for (const auto& side : cube_sides) {
+        for (const auto& side : cube_faces) {
             const WideFisheye lens = fisheye->through(side);
-            if (const auto box = lens.side_box(image)) out.push_back(window(camera, lens, *box));
+            if (const auto box = lens.side_box(image)) out.push_back(sub_camera(camera, lens, *box));
         }
         return out;
     }
@@ -92,9 +93,9 @@ std::vector<Camera> windows_of(const Camera& camera, double reach) {
                 {across == first ? -infinite : M_PI * (across - 1),
                  over == over_first ? -infinite : M_PI * (over - 0.5)},
                 {across == last ? infinite : M_PI * (across + 1), over == over_last ? infinite : M_PI * (over + 0.5)}};
-            for (const auto& side : cube_sides) {
+            for (const auto& side : cube_faces) {
                 const Equirectangular of_side(lens->K(), side, place);
-                if (const auto box = of_side.side_box(image)) out.push_back(window(camera, of_side, *box));
+                if (const auto box = of_side.side_box(image)) out.push_back(sub_camera(camera, of_side, *box));
             }
         }
     }
@@ -109,8 +110,8 @@ bool is_too_wide(const Camera& camera) {
     return !(most <= 2 * M_PI * most_turns);
 }
 
-void add_intrinsics(const Camera& window, const IntrinsicsGrad& bar, double* K, double* distortion) {
-    const bool side = has_sides(window.lens);
+void add_intrinsics(const Camera& sub_camera, const IntrinsicsGrad& bar, double* K, double* distortion) {
+    const bool side = has_sides(sub_camera.lens);
     const double *of_k = side ? bar.distortion : bar.k, *of_lens = bar.distortion + (side ? 6 : 0);
     if (K)
         for (int i = 0; i < 6; ++i) K[i] += of_k[i];
@@ -118,9 +119,9 @@ void add_intrinsics(const Camera& window, const IntrinsicsGrad& bar, double* K, 
         for (int i = 0; i < (side ? most_parameters - 6 : most_coefficients); ++i) distortion[i] += of_lens[i];
 }
 
-IntrinsicsGrad window_intrinsics(const Camera& window, const double* K, const double* distortion) {
+IntrinsicsGrad sub_camera_intrinsics(const Camera& sub_camera, const double* K, const double* distortion) {
     IntrinsicsGrad out;
-    const bool side = has_sides(window.lens);
+    const bool side = has_sides(sub_camera.lens);
     if (K) std::copy(K, K + 6, side ? out.distortion : out.k);
     if (distortion)
         std::copy(distortion, distortion + (side ? most_parameters - 6 : most_coefficients),

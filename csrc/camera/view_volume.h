@@ -10,7 +10,7 @@
 
 namespace edgegrad {
 
-// The rectangle of the straight image that holds all that is visible, the image widened by the radius of the pixel
+// The rectangle of the undistorted image that holds all that is visible, the image widened by the radius of the pixel
 // filter, as four planes n · q + d ≥ 0 through the camera and the rectangle's sides. Whatever lies inside all four is
 // in front of the camera (adding opposite planes gives Z · width ≥ 0), so no near plane is needed.
 struct ViewVolume {
@@ -20,7 +20,7 @@ struct ViewVolume {
     double least[4];  // of the distance to each plane: zero, or what is greater, where the plane belongs to a neighbour
 
     ViewVolume(const Camera& c, double margin) : low{-margin, -margin}, high{c.width + margin, c.height + margin} {
-        if (!c.is_straight()) low = c.lens_view.low, high = c.lens_view.high;
+        if (!c.is_undistorted()) low = c.lens_view.low, high = c.lens_view.high;
         const double bound[4] = {low.x, high.x, low.y, high.y};
         for (int i = 0; i < 4; ++i) {
             const double* row = c.k + (i < 2 ? 0 : 3);

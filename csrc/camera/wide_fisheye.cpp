@@ -9,7 +9,7 @@ namespace {
 
 constexpr int steps = 512;
 
-double rim_of(const Fisheye& fisheye) {
+double lens_boundary_of(const Fisheye& fisheye) {
     const std::vector<double> turns = fisheye.turning_angles(M_PI);
     return turns.empty() ? M_PI : turns.front();
 }
@@ -28,10 +28,10 @@ double angle_between(const Fisheye& fisheye, double low, double high, double m) 
     return angle;
 }
 
-std::vector<double> angles_at_steps(const Fisheye& fisheye, double rim, double reach) {
+std::vector<double> angles_at_steps(const Fisheye& fisheye, double lens_boundary, double reach) {
     std::vector<double> out{0};
-    for (int i = 1; i < steps; ++i) out.push_back(angle_between(fisheye, out.back(), rim, reach * i / steps));
-    out.push_back(rim);
+    for (int i = 1; i < steps; ++i) out.push_back(angle_between(fisheye, out.back(), lens_boundary, reach * i / steps));
+    out.push_back(lens_boundary);
     return out;
 }
 
@@ -39,17 +39,17 @@ std::vector<double> angles_at_steps(const Fisheye& fisheye, double rim, double r
 
 WideFisheye::WideFisheye(const double* K, const Fisheye& fisheye)
     : fisheye_(fisheye),
-      side_(cube_sides[5]),
-      rim_(rim_of(fisheye)),
-      reach_(fisheye.at_angle(rim_)),
-      angles_(std::make_shared<const std::vector<double>>(angles_at_steps(fisheye, rim_, reach_))) {
+      side_(cube_faces[5]),
+      lens_boundary_(lens_boundary_of(fisheye)),
+      reach_(fisheye.at_angle(lens_boundary_)),
+      angles_(std::make_shared<const std::vector<double>>(angles_at_steps(fisheye, lens_boundary_, reach_))) {
     std::copy(K, K + 6, k_);
     const double det = k_[0] * k_[4] - k_[1] * k_[3], size = std::sqrt(std::fabs(det));
     inverse_[0] = k_[4] / det, inverse_[1] = -k_[1] / det, inverse_[2] = -k_[3] / det, inverse_[3] = k_[0] / det;
     scale_ = {size, det < 0 ? -size : size};
 }
 
-WideFisheye WideFisheye::through(const CubeSide& side) const {
+WideFisheye WideFisheye::through(const CubeFace& side) const {
     WideFisheye out = *this;
     out.side_ = side;
     return out;
@@ -83,7 +83,7 @@ Vec2 WideFisheye::scaled(Vec2 m) const {
     return {(k_[0] * m.x + k_[1] * m.y) / scale_.x, (k_[3] * m.x + k_[4] * m.y) / scale_.y};
 }
 
-Vec2 WideFisheye::bend(Vec2 n) const {
+Vec2 WideFisheye::distort(Vec2 n) const {
     const Polar p = polar(side_.direction(n));
     return scaled(fisheye_.at_angle(p.angle) * p.along) + Vec2{k_[2] / scale_.x, k_[5] / scale_.y};
 }
@@ -93,7 +93,7 @@ Vec2 WideFisheye::bend(Vec2 n) const {
 Mat2 WideFisheye::jacobian(Vec2 n) const {
     const Vec3 d = side_.direction(n);
     const Polar p = polar(d);
-    if (!(p.angle < rim_)) return {0, 0, 0, 0};
+    if (!(p.angle < lens_boundary_)) return {0, 0, 0, 0};
     const auto column = [&](Vec3 dot) {
         const Vec2 across{dot.x, dot.z};
         if (!(p.sine > 0)) return scaled((-1 / d.y) * across);
@@ -106,7 +106,7 @@ Mat2 WideFisheye::jacobian(Vec2 n) const {
     return {x.x, y.x, x.y, y.y};
 }
 
-void WideFisheye::bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
+void WideFisheye::distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
     n_bar += transposed_times(jacobian(n), bar);
     const Polar p = polar(side_.direction(n));
     const Vec2 m = fisheye_.at_angle(p.angle) * p.along;
@@ -126,10 +126,10 @@ double WideFisheye::angle_above(double m) const {
     return (*angles_)[int(std::clamp(i, 0.0, double(steps)))];
 }
 double WideFisheye::angle(double m) const {
-    return m < reach_ ? angle_between(fisheye_, angle_below(m), angle_above(m), m) : rim_;
+    return m < reach_ ? angle_between(fisheye_, angle_below(m), angle_above(m), m) : lens_boundary_;
 }
 
-std::optional<Vec2> WideFisheye::straighten(Vec2 m) const {
+std::optional<Vec2> WideFisheye::undistort(Vec2 m) const {
     const Vec2 at = m_of_pixel({scale_.x * m.x, scale_.y * m.y});
     const double size = length(at);
     if (!(size < reach_)) return {};
@@ -152,7 +152,7 @@ bool WideFisheye::may_show(Vec2 x, double reach) const {
 Box2 WideFisheye::image_box(Box2 n) const {
     const Box2 a = side_.angles(n);
     const auto radius = [&](double latitude) {
-        return fisheye_.at_angle(std::clamp(latitude + 0.5 * M_PI, 0.0, rim_));
+        return fisheye_.at_angle(std::clamp(latitude + 0.5 * M_PI, 0.0, lens_boundary_));
     };
     const Box2 m = sector_box(radius(a.low.y), radius(a.high.y), a.low.x, a.high.x);
     Box2 out = Box2::empty();
@@ -188,11 +188,13 @@ std::optional<Box2> WideFisheye::side_box(Box2 x) const {
 double WideFisheye::stretch(Box2 n) const {
     const Polar p = polar(side_.direction(middle(n)));
     const double least = has_pole() ? 0.5 * farthest_radius(n) : 1e-9;
-    return std::max(1.0, fisheye_.at_angle(std::min(p.angle, rim_)) / std::max(p.sine, least));
+    return std::max(1.0, fisheye_.at_angle(std::min(p.angle, lens_boundary_)) / std::max(p.sine, least));
 }
 
-Vec2 WideFisheye::rim_place(Vec2 e) const { return scaled(reach_ * e) + Vec2{k_[2] / scale_.x, k_[5] / scale_.y}; }
-Vec2 WideFisheye::rim_tangent(Vec2 e) const { return scaled(reach_ * Vec2{-e.y, e.x}); }
+Vec2 WideFisheye::lens_boundary_point(Vec2 e) const {
+    return scaled(reach_ * e) + Vec2{k_[2] / scale_.x, k_[5] / scale_.y};
+}
+Vec2 WideFisheye::lens_boundary_tangent(Vec2 e) const { return scaled(reach_ * Vec2{-e.y, e.x}); }
 
 bool WideFisheye::ends_in(Box2 x) const {
     double farthest = 0;

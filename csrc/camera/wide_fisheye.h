@@ -16,7 +16,8 @@ namespace edgegrad {
 //
 //     m = θ' (sin λ, cos λ)    θ' = θ (1 + k1 θ² + …)    x = K (m, 1).
 //
-// It ends at the rim, where θ' is greatest, or where θ is π: there all of a circle is the one direction behind.
+// It ends at the lens boundary, where θ' is greatest, or where θ is π: there all of a circle is the one direction
+// behind.
 //
 // Parameters are K, for the reason that a panorama has, and k1 to k4.
 class WideFisheye {
@@ -26,32 +27,32 @@ class WideFisheye {
     // The side ahead.
     WideFisheye(const double* K, const Fisheye& fisheye);
     // Another one of the same lens.
-    WideFisheye through(const CubeSide& side) const;
+    WideFisheye through(const CubeFace& side) const;
 
     Vec2 scale() const { return scale_; }
-    const CubeSide& side() const { return side_; }
-    Mat3 turn() const;                   // from the camera's frame to the side's
-    double rim() const { return rim_; }  // radians
+    const CubeFace& side() const { return side_; }
+    Mat3 turn() const;                                       // from the camera's frame to the side's
+    double lens_boundary() const { return lens_boundary_; }  // radians
     // Whether the antipode of the axis lies ahead, around which areas grow as 1 / distance.
     bool has_pole() const { return side_.turn.row[2].y > 0; }
 
-    Vec2 bend(Vec2 n) const;
-    Mat2 jacobian(Vec2 n) const;  // zero beyond the rim
-    void bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const;
+    Vec2 distort(Vec2 n) const;
+    Mat2 jacobian(Vec2 n) const;  // zero beyond the lens boundary
+    void distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const;
 
     // As those of Equirectangular.
-    std::optional<Vec2> straighten(Vec2 m) const;
+    std::optional<Vec2> undistort(Vec2 m) const;
     bool may_show(Vec2 x, double reach) const;
     Box2 image_box(Box2 n) const;
     std::optional<Box2> side_box(Box2 x) const;
     double stretch(Box2 n) const;
 
-    // The m of a point of the rim, its derivative by the angle of e in the image, and its direction.
-    Vec2 rim_place(Vec2 e) const;
-    Vec2 rim_tangent(Vec2 e) const;
-    Vec3 rim_direction(Vec2 e) const { return direction_of(rim_, e); }
+    // The m of a point of the lens boundary, its derivative by the angle of e in the image, and its direction.
+    Vec2 lens_boundary_point(Vec2 e) const;
+    Vec2 lens_boundary_tangent(Vec2 e) const;
+    Vec3 lens_boundary_direction(Vec2 e) const { return direction_of(lens_boundary_, e); }
 
-    // Whether some of a box of pixel positions lies beyond the rim.
+    // Whether some of a box of pixel positions lies beyond the lens boundary.
     bool ends_in(Box2 x) const;
 
    private:
@@ -64,16 +65,16 @@ class WideFisheye {
     static Vec3 direction_of(double angle, Vec2 along);
     Vec2 m_of_pixel(Vec2 x) const;
     Vec2 scaled(Vec2 m) const;  // K m over the scale
-    // The angle at which |m| is such; the rim beyond. And angles below and above it, at once.
+    // The angle at which |m| is such; the lens boundary beyond. And angles below and above it, at once.
     double angle(double m) const;
     double angle_below(double m) const;
     double angle_above(double m) const;
 
     double k_[6], inverse_[4];
     Fisheye fisheye_;
-    CubeSide side_;
+    CubeFace side_;
     Vec2 scale_;
-    double rim_, reach_;                                 // θ there, and θ'
+    double lens_boundary_, reach_;                       // θ there, and θ'
     std::shared_ptr<const std::vector<double>> angles_;  // at equal steps of |m| up to the reach
 };
 

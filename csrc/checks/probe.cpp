@@ -23,7 +23,7 @@ void shade_at(const SceneView<T>& scene, const Camera& camera, int64_t n, const 
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
         Barycentrics b;
         barycentrics(face_map(camera, corner),
-                     normalised(camera, straighten(camera, {points[2 * i], points[2 * i + 1]})), b);
+                     normalised(camera, undistort(camera, {points[2 * i], points[2 * i + 1]})), b);
         shade<0>(scene, faces[i], b, radiance + i * scene.channels);
     }
 }
@@ -33,14 +33,14 @@ void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, co
                   const double* points, const double* radiance_bar, const Gradients& grad) {
     Team team(1);
     const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
-    ChunkGrad chunk;
+    LocalGradients chunk;
     chunk.q.prepare(3, 1), chunk.uvs.prepare(2, 1);
     chunk.colors.prepare(scene.channels, 1), chunk.texels.prepare(scene.channels, 1);
     CornerGrad rows;
     for (int64_t i = 0; i < n; ++i) {
         const int32_t* v = scene.faces + 3 * int64_t(faces[i]);
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-        const Vec2 n = normalised(camera, straighten(camera, {points[2 * i], points[2 * i + 1]}));
+        const Vec2 n = normalised(camera, undistort(camera, {points[2 * i], points[2 * i + 1]}));
         const FaceMap map = face_map(camera, corner);
         Barycentrics b;
         barycentrics(map, n, b);

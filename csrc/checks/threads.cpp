@@ -124,9 +124,9 @@ struct Lit {
         LitMesh mesh;
         mesh.faces = view.n_faces, mesh.has_material = true;
         scene.meshes = {mesh};
-        Lamp lamp;
-        lamp.kind = Lamp::Kind::point, lamp.position = 2, lamp.intensity = 3, lamp.eps = 1e-7;
-        scene.lamps = {lamp};
+        Light light;
+        light.kind = Light::Kind::point, light.position = 2, light.intensity = 3, light.eps = 1e-7;
+        scene.lights = {light};
         scene.faces = view.faces, scene.verts = 0, scene.eye = 1, scene.perspective = camera.perspective;
         scene.channels = channels, scene.radius = 4;
     }

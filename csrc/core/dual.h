@@ -8,7 +8,7 @@
 
 namespace edgegrad {
 
-// Beside those of Dual.
+// Overloads next to those of Dual.
 using std::cos;
 using std::log2;
 using std::sqrt;

@@ -1,6 +1,6 @@
 // Loops over OpenMP's threads. A call of the kernel is one parallel region, and a loop is a task for each thread.
 // Regions of `omp for` would wait at each loop's end until all threads had a processor; a call waits for that once, and
-// a loop for tasks that began. Beside busy processes this halves the time of a step (docs/performance.md).
+// a loop for tasks that began. Next to busy processes this halves the time of a step (docs/performance.md).
 #pragma once
 
 #include <algorithm>
@@ -50,7 +50,7 @@ class Team {
         });
     }
     // Calls body(k, first, last) for the blocks k of 0 … n − 1. The size of a block is fixed, so that sums over blocks
-    // are rounded alike at any number of threads.
+    // are rounded equally at any number of threads.
     static constexpr int64_t block = 4096;
     static int64_t blocks(int64_t n) { return (n + block - 1) / block; }
     template <class Body>
@@ -58,7 +58,7 @@ class Team {
         each(blocks(n), [&](int64_t k) { body(k, k * block, std::min(n, (k + 1) * block)); });
     }
     // Returns what body(first, last) returns for each block, in their order. Each value is made on the thread's own
-    // stack: threads that write beside one another in an array wait for each other's caches.
+    // stack: threads that write next to one another in an array wait for each other's caches.
     template <class Body>
     auto of_blocks(int64_t n, Body body) {
         std::vector<decltype(body(n, n))> out(blocks(n));

@@ -1,4 +1,4 @@
-// Seconds between two looks.
+// Seconds between two readings.
 #pragma once
 
 #include <chrono>

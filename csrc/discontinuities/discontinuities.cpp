@@ -32,10 +32,10 @@ struct Family {
     int64_t count() const { return end - first; }
 };
 
-// A face with the lines that cross it, where the loss looks.
+// A face with the lines that cross it, where the adjoint is not zero.
 struct LinedFace {
     int32_t face;
-    double spacing;  // px of the straight image
+    double spacing;  // px of the undistorted image
     Vec2 low, high;  // the box of what is in view
     Family horizontal, vertical;
     int64_t before = 0;  // lines of the faces before it
@@ -118,16 +118,17 @@ class StepLines {
 }  // namespace
 
 template <class T>
-void add_steps(const BackwardView<T>& view, const Contraction& contraction, Destination& to, BackwardProfile& profile) {
+void add_steps(const BackwardView<T>& view, const Accumulation& accumulation, GradientSink& to,
+               BackwardProfile& profile) {
     Stopwatch watch;
     const StepLines<T> lines(view);
     profile.step_lines = lines.count();
     profile.step[0] += watch.lap();
     if (view.options.dry || lines.count() == 0) return;
     const uint64_t seed = hash(view.options.seed, 7, gradient_stream);
-    view.scatter.add(lines.count(), to, profile.step, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(lines.count(), to, profile.step, [&](int64_t first, int64_t last, LocalGradients& grad) {
         StepSource<T> source(view);
-        const std::unique_ptr<CurveContraction> to_chunk = contract_curves(view, contraction, grad);
+        const std::unique_ptr<CurveAccumulation> to_chunk = accumulate_curves(view, accumulation, grad);
         CurveSamples samples(view, source, *to_chunk);
         StepFinder<T> finder(view);
         lines.each(first, last, [&](const LinedFace& face, Vec2 a, Vec2 b, bool vertical, int64_t line) {
@@ -142,7 +143,7 @@ void add_steps(const BackwardView<T>& view, const Contraction& contraction, Dest
     });
 }
 
-template void add_steps(const BackwardView<float>&, const Contraction&, Destination&, BackwardProfile&);
-template void add_steps(const BackwardView<double>&, const Contraction&, Destination&, BackwardProfile&);
+template void add_steps(const BackwardView<float>&, const Accumulation&, GradientSink&, BackwardProfile&);
+template void add_steps(const BackwardView<double>&, const Accumulation&, GradientSink&, BackwardProfile&);
 
 }  // namespace edgegrad

@@ -1,5 +1,5 @@
-// The boundary term of steps within faces: of what is cut out (rays/alpha_mask.h), and of borders between texels where
-// the nearest one is taken.
+// The boundary term of steps within faces: of what is alpha-tested (rays/alpha_mask.h), and of borders between texels
+// where the nearest one is taken.
 #pragma once
 
 #include "accumulate/accumulation.h"
@@ -12,6 +12,7 @@ constexpr int64_t lined_face_bytes = 3 * 104;
 
 // Adds what lines find on the faces in view, GradientOptions::step_spacing apart; see add_boundary.
 template <class T>
-void add_steps(const BackwardView<T>& view, const Contraction& contraction, Destination& to, BackwardProfile& profile);
+void add_steps(const BackwardView<T>& view, const Accumulation& accumulation, GradientSink& to,
+               BackwardProfile& profile);
 
 }  // namespace edgegrad

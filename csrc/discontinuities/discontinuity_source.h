@@ -1,4 +1,4 @@
-// Steps within faces as a source of curves: rims of cut-outs, and borders of nearest texels.
+// Steps within faces as a source of curves: alpha edges, and borders of nearest texels.
 //
 // Lines at a spacing Δ, horizontal and vertical, each family with one random shift, meet the curve F = 0 in points
 // (Crofton). With n = ∇F / |∇F|,
@@ -35,7 +35,7 @@ class StepSource {
         FaceMap map;
         Barycentrics b, side[2], slope;  // slope: ∂F/∂b
         Vec2 by_n;                       // ∂F/∂n
-        double scale;                    // |n_x| / |∇F| or |n_y| / |∇F|, in the straight image
+        double scale;                    // |n_x| / |∇F| or |n_y| / |∇F|, in the undistorted image
     };
 
     explicit StepSource(const BackwardView<T>& view) : view_(view) {}
@@ -60,9 +60,9 @@ class StepSource {
             const double moved = (k ? -curve.side : curve.side) / (slope.u * slope.u + slope.v * slope.v);
             sample.side[k] = {sample.b.u + moved * slope.u, sample.b.v + moved * slope.v};
         }
-        if (curve.is_rim) {
-            // The ray goes by on the side where the face is cut out: a neighbour that has the rim in common, where it
-            // runs along their edge, is cut out there too.
+        if (curve.is_alpha_edge) {
+            // The ray goes by on the side where the face is alpha-tested: a neighbour that has the alpha edge in
+            // common, where it runs along their edge, is alpha-tested there too.
             constexpr double aside = 1e-6;  // px
             sample.sight = normalised(view_.camera, curve.u + (-aside / std::sqrt(squared)) * gradient);
         } else {
@@ -81,7 +81,7 @@ class StepSource {
 
     SampleSurfaces surfaces(const Sample& sample) const {
         const SurfacePoint there{sample.face, sample.side[0], sample.point.z};
-        if (sample.crossing.is_rim) return {{there, sample.behind}};
+        if (sample.crossing.is_alpha_edge) return {{there, sample.behind}};
         return {{there, {sample.face, sample.side[1], sample.point.z}}};
     }
 
@@ -116,7 +116,7 @@ class StepSource {
         return {sample.scale * sample.area_scale * F_dot, 0};
     }
 
-    void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) const {
+    void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) const {
         const StepCrossing& crossing = sample.crossing;
         const double F_bar = sample.scale * sample.area_scale * jumps.first;
         if (grad.q.is_wanted()) {
@@ -143,11 +143,11 @@ class StepSource {
     }
 
     void cast() {}
-    void finish(ChunkGrad&) {}
+    void finish(LocalGradients&) {}
 
    private:
     static double dot(Vec2 a, Vec2 b) { return a.x * b.x + a.y * b.y; }
-    static bool is_of_alpha(const StepCrossing& c) { return c.is_rim && c.side == 0; }
+    static bool is_of_alpha(const StepCrossing& c) { return c.is_alpha_edge && c.side == 0; }
     int32_t vertex_of(int32_t face, int corner) const { return view_.scene.faces[3 * int64_t(face) + corner]; }
     int32_t uv_row(int32_t face, int corner) const { return view_.scene.uv_corners[3 * int64_t(face) + corner]; }
     Vec2 uv(int32_t face, int corner) const {

@@ -15,8 +15,9 @@ struct GradientOptions {
     uint64_t seed = 0;
     bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary = true;
-    bool intrinsics = true;  // whether they may move; where boundary does count, the rim of what a lens shows then does
-    bool steps = true;       // whether what moves steps within faces counts
+    bool intrinsics =
+        true;           // whether they may move; where boundary does count, the border of what a lens shows then does
+    bool steps = true;  // whether what moves steps within faces counts
     double step_spacing = 1;  // px between the lines that find them
     bool lit = false;         // whether samples are shaded by lights, at several times the cost
     bool dry = false;         // only count the samples
@@ -29,15 +30,15 @@ struct BackwardProfile {
     int64_t surface_samples = 0, edge_samples = 0;
     int64_t surface_wanted = 0, edge_wanted = 0;              // default samples before the budget (budget.h)
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // curves in view
-    double rim = 0;                                           // px in view of that of a lens
+    double lens_boundary = 0;                                 // px in view of that of a lens
     int64_t step_lines = 0;                                   // that look for steps within faces
     int64_t shadow_samples = 0;
-    double view = 0;                 // vertices in camera coordinates, where the loss looks
+    double view = 0;                 // vertices in camera coordinates, where the adjoint is not zero
     double measure = 0, curves = 0;  // triangles and curves laid end to end
     double surface[2] = {0, 0}, edge[2] = {0, 0}, step[2] = {0, 0};  // samples with their rays; adding what they found
     double world = 0;                                                // from camera coordinates to the user's arrays
 
-    // Of another window of the camera.
+    // Of another sub-camera of the camera.
     BackwardProfile& operator+=(const BackwardProfile& o);
 };
 
@@ -53,10 +54,10 @@ struct BackwardInput {
     // (F,): faces that look as a texture says, which the scene's own colours need not; null: none.
     const uint8_t* detailed = nullptr;
     // (F,): faces that one sees through, so that they hide no curve; null: none.
-    const uint8_t* panes = nullptr;
+    const uint8_t* transparent = nullptr;
     // (H, W), above zero: how much records are to look at each pixel, for want of an adjoint; null: the same
     // everywhere.
-    const T* looks = nullptr;
+    const T* importance_map = nullptr;
 };
 
 // The geometry that the terms of a derivative need.

@@ -26,7 +26,7 @@ class ImageHits {
         : parts_(parts), at_(scene.n_verts), share_(2 * parts.size()) {
         team.each_block(scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t v = first; v < last; ++v)
-                at_[v] = camera.is_straight() && !vertices.outcode[v] &&
+                at_[v] = camera.is_undistorted() && !vertices.outcode[v] &&
                                  occlusion.hides_around(vertices.x[v], vertices.q[v].z)
                              ? behind
                              : 0;
@@ -56,7 +56,7 @@ class ImageHits {
             count();
         });
         team.each_block(scene.n_faces, [&](int64_t k, int64_t first, int64_t last) {
-            // Where no face of a part was hit there is no rim.
+            // Where no face of a part was hit there is no border.
             if (const int64_t part = parts_.of_block(k); part >= 0 && hits[2 * part] + hits[2 * part + 1] == 0) return;
             for (int64_t f = first; f < last; ++f) {
                 const int32_t* v = scene.faces + 3 * f;
@@ -64,7 +64,7 @@ class ImageHits {
                     return std::atomic_ref(at_[v[i]]).load(std::memory_order_relaxed) & hit;
                 };
                 const int n = is_hit(0) + is_hit(1) + is_hit(2);
-                if (n == 1 || n == 2) mark(v, rim);
+                if (n == 1 || n == 2) mark(v, border);
             }
         });
         team.each_block(parts_.size(), [&](int64_t, int64_t first, int64_t last) {
@@ -79,14 +79,14 @@ class ImageHits {
     bool at(int64_t vertex) const { return at_[vertex] & hit; }
 
     // What the corners of a face say together: `missed`: none is of a face that was hit; `partly`: one is, or of a
-    // neighbour of such a face; `whole`: all are of faces that were hit; `clear`: and no face beside it has others.
+    // neighbour of such a face; `whole`: all are of faces that were hit; `clear`: and no face next to it has others.
     struct Face {
         bool missed, partly, whole, clear;
     };
     Face of(const int32_t* v) const {
         const uint8_t a = at_[v[0]], b = at_[v[1]], c = at_[v[2]];
-        return {((a | b | c) & hit) == 0, ((a | b | c) & (hit | rim)) != 0, (a & b & c & hit) != 0,
-                !((a | b | c) & rim)};
+        return {((a | b | c) & hit) == 0, ((a | b | c) & (hit | border)) != 0, (a & b & c & hit) != 0,
+                !((a | b | c) & border)};
     }
 
     // Whether the corners of a face lie inside the view, behind all that was hit around them (OcclusionHint), and it is
@@ -116,9 +116,9 @@ class ImageHits {
 
    private:
     // Of a vertex: of a face that was hit; of a face that has such vertices and others; behind all around it.
-    static constexpr uint8_t hit = 1, rim = 2, behind = 4;
+    static constexpr uint8_t hit = 1, border = 2, behind = 4;
     static constexpr double some = 1.0 / 16;
-    static constexpr int enough = 64;  // faces that tell which sides of a part are visible
+    static constexpr int enough = 64;  // faces that say which sides of a part are visible
     const Parts& parts_;
     Array<uint8_t> at_;
     std::vector<float> share_;  // by part and side: of the faces of the part that were hit; 1 where too few were

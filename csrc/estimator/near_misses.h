@@ -17,13 +17,13 @@ constexpr double passed_by[] = {2, 0.5, 1.0 / 8, 1.0 / 32};
 // Calls found(face) for each face that they meet, and returns that of the ray at n itself; −1: none. `error` is the way
 // across a border of faces that runs by, as long as floats may err.
 template <class T, class Found>
-int32_t each_beside(const BackwardView<T>& view, Vec2 n, Vec2 error, std::span<const int32_t> ignored, Found found) {
+int32_t each_near_miss(const BackwardView<T>& view, Vec2 n, Vec2 error, std::span<const int32_t> ignored, Found found) {
     constexpr int rays = 1 + int(std::size(passed_by));
     CameraRays cast(view.frame);
     cast.n_x[0] = n.x, cast.n_y[0] = n.y, cast.count = rays;
     for (int i = 1; i < rays; ++i) {
-        const Vec2 beside = n + passed_by[i - 1] * error;
-        cast.n_x[i] = beside.x, cast.n_y[i] = beside.y;
+        const Vec2 miss = n + passed_by[i - 1] * error;
+        cast.n_x[i] = miss.x, cast.n_y[i] = miss.y;
     }
     std::span<const int32_t> all[rays];
     std::fill(std::begin(all), std::end(all), ignored);

@@ -12,7 +12,7 @@ EDGEGRAD_VECTORIZED void place_in_pixel(const Camera& camera, const Filter& filt
         const double dx = n_x[i], dy = n_y[i];
         n_x[i] = n0.x + (a * dx + b * dy), n_y[i] = n0.y + (c * dx + d * dy);
     }
-    if (!camera.is_straight()) straighten_near(camera.lens, camera.lens_view.disc, n0, n, n_x, n_y);
+    if (!camera.is_undistorted()) undistort_near(camera.lens, camera.lens_view.disc, n0, n, n_x, n_y);
 }
 
 EDGEGRAD_VECTORIZED void PixelRays::append(int x, int y, int first, int n, CameraRays& rays) const {

@@ -31,7 +31,7 @@ Array<T> adjoint_at_vertices(const FilteredAdjoint<T>& filtered, const VertexVie
 
 // Adds cotangents of places in the image (V, 2) to those of camera coordinates and of K.
 template <class T>
-void add_places(const BackwardView<T>& view, const Array<double>& x_bar, Destination& to) {
+void add_places(const BackwardView<T>& view, const Array<double>& x_bar, GradientSink& to) {
     const auto intrinsics = view.team.of_blocks(view.scene.n_verts, [&](int64_t first, int64_t last) {
         IntrinsicsGrad sum;
         for (int64_t v = first; v < last; ++v) {

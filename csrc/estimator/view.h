@@ -32,8 +32,8 @@ struct BackwardView {
     Team& team;
     Scatter& scatter;
     const CameraFrame& frame;
-    const SeenThrough* cut_outs;  // null: there are none
-    const uint8_t* panes;         // BackwardInput::panes
+    const AlphaTest* alpha_masks;  // null: there are none
+    const uint8_t* transparent;    // BackwardInput::transparent faces
     const OcclusionHint& occlusion;
     const ImageHits* hits;           // null where neither term asks
     const uint8_t* detailed;         // (F,), null: see BackwardInput
@@ -56,7 +56,7 @@ std::array<Vec3, 3> corners_of(const BackwardView<T>& view, int64_t face) {
     return {q[v[0]], q[v[1]], q[v[2]]};
 }
 
-// Whether the filter of a pixel reaches y, in camera coordinates, and what is there belongs to this window.
+// Whether the filter of a pixel reaches y, in camera coordinates, and what is there belongs to this sub-camera.
 template <class T>
 bool is_in_view(const BackwardView<T>& view, Vec3 y) {
     return view.camera.depth_weight(y) > 0 && view.volume.outcode(y) == 0;
@@ -79,13 +79,13 @@ uint16_t cell_of(const BackwardView<T>& view, int32_t vertex) {
     return uint16_t(z_order(index(x.x), index(x.y)));
 }
 
-// What the density of samples is multiplied by on a face, and on curves beside it, of which so many px² lie in view:
+// What the density of samples is multiplied by on a face, and on curves next to it, of which so many px² lie in view:
 // less where rays of the image should have hit it and none did, for it is most likely occluded. By no less than an
 // eighth: a strip of it may show, and along a curve, too narrow for rays to find.
 template <class T>
 double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
     constexpr OcclusionHint::Few unhit{.rays = 16, .share = 0, .least = 1.0 / 8};
-    return view.seen[face] || view.panes ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
+    return view.seen[face] || view.transparent ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
 }
 
 // px by which rays may miss a point, at most: by then the image shows floats, not faces. What runs along a silhouette
@@ -124,7 +124,7 @@ inline double curve_offset_of(const Camera& camera, const CameraFrame& frame, co
 // Whether a face that the ray at n meets is there, not cut out.
 template <class T>
 bool is_there(const BackwardView<T>& view, int64_t face, Vec2 n) {
-    return !view.cut_outs || view.cut_outs->shows(int32_t(face), n);
+    return !view.alpha_masks || view.alpha_masks->shows(int32_t(face), n);
 }
 
 // Whether the ray at n meets a face, decided in double.

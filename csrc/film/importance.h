@@ -1,4 +1,4 @@
-// How much the loss looks at a region of the image: the mean size of the adjoint over a rectangle, in constant time.
+// The importance of a region of the image: the mean size of the adjoint over a rectangle, in constant time.
 #pragma once
 
 #include <algorithm>
@@ -15,7 +15,7 @@ namespace edgegrad {
 
 // A summed-area table (Crow 1984) over integers, so that differences are exact: a rectangle gives zero if and only if
 // every adjoint in it is zero, and then leaving it out is no bias. A pixel with an adjoint counts 1 + 8 |A| / mean, the
-// one being the defensive floor that bounds the weight of what is small but not zero.
+// one being the defensive lower bound that bounds the weight of what is small but not zero.
 class Importance {
    public:
     // Without an adjoint all pixels count the same, and there is no table. What stands for one that is not known yet

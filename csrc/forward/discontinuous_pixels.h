@@ -1,5 +1,5 @@
 // Pixels that borders run through, where one point of a face is a poor guess at the whole pixel: of shadows of punctual
-// lamps, and of nearest texels; and where paths are traced of what emits, which is brighter than all that it lights.
+// lights, and of nearest texels; and where paths are traced of what emits, which is brighter than all that it lights.
 //
 // A pixel is one of them where the pixels around it are on both sides. What was found in the pixel itself is not asked:
 // whether it is shaded again, with other points, must not depend on the points that it then does without, or the mean
@@ -40,10 +40,10 @@ class PaddedImage {
     std::vector<V> values_;
 };
 
-// What is seen of punctual lamps.
-class LampVisibility {
+// What is seen of punctual lights.
+class LightVisibility {
    public:
-    LampVisibility(int width, int height, const LitScene& lit, const LitOptions& options)
+    LightVisibility(int width, int height, const LitScene& lit, const LitOptions& options)
         : width_(width), columns_(columns(lit, options)), seen_(width, height, columns_.size(), 0) {}
 
     bool empty() const { return columns_.empty(); }
@@ -70,13 +70,13 @@ class LampVisibility {
    private:
     enum : uint8_t { hidden = 1, visible = 2 };
 
-    // Of light samples, those of punctual lamps.
+    // Of light samples, those of punctual lights.
     static std::vector<size_t> columns(const LitScene& lit, const LitOptions& options) {
         std::vector<size_t> out;
         if (!options.shadows) return out;
         const std::vector<LightSample> lights = light_samples(lit, options);
         for (size_t k = 0; k < lights.size(); ++k)
-            if (lit.lamps[lights[k].lamp].is_punctual()) out.push_back(k);
+            if (lit.lights[lights[k].light].is_punctual()) out.push_back(k);
         return out;
     }
 
@@ -197,7 +197,7 @@ class ImageBorders {
           height_(height),
           paths_(options.bounces > 1),
           points_(size_t(width) * size_t(height), 0),
-          lamps_(width, height, lit, options),
+          lights_(width, height, lit, options),
           texels_(width, height, lit),
           has_texels_(!NearestTexels::empty(lit)),
           emitters_(width, height, lit, options),
@@ -206,7 +206,7 @@ class ImageBorders {
     // A point that was shaded, and what it sees of light samples.
     void add(int32_t pixel, int32_t face, const double* b, const int8_t* seen) {
         ++points_[pixel];
-        lamps_.add(pixel % width_, pixel / width_, seen);
+        lights_.add(pixel % width_, pixel / width_, seen);
         if (has_texels_) texels_.add(pixel % width_, pixel / width_, face, b);
         if (has_emitters_) emitters_.add(pixel % width_, pixel / width_, face);
     }
@@ -214,9 +214,9 @@ class ImageBorders {
     // How many times as many points of each face are to be shaded in those pixels, 0: there are none.
     int find(std::vector<uint8_t>& pixels, Team& team) const {
         pixels.assign(points_.size(), 0);
-        if (lamps_.empty() && !has_texels_ && !has_emitters_) return 0;
+        if (lights_.empty() && !has_texels_ && !has_emitters_) return 0;
         team.each(height_, [&](int64_t y) {
-            if (!lamps_.empty()) lamps_.mark(int(y), &pixels[y * width_]);
+            if (!lights_.empty()) lights_.mark(int(y), &pixels[y * width_]);
             if (has_texels_) texels_.mark(int(y), &pixels[y * width_]);
             if (has_emitters_) emitters_.mark(int(y), &pixels[y * width_]);
         });
@@ -231,7 +231,7 @@ class ImageBorders {
     int width_, height_;
     bool paths_;
     std::vector<int32_t> points_;
-    LampVisibility lamps_;
+    LightVisibility lights_;
     NearestTexels texels_;
     bool has_texels_;
     SeenEmitters emitters_;

@@ -111,7 +111,7 @@ class PixelRow {
     // in the next one.
     struct alignas(N ? 256 : 8) Shaded {
         int32_t face = -1;
-        bool textured = false, unseen = false;
+        bool textured = false, indirect = false;
         FaceMap map;
         DepthBound depth;
         AffineRadiance<N> radiance;
@@ -156,7 +156,7 @@ class PixelRow {
                     const int first = std::countr_zero(left);
                     const int32_t face = rays_.face[i + first];
                     const Shaded& s = shaded(face);
-                    if (s.unseen) [[unlikely]] {
+                    if (s.indirect) [[unlikely]] {
                         cast_beyond();
                         left &= ~on_face(rays_.face + i, -1);
                         continue;
@@ -179,7 +179,7 @@ class PixelRow {
                     }
                 }
             for (; i < end; ++i) {
-                if (rays_.face[i] >= 0 && shaded(rays_.face[i]).unseen) [[unlikely]]
+                if (rays_.face[i] >= 0 && shaded(rays_.face[i]).indirect) [[unlikely]]
                     cast_beyond();
                 if (rays_.face[i] >= 0) hits += add(i, part_[p].column, sum);
             }
@@ -243,10 +243,10 @@ class PixelRow {
     // Casts the rays again, through the faces whose plane holds the eye. What the others hit stays the same.
     void cast_beyond() {
         rays_.prepare();
-        side_->frame.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
+        side_->frame.cast_with_alpha_test(rays_, nullptr, [&](int32_t face) { return !is_indirect(face); });
     }
 
-    bool is_unseen(int32_t face) const {
+    bool is_indirect(int32_t face) const {
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Array<Vec3>& q = side_->q;
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
@@ -261,8 +261,8 @@ class PixelRow {
         const Array<Vec3>& q = side_->q;
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
         s.map = face_map(camera, corner);
-        s.unseen = camera.passes_through_eye(corner);
-        if (s.unseen) return;
+        s.indirect = camera.passes_through_eye(corner);
+        if (s.indirect) return;
         s.depth.set(camera, corner, s.map);
         if (!s.textured) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.

@@ -18,7 +18,7 @@ constexpr Vec2 nowhere{std::numeric_limits<double>::quiet_NaN(), std::numeric_li
 
 // Where a place lies in the image plane of a side, in normalised coordinates; not numbers where it does not show it.
 Vec2 through(const Camera& side, Vec2 x) {
-    return side.may_show(x, 0) ? normalised(side, straighten(side, x)) : nowhere;
+    return side.may_show(x, 0) ? normalised(side, undistort(side, x)) : nowhere;
 }
 
 }  // namespace
@@ -30,13 +30,13 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
     out.face.assign(places.size, -1), out.part.assign(places.size, -1), out.b.assign(2 * places.size, 0.0);
     for (const Camera& side : sides_of(camera)) {
         const Array<Vec3> q = camera_vertices(side, scene.verts, scene.n_verts, team);
-        const CutOuts<T> cut_outs(scene, side, q.data());
-        const CameraFrame frame(geometry.caster(), side, scene.cut_outs.face ? &cut_outs : nullptr);
+        const AlphaMasks<T> alpha_masks(scene, side, q.data());
+        const CameraFrame frame(geometry.caster(), side, scene.alpha_masks.face ? &alpha_masks : nullptr);
         const auto corners = [&](int32_t face) {
             const int32_t* v = scene.faces + 3 * int64_t(face);
             return std::array<Vec3, 3>{q[v[0]], q[v[1]], q[v[2]]};
         };
-        // A face whose plane holds the eye is not seen; the image looks through it, too.
+        // A face whose plane holds the eye is not seen; the image shows what is behind it, too.
         const auto is_seen = [&](int32_t face) { return !side.passes_through_eye(corners(face).data()); };
         team.each_block(places.size, [&](int64_t, int64_t first, int64_t last) {
             team.check();
@@ -74,12 +74,12 @@ RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, 
     team.each_block(places.size, [&](int64_t block, int64_t first, int64_t last) {
         RayRecords& to = blocks[block];
         for (int64_t k = first; k < last; ++k) {
-            const Camera* window = &sides.front();
+            const Camera* sub_camera = &sides.front();
             Vec2 n = nowhere;
             for (const Camera& side : sides)
                 if (const Vec2 here = through(side, places[k]); std::isfinite(here.x + here.y))
-                    window = &side, n = here;
-            append_ray(*window, n, to.along, intrinsics ? &to.along_by_k : nullptr, &to.along_by_x);
+                    sub_camera = &side, n = here;
+            append_ray(*sub_camera, n, to.along, intrinsics ? &to.along_by_k : nullptr, &to.along_by_x);
         }
     });
     RayRecords all;

@@ -90,7 +90,7 @@ class LitRow : public RowVisitor {
             if (in_.borders) in_.borders->add(hit.pixel, hit.face, &b_[3 * i], seen);
             for (size_t k = 0; k < K; ++k)
                 if (seen[k] != not_asked)
-                    std::atomic_ref(in_.to.asked[lights_[k].lamp]).store(1, std::memory_order_relaxed);
+                    std::atomic_ref(in_.to.asked[lights_[k].light]).store(1, std::memory_order_relaxed);
         }
     }
 
@@ -125,7 +125,7 @@ LitImage<T> render_lit(const LitScene& given, const SceneView<T>& scene, const C
                        const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,
                        const HitBuffers<T>& hits) {
     LitImage<T> out{Array<T>(int64_t(camera.width) * camera.height * given.channels),
-                    std::vector<uint8_t>(given.lamps.size(), 0)};
+                    std::vector<uint8_t>(given.lights.size(), 0)};
     std::unique_ptr<ImageBorders> borders;
     if (image.spp > 1) borders = std::make_unique<ImageBorders>(camera.width, camera.height, given, options);
     const auto shade_pixels = [&](const LitScene& lit, const ImageOptions& image, const PixelChoice& choice,

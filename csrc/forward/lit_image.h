@@ -17,7 +17,7 @@ struct LitSampling {
     uint64_t seed, again;  // of the first pass, and of pixels that are shaded again
 };
 
-// (H · W, C) before what lies behind the surfaces, and for each lamp whether a point asked for its shadow.
+// (H · W, C) before what lies behind the surfaces, and for each light whether a point asked for its shadow.
 template <class T>
 struct LitImage {
     Array<T> radiance;

@@ -90,7 +90,7 @@ class HitRow {
     // What pixels on one face have in common. Some faces are kept, for they come again in the next pixel.
     struct Kept {
         int32_t face = -1;
-        bool unseen = false;
+        bool indirect = false;
         FaceMap map;
         DepthBound depth;
     };
@@ -117,9 +117,10 @@ class HitRow {
             for (int k = i; k < end; ++k) {
                 if (rays_.face[k] < 0) continue;
                 // A face whose plane holds the eye shows nothing.
-                if (kept(rays_.face[k]).unseen) [[unlikely]] {
+                if (kept(rays_.face[k]).indirect) [[unlikely]] {
                     rays_.prepare();
-                    side_->frame.cast_through(rays_, nullptr, [&](int32_t face) { return !kept(face).unseen; });
+                    side_->frame.cast_with_alpha_test(rays_, nullptr,
+                                                      [&](int32_t face) { return !kept(face).indirect; });
                     if (rays_.face[k] < 0) continue;
                 }
                 add(rays_.face[k], samples_ + k - i, rays_.n(k));
@@ -167,7 +168,7 @@ class HitRow {
             const Kept& face = kept(g.face);
             for (const Drawn& drawn : g.drawn) {
                 const Barycentrics b = barycentrics_of_hit(face.map, drawn.n);
-                const Vec2 x = bend(camera, to_pixels(camera, drawn.n)).x;
+                const Vec2 x = distort(camera, to_pixels(camera, drawn.n)).x;
                 const double weight = double(g.count) / (double(options_.spp) * g.drawn.size());
                 const Spread spread = choice_.spread ? spread_at(camera, face.map, drawn.n) : Spread();
                 to.push_back({int32_t(int64_t(y_) * camera.width + x_), g.face, b, x, weight, spread});
@@ -189,8 +190,8 @@ class HitRow {
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Vec3 corner[3] = {side_->q[v[0]], side_->q[v[1]], side_->q[v[2]]};
         kept.face = face;
-        kept.unseen = camera.passes_through_eye(corner);
-        if (kept.unseen) return;
+        kept.indirect = camera.passes_through_eye(corner);
+        if (kept.indirect) return;
         kept.map = face_map(camera, corner);
         kept.depth.set(camera, corner, kept.map);
         std::atomic_ref<uint8_t> seen(out_.seen[face]);

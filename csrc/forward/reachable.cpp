@@ -27,7 +27,7 @@ ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, 
     });
     for (const Bounds& b : of_block)
         for (int k = 0; k < 4; ++k) bounds_.add(k, b.low[k]), bounds_.add(k, b.high[k]);
-    if (!camera.is_straight() && !has_sides(camera.lens)) bend_bounds(camera);
+    if (!camera.is_undistorted() && !has_sides(camera.lens)) distort_bounds(camera);
 }
 
 std::vector<Vec2> ReachablePixels::polygon(const Bounds& bounds, Vec2 low, Vec2 high) {
@@ -50,22 +50,22 @@ std::vector<Vec2> ReachablePixels::polygon(const Bounds& bounds, Vec2 low, Vec2 
 }
 
 // Within its disc a lens takes the octagon one to one, so that the image of its border surrounds its own.
-void ReachablePixels::bend_bounds(const Camera& camera) {
+void ReachablePixels::distort_bounds(const Camera& camera) {
     constexpr int pieces = 64;  // of a side
     const Vec2 widen{margin_, margin_};
     const std::vector<Vec2> corners = polygon(bounds_, camera.lens_view.low - widen, camera.lens_view.high + widen);
     spans_.assign(camera.height, {});
     for (size_t i = 0; i < corners.size(); ++i) {
         const Vec2 from = corners[i], side = corners[(i + 1) % corners.size()] - from;
-        Bent bent[2 * pieces + 1];
+        Distorted distorted[2 * pieces + 1];
         for (int j = 0; j <= 2 * pieces; ++j) {
-            bent[j] = bend(camera, from + (0.5 * j / pieces) * side);
-            if (!(bent[j].area_scale > 0)) return spans_.assign(camera.height, {-infinite, infinite});
+            distorted[j] = distort(camera, from + (0.5 * j / pieces) * side);
+            if (!(distorted[j].area_scale > 0)) return spans_.assign(camera.height, {-infinite, infinite});
         }
         for (int j = 0; j < 2 * pieces; j += 2) {
-            const Vec2 a = bent[j].x, b = bent[j + 2].x;
+            const Vec2 a = distorted[j].x, b = distorted[j + 2].x;
             // Twice as far as its middle lies from the chord, no piece leaves it.
-            const double more = margin_ + 2 * length(bent[j + 1].x - 0.5 * (a + b));
+            const double more = margin_ + 2 * length(distorted[j + 1].x - 0.5 * (a + b));
             const auto row = [&](double y) { return int(std::clamp(y, 0.0, double(camera.height))); };
             const Span piece{std::min(a.x, b.x) - more, std::max(a.x, b.x) + more};
             for (int y = row(std::min(a.y, b.y) - more), end = row(std::max(a.y, b.y) + more + 1); y < end; ++y)

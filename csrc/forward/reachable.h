@@ -19,7 +19,7 @@ inline int pixels_of_batches(int spp) { return RayBatch::size / std::gcd(RayBatc
 
 // The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these
 // lie before the eye. With a pixel more on each side, for Embree sees positions rounded to floats. Through a lens the
-// octagon of the straight image is bent, and each row reaches from its first place there to its last.
+// octagon of the undistorted image is bent, and each row reaches from its first place there to its last.
 class ReachablePixels {
    public:
     // `q` are the vertices in the camera's frame.
@@ -47,7 +47,7 @@ class ReachablePixels {
     };
     // The part of the octagon in a box.
     static std::vector<Vec2> polygon(const Bounds& bounds, Vec2 low, Vec2 high);
-    void bend_bounds(const Camera& camera);
+    void distort_bounds(const Camera& camera);
 
     int width_;
     double margin_;

@@ -1,7 +1,7 @@
 // Where points of a scene see its sky from: few paths of an image find it out, before the others draw points of the
 // sky.
 //
-// Drawn by how bright it is alone, most points of a sky that falls through an opening are hidden. For one density q for
+// Drawn by how bright it is alone, most points of a sky that falls through an opening are hidden. For one pdf q for
 // all points, whose variance is least at q ∝ L √E[V (n·l)²] with the sky's radiance L and visibility V, the mean is
 // taken over cells of the sky. It only has a say in where points are drawn: all of them may be.
 #pragma once
@@ -20,11 +20,11 @@ namespace edgegrad {
 class SkyGuide {
    public:
     explicit SkyGuide(const LitScene& lit) : lit_(lit) {
-        for (size_t k = 0; k < lit.lamps.size() && lamp_ < 0; ++k)
-            if (lit.lamps[k].kind == Lamp::Kind::environment && lit.lamps[k].is_image) lamp_ = int(k);
+        for (size_t k = 0; k < lit.lights.size() && light_ < 0; ++k)
+            if (lit.lights[k].kind == Light::Kind::environment && lit.lights[k].is_image) light_ = int(k);
     }
 
-    bool has_sky() const { return lamp_ >= 0; }
+    bool has_sky() const { return light_ >= 0; }
 
     // What the points of paths 0 … n − 1 saw.
     void add(const Paths& paths, int64_t n) {
@@ -33,28 +33,28 @@ class SkyGuide {
             const Path path = paths.path(i);
             for (int k = i % paths_of_point ? 1 : 0; k < path.points; ++k)
                 for (size_t j = 0; j < lights.size(); ++j)
-                    if (lights[j].lamp == lamp_) add(path.drawn_at(k)[j], path.seen_at(k)[j], paths.surface(i, k).n);
+                    if (lights[j].light == light_) add(path.drawn_at(k)[j], path.seen_at(k)[j], paths.surface(i, k).n);
         }
     }
 
     // The scene with the sky's points drawn by what was added; it refers to this.
     LitScene guided() {
-        const Lamp& lamp = lit_.lamps[lamp_];
+        const Light& light = lit_.lights[light_];
         double total_sum = 0, total = 0, mass = 0, before = 0;
         for (size_t c = 0; c < sum_.size(); ++c) total_sum += double(sum_[c]) / unit, total += double(count_[c]);
         LitScene out = lit_;
         if (!(total_sum > 0)) return out;
         const double mean = total_sum / total;
-        density_.resize(lamp.size), running_.resize(lamp.size);
-        for (int64_t t = 0; t < lamp.size; ++t) {
+        pdf_.resize(light.size), running_.resize(light.size);
+        for (int64_t t = 0; t < light.size; ++t) {
             const size_t c = cell(t);
             const double here = (double(sum_[c]) / unit + few * mean) / (double(count_[c]) + few);
             const double factor = std::sqrt(std::max(here, least * mean));
-            mass += factor * (lamp.running[t] - before), before = lamp.running[t];
-            running_[t] = mass, density_[t] = factor * lamp.density[t];
+            mass += factor * (light.running[t] - before), before = light.running[t];
+            running_[t] = mass, pdf_[t] = factor * light.pdf[t];
         }
-        for (int64_t t = 0; t < lamp.size; ++t) running_[t] /= mass, density_[t] /= mass;
-        out.lamps[lamp_].running = running_.data(), out.lamps[lamp_].density = density_.data();
+        for (int64_t t = 0; t < light.size; ++t) running_[t] /= mass, pdf_[t] /= mass;
+        out.lights[light_].running = running_.data(), out.lights[light_].pdf = pdf_.data();
         return out;
     }
 
@@ -65,22 +65,23 @@ class SkyGuide {
     static constexpr double unit = 1 << 20;
 
     size_t cell(int64_t texel) const {
-        const Lamp& lamp = lit_.lamps[lamp_];
-        return size_t(texel / lamp.width * rows / lamp.height * columns + texel % lamp.width * columns / lamp.width);
+        const Light& light = lit_.lights[light_];
+        return size_t(texel / light.width * rows / light.height * columns +
+                      texel % light.width * columns / light.width);
     }
     // Sums of whole numbers do not depend on their order.
     void add(const LightPoint& p, int8_t seen, Vec3 n) {
         if (seen == not_asked) return;
-        const double cosine = dot(n, place(lit_, lit_.lamps[lamp_], p));
+        const double cosine = dot(n, place(lit_, lit_.lights[light_], p));
         const size_t c = cell(p.index);
         std::atomic_ref(count_[c]).fetch_add(1, std::memory_order_relaxed);
         if (seen > 0) std::atomic_ref(sum_[c]).fetch_add(int64_t(unit * cosine * cosine), std::memory_order_relaxed);
     }
 
     const LitScene& lit_;
-    int lamp_ = -1;
+    int light_ = -1;
     std::array<int64_t, rows * columns> sum_{}, count_{};
-    std::vector<double> density_, running_;
+    std::vector<double> pdf_, running_;
 };
 
 }  // namespace edgegrad

@@ -19,8 +19,8 @@ Side::Side(const SceneView<T>& scene, const Camera& camera_, const RayCaster& ca
 Side::~Side() = default;
 
 template <class T>
-const SeenThrough* Side::see_through(const SceneView<T>& scene) {
-    return scene.cut_outs.face ? &cut_outs.template emplace<CutOuts<T>>(scene, camera, q.data()) : nullptr;
+const AlphaTest* Side::see_through(const SceneView<T>& scene) {
+    return scene.alpha_masks.face ? &alpha_masks.template emplace<AlphaMasks<T>>(scene, camera, q.data()) : nullptr;
 }
 
 template <class T>

@@ -20,14 +20,14 @@ struct Side {
 
     const Camera camera;
     const Array<Vec3> q;
-    std::variant<std::monostate, CutOuts<float>, CutOuts<double>> cut_outs;
+    std::variant<std::monostate, AlphaMasks<float>, AlphaMasks<double>> alpha_masks;
     const CameraFrame frame;
     const PixelRays pixel_rays;
     const Vec2 reach;  // of the filter around a pixel, in normalised image coordinates
 
    private:
     template <class T>
-    const SeenThrough* see_through(const SceneView<T>& scene);
+    const AlphaTest* see_through(const SceneView<T>& scene);
 };
 
 template <class T>

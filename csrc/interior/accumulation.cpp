@@ -12,9 +12,9 @@ namespace edgegrad {
 namespace {
 
 template <int N, class T>
-class ReverseInterior final : public SurfaceContraction {
+class ReverseInterior final : public SurfaceAccumulation {
    public:
-    ReverseInterior(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
+    ReverseInterior(const BackwardView<T>& view, bool geometry, const GradientSink& to, LocalGradients& grad)
         : view_(view),
           C_(channels_of<N>(view.scene)),
           run_(view, geometry, to, grad),
@@ -63,9 +63,9 @@ class ReverseInterior final : public SurfaceContraction {
 };
 
 template <class T>
-class ForwardInterior final : public SurfaceContraction {
+class ForwardInterior final : public SurfaceAccumulation {
    public:
-    ForwardInterior(const BackwardView<T>& view, Directions directions, ChunkGrad& grad)
+    ForwardInterior(const BackwardView<T>& view, Directions directions, LocalGradients& grad)
         : view_(view),
           directions_(directions),
           C_(view.scene.channels),
@@ -123,9 +123,9 @@ class ForwardInterior final : public SurfaceContraction {
 
 // −Ã · ∂L/∂x: how the loss changes as what is seen at x moves in the image.
 template <class T>
-class ScreenInterior final : public SurfaceContraction {
+class ScreenInterior final : public SurfaceAccumulation {
    public:
-    ScreenInterior(const BackwardView<T>& view, ChunkGrad& grad)
+    ScreenInterior(const BackwardView<T>& view, LocalGradients& grad)
         : view_(view), grad_(grad), adjoint_(RayBatch::size * view.scene.channels), in_pixel_(view.scene.channels) {}
 
     bool wants(int i, const SurfaceSample& s) override {
@@ -164,16 +164,16 @@ class ScreenInterior final : public SurfaceContraction {
     }
 
     const BackwardView<T>& view_;
-    ChunkGrad& grad_;
+    LocalGradients& grad_;
     std::vector<double> adjoint_, in_pixel_;
     CornerGrad corners_;
     int64_t pixel_ = 0;
 };
 
 template <class T>
-class RecordInterior final : public SurfaceContraction {
+class InteriorRecorder final : public SurfaceAccumulation {
    public:
-    RecordInterior(const BackwardView<T>& view, const Record& kept, SurfaceRecords& records)
+    InteriorRecorder(const BackwardView<T>& view, const Record& kept, SurfaceRecords& records)
         : view_(view), kept_(kept), records_(records) {
         records_.reserve(scatter_chunk);
     }
@@ -221,23 +221,23 @@ class RecordInterior final : public SurfaceContraction {
 }  // namespace
 
 template <class T>
-std::unique_ptr<SurfaceContraction> contract_surfaces(const BackwardView<T>& view, const Contraction& contraction,
-                                                      const Destination& to, ChunkGrad& grad) {
-    using Made = std::unique_ptr<SurfaceContraction>;
-    if (const Reverse* c = std::get_if<Reverse>(&contraction))
+std::unique_ptr<SurfaceAccumulation> accumulate_surfaces(const BackwardView<T>& view, const Accumulation& accumulation,
+                                                         const GradientSink& to, LocalGradients& grad) {
+    using Made = std::unique_ptr<SurfaceAccumulation>;
+    if (const Reverse* c = std::get_if<Reverse>(&accumulation))
         return dispatch_channels(view.scene.channels, view.scene.channels > view.scene.radiance, [&]<int N>() -> Made {
             return std::make_unique<ReverseInterior<N, T>>(view, c->geometry, to, grad);
         });
-    if (const Forward* c = std::get_if<Forward>(&contraction))
+    if (const Forward* c = std::get_if<Forward>(&accumulation))
         return std::make_unique<ForwardInterior<T>>(view, c->directions, grad);
-    if (const Record* c = std::get_if<Record>(&contraction))
-        return std::make_unique<RecordInterior<T>>(view, *c, grad.records.surface);
+    if (const Record* c = std::get_if<Record>(&accumulation))
+        return std::make_unique<InteriorRecorder<T>>(view, *c, grad.records.surface);
     return std::make_unique<ScreenInterior<T>>(view, grad);
 }
 
-template std::unique_ptr<SurfaceContraction> contract_surfaces(const BackwardView<float>&, const Contraction&,
-                                                               const Destination&, ChunkGrad&);
-template std::unique_ptr<SurfaceContraction> contract_surfaces(const BackwardView<double>&, const Contraction&,
-                                                               const Destination&, ChunkGrad&);
+template std::unique_ptr<SurfaceAccumulation> accumulate_surfaces(const BackwardView<float>&, const Accumulation&,
+                                                                  const GradientSink&, LocalGradients&);
+template std::unique_ptr<SurfaceAccumulation> accumulate_surfaces(const BackwardView<double>&, const Accumulation&,
+                                                                  const GradientSink&, LocalGradients&);
 
 }  // namespace edgegrad

@@ -10,7 +10,7 @@
 
 namespace edgegrad {
 
-// A sample at u in the straight image, with barycentrics λ there, that stands for a share of the face's area; it is
+// A sample at u in the undistorted image, with barycentrics λ there, that stands for a share of the face's area; it is
 // seen at x, where `weight` px² are its own.
 struct SurfaceSample {
     int32_t face;
@@ -21,10 +21,10 @@ struct SurfaceSample {
     Vec2 across = {};  // a narrow face, by as much as rays err, px; 0: it is wide
 };
 
-// Contractions are compiled once for each type of image and number of channels, what draws the samples without either.
-class SurfaceContraction {
+// Accumulations are compiled once for each type of image and number of channels, what draws the samples without either.
+class SurfaceAccumulation {
    public:
-    virtual ~SurfaceContraction() = default;
+    virtual ~SurfaceAccumulation() = default;
 
     // False if nothing could come of a sample; i tells those of a batch apart.
     virtual bool wants(int i, const SurfaceSample& sample) = 0;
@@ -40,7 +40,7 @@ class SurfaceContraction {
 
 // Of the samples of one chunk.
 template <class T>
-std::unique_ptr<SurfaceContraction> contract_surfaces(const BackwardView<T>& view, const Contraction& contraction,
-                                                      const Destination& to, ChunkGrad& grad);
+std::unique_ptr<SurfaceAccumulation> accumulate_surfaces(const BackwardView<T>& view, const Accumulation& accumulation,
+                                                         const GradientSink& to, LocalGradients& grad);
 
 }  // namespace edgegrad

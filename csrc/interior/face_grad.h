@@ -12,7 +12,7 @@ namespace edgegrad {
 template <int N, class T>
 class FaceGrad {
    public:
-    FaceGrad(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
+    FaceGrad(const BackwardView<T>& view, bool geometry, const GradientSink& to, LocalGradients& grad)
         : view_(view),
           geometry_(geometry),
           to_(to),
@@ -68,8 +68,8 @@ class FaceGrad {
    private:
     const BackwardView<T>& view_;
     const bool geometry_;
-    const Destination& to_;
-    ChunkGrad& grad_;
+    const GradientSink& to_;
+    LocalGradients& grad_;
 
     int32_t face_ = -1;
     bool controlled_ = false, seen_ = false;

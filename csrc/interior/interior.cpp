@@ -33,14 +33,14 @@ namespace {
 template <class T>
 class InteriorChunk {
    public:
-    InteriorChunk(const BackwardView<T>& view, SurfaceContraction& contraction)
-        : view_(view), contraction_(contraction), rays_(view.frame) {}
+    InteriorChunk(const BackwardView<T>& view, SurfaceAccumulation& accumulation)
+        : view_(view), accumulation_(accumulation), rays_(view.frame) {}
 
     void add(SurfaceSample sample) {
         const int i = rays_.count;
-        const auto [x, area_scale] = bend(view_.camera, sample.u);
+        const auto [x, area_scale] = distort(view_.camera, sample.u);
         sample.x = x, sample.weight *= area_scale;
-        if (area_scale == 0 || !contraction_.wants(i, sample)) return;
+        if (area_scale == 0 || !accumulation_.wants(i, sample)) return;
         const Vec2 n = normalised(view_.camera, sample.u);
         sample_[i] = sample, rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
         if (++rays_.count == RayBatch::size) cast();
@@ -48,19 +48,19 @@ class InteriorChunk {
 
     void finish() {
         cast();
-        contraction_.finish();
+        accumulation_.finish();
     }
 
    private:
     void cast() {
         rays_.prepare();
         view_.frame.cast(rays_);
-        for (int i = 0; i < rays_.count; ++i) contraction_.add(i, sample_[i], rays_.n(i), is_visible(i));
+        for (int i = 0; i < rays_.count; ++i) accumulation_.add(i, sample_[i], rays_.n(i), is_visible(i));
         rays_.count = 0;
     }
 
     // Whether nothing lies before the sample. Its ray may miss its own face, when that is thinner than floats are
-    // apart; then what counts is whether what it met instead lies behind, by more than floats can tell.
+    // apart; then what counts is whether what it met instead lies behind, by more than floats can decide.
     bool is_visible(int i) const {
         const int32_t own = sample_[i].face;
         const Vec2 n = rays_.n(i);
@@ -77,7 +77,7 @@ class InteriorChunk {
     }
 
     // Whether something lies before the sample of a face that is narrower than rays err, though its ray found it: the
-    // border of what hides it runs so near that floats take the ray for one beside it.
+    // border of what hides it runs so near that floats take the ray for one next to it.
     bool is_hidden_by_a_hair(int i) const {
         const SurfaceSample& sample = sample_[i];
         if (sample.across.x == 0 && sample.across.y == 0) return false;
@@ -88,7 +88,7 @@ class InteriorChunk {
         bool hidden = false;
         for (const double side : {-1.0, 1.0}) {
             const Vec2 error = normalised(view_.camera, sample.u + side * sample.across) - n;
-            each_beside(view_, n, error, {&own, 1}, [&](int32_t met) {
+            each_near_miss(view_, n, error, {&own, 1}, [&](int32_t met) {
                 hidden = hidden || (meets(view_, met, n) && depth_of(view_, met, n) < before);
             });
         }
@@ -96,7 +96,7 @@ class InteriorChunk {
     }
 
     const BackwardView<T>& view_;
-    SurfaceContraction& contraction_;
+    SurfaceAccumulation& accumulation_;
     CameraRays rays_;
     SurfaceSample sample_[RayBatch::size];
 };
@@ -134,13 +134,13 @@ void prefetch_face(const BackwardView<T>& view, int64_t face) {
 // Adds what n samples find on the faces, which are laid end to end.
 template <class T>
 void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systematic& systematic,
-                         const SurfaceMeasure<T>& surface, const Contraction& contraction, Destination& to,
+                         const SurfaceMeasure<T>& surface, const Accumulation& accumulation, GradientSink& to,
                          double (&seconds)[2]) {
     const ShiftedSequence sequence(hash(view.options.seed, 2, gradient_stream));
     const auto cell = [&](int64_t f) { return cell_of(view, view.scene.faces[3 * f]); };
     const OrderedDraws draws(systematic, n, {view.scene.n_faces}, cell, view.team);
-    view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        const std::unique_ptr<SurfaceContraction> to_chunk = contract_surfaces(view, contraction, to, grad);
+    view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
+        const std::unique_ptr<SurfaceAccumulation> to_chunk = accumulate_surfaces(view, accumulation, to, grad);
         InteriorChunk chunk(view, *to_chunk);
         VisiblePolygon polygon;
         PolygonSampler sampler;
@@ -179,8 +179,8 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
 // of a pixel and of its neighbours are spread evenly over it (sobol.h). For others it is poor: a triangle that is seen
 // at a grazing angle, or is smaller than a pixel, is hit by chance.
 template <class T>
-void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,
-                       Destination& to, double (&seconds)[2]) {
+void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Accumulation& accumulation,
+                       GradientSink& to, double (&seconds)[2]) {
     const auto& [pixels, spp, seed, faces, share, beyond, by_importance] = samples;
     const int margin = beyond.value_or(0), stride = view.camera.width + 2 * margin;
     const Filter filter = beyond ? Filter(FilterKind::box) : view.image.filter;
@@ -195,8 +195,8 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
     };
     std::vector<ScrambledSobol> sobol{ScrambledSobol(seed)};
     for (uint64_t k = 1; by_importance && k < most_times; ++k) sobol.emplace_back(hash(seed, k, gradient_stream));
-    view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        const std::unique_ptr<SurfaceContraction> chunk = contract_surfaces(view, contraction, to, grad);
+    view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
+        const std::unique_ptr<SurfaceAccumulation> chunk = accumulate_surfaces(view, accumulation, to, grad);
         CameraRays rays(view.frame);
         struct {
             int64_t pixel;
@@ -240,8 +240,8 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
 }
 
 template <class T>
-void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, const Contraction& contraction,
-                  Destination& to, BackwardProfile& profile) {
+void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, const Accumulation& accumulation,
+                  GradientSink& to, BackwardProfile& profile) {
     const GradientOptions& o = view.options;
     profile.surface_samples = surface.pixel_samples() + n;
     if (o.dry) return;
@@ -249,19 +249,19 @@ void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64
         PixelSamples samples{surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
                              surface.by_pixels.data(), surface.pixel_share};
         if (view.detailed) samples.beyond = surface.beyond, samples.by_importance = true;
-        add_pixel_samples(view, samples, contraction, to, profile.surface);
+        add_pixel_samples(view, samples, accumulation, to, profile.surface);
     }
     if (n == 0) return;
     Systematic systematic(surface.of_face, view.team);
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
-    add_surface_samples(view, n, systematic, surface, contraction, to, profile.surface);
+    add_surface_samples(view, n, systematic, surface, accumulation, to, profile.surface);
 }
 
-#define EDGEGRAD_INSTANTIATE(T)                                                                                       \
-    template void add_interior(const BackwardView<T>&, SurfaceMeasure<T>&, int64_t, const Contraction&, Destination&, \
-                               BackwardProfile&);                                                                     \
-    template void add_pixel_samples(const BackwardView<T>&, const PixelSamples&, const Contraction&, Destination&,    \
+#define EDGEGRAD_INSTANTIATE(T)                                                                                      \
+    template void add_interior(const BackwardView<T>&, SurfaceMeasure<T>&, int64_t, const Accumulation&,             \
+                               GradientSink&, BackwardProfile&);                                                     \
+    template void add_pixel_samples(const BackwardView<T>&, const PixelSamples&, const Accumulation&, GradientSink&, \
                                     double (&)[2]);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)

@@ -14,8 +14,8 @@ struct SurfaceMeasure;
 
 // Adds what n samples find on the measured surface, and those of the pixels.
 template <class T>
-void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, const Contraction& contraction,
-                  Destination& to, BackwardProfile& profile);
+void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, const Accumulation& accumulation,
+                  GradientSink& to, BackwardProfile& profile);
 
 // So many samples in each of some pixels, on the faces marked in `faces` (F,), or on all if it is null.
 struct PixelSamples {
@@ -30,7 +30,7 @@ struct PixelSamples {
     bool by_importance = false;  // a pixel that counts more than the mean gets more samples
 };
 template <class T>
-void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,
-                       Destination& to, double (&seconds)[2]);
+void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Accumulation& accumulation,
+                       GradientSink& to, double (&seconds)[2]);
 
 }  // namespace edgegrad

@@ -17,10 +17,10 @@ namespace edgegrad {
 namespace {
 
 // What the density of a triangle is multiplied by if it lies behind what the image hit (occlusion.h): one of which no
-// neighbour was hit either, and one beside a face that was hit. Never zero, for the triangle may be visible all the
+// neighbour was hit either, and one next to a face that was hit. Never zero, for the triangle may be visible all the
 // same.
 constexpr OcclusionHint::Few occluded{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
-constexpr double occluded_beside_hits = 1.0 / 8;
+constexpr double occluded_near_hits = 1.0 / 8;
 
 // Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
 // from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
@@ -106,13 +106,13 @@ class PixelMask {
     std::vector<uint8_t> marked_;
 };
 
-// Looks at the faces of one chunk.
+// Visits the faces of one chunk.
 template <class T>
 class MeasuredChunk {
    public:
     MeasuredChunk(const BackwardView<T>& view, const std::vector<double>& importance_around, bool geometry,
-                  const Destination& to, Array<int8_t>& facing, SurfaceMeasure<T>& out, PixelMask& mask,
-                  ChunkGrad& grad)
+                  const GradientSink& to, Array<int8_t>& facing, SurfaceMeasure<T>& out, PixelMask& mask,
+                  LocalGradients& grad)
         : view_(view),
           importance_around_(importance_around),
           want_places_(geometry),
@@ -193,7 +193,7 @@ class MeasuredChunk {
     void gather(int64_t f) {
         const int32_t* v = view_.scene.faces + 3 * f;
         const VertexView& p = view_.vertices;
-        if ((p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) || !view_.camera.is_straight()) {
+        if ((p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) || !view_.camera.is_undistorted()) {
             set_facing(f, 0, 0);
             if (!polygon_.set(view_.camera, view_.volume, p, v)) return;
             const auto [low, high] = view_.camera.image_box(polygon_.low, polygon_.high);
@@ -244,7 +244,7 @@ class MeasuredChunk {
         const double m = (e.area + e.longest) * rate(f), unhit = where_unhit(view_, f, e.area);
         const int64_t hiding = view_.seen[f] ? 0 : view_.occlusion.hiding_pixels(e.low, e.high, e.nearest);
         if (hits.partly)
-            return m * std::min(hiding ? OcclusionHint::factor(occluded_beside_hits, view_.image.spp) : 1, unhit);
+            return m * std::min(hiding ? OcclusionHint::factor(occluded_near_hits, view_.image.spp) : 1, unhit);
         if (hiding) return m * hidden(hiding);
         return m * view_.hits->where_missed(view_.scene.faces[3 * f], side());
     }
@@ -370,12 +370,12 @@ class MeasuredChunk {
     const BackwardView<T>& view_;
     const std::vector<double>& importance_around_;  // of what lies within two tiles of a point, by its own
     const bool want_places_;
-    const Destination& to_;
+    const GradientSink& to_;
     Array<int8_t>& facing_;
     const bool want_facing_;
     SurfaceMeasure<T>& out_;
     PixelMask& mask_;
-    ChunkGrad& grad_;
+    LocalGradients& grad_;
     const int C_;
     const double rough_;                                                 // of faces without a control
     const double rounding_ = 16 * view_.camera.rounding_of_positions();  // of a wedge, over the longer side
@@ -409,7 +409,7 @@ void thin_out(std::vector<int64_t>& pixels, double share, double offset) {
 }  // namespace
 
 template <class T>
-SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, Destination& to) {
+SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, GradientSink& to) {
     const GradientOptions& o = view.options;
     const int64_t F = view.scene.n_faces, chunks = (F + scatter_chunk - 1) / scatter_chunk;
     SurfaceMeasure<T> out{Array<double>(F), Array<uint8_t>(F), {}, {}};
@@ -420,7 +420,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     PixelMask mask(view.camera, margin, out.beyond);
     // What the controls are of all of their faces, summed by the places of vertices in the image.
     Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
-    Destination whole;
+    GradientSink whole;
     whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors;
     whole.vertex_attributes = to.vertex_attributes, whole.face_attributes = to.face_attributes;
     std::vector<double> total(chunks), of_pixels(chunks);
@@ -433,7 +433,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
                 view.importance.mean({(i - 2) * tile, (j - 2) * tile}, {(i + 3) * tile, (j + 3) * tile});
     });
     double seconds[2] = {};
-    view.scatter.add(F, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(F, whole, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
         MeasuredChunk<T> chunk(view, importance_around, geometry, to, facing, out, mask, grad);
         chunk.add(first, last);
         total[first / scatter_chunk] = chunk.total(), of_pixels[first / scatter_chunk] = chunk.of_pixels();
@@ -451,7 +451,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     return out;
 }
 
-template SurfaceMeasure<float> measure_surface(const BackwardView<float>&, bool, Array<int8_t>&, Destination&);
-template SurfaceMeasure<double> measure_surface(const BackwardView<double>&, bool, Array<int8_t>&, Destination&);
+template SurfaceMeasure<float> measure_surface(const BackwardView<float>&, bool, Array<int8_t>&, GradientSink&);
+template SurfaceMeasure<double> measure_surface(const BackwardView<double>&, bool, Array<int8_t>&, GradientSink&);
 
 }  // namespace edgegrad

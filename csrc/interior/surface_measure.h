@@ -10,9 +10,9 @@
 
 namespace edgegrad {
 
-// Triangles are laid end to end by the measure m = (area + longest side · 1 px) · (how much the loss looks there), in
-// image units, clipped to the view; more where there is a texture, less where the forward pass saw nothing or where a
-// control (control.h) says nearly all.
+// Triangles are laid end to end by the measure m = (area + longest side · 1 px) · (the importance of the adjoint
+// there), in image units, clipped to the view; more where there is a texture, less where the forward pass saw nothing
+// or where a control (control.h) says nearly all.
 template <class T>
 struct SurfaceMeasure {
     Array<double> of_face;            // (F,) m
@@ -41,6 +41,6 @@ struct SurfaceMeasure {
 // Measures all faces, and adds to `to` the integrals of the controls. What it finds of their orientation in the image
 // it writes into `facing` (F,), as Camera::facing has it, unless that is empty.
 template <class T>
-SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, Destination& to);
+SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, GradientSink& to);
 
 }  // namespace edgegrad

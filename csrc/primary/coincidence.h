@@ -85,7 +85,7 @@ class Coincidence {
    public:
     Coincidence(const BackwardView<T>& view, const CurveFinder<T>& finder) : view_(view), finder_(finder) {}
 
-    // The faces of a curve beside the line of `line`.
+    // The faces of a curve next to the line of `line`.
     CoincidentCurve on_line(const Curve& curve, const Curve& line) const {
         CoincidentCurve c{.curve = curve};
         c.side[0].face = c.side[1].face = -1;
@@ -196,7 +196,7 @@ class Coincidence {
         return {k[0] * q.x + k[1] * q.y + k[2] * w, k[3] * q.x + k[4] * q.y + k[5] * w, w};
     }
 
-    // Whether a face is no wider beside a curve than doubles tell.
+    // Whether a face is no wider next to a curve than doubles say.
     bool lies_on(const HalfEdge& h, const Curve& c) const {
         const Vec2 along = c.tangent();
         const Vec3 o = homogeneous(opposite_corner(h));

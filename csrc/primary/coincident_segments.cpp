@@ -38,7 +38,7 @@ void each_few(int64_t n, Team& team, Body body) {
     team.each((n + few - 1) / few, [&](int64_t k) { body(k, k * few, std::min(n, (k + 1) * few)); });
 }
 
-// How s meets o, over the part of s that lies beside o.
+// How s meets o, over the part of s that lies next to o.
 CoincidentCurves::Meeting meeting_within(const ImageSegment& s, const ImageSegment& o) {
     const Vec2 along = s.b - s.a, other = o.b - o.a;
     const double squared = along.x * along.x + along.y * along.y;
@@ -77,7 +77,7 @@ CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts,
         n += int64_t(parts[k].size()), total += length_of[k], margin_ = std::max(margin_, reach_of[k]);
     if (n == 0) return;
     // Some segments wide, so that few share a cell where a mesh is fine and many where it is coarse; a millionth: so
-    // that cells can be counted; at most 16 px, so that distances in a cell tell lines apart, unless many long segments
+    // that cells can be counted; at most 16 px, so that distances in a cell say lines apart, unless many long segments
     // would pass too many cells.
     const double cell = std::min(std::max({4 * total / double(n), 8 * margin_, 1e-6}), 16.0);
     lines_ = LineBuckets(std::max(cell, total / (2.0 * double(n) + 0x1p16)), margin_);
@@ -92,7 +92,7 @@ CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts,
     });
     if (segments_.empty()) return;
     fill(team);
-    find_companions(samples, team);
+    find_coincident(samples, team);
 }
 
 // In most scenes nearly all segments are alone on their lines.
@@ -104,7 +104,7 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
         sampled += std::count_if(parts[k].begin(), parts[k].end(),
                                  [&](const ImageSegment& s) { return samples.may_draw(s.curve); });
     });
-    // Of sampled ones all buckets that lines beside them may be in; the others then ask for their own alone.
+    // Of sampled ones all buckets that lines next to them may be in; the others then ask for their own alone.
     Occupancy around_sampled(4 * sampled), of_sampled(sampled), of_others(sampled);
     team.each(n, [&](int64_t k) {
         for (const ImageSegment& s : parts[k])
@@ -119,14 +119,14 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
     team.each(n, [&](int64_t k) {
         std::erase_if(parts[k], [&](const ImageSegment& s) {
             if (samples.may_draw(s.curve)) return false;
-            bool beside = false;
+            bool adjacent = false;
             lines_.each_cell(s, [&](const LineBuckets::Line& l) {
                 const uint64_t key = LineBuckets::key(l);
                 if (!around_sampled.any(key)) return;
-                beside = true;
+                adjacent = true;
                 of_others.add(key);
             });
-            return !beside;
+            return !adjacent;
         });
     });
     team.each(n, [&](int64_t k) {
@@ -190,9 +190,9 @@ void CoincidentCurves::fill(Team& team) {
 }
 
 // Buckets are shared by what follows end to end along a line, too. Where one holds many, all of them are kept unasked.
-void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
+void CoincidentCurves::find_coincident(const Systematic& samples, Team& team) {
     constexpr uint32_t many = 64;
-    const auto any_beside = [&](const ImageSegment& s, const LineBuckets::Line& l) {
+    const auto any_adjacent = [&](const ImageSegment& s, const LineBuckets::Line& l) {
         uint64_t keys[4];
         LineBuckets::keys_around(l, keys);
         const bool x = LineBuckets::runs_along_x(l);
@@ -209,27 +209,27 @@ void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
         }
         return false;
     };
-    std::vector<std::vector<Companion>> parts((segments_.size() + few - 1) / few);
+    std::vector<std::vector<CoincidentSegment>> parts((segments_.size() + few - 1) / few);
     each_few(segments_.size(), team, [&](int64_t k, int64_t first, int64_t last) {
-        std::vector<Companion> part;
+        std::vector<CoincidentSegment> part;
         for (int64_t i = first; i < last; ++i) {
             if (!samples.may_draw(segments_[i].curve)) continue;
             bool found = false;
             lines_.each_cell(segments_[i],
-                             [&](const LineBuckets::Line& l) { found = found || any_beside(segments_[i], l); });
+                             [&](const LineBuckets::Line& l) { found = found || any_adjacent(segments_[i], l); });
             if (found) part.push_back({segments_[i].edge, uint32_t(i)});
         }
         parts[k] = std::move(part);
     });
-    for (const auto& part : parts) companions_.insert(companions_.end(), part.begin(), part.end());
-    std::sort(companions_.begin(), companions_.end(),
-              [](const Companion& a, const Companion& b) { return a.edge < b.edge; });
+    for (const auto& part : parts) coincident_.insert(coincident_.end(), part.begin(), part.end());
+    std::sort(coincident_.begin(), coincident_.end(),
+              [](const CoincidentSegment& a, const CoincidentSegment& b) { return a.edge < b.edge; });
 }
 
 const ImageSegment* CoincidentCurves::find(int64_t edge) const {
-    const auto at = std::lower_bound(companions_.begin(), companions_.end(), edge,
-                                     [](const Companion& c, int64_t edge) { return c.edge < edge; });
-    return at != companions_.end() && at->edge == edge ? &segments_[at->segment] : nullptr;
+    const auto at = std::lower_bound(coincident_.begin(), coincident_.end(), edge,
+                                     [](const CoincidentSegment& c, int64_t edge) { return c.edge < edge; });
+    return at != coincident_.end() && at->edge == edge ? &segments_[at->segment] : nullptr;
 }
 
 CoincidentCurves::Meeting CoincidentCurves::at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x) {

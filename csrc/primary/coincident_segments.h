@@ -120,7 +120,7 @@ class CoincidentCurves {
     // Of each curve, at most: its segment in a list that doubles as it grows, and again where others lie on its line;
     // two tables; its entry in each of up to 7 cells; its companion, twice. Most pass one or two cells, and are alone.
     static constexpr int64_t bytes_per_curve() {
-        return sizeof(ImageSegment) + 2 * 16 + 7 * sizeof(Entry) + 2 * sizeof(Companion);
+        return sizeof(ImageSegment) + 2 * 16 + 7 * sizeof(Entry) + 2 * sizeof(CoincidentSegment);
     }
 
     // The segment of an edge that has samples; null if no other lies on it anywhere.
@@ -162,19 +162,19 @@ class CoincidentCurves {
     void keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, const Systematic& samples,
                               Team& team) const;
     void fill(Team& team);
-    void find_companions(const Systematic& samples, Team& team);
+    void find_coincident(const Systematic& samples, Team& team);
     static Meeting meeting(const ImageSegment& s, const ImageSegment& o);
     static Meeting at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x);
 
     LineBuckets lines_;
     // A segment that others lie on.
-    struct Companion {
+    struct CoincidentSegment {
         int64_t edge;
         uint32_t segment;
     };
 
     Array<ImageSegment> segments_{0};
-    std::vector<Companion> companions_;  // by ascending edges
+    std::vector<CoincidentSegment> coincident_;  // by ascending edges
     uint64_t mask_ = 0;
     std::vector<uint32_t> begin_;  // of each bucket, in entries_
     Array<Entry> entries_{0};

@@ -70,8 +70,8 @@ class ControlOfChannels final : public CreaseControl {
         const SceneView<T>& scene = view_.scene;
         if (!joins_colors(scene, curve) || curve.t0 > 0 || curve.t1 < 1) return false;
         // A crease that comes near the eye does not move in the image as its ends do.
-        bend_ = std::fabs(curve.w1 - curve.w0) / (curve.w0 + curve.w1);
-        if (!(bend_ < 1.0 / 3)) return false;
+        distort_ = std::fabs(curve.w1 - curve.w0) / (curve.w0 + curve.w1);
+        if (!(distort_ < 1.0 / 3)) return false;
         curve_ = &curve, tangent_ = curve.tangent();
         jumps_.set(curve.minus, curve.plus);
         for (int k = 0; k < 2; ++k) {
@@ -89,7 +89,7 @@ class ControlOfChannels final : public CreaseControl {
     }
 
     double density(double least) const override {
-        return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0);
+        return std::clamp(std::max(curve_->length / wide, distort_), least, 1.0);
     }
 
     void add_integral() override {
@@ -218,7 +218,7 @@ class ControlOfChannels final : public CreaseControl {
     const Curve* curve_ = nullptr;
     Vec2 tangent_;
     double per_[2];  // 1 / tangent_
-    double bend_ = 0;
+    double distort_ = 0;
     int32_t vertex_[2][2];  // of minus and plus; a and b
     double at_a_ = 0, at_b_ = 0;
     CreaseJumps<N, T> jumps_;

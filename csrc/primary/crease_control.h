@@ -24,7 +24,7 @@ namespace edgegrad {
 template <class T>
 bool joins_colors(const SceneView<T>& scene, const Curve& c) {
     return c.is_crease() && !is_textured(scene, c.minus.face) && !is_textured(scene, c.plus.face) &&
-           !cut_outs_jump(scene, c.minus, c.plus);
+           !alpha_masks_jump(scene, c.minus, c.plus);
 }
 
 // Of one curve after the other.

@@ -23,7 +23,7 @@ struct CreaseFace {
     // `seen`: and hit itself. `unknown` for all others.
     enum State : uint8_t { unknown, turned, hidden, clear, seen };
     float value;   // of two that differ the faces differ along their edge; not a number: of this one it does not say
-    float pixels;  // of one that is hidden or turned: the measure of a crease beside it, without the adjoint
+    float pixels;  // of one that is hidden or turned: the measure of a crease next to it, without the adjoint
     float importance;  // and of the adjoint
     State state;
 

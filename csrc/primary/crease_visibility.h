@@ -51,7 +51,7 @@ class CreaseVisibility {
                                               view_.image.spp)};
     }
 
-    // Of any other; nothing where rays must tell.
+    // Of any other; nothing where rays must say.
     std::optional<Expected> without_rays(const Curve& c, Relation relation) const {
         const double missed = where_missed(c);
         if (relation == Relation::across) return Expected{hits(c.minus).whole && hits(c.plus).whole, missed};
@@ -66,7 +66,7 @@ class CreaseVisibility {
     // Adds rays to some points of a crease to the batch; returns its place there.
     int ask(const Curve& c, Relation relation) {
         const int n = points(c);
-        asked_[size_] = {c, n, by_evidence(std::max(fewest(c, relation), beside_silhouettes)), where_missed(c)};
+        asked_[size_] = {c, n, by_evidence(std::max(fewest(c, relation), near_silhouettes)), where_missed(c)};
         for (int i = 0; i < n; ++i) {
             const Vec2 at = normalised(view_.camera, c.position(asked_at[i]));
             rays_.n_x[rays_.count] = at.x, rays_.n_y[rays_.count++] = at.y;
@@ -87,7 +87,7 @@ class CreaseVisibility {
                 const Answer a = at(c, asked_at[i], ray++);
                 visible += a == Answer::visible, hidden += a == Answer::hidden;
             }
-            // Beside what the image hit, one that rays find hidden may be visible between them, as at a limb.
+            // Next to what the image hit, one that rays find hidden may be visible between them, as at a limb.
             const bool agreed = visible == points || (hidden == points && missed < 1);
             body(k, c, Expected{visible > hidden, agreed ? std::min(fewest, missed) : missed});
         }
@@ -104,29 +104,29 @@ class CreaseVisibility {
     static int points(const Curve& c) { return c.length < 4 ? few_points : most_points; }
 
     // Least fractions of the samples: where nothing may divide a crease; and where it may, but rays find it undivided.
-    static constexpr double few = CreaseSamples::visible, beside_silhouettes = 1.0 / 128, beside_parts = 1.0 / 32,
-                            beside_missed = 1.0 / 8;  // faces near which others were not hit: something may pass
-                                                      // through, or be cut out
+    static constexpr double few = CreaseSamples::visible, near_silhouettes = 1.0 / 128, near_other_parts = 1.0 / 32,
+                            near_missed = 1.0 / 8;  // faces near which others were not hit: something may pass
+                                                    // through, or be alpha-tested
 
     // Fewer than 16 rays a pixel miss more of where parts meet, and of which faces are divided.
     double by_evidence(double least) const { return OcclusionHint::factor(least, view_.image.spp); }
 
     double fewest(const Curve& c, Relation relation) const {
-        if (view_.cut_outs) return beside_missed;
-        if (relation != Relation::apart) return beside_parts;
+        if (view_.alpha_masks) return near_missed;
+        if (relation != Relation::apart) return near_other_parts;
         Vec2 low{INFINITY, INFINITY}, high{-INFINITY, -INFINITY};  // of both faces
         double farthest = -INFINITY;
         for (const HalfEdge* h : {&c.minus, &c.plus})
             for (int i = 0; i < 3; ++i) {
                 const int32_t v = vertex(view_.scene, *h, i);
-                if (view_.vertices.outcode[v]) return beside_parts;  // it is not known where all of the face is
+                if (view_.vertices.outcode[v]) return near_other_parts;  // it is not known where all of the face is
                 const Vec2 x = view_.vertices.x[v];
                 low = {std::min(low.x, x.x), std::min(low.y, x.y)};
                 high = {std::max(high.x, x.x), std::max(high.y, x.y)};
                 farthest = std::max(farthest, view_.vertices.q[v].z);
             }
-        if (!hits(c.minus).clear || !hits(c.plus).clear) return beside_missed;
-        return meeting_.in(low, high) ? beside_parts : crossings_.in(low, high, farthest) ? beside_silhouettes : few;
+        if (!hits(c.minus).clear || !hits(c.plus).clear) return near_missed;
+        return meeting_.in(low, high) ? near_other_parts : crossings_.in(low, high, farthest) ? near_silhouettes : few;
     }
 
     // Whether an own face is no wider in the image than rays err: their places are rounded to floats of the image's
@@ -139,7 +139,7 @@ class CreaseVisibility {
         return std::fabs(wedge(c.tangent(), view_.vertices.x[opposite] - c.x0)) < error * c.length;
     }
 
-    // What a ray says of the point s of a crease. Of what is nearer by less than a part of a pixel it does not tell:
+    // What a ray says of the point s of a crease. Of what is nearer by less than a part of a pixel it does not say:
     // where faces are seen nearly edge-on, it may be a neighbour that the ray should have missed, and what touches the
     // crease is decided in double.
     enum class Answer { visible, hidden, unknown };

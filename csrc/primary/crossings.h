@@ -65,7 +65,7 @@ class Crossings {
     }
 
     // How those that pass before a curve, or no farther behind it than `touching`, lie to it: none meets it between its
-    // ends; one runs along it, so near that floats do not tell them apart; one crosses it, as far as is known.
+    // ends; one runs along it, so near that floats do not show them apart; one crosses it, as far as is known.
     enum class Relation { apart, along, across };
     Relation relation(const Curve& c, double touching) const {
         const double farthest = std::max(c.a.z, c.b.z) + touching;

@@ -56,13 +56,14 @@ template <class T>
 struct CreaseHints {
     const Crossings crossings;
     const MeetingParts meeting;
-    std::optional<CreaseFaces<T>> faces;  // none where some are cut out: their rims are no silhouettes that they know
+    std::optional<CreaseFaces<T>>
+        faces;  // none where some are alpha-tested: their alpha edges are no silhouettes that they know
 
     CreaseHints(const BackwardView<T>& view, const CurveFinder<T>& finder,
                 const std::vector<std::vector<ImageSegment>>& silhouettes)
         : crossings(silhouettes, view.camera.width, view.camera.height, view.team),
           meeting(view.hit, view.scene.faces, view.geometry.parts(), view.camera.width, view.camera.height, view.team) {
-        if (!view.scene.cut_outs.face) faces.emplace(view, finder, crossings, meeting);
+        if (!view.scene.alpha_masks.face) faces.emplace(view, finder, crossings, meeting);
     }
 };
 
@@ -93,7 +94,7 @@ class MeasuredEdges {
 
     void add(int64_t first, int64_t last) {
         if (faces_) curves.reserve(last - first);  // where faces differ nearly all edges are curves
-        finder_.each(first, last, FaceGlance{*this}, [&](int64_t e) {
+        finder_.each(first, last, FaceEarlyOut{*this}, [&](int64_t e) {
             if (!add_clear(e)) add_any(e);
         });
         answer();
@@ -107,17 +108,17 @@ class MeasuredEdges {
     };
 
     // What is known of the faces on both sides of an edge.
-    struct FaceGlance {
+    struct FaceEarlyOut {
         MeasuredEdges& edges;
-        using Glance = typename CurveFinder<T>::Glance;
+        using EarlyOut = typename CurveFinder<T>::EarlyOut;
 
-        Glance operator()(int64_t e, int32_t f, int32_t g) const {
-            if (!edges.faces_) return Glance::unknown;
+        EarlyOut operator()(int64_t e, int32_t f, int32_t g) const {
+            if (!edges.faces_) return EarlyOut::unknown;
             const CreaseFace &one = (*edges.faces_)[f], &other = (*edges.faces_)[g];
-            if (one.value == other.value || std::isnan(one.value + other.value)) return Glance::unknown;
-            if (!one.is_hidden() || !other.is_hidden()) return Glance::differs;
+            if (one.value == other.value || std::isnan(one.value + other.value)) return EarlyOut::unknown;
+            if (!one.is_hidden() || !other.is_hidden()) return EarlyOut::differs;
             edges.add_hidden(e, one, other);
-            return Glance::done;
+            return EarlyOut::done;
         }
         void prefetch(int32_t face) const {
             if (edges.faces_) edgegrad::prefetch(&(*edges.faces_)[face]);
@@ -187,7 +188,7 @@ class MeasuredEdges {
             segments.push_back(image_segment(view_, c, jump.curve));
             measure(c, jump,
                     std::min(hiding ? view_.occlusion.factor(occluded, double(hiding), view_.image.spp) : 1,
-                             beside_unhit(view_, c.minus.face >= 0 ? c.minus.face : c.plus.face)));
+                             next_to_unhit(view_, c.minus.face >= 0 ? c.minus.face : c.plus.face)));
         }
     }
 
@@ -255,12 +256,12 @@ class MeasuredEdges {
     Jump asked_[CreaseVisibility<T>::most];
 };
 
-// The rim of what the lens shows, where the loss looks. Nothing is known of the jump.
+// The lens boundary, where the adjoint is not zero. Nothing is known of the jump.
 template <class T>
-void measure_rim(const BackwardView<T>& view, Curves<T>& out) {
+void measure_lens_boundary(const BackwardView<T>& view, Curves<T>& out) {
     if (!view.camera.lens_view.end) return;
-    for (const RimArc& arc : out.rim_curve.emplace(view.camera, view.importance).arcs) {
-        out.rim += arc.length, out.pixels += arc.length;
+    for (const LensBoundaryArc& arc : out.lens_boundary_curve.emplace(view.camera, view.importance).arcs) {
+        out.lens_boundary += arc.length, out.pixels += arc.length;
         out.squares += arc.measure * arc.measure, out.unknown += arc.measure * arc.measure;
     }
 }
@@ -284,7 +285,7 @@ std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, 
 template <class T>
 Curves<T>::Curves(const BackwardView<T>& view, Array<int8_t> facing)
     : finder(view, std::move(facing)),
-      x_bar(zeros(view.hits && finder.finds_creases() && view.options.controls && view.camera.is_straight()
+      x_bar(zeros(view.hits && finder.finds_creases() && view.options.controls && view.camera.is_undistorted()
                       ? 2 * view.scene.n_verts
                       : 0,
                   view.team)) {}
@@ -336,7 +337,7 @@ void Curves<T>::add_segments(const BackwardView<T>& view, const Systematic& samp
 }
 
 template <class T>
-Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool rim) {
+Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool lens_boundary) {
     Curves<T> out(view, std::move(facing));
     const int64_t E = view.geometry.topology().n_edges();
     const JumpScale scale = out.finder.finds_creases() ? jump_scale(view) : JumpScale{};
@@ -360,10 +361,10 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
         view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) { measure(k, first, last, nullptr); });
     } else {
         resize((E + scatter_chunk - 1) / scatter_chunk);
-        Destination whole;
+        GradientSink whole;
         whole.x = out.x_bar.data();
         double seconds[2] = {};
-        view.scatter.add(E, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        view.scatter.add(E, whole, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
             measure(first / scatter_chunk, first, last, &grad.x);
         });
     }
@@ -374,12 +375,12 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
     for (const auto& part : curves) first.push_back(first.back() + int64_t(part.size()));
     const int64_t n = first.back();
     measure_intersections(view, out);
-    if (rim) measure_rim(view, out);
+    if (lens_boundary) measure_lens_boundary(view, out);
     out.curve = Array<MeasuredCurve>(n), out.measure = Array<double>(n + int64_t(out.intersection.size()) + out.arcs());
     int64_t next = n;
     for (const MeasuredIntersection& i : out.intersection) out.measure[next++] = i.measure;
-    if (out.rim_curve)
-        for (const RimArc& arc : out.rim_curve->arcs) out.measure[next++] = arc.measure;
+    if (out.lens_boundary_curve)
+        for (const LensBoundaryArc& arc : out.lens_boundary_curve->arcs) out.measure[next++] = arc.measure;
     view.team.each(int64_t(curves.size()), [&](int64_t k) {
         for (ImageSegment& s : out.segments[k]) s.curve += int32_t(first[k]);
         for (ClearCrease& c : out.clear[k]) c.curve += int32_t(first[k]);

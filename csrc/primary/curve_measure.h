@@ -19,7 +19,7 @@ struct CurvesFound {
     double pixels = 0;                // the measure without the adjoint, which default samples go by
     double squares = 0, unknown = 0;  // Σ measure² of what is expected to be visible, and of what controls do not say
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // in view
-    double rim = 0;                                           // px of the rim of what a lens shows, in view
+    double lens_boundary = 0;                                 // px of the lens boundary, in view
 };
 struct MeasuredCurve {
     double measure = 0;
@@ -44,14 +44,14 @@ constexpr int64_t bytes_per_curve() {
 template <class T>
 struct Curves : CurvesFound {
     CurveFinder<T> finder;
-    Array<MeasuredCurve> curve{0};                   // those where the loss looks, by ascending edges
-    Array<Intersection> drawn{0};                    // of those of the geometry, if this view draws its own
-    std::vector<MeasuredIntersection> intersection;  // after them, those of faces that pass through each other
-    std::optional<RimCurve> rim_curve;               // and after these the rim of what a lens shows, if it is asked for
-    Array<double> measure{0};                        // of all
-    std::vector<std::vector<ImageSegment>> segments;  // of those that others may lie on
-    std::vector<std::vector<ClearCrease>> clear;      // of which no segment was made
-    bool any_hidden = false;                          // or of creases between hidden faces, if there are any
+    Array<MeasuredCurve> curve{0};                         // those where the adjoint is not zero, by ascending edges
+    Array<Intersection> drawn{0};                          // of those of the geometry, if this view draws its own
+    std::vector<MeasuredIntersection> intersection;        // after them, those of faces that pass through each other
+    std::optional<LensBoundaryCurve> lens_boundary_curve;  // and after these the lens boundary, if it is asked for
+    Array<double> measure{0};                              // of all
+    std::vector<std::vector<ImageSegment>> segments;       // of those that others may lie on
+    std::vector<std::vector<ClearCrease>> clear;           // of which no segment was made
+    bool any_hidden = false;                               // or of creases between hidden faces, if there are any
     Array<double> x_bar;  // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
 
     Curves(const BackwardView<T>& view, Array<int8_t> facing);
@@ -59,7 +59,7 @@ struct Curves : CurvesFound {
     const Array<Intersection>& lines(const Geometry& geometry) const {
         return geometry.intersections().are_drawn() ? drawn : geometry.intersections().all();
     }
-    int64_t arcs() const { return rim_curve ? int64_t(rim_curve->arcs.size()) : 0; }
+    int64_t arcs() const { return lens_boundary_curve ? int64_t(lens_boundary_curve->arcs.size()) : 0; }
 
     // Samples: so many as are given, if not −1, or the defaults.
     int64_t wanted(const GradientOptions& o) const;
@@ -70,8 +70,8 @@ struct Curves : CurvesFound {
 };
 
 // Finds and measures all curves, and begins x_bar with the integrals of the controls. `facing` (F,): Camera::facing.
-// `rim`: whether that of a lens counts, which moves with its parameters alone.
+// `boundary`: whether that of a lens counts, which moves with its parameters alone.
 template <class T>
-Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool rim);
+Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool lens_boundary);
 
 }  // namespace edgegrad

@@ -44,7 +44,7 @@ class EdgeSource {
     bool place(const Curve& curve, double s, Sample& sample) {
         if (places_ == 0 || place_[places_ - 1].own.curve.edge != curve.edge) {
             // A place of which no sample waits, for all were hidden, is free again: so there are never more than lanes.
-            if (places_ > 0 && waiting_ != places_ - 1) --places_;
+            if (places_ > 0 && pending_ != places_ - 1) --places_;
             start(place_[places_++], curve);
         }
         Place& place = place_[places_ - 1];
@@ -54,7 +54,7 @@ class EdgeSource {
         sample.t = t;
         sample.behind = {};
         sample.share = {.side = {curve.minus, curve.plus}, .side_t = {t, t}};
-        if (view_.cut_outs && !show(curve, t, sample.share)) return false;
+        if (view_.alpha_masks && !show(curve, t, sample.share)) return false;
         const std::span<const int32_t> own = place.faces.faces;
         sample.gathered.clear();
         if ((place.segment || place.edge_on) && !share(place, sample)) return false;
@@ -63,7 +63,7 @@ class EdgeSource {
             std::sort(sample.gathered.begin(), sample.gathered.end());
         }
         sample.ignored = sample.gathered.empty() ? own : std::span<const int32_t>(sample.gathered);
-        waiting_ = sample.place;
+        pending_ = sample.place;
         return true;
     }
 
@@ -77,7 +77,7 @@ class EdgeSource {
         SampleSurfaces surfaces;
         for (int k = 0; k < 2; ++k) {
             const HalfEdge& h = share.side[k];
-            surfaces.at[k] = h.face >= 0 ? SurfacePoint{h.face, beside_edge(view_.scene, h, share.side_t[k])} : behind;
+            surfaces.at[k] = h.face >= 0 ? SurfacePoint{h.face, next_to_edge(view_.scene, h, share.side_t[k])} : behind;
         }
         if (uncovers(sample))
             surfaces.at[surfaces.count++] =
@@ -97,7 +97,7 @@ class EdgeSource {
 
     // δx ∧ τ = δx · (τ_y, −τ_x).
     Vec2 normal(const Sample& sample) const {
-        const Vec2 tangent = bent_tangent(sample);
+        const Vec2 tangent = distorted_tangent(sample);
         return {tangent.y, -tangent.x};
     }
 
@@ -105,7 +105,7 @@ class EdgeSource {
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
         if (!direction.moves()) return {};
         const Curve& curve = place_[sample.place].own.curve;
-        const Vec2 tangent = bent_tangent(sample);
+        const Vec2 tangent = distorted_tangent(sample);
         const auto velocity = [&](Vec3 point, Vec3 point_dot) {
             return wedge(project_jvp(view_.camera, point, point_dot, direction.intrinsics), tangent);
         };
@@ -124,10 +124,10 @@ class EdgeSource {
         return {velocity(sample.point, point_dot), of_second};
     }
 
-    void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) {
+    void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) {
         const Curve& curve = place_[sample.place].own.curve;
         const CoincidentShare& share = sample.share;
-        const Vec2 tangent = bent_tangent(sample);
+        const Vec2 tangent = distorted_tangent(sample);
         const auto move = [&](Vec3 point, double jump) {
             Vec3 point_bar;
             project_vjp(view_.camera, point, {jump * tangent.y, -jump * tangent.x}, point_bar, grad.k);
@@ -148,9 +148,9 @@ class EdgeSource {
         second_bar_[1] += second.t * second_bar;
     }
 
-    void cast() { places_ = 0, waiting_ = -1; }
+    void cast() { places_ = 0, pending_ = -1; }
 
-    void finish(ChunkGrad& grad) {
+    void finish(LocalGradients& grad) {
         flush(grad);
         flush_second(grad);
     }
@@ -178,12 +178,12 @@ class EdgeSource {
         other_edges_.clear();
     }
 
-    // Sets what is there on either side at the point t, where faces may be cut out; false if nothing is.
+    // Sets what is there on either side at the point t, where faces may be alpha-tested; false if nothing is.
     bool show(const Curve& curve, double t, CoincidentShare& share) const {
         share.side[0].face = share.side[1].face = -1;
         for (const HalfEdge& h : view_.geometry.topology().half_edges(curve.edge)) {
             const int turn = finder_.turn_of(h);
-            if (turn == 0 || !shows(view_.scene, h.face, beside_edge(view_.scene, h, t))) continue;
+            if (turn == 0 || !shows(view_.scene, h.face, next_to_edge(view_.scene, h, t))) continue;
             HalfEdge& side = share.side[turn > 0 ? 0 : 1];
             if (side.face < 0 || !in_front(view_, side, h, curve.a, curve.b)) side = h;
         }
@@ -202,8 +202,8 @@ class EdgeSource {
     }
 
     // dx/ds at the pixel position.
-    Vec2 bent_tangent(const Sample& sample) const {
-        return bend_jvp(view_.camera, sample.n, place_[sample.place].own.curve.tangent());
+    Vec2 distorted_tangent(const Sample& sample) const {
+        return distort_jvp(view_.camera, sample.n, place_[sample.place].own.curve.tangent());
     }
 
     // What the curves that lie on this one leave to a sample of it; false if nothing. Gathers their faces.
@@ -229,7 +229,7 @@ class EdgeSource {
                 if (s < 0 || s > 1) return true;
                 const CoincidentCurve& c = other(o.edge, curve);
                 CoincidentShare there;
-                if (view_.cut_outs && !show(c.curve, c.curve.parameter(s), there)) return true;
+                if (view_.alpha_masks && !show(c.curve, c.curve.parameter(s), there)) return true;
                 return visible = coincidence_.add(c, c.curve.parameter(s));
             }
             for (const int32_t f : faces) {
@@ -261,7 +261,7 @@ class EdgeSource {
 
     // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to
     // each, which matters only if they have copies of their own of the vertices.
-    void flush(ChunkGrad& grad) {
+    void flush(LocalGradients& grad) {
         if (current_.edge < 0) return;
         const bool both = current_.is_crease();
         for (const HalfEdge* h : {&current_.minus, &current_.plus}) {
@@ -273,7 +273,7 @@ class EdgeSource {
         current_.edge = -1;
     }
 
-    void flush_second(ChunkGrad& grad) {
+    void flush_second(LocalGradients& grad) {
         for (int i = 0; i < 2; ++i)
             if (second_[i] >= 0) grad.q.add<3>(second_[i], &second_bar_[i].x);
         second_[0] = second_[1] = -1;
@@ -286,7 +286,7 @@ class EdgeSource {
     Coincidence<T> coincidence_;
 
     Place place_[RayBatch::size];         // of the samples that wait
-    int places_ = 0, waiting_ = -1;       // the place of the latest sample that waits
+    int places_ = 0, pending_ = -1;       // the place of the latest sample that waits
     std::vector<int64_t> other_edges_;    // of the curves on the line of the latest
     std::deque<CoincidentCurve> others_;  // theirs; those beyond wait to be used again
     FaceSet asked_;                       // whether the latest sample's ray meets them

@@ -1,4 +1,4 @@
-// Curves that lie behind what the image hit, or beside faces that it did not hit.
+// Curves that lie behind what the image hit, or next to faces that it did not hit.
 #pragma once
 
 #include <algorithm>
@@ -13,20 +13,20 @@ namespace edgegrad {
 
 // How few samples a silhouette gets if it lies behind what the image hit (occlusion.h). Never none, for it may be
 // visible all the same; a gap may run along it, so that fewer rays than elsewhere find it. What was merely not hit
-// counts in full: at the limb of a fine mesh the faces beside a silhouette are a hundredth of a pixel wide and hit by
+// counts in full: at the limb of a fine mesh the faces next to a silhouette are a hundredth of a pixel wide and hit by
 // chance. Of creases more is known: crease_visibility.h.
 constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
 
-// The same of a curve beside a face that shows along it wherever the curve does, if no ray hit that face.
+// The same of a curve next to a face that shows along it wherever the curve does, if no ray hit that face.
 template <class T>
-double beside_unhit(const BackwardView<T>& view, int64_t face) {
+double next_to_unhit(const BackwardView<T>& view, int64_t face) {
     if (view.seen[face]) return 1;
     const int32_t* v = view.scene.faces + 3 * face;
     const VertexView& p = view.vertices;
     if (p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) return 1;
     const Vec2 a = p.x[v[0]], b = p.x[v[1]], c = p.x[v[2]];
-    const double bent = bend(view.camera, (1.0 / 3) * (a + b + c)).area_scale;
-    return where_unhit(view, face, 0.5 * bent * std::fabs(wedge(b - a, c - a)));
+    const double distorted = distort(view.camera, (1.0 / 3) * (a + b + c)).area_scale;
+    return where_unhit(view, face, 0.5 * distorted * std::fabs(wedge(b - a, c - a)));
 }
 
 // In how many pixels a curve is behind all that was hit; 0: not in all of them.

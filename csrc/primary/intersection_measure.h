@@ -14,7 +14,7 @@
 
 namespace edgegrad {
 
-// How much a line where faces pass through each other counts beside another one: by how the radiance differs at its
+// How much a line where faces pass through each other counts next to another one: by how the radiance differs at its
 // ends, which is known, and by how far it moves with the faces, which is far where their planes are nearly the same.
 template <class T>
 class IntersectionSize {
@@ -33,7 +33,7 @@ class IntersectionSize {
     }
 
    private:
-    // Not so little that a sample stands for too much, where ends do not tell of what lies between them.
+    // Not so little that a sample stands for too much, where ends do not show of what lies between them.
     static double within(double x, double most) { return x > 1.0 / 64 ? std::min(x, most) : 1.0 / 64; }
 
     // The size of the mean where textures would have to be asked.
@@ -74,7 +74,7 @@ Array<Intersection> draw_intersections(const BackwardView<T>& view) {
             const uint8_t some = p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]];
             if (view.seen[f]) share[f] = 1;
             else if (some) share[f] = p.outcode[v[0]] & p.outcode[v[1]] & p.outcode[v[2]] ? hidden : 1;
-            else share[f] = behind(0) && behind(1) && behind(2) ? hidden : float(beside_unhit(view, f));
+            else share[f] = behind(0) && behind(1) && behind(2) ? hidden : float(next_to_unhit(view, f));
         }
     });
     return view.geometry.intersections().drawn(
@@ -82,9 +82,9 @@ Array<Intersection> draw_intersections(const BackwardView<T>& view) {
         hash(view.options.seed, 12, gradient_stream), view.team);
 }
 
-// Lines where faces pass through each other: those where the loss looks, appended to `out.intersection`. What is known
-// of their jumps tells how they compare with one another. Of silhouettes it is not known, so together they count as
-// half their length, for where they are many most join what is near in space too.
+// Lines where faces pass through each other: those where the adjoint is not zero, appended to `out.intersection`. What
+// is known of their jumps tells how they compare with one another. Of silhouettes it is not known, so together they
+// count as half their length, for where they are many most join what is near in space too.
 constexpr double share_of_length = 0.5;
 template <class T>
 void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
@@ -111,7 +111,7 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
             const int64_t hiding = hiding_pixels(view.occlusion, low, high, c.nearest_depth());
             const double samples =
                 std::min(hiding ? view.occlusion.factor(occluded, double(hiding), view.image.spp) : 1,
-                         std::max(beside_unhit(view, all[i].face[0]), beside_unhit(view, all[i].face[1])));
+                         std::max(next_to_unhit(view, all[i].face[0]), next_to_unhit(view, all[i].face[1])));
             const double pixels = c.length * view.camera.stretch(c.low(), c.high()) * samples;
             const double size = size_of(c);
             part.pixels += all[i].weight * pixels, part.sized += pixels * size;

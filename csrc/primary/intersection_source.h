@@ -10,7 +10,7 @@
 //
 //     (N · dq/dz) δz = N · (Σ b_i δq_i − δq(z)).
 //
-// Where a lens bends the image, dℓ / |∇F| is that of the straight image times the area scale.
+// Where a lens bends the image, dℓ / |∇F| is that of the undistorted image times the area scale.
 #pragma once
 
 #include <algorithm>
@@ -44,7 +44,7 @@ template <class T>
 bool find_intersection(const BackwardView<T>& view, const Array<int8_t>& facing, const Intersection& i,
                        IntersectionCurve& c) {
     if (facing[i.face[0]] == 0 || facing[i.face[1]] == 0) return false;
-    if (i.next >= 0 && facing[i.next] * facing[i.face[i.beside]] <= 0) return false;
+    if (i.next >= 0 && facing[i.next] * facing[i.face[i.ending]] <= 0) return false;
     const Camera& camera = view.camera;
     const Vec3 a = camera.to_camera(i.a), b = camera.to_camera(i.b);
     double t0, t1;
@@ -63,7 +63,7 @@ struct IntersectionPlanes {
     FaceMap map[2];
     Vec3 normal[2];
     Vec2 slope;        // ∂F/∂n
-    double scale = 0;  // length / |∇F| in the straight image, times the weight of the intersection
+    double scale = 0;  // length / |∇F| in the undistorted image, times the weight of the intersection
 
     template <class T>
     IntersectionPlanes& set(const BackwardView<T>& view, const IntersectionCurve& curve) {
@@ -152,7 +152,7 @@ class IntersectionSource {
         return {place.planes.scale * sample.area_scale * F_dot, 0};
     }
 
-    void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) {
+    void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) {
         const Place& place = place_[sample.place];
         if (current_ != place.curve.faces) finish(grad), current_ = place.curve.faces;
         const double z = sample.point.z, F_bar = place.planes.scale * sample.area_scale * jumps.first;
@@ -170,7 +170,7 @@ class IntersectionSource {
     void cast() { places_ = 0; }
 
     // Adds what was summed for the latest curve.
-    void finish(ChunkGrad& grad) {
+    void finish(LocalGradients& grad) {
         if (!current_) return;
         for (int k = 0; k < 2; ++k)
             for (int i = 0; i < 3; ++i) {

@@ -31,7 +31,7 @@ double mean_size(const Number* values, int64_t rows, const double* weights, int 
 }
 
 // The channels of radiance have one unit. Attributes have units of their own, so there a channel counts as much as the
-// loss looks at it.
+// loss depends on it.
 template <class T>
 JumpScale jump_scale(const BackwardView<T>& view) {
     const SceneView<T>& scene = view.scene;

@@ -1,7 +1,7 @@
-// The rim of what a lens shows (camera/lens_boundary.h), along which the image jumps from the scene to the background.
+// The lens boundary (camera/lens_boundary.h), along which the image jumps from the scene to the background.
 //
 // Its share of ∂loss/∂Φ is ∫ Ã · [L_inside − L_background] (∂x/∂Φ · N) dθ, with N the normal that points outwards, as
-// long as dx/dθ. The ray of a sample is that of the rim itself, the last that is seen.
+// long as dx/dθ. The ray of a sample is that of the lens boundary itself, the last that is seen.
 #pragma once
 
 #include <cmath>
@@ -17,17 +17,17 @@
 
 namespace edgegrad {
 
-struct RimArc {
-    Rim::Arc arc;
+struct LensBoundaryArc {
+    LensBoundary::Arc arc;
     double length, measure;  // px; and with the mean |Ã| near it
 };
 
-// The rim in arcs of a few pixels: those where the loss looks.
-struct RimCurve {
-    const Rim rim;
-    std::vector<RimArc> arcs;
+// The lens boundary in arcs of a few pixels: those where the adjoint is not zero.
+struct LensBoundaryCurve {
+    const LensBoundary lens_boundary;
+    std::vector<LensBoundaryArc> arcs;
 
-    RimCurve(const Camera& camera, const Importance& importance) : rim(camera) {
+    LensBoundaryCurve(const Camera& camera, const Importance& importance) : lens_boundary(camera) {
         constexpr int whole = 64;
         for (int i = 0; i < whole; ++i) add(importance, {2 * M_PI * i / whole, 2 * M_PI * (i + 1) / whole});
     }
@@ -35,10 +35,11 @@ struct RimCurve {
    private:
     static constexpr double longest = 4;  // px
 
-    void add(const Importance& importance, Rim::Arc arc) {
+    void add(const Importance& importance, LensBoundary::Arc arc) {
         Vec2 low, high;
-        if (!rim.box(arc, low, high)) return;
-        const double mean = importance.mean(low, high), size = length(rim.place(arc.to) - rim.place(arc.from));
+        if (!lens_boundary.box(arc, low, high)) return;
+        const double mean = importance.mean(low, high),
+                     size = length(lens_boundary.place(arc.to) - lens_boundary.place(arc.from));
         if (!(mean > 0) || !std::isfinite(size)) return;
         if (size <= longest) return arcs.push_back({arc, size, size * mean});
         const double middle = 0.5 * (arc.from + arc.to);
@@ -46,17 +47,17 @@ struct RimCurve {
     }
 };
 
-// What a contraction asks of it.
-class RimSource {
+// What a accumulation asks of it.
+class LensBoundarySource {
    public:
     struct Sample {
         Vec2 x, normal;  // px, and N
-        Rim::Point point;
+        LensBoundary::Point point;
         double weight;  // inverse of the density of samples along the arc
         SurfacePoint inside;
     };
 
-    explicit RimSource(const Rim& rim) : rim_(rim) {}
+    explicit LensBoundarySource(const LensBoundary& lens_boundary) : lens_boundary_(lens_boundary) {}
 
     SampleSurfaces surfaces(const Sample& sample) const { return {{sample.inside, SurfacePoint()}}; }
     CurveJumps jumps(const Sample& sample, const double* radiance) const {
@@ -66,33 +67,37 @@ class RimSource {
 
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
         if (!direction.moves()) return {};
-        const Vec2 moved = rim_.velocity(sample.point, direction.intrinsics);
+        const Vec2 moved = lens_boundary_.velocity(sample.point, direction.intrinsics);
         return {moved.x * sample.normal.x + moved.y * sample.normal.y, 0};
     }
-    void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) const {
-        rim_.velocity_vjp(sample.point, jumps.first * sample.normal, grad.k);
+    void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) const {
+        lens_boundary_.velocity_vjp(sample.point, jumps.first * sample.normal, grad.k);
     }
-    void finish(ChunkGrad&) {}
+    void finish(LocalGradients&) {}
 
    private:
-    const Rim& rim_;
+    const LensBoundary& lens_boundary_;
 };
-static_assert(MovingCurve<RimSource>);
+static_assert(MovingCurve<LensBoundarySource>);
 
-// Samples in batches of rays, of which none ignores a face: nothing hides a point of the rim.
+// Samples in batches of rays, of which none ignores a face: nothing hides a point of the lens boundary.
 template <class T>
-class RimSamples {
+class LensBoundarySamples {
    public:
-    RimSamples(const BackwardView<T>& view, const Rim& rim, CurveContraction& contraction)
-        : view_(view), rim_(rim), source_(rim), contraction_(contraction), rays_(view.frame) {}
+    LensBoundarySamples(const BackwardView<T>& view, const LensBoundary& lens_boundary, CurveAccumulation& accumulation)
+        : view_(view),
+          lens_boundary_(lens_boundary),
+          source_(lens_boundary),
+          accumulation_(accumulation),
+          rays_(view.frame) {}
 
     // The point at the fraction s of an arc; its x is a place that shows the inside, for who asks there for a ray.
-    void add(Rim::Arc arc, double s, double weight) {
+    void add(LensBoundary::Arc arc, double s, double weight) {
         const int i = rays_.count;
-        const std::optional<Rim::Point> point = rim_.at(arc.from + s * (arc.to - arc.from));
-        if (!point || !contraction_.wants(i, point->x)) return;
-        sample_[i] = {.x = point->x - (inwards / length(point->tangent)) * rim_.outward(point->tangent),
-                      .normal = (arc.to - arc.from) * rim_.outward(point->tangent),
+        const std::optional<LensBoundary::Point> point = lens_boundary_.at(arc.from + s * (arc.to - arc.from));
+        if (!point || !accumulation_.wants(i, point->x)) return;
+        sample_[i] = {.x = point->x - (inwards / length(point->tangent)) * lens_boundary_.outward(point->tangent),
+                      .normal = (arc.to - arc.from) * lens_boundary_.outward(point->tangent),
                       .point = *point,
                       .weight = weight,
                       .inside = {}};
@@ -102,7 +107,7 @@ class RimSamples {
         if (++rays_.count == RayBatch::size) cast();
     }
 
-    void finish(ChunkGrad& grad) {
+    void finish(LocalGradients& grad) {
         cast();
         source_.finish(grad);
     }
@@ -119,17 +124,17 @@ class RimSamples {
             const Vec2 n = rays_.n(i);
             const FaceMap map = face_map(view_.camera, corners_of(view_, face).data());
             sample_[i].inside = {face, barycentrics_of_hit(map, n), depth_of(view_, face, n)};
-            contraction_.add(i, source_, sample_[i]);
+            accumulation_.add(i, source_, sample_[i]);
         }
         rays_.count = 0;
     }
 
     const BackwardView<T>& view_;
-    const Rim& rim_;
-    RimSource source_;
-    CurveContraction& contraction_;
+    const LensBoundary& lens_boundary_;
+    LensBoundarySource source_;
+    CurveAccumulation& accumulation_;
     CameraRays rays_;
-    RimSource::Sample sample_[RayBatch::size];
+    LensBoundarySource::Sample sample_[RayBatch::size];
 };
 
 }  // namespace edgegrad

@@ -51,7 +51,7 @@ class MeetingParts {
         });
     }
 
-    // Whether some may meet in a box of the image, or a pixel beside it.
+    // Whether some may meet in a box of the image, or a pixel next to it.
     bool in(Vec2 low, Vec2 high) const {
         if (meet_.empty()) return false;
         const int i0 = pixel(low.x, width_), i1 = pixel(high.x, width_);
@@ -69,7 +69,7 @@ class MeetingParts {
     static int pixel(double x, int count) { return int(std::clamp(x, 0.0, double(count - 1))); }
     static constexpr int64_t most_pixels = 64;  // larger boxes are not searched
     int width_, height_;
-    std::vector<uint8_t> meet_;  // (H, W): in a pixel or beside it; empty: there is one part
+    std::vector<uint8_t> meet_;  // (H, W): in a pixel or next to it; empty: there is one part
 };
 
 }  // namespace edgegrad

@@ -23,7 +23,7 @@ namespace edgegrad {
 namespace {
 
 // Of a sample it only matters whether it is visible.
-class Witness final : public CurveContraction {
+class VisibilityQuery final : public CurveAccumulation {
    public:
     bool visible = false;
 
@@ -33,8 +33,8 @@ class Witness final : public CurveContraction {
     void contract(int, MovingSample&) override { visible = true; }
 };
 
-// Edges, lines where faces pass through each other, and the rim of a lens, in their order as primitives.
-enum Kind { on_edges, on_intersections, on_rim };
+// Edges, lines where faces pass through each other, and the lens boundary, in their order as primitives.
+enum Kind { on_edges, on_intersections, on_lens_boundary };
 
 template <class T>
 OrderedDraws ordered(const BackwardView<T>& view, const Curves<T>& curves, const Systematic& systematic, int64_t n) {
@@ -89,10 +89,10 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
     const CoincidentCurves alone({}, draws.systematic(), view.team);
     std::vector<uint8_t> found((n + scatter_chunk - 1) / scatter_chunk, 0);
     view.team.each(int64_t(found.size()), [&](int64_t chunk) {
-        Witness witness;
-        CurveContraction& contraction = witness;
+        VisibilityQuery query;
+        CurveAccumulation& accumulation = query;
         EdgeSource<T> source(view, curves.finder, alone);
-        CurveSamples samples(view, source, contraction);
+        CurveSamples samples(view, source, accumulation);
         Curve curve;
         const Drawn drawn{draws, chunk * scatter_chunk, std::min(n, (chunk + 1) * scatter_chunk)};
         drawn.each([&](int64_t k, double s, double weight) {
@@ -101,16 +101,16 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
             samples.add(curve, kept_off_ends(curve, s), weight);
         });
         samples.cast();
-        found[chunk] = witness.visible;
+        found[chunk] = query.visible;
     });
     return std::find(found.begin(), found.end(), 1) != found.end();
 }
 
 template <class T>
 void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const CoincidentCurves& coincident, bool hidden,
-               const Drawn& drawn, CurveContraction& contraction, ChunkGrad& grad) {
+               const Drawn& drawn, CurveAccumulation& accumulation, LocalGradients& grad) {
     EdgeSource<T> source(view, curves.finder, coincident);
-    CurveSamples samples(view, source, contraction);
+    CurveSamples samples(view, source, accumulation);
     const std::unique_ptr<CreaseControl> control = make_crease_control(view);
     Curve curve;
     bool controlled = false;
@@ -133,10 +133,10 @@ void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const Coinc
 
 template <class T>
 void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn,
-                       CurveContraction& contraction, ChunkGrad& grad) {
+                       CurveAccumulation& accumulation, LocalGradients& grad) {
     const Array<Intersection>& all = curves.lines(view.geometry);
     IntersectionSource<T> source(view);
-    CurveSamples samples(view, source, contraction);
+    CurveSamples samples(view, source, accumulation);
     IntersectionCurve curve;
     drawn.each([&](int64_t k, double s, double weight) {
         const Intersection& i = all[curves.intersection[k - int64_t(curves.curve.size())].index];
@@ -147,12 +147,12 @@ void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, con
 }
 
 template <class T>
-void add_rim(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn, CurveContraction& contraction,
-             ChunkGrad& grad) {
-    RimSamples samples(view, curves.rim_curve->rim, contraction);
+void add_lens_boundary(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn,
+                       CurveAccumulation& accumulation, LocalGradients& grad) {
+    LensBoundarySamples samples(view, curves.lens_boundary_curve->lens_boundary, accumulation);
     const auto before = int64_t(curves.curve.size() + curves.intersection.size());
     drawn.each([&](int64_t k, double s, double weight) {
-        samples.add(curves.rim_curve->arcs[k - before].arc, std::clamp(s, 0.0, 1.0), weight);
+        samples.add(curves.lens_boundary_curve->arcs[k - before].arc, std::clamp(s, 0.0, 1.0), weight);
     });
     samples.finish(grad);
 }
@@ -160,8 +160,8 @@ void add_rim(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& 
 }  // namespace
 
 template <class T>
-void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, const Contraction& contraction,
-                  Destination& to, BackwardProfile& profile) {
+void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, const Accumulation& accumulation,
+                  GradientSink& to, BackwardProfile& profile) {
     profile.edge_samples = n;
     if (n == 0 || view.options.dry) return;
     Stopwatch watch;
@@ -174,8 +174,8 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     const CoincidentCurves coincident(std::move(curves.segments), systematic, view.team);
     profile.curves += watch.lap();
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
-    view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        const std::unique_ptr<CurveContraction> to_chunk = contract_curves(view, contraction, grad);
+    view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, LocalGradients& grad) {
+        const std::unique_ptr<CurveAccumulation> to_chunk = accumulate_curves(view, accumulation, grad);
         const auto part = [&](Kind kind) {
             const int64_t begin = kind ? draws.end_of_kind(kind - 1) : 0;
             return Drawn{draws, std::max(first, begin), std::min(last, draws.end_of_kind(kind))};
@@ -184,14 +184,15 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
             add_edges(view, curves, coincident, hidden, d, *to_chunk, grad);
         if (const Drawn d = part(on_intersections); d.first < d.last)
             add_intersections(view, curves, d, *to_chunk, grad);
-        if (const Drawn d = part(on_rim); d.first < d.last) add_rim(view, curves, d, *to_chunk, grad);
+        if (const Drawn d = part(on_lens_boundary); d.first < d.last)
+            add_lens_boundary(view, curves, d, *to_chunk, grad);
     });
     to.x = nullptr;
 }
 
-template void add_boundary(const BackwardView<float>&, Curves<float>&, int64_t, const Contraction&, Destination&,
+template void add_boundary(const BackwardView<float>&, Curves<float>&, int64_t, const Accumulation&, GradientSink&,
                            BackwardProfile&);
-template void add_boundary(const BackwardView<double>&, Curves<double>&, int64_t, const Contraction&, Destination&,
+template void add_boundary(const BackwardView<double>&, Curves<double>&, int64_t, const Accumulation&, GradientSink&,
                            BackwardProfile&);
 
 }  // namespace edgegrad

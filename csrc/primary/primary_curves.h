@@ -17,7 +17,7 @@ struct Curves;
 
 // Adds what n samples find on the measured curves.
 template <class T>
-void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, const Contraction& contraction,
-                  Destination& to, BackwardProfile& profile);
+void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, const Accumulation& accumulation,
+                  GradientSink& to, BackwardProfile& profile);
 
 }  // namespace edgegrad

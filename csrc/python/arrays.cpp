@@ -23,7 +23,7 @@ Spacing make_spacing(const std::vector<double>& pairs) {
 AnyLens make_lens(const std::string& name, In<double, 2> K, In<double, 1> distortion) {
     if (distortion.size() != most_coefficients) refuse("distortion: expected 8 numbers");
     check_finite("distortion", distortion.data(), most_coefficients, most_coefficients, 1);
-    if (name == "pinhole") return StraightLens();
+    if (name == "pinhole") return PinholeLens();
     if (name == "brown-conrady") return BrownConrady(distortion.data());
     if (name == "fisheye") return Fisheye(distortion.data());
     if (name == "panorama") return Equirectangular(K.data(), {}, {});
@@ -46,7 +46,7 @@ template <class T>
 SceneArrays<T>::SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_,
                             In<double, 2> uvs_, In<T, 2> texels_, In<int64_t, 2> textures_,
                             In<int32_t, 1> face_texture_, In<int32_t, 2> uv_corners_, In<T, 2> alphas_,
-                            In<int64_t, 2> cut_outs_, In<int32_t, 1> face_cut_out_, In<T, 3> background_,
+                            In<int64_t, 2> alpha_masks_, In<int32_t, 1> face_alpha_mask_, In<T, 3> background_,
                             const std::vector<double>& cutoffs_, const std::vector<double>& spacing_, int threads)
     : verts(verts_),
       faces(faces_),
@@ -58,8 +58,8 @@ SceneArrays<T>::SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int3
       face_texture(face_texture_),
       uv_corners(uv_corners_),
       alphas(alphas_),
-      cut_outs(cut_outs_),
-      face_cut_out(face_cut_out_),
+      alpha_masks(alpha_masks_),
+      face_alpha_mask(face_alpha_mask_),
       background(background_),
       cutoffs(cutoffs_),
       spacing(make_spacing(spacing_)) {
@@ -73,7 +73,7 @@ SceneArrays<T>::SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int3
     width("uvs", uvs.shape(1), 2), width("texels", texels.shape(1), R);
     width("textures", textures.shape(1), texture_columns);
     width("uv_corners", uv_corners.shape(1), 3), width("alpha", alphas.shape(1), 1);
-    width("cut_outs", cut_outs.shape(1), texture_columns);
+    width("alpha_masks", alpha_masks.shape(1), texture_columns);
     if (corners.shape(0) != faces.shape(0)) refuse("corners: expected one row a face");
     if (faces.shape(0) == 0 || verts.shape(0) == 0) refuse("faces: expected at least one face, got none");
     check_finite("verts", verts.data(), verts.size(), 3, threads);
@@ -83,7 +83,7 @@ SceneArrays<T>::SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int3
     check_finite("alpha", alphas.data(), alphas.size(), 1, threads);
     check_finite("background", background.data(), background.size(), background.shape(2), threads);
     check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts", threads);
-    check_cut_outs(threads);
+    check_alpha_masks(threads);
     const bool textured = textures.shape(0) > 0;
     if (!textured) {
         // Colours of vertices are indexed by the faces, or by a copy of them.
@@ -136,7 +136,7 @@ void SceneArrays<T>::check_textures(const char* name, const In<int64_t, 2>& tabl
 }
 
 template <class T>
-void SceneArrays<T>::check_cut_outs(int threads) const {
+void SceneArrays<T>::check_alpha_masks(int threads) const {
     const size_t F = faces.shape(0), own = uv_corners.shape(0);
     if (own != 0 && own != F) refuse("uv_corners: expected one row a face");
     if (own != 0 && !all_pass(uv_corners.size(), threads, [&](int64_t first, int64_t last) {
@@ -144,15 +144,16 @@ void SceneArrays<T>::check_cut_outs(int threads) const {
             return std::all_of(v + first, v + last, [&](int32_t i) { return i >= -1 && i < int64_t(uvs.shape(0)); });
         }))
         refuse("uv_faces: expected indices from 0 to " + std::to_string(int64_t(uvs.shape(0)) - 1) + " (rows of uvs)");
-    if (cutoffs.size() != cut_outs.shape(0)) refuse("cutoffs: expected one number a cut-out");
-    check_textures("cut_outs", cut_outs, int64_t(alphas.shape(0)));
-    if (cut_outs.shape(0) == 0) return;
-    if (face_cut_out.shape(0) != F || own == 0) refuse("face_cut_out: expected one number a face, and uv_corners");
+    if (cutoffs.size() != alpha_masks.shape(0)) refuse("cutoffs: expected one number a cut-out");
+    check_textures("alpha_masks", alpha_masks, int64_t(alphas.shape(0)));
+    if (alpha_masks.shape(0) == 0) return;
+    if (face_alpha_mask.shape(0) != F || own == 0)
+        refuse("face_alpha_mask: expected one number a face, and uv_corners");
     for (size_t f = 0; f < F; ++f) {
-        if (face_cut_out(f) >= int64_t(cut_outs.shape(0)))
-            refuse("face_cut_out: expected a cut-out's number, got " + std::to_string(face_cut_out(f)));
+        if (face_alpha_mask(f) >= int64_t(alpha_masks.shape(0)))
+            refuse("face_alpha_mask: expected a cut-out's number, got " + std::to_string(face_alpha_mask(f)));
         for (int i = 0; i < 3; ++i)
-            if (face_cut_out(f) >= 0 && uv_corners(f, i) < 0)
+            if (face_alpha_mask(f) >= 0 && uv_corners(f, i) < 0)
                 refuse("uv_faces: expected indices from 0 to " + std::to_string(int64_t(uvs.shape(0)) - 1) +
                        " (rows of uvs), got another at " + at(3 * int64_t(f) + i, 3));
     }
@@ -192,8 +193,8 @@ SceneView<T> SceneArrays<T>::view_of(const Attributes& attributes) const {
             attributes,
             int(colors.shape(1)),
             uv_corners.shape(0) ? uv_corners.data() : of_corners,
-            {alphas.data(), int64_t(alphas.shape(0)), cut_outs.data(), cutoffs.data(),
-             cut_outs.shape(0) ? face_cut_out.data() : nullptr}};
+            {alphas.data(), int64_t(alphas.shape(0)), alpha_masks.data(), cutoffs.data(),
+             alpha_masks.shape(0) ? face_alpha_mask.data() : nullptr}};
 }
 
 template <class T>
@@ -215,8 +216,8 @@ Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, In<double, 1>
     const Camera camera(world_to_camera.data(), K.data(), perspective, width, height, make_lens(lens, K, distortion));
     if (camera.k_det == 0) refuse("K: expected focal lengths that are not zero, got a singular matrix");
     if (is_too_wide(camera)) refuse("K: expected a panorama that reaches around no more than 4 times");
-    const auto* bends = std::get_if<BrownConrady>(&camera.lens);
-    if (bends && bends->is_identity() && !by_distortion && !camera.lens_view.end)
+    const auto* distorts = std::get_if<BrownConrady>(&camera.lens);
+    if (distorts && distorts->is_identity() && !by_distortion && !camera.lens_view.end)
         return Camera(world_to_camera.data(), K.data(), perspective, width, height);
     return camera;
 }

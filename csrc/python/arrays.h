@@ -14,7 +14,7 @@
 
 namespace edgegrad {
 
-// What is rendered beside the radiance, for one camera.
+// What is rendered besides the radiance, for one camera.
 struct ChannelArrays {
     In<double, 2> vertex, face;  // (V, Kv), (F, Kf)
     Attributes view;
@@ -34,8 +34,8 @@ struct SceneArrays {
     In<int32_t, 1> face_texture;
     In<int32_t, 2> uv_corners;  // (F, 3) or (0, 3)
     In<T, 2> alphas;
-    In<int64_t, 2> cut_outs;
-    In<int32_t, 1> face_cut_out;
+    In<int64_t, 2> alpha_masks;
+    In<int32_t, 1> face_alpha_mask;
     In<T, 3> background;  // (1, 1, C) or (H, W, C)
     std::vector<double> cutoffs;
     Spacing spacing;
@@ -43,9 +43,9 @@ struct SceneArrays {
 
     SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_,
                 In<double, 2> uvs_, In<T, 2> texels_, In<int64_t, 2> textures_, In<int32_t, 1> face_texture_,
-                In<int32_t, 2> uv_corners_, In<T, 2> alphas_, In<int64_t, 2> cut_outs_, In<int32_t, 1> face_cut_out_,
-                In<T, 3> background_, const std::vector<double>& cutoffs_, const std::vector<double>& spacing_,
-                int threads);
+                In<int32_t, 2> uv_corners_, In<T, 2> alphas_, In<int64_t, 2> alpha_masks_,
+                In<int32_t, 1> face_alpha_mask_, In<T, 3> background_, const std::vector<double>& cutoffs_,
+                const std::vector<double>& spacing_, int threads);
 
     SceneView<T> view() const { return view_of(Attributes()); }
     SceneView<T> view(const ChannelArrays& channels, int threads) const;
@@ -54,7 +54,7 @@ struct SceneArrays {
 
    private:
     void check_textures(const char* name, const In<int64_t, 2>& table, int64_t texels) const;
-    void check_cut_outs(int threads) const;
+    void check_alpha_masks(int threads) const;
     bool all_have_uvs() const;
     SceneView<T> view_of(const Attributes& attributes) const;
 };
@@ -76,7 +76,7 @@ void check_image(const char* name, const Out<T, 3>& image, const Camera& camera,
         refuse(std::string(name) + ": expected an image of the camera's size and the scene's channels");
 }
 
-// A number for each face; see BackwardInput::detailed and panes.
+// A number for each face; see BackwardInput::detailed and transparent faces.
 template <class T>
 const uint8_t* marked_faces(const char* name, const SceneArrays<T>& scene,
                             const std::optional<In<uint8_t, 1>>& marked) {

@@ -23,7 +23,7 @@ using Out = nb::ndarray<T, nb::numpy, nb::ndim<Dimensions>, nb::c_contig, nb::de
 // A place in rows of this width, as Python writes it.
 std::string at(int64_t index, int64_t width);
 
-// Looks at blocks of the numbers first … last − 1, on several threads where these save more than they cost: whether all
+// Checks blocks of the numbers first … last − 1, on several threads where these save more than they cost: whether all
 // pass.
 bool all_pass(int64_t n, int threads, const std::function<bool(int64_t first, int64_t last)>& pass);
 

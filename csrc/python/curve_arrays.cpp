@@ -24,7 +24,8 @@ nb::dict curve_arrays(const std::vector<CurveRecords>& parts, double least, bool
     add_rows("row_of", &C::row_of), add("vertex", &C::vertex), add("by_q", &C::by_q, {3});
     add_rows("uv_row_of", &C::uv_row_of), add("uv", &C::uv), add("by_uv", &C::by_uv, {2});
     add_rows("alpha_row_of", &C::alpha_row_of), add("alpha", &C::alpha), add("by_alpha", &C::by_alpha);
-    add_rows("pane_row_of", &C::pane_row_of), add("pane", &C::pane), add("pane_b", &C::pane_b, {2});
+    add_rows("transparent_row_of", &C::transparent_row_of), add("transparent", &C::transparent),
+        add("transparent_b", &C::transparent_b, {2});
     add("light", &C::light), add("light_uv", &C::light_uv, {2}), add("by_light", &C::by_light, {3});
     return curves;
 }

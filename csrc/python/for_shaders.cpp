@@ -50,21 +50,23 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
                   const GradientOptions& options, double least, int threads, const HitArrays<T>& hits,
-                  const std::optional<In<uint8_t, 1>>& detailed, const std::optional<In<uint8_t, 1>>& panes,
-                  const std::optional<In<T, 2>>& looks) {
+                  const std::optional<In<uint8_t, 1>>& detailed, const std::optional<In<uint8_t, 1>>& transparent,
+                  const std::optional<In<T, 2>>& importance) {
     hits.check(arrays, camera);
-    if (looks) {
-        if (int(looks->shape(0)) != camera.height || int(looks->shape(1)) != camera.width)
-            refuse("looks: expected a number a pixel");
-        if (!std::all_of(looks->data(), looks->data() + looks->size(), [](T x) { return x > 0 && std::isfinite(x); }))
-            refuse("looks: expected finite numbers above zero");
+    if (importance) {
+        if (int(importance->shape(0)) != camera.height || int(importance->shape(1)) != camera.width)
+            refuse("importance: expected a number a pixel");
+        if (!std::all_of(importance->data(), importance->data() + importance->size(),
+                         [](T x) { return x > 0 && std::isfinite(x); }))
+            refuse("importance: expected finite numbers above zero");
     }
     const SceneView<T> scene = arrays.view();
     RecordList found;
     with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
         found = record_samples(BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(),
                                                 marked_faces("detailed", arrays, detailed),
-                                                marked_faces("panes", arrays, panes), looks ? looks->data() : nullptr},
+                                                marked_faces("transparent", arrays, transparent),
+                                                importance ? importance->data() : nullptr},
                                options, team);
     });
     nb::dict surface;
@@ -107,7 +109,7 @@ template <class T>
 nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const Camera& camera,
                         const ImageOptions& image, const GradientOptions& options, const LightArrays& light,
                         int64_t samples, double least, bool one, bool seen, int threads, const HitArrays<T>& hits,
-                        const std::optional<In<uint8_t, 1>>& panes) {
+                        const std::optional<In<uint8_t, 1>>& transparent) {
     hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
     if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
     const SceneView<T> scene = arrays.view(), casting = casters.view();
@@ -116,9 +118,9 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
         const BackwardInput<T> input{scene,   camera,      *geometry, image,
-                                     nullptr, hits.view(), nullptr,   marked_faces("panes", arrays, panes)};
+                                     nullptr, hits.view(), nullptr,   marked_faces("transparent", arrays, transparent)};
         found = seen ? record_shadows(input, casting, options, light.view(), samples, team)
-                     : record_unseen_shadows(input, casting, options, light.view(), samples, team);
+                     : record_indirect_shadows(input, casting, options, light.view(), samples, team);
     });
     return curve_arrays(found, least, one, threads);
 }
@@ -279,9 +281,9 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
         .def("pixel_hits", &pixel_hits<T>, "camera"_a, "image"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a, "hits"_a,
-             "detailed"_a.none(), "panes"_a.none(), "looks"_a.none())
+             "detailed"_a.none(), "transparent"_a.none(), "importance"_a.none())
         .def("shadow_samples", &shadow_samples<T>, "casters"_a, "camera"_a, "image"_a, "options"_a, "light"_a,
-             "samples"_a, "least"_a, "one"_a, "seen"_a, "threads"_a, "hits"_a, "panes"_a.none())
+             "samples"_a, "least"_a, "one"_a, "seen"_a, "threads"_a, "hits"_a, "transparent"_a.none())
         .def("has_intersections", &has_intersections<T>, "threads"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),

@@ -52,7 +52,7 @@ std::array<double, N> array(const double (&a)[N]) {
 }
 // Tangents of K and of the coefficients, one after the other; and cotangents, side by side.
 IntrinsicsGrad intrinsics(const Camera& c, const std::array<double, 6 + most_coefficients>& dot) {
-    return window_intrinsics(c, dot.data(), dot.data() + 6);
+    return sub_camera_intrinsics(c, dot.data(), dot.data() + 6);
 }
 std::tuple<std::array<double, 6>, std::array<double, most_coefficients>> of_camera(const Camera& c,
                                                                                    const IntrinsicsGrad& bar) {
@@ -148,7 +148,7 @@ void bind_for_tests(nb::module_& m) {
     bind_scene_functions<double>(p);
     bind_paths_for_tests(p);
 
-    p.def("project", [](const Camera& c, A3 q) { return array(bend(c, project(c, vec(q))).x); });
+    p.def("project", [](const Camera& c, A3 q) { return array(distort(c, project(c, vec(q))).x); });
     p.def("project_straight", [](const Camera& c, A3 q) { return array(project(c, vec(q))); });
     p.def("project_vjp", [](const Camera& c, A3 q, A2 bar) {
         Vec3 q_bar;
@@ -157,10 +157,10 @@ void bind_for_tests(nb::module_& m) {
         const auto [k, distortion] = of_camera(c, grad);
         return std::tuple(array(q_bar), k, distortion);
     });
-    p.def("normalised", [](const Camera& c, A2 x) { return array(normalised(c, straighten(c, vec(x)))); });
+    p.def("normalised", [](const Camera& c, A2 x) { return array(normalised(c, undistort(c, vec(x)))); });
     p.def("normalised_vjp", [](const Camera& c, A2 x, A2 bar) {
         IntrinsicsGrad grad;
-        normalised_vjp(c, normalised(c, straighten(c, vec(x))), vec(bar), grad);
+        normalised_vjp(c, normalised(c, undistort(c, vec(x))), vec(bar), grad);
         return of_camera(c, grad);
     });
     // Where the rays through places (N, 2) of the unit square of pixel (x, y) go.
@@ -172,30 +172,31 @@ void bind_for_tests(nb::module_& m) {
         for (size_t i = 0; i < places.size(); ++i) out.push_back({n_x[i], n_y[i]});
         return out;
     });
-    // By the bend of the straight image: where a place is seen, the area scale, and what becomes of a tangent there.
-    p.def("bend", [](const Camera& c, A2 u, A2 tangent) {
-        const Bent b = bend(c, vec(u));
-        return std::tuple(array(b.x), b.area_scale, array(bend_jvp(c, normalised(c, vec(u)), vec(tangent))));
+    // By the distortion of the undistorted image: where a place is seen, the area scale, and what becomes of a tangent
+    // there.
+    p.def("distort", [](const Camera& c, A2 u, A2 tangent) {
+        const Distorted b = distort(c, vec(u));
+        return std::tuple(array(b.x), b.area_scale, array(distort_jvp(c, normalised(c, vec(u)), vec(tangent))));
     });
     p.def("image_box", [](const Camera& c, A2 low, A2 high) {
         const auto [a, b] = c.image_box(vec(low), vec(high));
         return std::tuple(array(a), array(b));
     });
     // What a camera sees through, with the turn into its frame.
-    p.def("windows", [](const Camera& c, double reach) {
+    p.def("sub_cameras", [](const Camera& c, double reach) {
         std::vector<std::tuple<Camera, A33>> out;
-        for (const Camera& w : windows_of(c, reach))
+        for (const Camera& w : sub_cameras_of(c, reach))
             out.emplace_back(w, A33{array(w.turn.row[0]), array(w.turn.row[1]), array(w.turn.row[2])});
         return out;
     });
-    // The box of its straight image.
+    // The box of its undistorted image.
     p.def("view_box", [](const Camera& c) { return std::tuple(array(c.lens_view.low), array(c.lens_view.high)); });
     // In forward mode.
     p.def("project_jvp", [](const Camera& c, A3 q, A3 q_dot, std::array<double, 6 + most_coefficients> k_dot) {
         return array(project_jvp(c, vec(q), vec(q_dot), intrinsics(c, k_dot)));
     });
     p.def("normalised_jvp", [](const Camera& c, A2 x, std::array<double, 6 + most_coefficients> k_dot) {
-        return array(normalised_jvp(c, normalised(c, straighten(c, vec(x))), intrinsics(c, k_dot)));
+        return array(normalised_jvp(c, normalised(c, undistort(c, vec(x))), intrinsics(c, k_dot)));
     });
     p.def("face_map_jvp", [](const Camera& c, A33 q, A33 q_dot) {
         const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])},

@@ -64,7 +64,7 @@ nb::object light_on_faces(In<double, 2> verts, Rows faces, In<double, 1> eye, bo
     return shaped(std::move(found), {F, 3, L});
 }
 
-// The image before what lies behind the surfaces, (H · W, C), and which lamps' shadows were asked for.
+// The image before what lies behind the surfaces, (H · W, C), and which lights' shadows were asked for.
 template <class T>
 nb::tuple lit_image(const SceneArrays<T>& arrays, const LitArrays& lit, const Camera& camera, const ImageOptions& image,
                     const LitOptions& options, int points, uint64_t seed, uint64_t again, int threads,
@@ -79,9 +79,9 @@ nb::tuple lit_image(const SceneArrays<T>& arrays, const LitArrays& lit, const Ca
                            LitSampling{points, seed, again}, team, hits.view());
     });
     const size_t channels = size_t(lit.scene.channels), pixels = size_t(found.radiance.size()) / channels;
-    const size_t lamps = found.asked.size();
+    const size_t lights = found.asked.size();
     return nb::make_tuple(shaped(std::move(found.radiance), {pixels, channels}),
-                          shaped(std::move(found.asked), {lamps, 1}));
+                          shaped(std::move(found.asked), {lights, 1}));
 }
 
 void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions& options, const In<int8_t, 2>& seen) {
@@ -287,20 +287,19 @@ nb::tuple points_towards_camera(const SceneArrays<T>& arrays, const LitArrays& l
 }
 
 // Index, uv and density, (N, samples) of each.
-nb::tuple drawn_light_points(const LitArrays& lit, const PointArrays& points, const LitOptions& options, int lamp,
+nb::tuple drawn_light_points(const LitArrays& lit, const PointArrays& points, const LitOptions& options, int light,
                              int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));
-    if (lamp < 0 || size_t(lamp) >= lit.scene.lamps.size() || options.samples < 1)
-        refuse("lamp: expected one of the scene");
+    if (light < 0 || size_t(light) >= lit.scene.lights.size() || options.samples < 1)
+        refuse("light: expected one of the scene");
     const size_t n = size_t(view.size), k = size_t(options.samples);
     std::vector<LightPoint> found(n * k);
-    unlocked(threads, [&](Team& team) { draw_light_points(lit.scene, view, options, lamp, found.data(), team); });
+    unlocked(threads, [&](Team& team) { draw_light_points(lit.scene, view, options, light, found.data(), team); });
     std::vector<int64_t> index;
-    std::vector<double> uv, density;
-    for (const LightPoint& p : found)
-        index.push_back(p.index), uv.insert(uv.end(), {p.u, p.v}), density.push_back(p.density);
+    std::vector<double> uv, pdf;
+    for (const LightPoint& p : found) index.push_back(p.index), uv.insert(uv.end(), {p.u, p.v}), pdf.push_back(p.pdf);
     return nb::make_tuple(shaped(std::move(index), {n, k}), shaped(std::move(uv), {n, k, 2}),
-                          shaped(std::move(density), {n, k}));
+                          shaped(std::move(pdf), {n, k}));
 }
 
 }  // namespace
@@ -327,7 +326,7 @@ void bind_lit(nb::module_& m) {
     bind_lit_arrays(m);
     m.def("shade_vjp", &shade_points_vjp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
           "bar"_a.noconvert(), "wanted"_a, "threads"_a);
-    m.def("light_points", &drawn_light_points, "lit"_a, "points"_a, "options"_a, "lamp"_a, "threads"_a);
+    m.def("light_points", &drawn_light_points, "lit"_a, "points"_a, "options"_a, "light"_a, "threads"_a);
     m.def("light_on_faces", &light_on_faces, "verts"_a.noconvert(), "faces"_a.noconvert(), "eye"_a.noconvert(),
           "perspective"_a, "place"_a.noconvert(), "infinite"_a, "power"_a, "threads"_a);
     m.def("shade_jvp", &shade_points_jvp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),

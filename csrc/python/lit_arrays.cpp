@@ -56,49 +56,52 @@ MeshArrays make_mesh(int64_t first_face, int64_t faces, int32_t first_vertex, bo
     return {mesh, {color, base, metallic, roughness, emission, normal_map, tangents}, normal_faces};
 }
 
-LampArrays make_lamp(const std::string& kind, int position, int direction, int intensity, int color, int inner_angle,
-                     int outer_angle, int rotation, int radiance, int mesh, int64_t height, int64_t width,
-                     bool is_image, std::optional<In<double, 1>> running, std::optional<In<double, 1>> density,
-                     std::optional<In<double, 1>> brightness, std::optional<In<double, 1>> cosines,
-                     std::shared_ptr<LampTree> tree, bool hides, const std::vector<uint64_t>& stream, double eps) {
-    Lamp lamp;
-    lamp.kind = kind_of<Lamp::Kind>("kind", kind,
-                                    {"directional", "point", "spot", "mesh", "environment", "spherical harmonics"});
-    lamp.position = position, lamp.direction = direction, lamp.intensity = intensity, lamp.color = color;
-    lamp.inner_angle = inner_angle, lamp.outer_angle = outer_angle, lamp.rotation = rotation, lamp.radiance = radiance;
-    lamp.mesh = mesh, lamp.height = height, lamp.width = width, lamp.is_image = is_image, lamp.eps = eps;
-    if (!lamp.is_punctual()) {
-        if (!running || !density || running->size() != density->size() || running->size() == 0)
-            refuse("running, density: expected a number for each face or texel");
-        lamp.running = running->data(), lamp.density = density->data(), lamp.size = int64_t(running->size());
+LightArrays make_light(const std::string& kind, int position, int direction, int intensity, int color, int inner_angle,
+                       int outer_angle, int rotation, int radiance, int mesh, int64_t height, int64_t width,
+                       bool is_image, std::optional<In<double, 1>> running, std::optional<In<double, 1>> pdf,
+                       std::optional<In<double, 1>> brightness, std::optional<In<double, 1>> cosines,
+                       std::shared_ptr<EmissiveFaceTree> tree, bool hides, const std::vector<uint64_t>& stream,
+                       double eps) {
+    Light light;
+    light.kind = kind_of<Light::Kind>("kind", kind,
+                                      {"directional", "point", "spot", "mesh", "environment", "spherical harmonics"});
+    light.position = position, light.direction = direction, light.intensity = intensity, light.color = color;
+    light.inner_angle = inner_angle, light.outer_angle = outer_angle, light.rotation = rotation,
+    light.radiance = radiance;
+    light.mesh = mesh, light.height = height, light.width = width, light.is_image = is_image, light.eps = eps;
+    if (!light.is_punctual()) {
+        if (!running || !pdf || running->size() != pdf->size() || running->size() == 0)
+            refuse("running, pdf: expected a number for each face or texel");
+        light.running = running->data(), light.pdf = pdf->data(), light.size = int64_t(running->size());
     }
-    if (lamp.kind == Lamp::Kind::environment) {
-        if (!brightness || int64_t(brightness->size()) != lamp.size || lamp.size != height * width)
+    if (light.kind == Light::Kind::environment) {
+        if (!brightness || int64_t(brightness->size()) != light.size || light.size != height * width)
             refuse("brightness: expected a number for each texel");
         if (!cosines || int64_t(cosines->size()) != height + 1) refuse("cosines: expected one more than rows");
-        lamp.brightness = brightness->data(), lamp.cosines = cosines->data();
+        light.brightness = brightness->data(), light.cosines = cosines->data();
     }
-    lamp.tree = tree.get(), lamp.hides = hides;
-    if (lamp.kind == Lamp::Kind::mesh) {
+    light.tree = tree.get(), light.hides = hides;
+    if (light.kind == Light::Kind::mesh) {
         if (!brightness || brightness->size() != 1) refuse("brightness: expected one number");
-        lamp.brightness = brightness->data();
-        lamp.is_round = tree && is_round(*tree, lamp.density, lamp.size);
+        light.brightness = brightness->data();
+        light.is_round = tree && is_round(*tree, light.pdf, light.size);
     }
-    if (stream.size() != std::size(lamp.stream)) refuse("stream: expected three numbers");
-    std::copy(stream.begin(), stream.end(), lamp.stream);
-    return {lamp, {running, density, brightness, cosines}, tree};
+    if (stream.size() != std::size(light.stream)) refuse("stream: expected three numbers");
+    std::copy(stream.begin(), stream.end(), light.stream);
+    return {light, {running, pdf, brightness, cosines}, tree};
 }
 
-std::shared_ptr<LampTree> make_tree(In<double, 2> verts, Rows faces) {
+std::shared_ptr<EmissiveFaceTree> make_tree(In<double, 2> verts, Rows faces) {
     if (verts.shape(1) != 3 || faces.shape(1) != 3 || faces.shape(0) == 0)
         refuse("verts, faces: expected three columns, and a face");
     check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts", 1);
-    return std::make_shared<LampTree>(verts.data(), int64_t(verts.shape(0)), faces.data(), int64_t(faces.shape(0)));
+    return std::make_shared<EmissiveFaceTree>(verts.data(), int64_t(verts.shape(0)), faces.data(),
+                                              int64_t(faces.shape(0)));
 }
 
 // What rays (N, 3) cross between `start` and `end` (N,), in lengths of their directions: ray and face (M, 2), and
 // barycentrics and distance (M, 3), ray after ray.
-nb::tuple crossings(const LampTree& tree, In<double, 2> origins, In<double, 2> directions, In<double, 1> start,
+nb::tuple crossings(const EmissiveFaceTree& tree, In<double, 2> origins, In<double, 2> directions, In<double, 1> start,
                     In<double, 1> end) {
     const size_t n = origins.shape(0);
     if (origins.shape(1) != 3 || directions.shape(1) != 3 || directions.shape(0) != n || start.size() != n ||
@@ -108,10 +111,11 @@ nb::tuple crossings(const LampTree& tree, In<double, 2> origins, In<double, 2> d
     std::vector<double> where;
     for (size_t i = 0; i < n; ++i) {
         const double *o = origins.data() + 3 * i, *d = directions.data() + 3 * i;
-        tree.each_crossing({o[0], o[1], o[2]}, {d[0], d[1], d[2]}, start(i), end(i), [&](const LampTree::Crossing& c) {
-            which.insert(which.end(), {int64_t(i), c.face}), where.insert(where.end(), {c.u, c.v, c.t});
-            return end(i);
-        });
+        tree.each_crossing(
+            {o[0], o[1], o[2]}, {d[0], d[1], d[2]}, start(i), end(i), [&](const EmissiveFaceTree::Crossing& c) {
+                which.insert(which.end(), {int64_t(i), c.face}), where.insert(where.end(), {c.u, c.v, c.t});
+                return end(i);
+            });
     }
     const size_t m = which.size() / 2;
     return nb::make_tuple(shaped(std::move(which), {m, 2}), shaped(std::move(where), {m, 3}));
@@ -119,9 +123,9 @@ nb::tuple crossings(const LampTree& tree, In<double, 2> origins, In<double, 2> d
 
 }  // namespace
 
-LitArrays::LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LampArrays> lamps,
+LitArrays::LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LightArrays> lights,
                      Rows faces, int verts, int eye, bool perspective, int channels, const std::vector<double>& ball)
-    : tables_(std::move(tables)), meshes_(std::move(meshes)), lamps_(std::move(lamps)), faces_(faces) {
+    : tables_(std::move(tables)), meshes_(std::move(meshes)), lights_(std::move(lights)), faces_(faces) {
     if (channels < 1 || channels > most_lit_channels) refuse("channels: expected 1 to 16");
     if (ball.size() != 4) refuse("ball: expected 4 numbers");
     for (const AnyTable& t : tables_) {
@@ -135,7 +139,7 @@ LitArrays::LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshe
     if (faces.shape(1) != 3) refuse("faces: expected three columns");
     check_indices("faces", faces.data(), faces.size(), size_t(table(verts).rows), "verts", 1);
     for (const MeshArrays& mesh : meshes_) check_mesh(mesh), scene.meshes.push_back(mesh.view);
-    for (const LampArrays& lamp : lamps_) check_lamp(lamp.view), scene.lamps.push_back(lamp.view);
+    for (const LightArrays& light : lights_) check_light(light.view), scene.lights.push_back(light.view);
 }
 
 void LitArrays::check_table(const char* name, int number, int64_t rows, int columns) const {
@@ -196,31 +200,31 @@ void LitArrays::check_mesh(const MeshArrays& arrays) const {
         refuse("normal_faces: expected a row for each face");
     check_index("normal_faces", m.normal.normal_faces, m.faces, m.normal.normals);
 }
-void LitArrays::check_lamp(const Lamp& lamp) const {
-    using Kind = Lamp::Kind;
+void LitArrays::check_light(const Light& light) const {
+    using Kind = Light::Kind;
     const auto optional = [&](const char* name, int number, int64_t rows, int columns) {
         if (number != no_table) check_table(name, number, rows, columns);
     };
-    optional("rotation", lamp.rotation, 1, 9);
-    if (lamp.kind == Kind::directional || lamp.kind == Kind::point || lamp.kind == Kind::spot) {
-        check_table("intensity", lamp.intensity, 1, 1);
-        if (lamp.color != no_table) check_channels("color", lamp.color, 1, scene.channels);
+    optional("rotation", light.rotation, 1, 9);
+    if (light.kind == Kind::directional || light.kind == Kind::point || light.kind == Kind::spot) {
+        check_table("intensity", light.intensity, 1, 1);
+        if (light.color != no_table) check_channels("color", light.color, 1, scene.channels);
     }
-    if (lamp.kind == Kind::point || lamp.kind == Kind::spot) check_table("position", lamp.position, 1, 3);
-    if (lamp.kind == Kind::directional || lamp.kind == Kind::spot) check_table("direction", lamp.direction, 1, 3);
-    if (lamp.kind == Kind::spot)
-        check_table("inner_angle", lamp.inner_angle, 1, 1), check_table("outer_angle", lamp.outer_angle, 1, 1);
-    if (lamp.kind == Kind::harmonics) check_channels("coefficients", lamp.radiance, 9, scene.channels);
-    if (lamp.kind == Kind::environment) {
-        if (lamp.height < 1 || lamp.width < 1 || lamp.height * lamp.width != lamp.size)
-            refuse("radiance: expected a density for each texel");
-        check_channels("radiance", lamp.radiance, lamp.is_image ? lamp.size : 1, scene.channels);
+    if (light.kind == Kind::point || light.kind == Kind::spot) check_table("position", light.position, 1, 3);
+    if (light.kind == Kind::directional || light.kind == Kind::spot) check_table("direction", light.direction, 1, 3);
+    if (light.kind == Kind::spot)
+        check_table("inner_angle", light.inner_angle, 1, 1), check_table("outer_angle", light.outer_angle, 1, 1);
+    if (light.kind == Kind::harmonics) check_channels("coefficients", light.radiance, 9, scene.channels);
+    if (light.kind == Kind::environment) {
+        if (light.height < 1 || light.width < 1 || light.height * light.width != light.size)
+            refuse("radiance: expected a pdf for each texel");
+        check_channels("radiance", light.radiance, light.is_image ? light.size : 1, scene.channels);
     }
-    if (lamp.kind != Kind::mesh) return;
-    if (lamp.mesh < 0 || size_t(lamp.mesh) >= scene.meshes.size()) refuse("mesh: expected one of the scene");
-    if (lamp.size != scene.meshes[size_t(lamp.mesh)].faces || !scene.meshes[size_t(lamp.mesh)].emission.exists())
-        refuse("mesh: expected one that emits, and a density for each of its faces");
-    if (lamp.tree && lamp.tree->n_faces() != lamp.size) refuse("tree: expected that of the mesh");
+    if (light.kind != Kind::mesh) return;
+    if (light.mesh < 0 || size_t(light.mesh) >= scene.meshes.size()) refuse("mesh: expected one of the scene");
+    if (light.size != scene.meshes[size_t(light.mesh)].faces || !scene.meshes[size_t(light.mesh)].emission.exists())
+        refuse("mesh: expected one that emits, and a pdf for each of its faces");
+    if (light.tree && light.tree->n_faces() != light.size) refuse("tree: expected that of the mesh");
 }
 
 LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
@@ -231,14 +235,14 @@ LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
     if (spread && (spread->shape(0) != n || spread->shape(1) != 2 || spread->shape(2) != 2))
         refuse("spread: expected two rows of two a point");
     LitPoints points{int64_t(n), face.data(), b.data(), seed.data(), {}, spread ? spread->data() : nullptr};
-    if (forced_lamp < 0) return points;
-    if (size_t(forced_lamp) >= scene.lamps.size() || !index || !uv || !density || !lit || index->size() != n ||
-        uv->shape(0) != n || uv->shape(1) != 2 || density->size() != n || lit->size() != n)
+    if (forced_light < 0) return points;
+    if (size_t(forced_light) >= scene.lights.size() || !index || !uv || !pdf || !lit || index->size() != n ||
+        uv->shape(0) != n || uv->shape(1) != 2 || pdf->size() != n || lit->size() != n)
         refuse("forced: expected a row a point");
-    const Lamp& lamp = scene.lamps[size_t(forced_lamp)];
-    for (size_t i = 0; !lamp.is_punctual() && i < n; ++i)
-        if ((*index)(i) < 0 || (*index)(i) >= lamp.size) refuse("forced: expected faces or texels of the light");
-    points.forced = {forced_lamp, index->data(), uv->data(), density->data(), lit->data()};
+    const Light& light = scene.lights[size_t(forced_light)];
+    for (size_t i = 0; !light.is_punctual() && i < n; ++i)
+        if ((*index)(i) < 0 || (*index)(i) >= light.size) refuse("forced: expected faces or texels of the light");
+    points.forced = {forced_light, index->data(), uv->data(), pdf->data(), lit->data()};
     return points;
 }
 
@@ -246,7 +250,7 @@ void bind_lit_arrays(nb::module_& m) {
     m.attr("MOST_LIT_CHANNELS") = most_lit_channels;
     m.attr("FAINTEST_NORMAL") = faintest_normal;
     m.attr("MOST_BOUNCES") = most_bounces;
-    m.attr("MOST_LAMP_FACES") = LampTree::most_faces;
+    m.attr("MOST_EMISSIVE_FACES") = EmissiveFaceTree::most_faces;
     nb::class_<SourceArrays>(m, "LitSource")
         .def(nb::new_(&make_source), "kind"_a, "value"_a = no_table, "factor"_a = no_table, "uvs"_a = no_table,
              "uv_faces"_a.noconvert() = nb::none(), "height"_a = 0, "width"_a = 0,
@@ -255,53 +259,51 @@ void bind_lit_arrays(nb::module_& m) {
         .def(nb::new_(&make_mesh), nb::kw_only(), "first_face"_a, "faces"_a, "first_vertex"_a, "has_material"_a,
              "two_sided"_a, "lambertian"_a, "color"_a, "base_color"_a, "metallic"_a, "roughness"_a, "emission"_a,
              "normal_map"_a, "normal_scale"_a, "tangents"_a, "normals"_a, "normal_faces"_a.noconvert());
-    nb::class_<LampArrays>(m, "Lamp").def(
-        nb::new_(&make_lamp), "kind"_a, nb::kw_only(), "position"_a = no_table, "direction"_a = no_table,
-        "intensity"_a = no_table, "color"_a = no_table, "inner_angle"_a = no_table, "outer_angle"_a = no_table,
-        "rotation"_a = no_table, "radiance"_a = no_table, "mesh"_a = -1, "height"_a = 1, "width"_a = 1,
-        "is_image"_a = false, "running"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
-        "brightness"_a.noconvert() = nb::none(), "cosines"_a.noconvert() = nb::none(), "tree"_a = nb::none(),
-        "hides"_a = true, "stream"_a, "eps"_a);
+    nb::class_<LightArrays>(m, "Light")
+        .def(nb::new_(&make_light), "kind"_a, nb::kw_only(), "position"_a = no_table, "direction"_a = no_table,
+             "intensity"_a = no_table, "color"_a = no_table, "inner_angle"_a = no_table, "outer_angle"_a = no_table,
+             "rotation"_a = no_table, "radiance"_a = no_table, "mesh"_a = -1, "height"_a = 1, "width"_a = 1,
+             "is_image"_a = false, "running"_a.noconvert() = nb::none(), "pdf"_a.noconvert() = nb::none(),
+             "brightness"_a.noconvert() = nb::none(), "cosines"_a.noconvert() = nb::none(), "tree"_a = nb::none(),
+             "hides"_a = true, "stream"_a, "eps"_a);
     nb::class_<LitArrays>(m, "Lit").def(
-        nb::init<std::vector<AnyTable>, std::vector<MeshArrays>, std::vector<LampArrays>, Rows, int, int, bool, int,
+        nb::init<std::vector<AnyTable>, std::vector<MeshArrays>, std::vector<LightArrays>, Rows, int, int, bool, int,
                  const std::vector<double>&>(),
-        nb::kw_only(), "tables"_a, "meshes"_a, "lamps"_a, "faces"_a.noconvert(), "verts"_a, "eye"_a, "perspective"_a,
+        nb::kw_only(), "tables"_a, "meshes"_a, "lights"_a, "faces"_a.noconvert(), "verts"_a, "eye"_a, "perspective"_a,
         "channels"_a, "ball"_a);
     nb::class_<PointArrays>(m, "LitPoints")
-        .def(nb::new_([](In<int64_t, 1> face, In<double, 2> b, In<int64_t, 1> seed, int forced_lamp,
+        .def(nb::new_([](In<int64_t, 1> face, In<double, 2> b, In<int64_t, 1> seed, int forced_light,
                          std::optional<In<int64_t, 1>> index, std::optional<In<double, 2>> uv,
-                         std::optional<In<double, 1>> density, std::optional<In<uint8_t, 1>> lit,
+                         std::optional<In<double, 1>> pdf, std::optional<In<uint8_t, 1>> lit,
                          std::optional<In<double, 3>> spread) {
-                 return PointArrays{face, b, seed, forced_lamp, index, uv, density, lit, spread};
+                 return PointArrays{face, b, seed, forced_light, index, uv, pdf, lit, spread};
              }),
-             nb::kw_only(), "face"_a.noconvert(), "b"_a.noconvert(), "seed"_a.noconvert(), "forced_lamp"_a = -1,
-             "index"_a.noconvert() = nb::none(), "uv"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
+             nb::kw_only(), "face"_a.noconvert(), "b"_a.noconvert(), "seed"_a.noconvert(), "forced_light"_a = -1,
+             "index"_a.noconvert() = nb::none(), "uv"_a.noconvert() = nb::none(), "pdf"_a.noconvert() = nb::none(),
              "lit"_a.noconvert() = nb::none(), "spread"_a.noconvert() = nb::none());
-    nb::class_<LampTree>(m, "LampTree")
+    nb::class_<EmissiveFaceTree>(m, "EmissiveFaceTree")
         .def(nb::new_(&make_tree), "verts"_a.noconvert(), "faces"_a.noconvert())
-        .def_prop_ro("is_flat", &LampTree::is_flat)
-        .def_prop_ro("is_convex", &LampTree::is_convex)
+        .def_prop_ro("is_flat", &EmissiveFaceTree::is_flat)
+        .def_prop_ro("is_convex", &EmissiveFaceTree::is_convex)
         .def(
             "is_round",
-            [](const LampTree& t, In<double, 1> density) {
-                return is_round(t, density.data(), int64_t(density.size()));
-            },
-            "density"_a.noconvert())
+            [](const EmissiveFaceTree& t, In<double, 1> pdf) { return is_round(t, pdf.data(), int64_t(pdf.size())); },
+            "pdf"_a.noconvert())
         .def_prop_ro("ball",
-                     [](const LampTree& t) {
+                     [](const EmissiveFaceTree& t) {
                          return std::array<double, 5>{t.center().x, t.center().y, t.center().z, t.radius(), t.size()};
                      })
         .def("crossings", &crossings, "origins"_a.noconvert(), "directions"_a.noconvert(), "start"_a.noconvert(),
              "end"_a.noconvert());
     nb::class_<LitOptions>(m, "LitOptions")
-        .def(nb::new_([](bool shadows, int samples, int only, bool in_fours, double dark, int bounces, double near,
-                         bool only_near) {
+        .def(nb::new_([](bool shadows, int samples, int only, bool antithetic, double dark, int bounces, double near,
+                         bool only_near_field) {
                  if (bounces < 1 || bounces > most_bounces) refuse("bounces: expected 1 to MOST_BOUNCES");
                  if (!(near >= 0)) refuse("near: expected no less than 0");
-                 return LitOptions{shadows, samples, only, in_fours, dark, bounces, near, only_near};
+                 return LitOptions{shadows, samples, only, antithetic, dark, bounces, near, only_near_field};
              }),
-             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "in_fours"_a, "dark"_a, "bounces"_a = 1, "near"_a = 0.0,
-             "only_near"_a = false);
+             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "antithetic"_a, "dark"_a, "bounces"_a = 1,
+             "near"_a = 0.0, "only_near_field"_a = false);
 }
 
 }  // namespace edgegrad

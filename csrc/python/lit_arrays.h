@@ -28,16 +28,16 @@ struct MeshArrays {
     std::optional<Rows> normal_faces;
 };
 
-struct LampArrays {
-    Lamp view;
+struct LightArrays {
+    Light view;
     std::vector<std::optional<In<double, 1>>> arrays;  // that it refers to
-    std::shared_ptr<LampTree> tree;
+    std::shared_ptr<EmissiveFaceTree> tree;
 };
 
 // All of it, checked: what indexes what exists.
 class LitArrays {
    public:
-    LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LampArrays> lamps, Rows faces,
+    LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LightArrays> lights, Rows faces,
               int verts, int eye, bool perspective, int channels, const std::vector<double>& ball);
 
     LitScene scene;
@@ -49,11 +49,11 @@ class LitArrays {
     void check_index(const char* name, const int32_t* index, int64_t faces, int number) const;
     void check_source(const char* name, const SourceArrays& arrays, const LitMesh& mesh, int channels) const;
     void check_mesh(const MeshArrays& arrays) const;
-    void check_lamp(const Lamp& lamp) const;
+    void check_light(const Light& light) const;
 
     std::vector<AnyTable> tables_;
     std::vector<MeshArrays> meshes_;
-    std::vector<LampArrays> lamps_;
+    std::vector<LightArrays> lights_;
     Rows faces_;
 };
 
@@ -70,10 +70,10 @@ struct PointArrays {
     In<int64_t, 1> face;
     In<double, 2> b;
     In<int64_t, 1> seed;
-    int forced_lamp;
+    int forced_light;
     std::optional<In<int64_t, 1>> index;
     std::optional<In<double, 2>> uv;
-    std::optional<In<double, 1>> density;
+    std::optional<In<double, 1>> pdf;
     std::optional<In<uint8_t, 1>> lit;
     std::optional<In<double, 3>> spread;
 

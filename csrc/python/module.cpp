@@ -23,18 +23,18 @@ using namespace nanobind::literals;
 
 namespace edgegrad {
 
-void bind_memory(nb::module_& m);       // memory.cpp
-void bind_for_shaders(nb::module_& m);  // for_shaders.cpp
-void bind_lit(nb::module_& m);          // lit.cpp
-void bind_bounces(nb::module_& m);      // secondary_edges.cpp
-void bind_moving_hits(nb::module_& m);  // moving_hits.cpp
-void bind_raster(nb::module_& m);       // raster.cpp
+void bind_memory(nb::module_& m);           // memory.cpp
+void bind_for_shaders(nb::module_& m);      // for_shaders.cpp
+void bind_lit(nb::module_& m);              // lit.cpp
+void bind_secondary_edges(nb::module_& m);  // secondary_edges.cpp
+void bind_moving_hits(nb::module_& m);      // moving_hits.cpp
+void bind_raster(nb::module_& m);           // raster.cpp
 template <class T>
 void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene);
 template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene);
 template <class T>
-void bind_scene_bounces(nb::class_<SceneArrays<T>>& scene);
+void bind_scene_secondary_edges(nb::class_<SceneArrays<T>>& scene);
 void bind_for_tests(nb::module_& m);  // for_tests.cpp
 
 namespace {
@@ -127,7 +127,7 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Chann
             {"silhouettes", double(p.silhouettes)},
             {"creases", double(p.creases)},
             {"intersections", double(p.intersections)},
-            {"rim", p.rim},
+            {"lens_boundary", p.lens_boundary},
             {"built rays", work.rays},
             {"built edges", work.edges},
             {"found intersections", work.intersections},
@@ -199,8 +199,8 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
                       const std::vector<double>&, const std::vector<double>&, int>(),
              "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(),
              "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
-             "uv_corners"_a.noconvert(), "alphas"_a.noconvert(), "cut_outs"_a.noconvert(), "face_cut_out"_a.noconvert(),
-             "background"_a.noconvert(), "cutoffs"_a, "spacing"_a, "threads"_a)
+             "uv_corners"_a.noconvert(), "alphas"_a.noconvert(), "alpha_masks"_a.noconvert(),
+             "face_alpha_mask"_a.noconvert(), "background"_a.noconvert(), "cutoffs"_a, "spacing"_a, "threads"_a)
         .def("forward", &forward<T>, "camera"_a, "channels"_a, "options"_a, "threads"_a, "image"_a.noconvert(),
              "hits"_a)
         .def("faces_at_centers", &find_faces<T>, "camera"_a, "channels"_a, "threads"_a, "face"_a.noconvert())
@@ -212,7 +212,7 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
              "adjoint"_a.noconvert(), "hits"_a, "gradient"_a.noconvert());
     bind_scene_for_shaders(scene);
     bind_scene_lit(scene);
-    bind_scene_bounces(scene);
+    bind_scene_secondary_edges(scene);
 }
 
 }  // namespace
@@ -275,7 +275,7 @@ NB_MODULE(_core, m) {
     m.attr("GRADIENT_SLOTS") = nb::tuple(nb::cast(slots));
     bind_for_shaders(m);
     bind_lit(m);
-    bind_bounces(m);
+    bind_secondary_edges(m);
     bind_moving_hits(m);
     bind_raster(m);
     bind_scene<float>(m, "SceneFloat", "HitsFloat");

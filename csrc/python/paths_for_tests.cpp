@@ -16,7 +16,7 @@ namespace edgegrad {
 namespace {
 
 // A dict of arrays (N, …): `points` of each path; (N, bounces, …) of its points face, b and density; (N, bounces,
-// lights, …) of points of lights index, uv, light_density and seen.
+// lights, …) of points of lights index, uv, light_pdf and seen.
 template <class T>
 nb::dict find_paths(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& from,
                     const LitOptions& options, int threads) {
@@ -29,18 +29,18 @@ nb::dict find_paths(const SceneArrays<T>& arrays, const LitArrays& lit, const Po
     });
     const size_t n = size_t(view.size), B = size_t(options.bounces), K = paths.lights().size();
     std::vector<int64_t> points(n), face(n * B), index(n * B * K);
-    std::vector<double> b(3 * n * B), density(n * B), uv(2 * n * B * K), light_density(n * B * K);
+    std::vector<double> b(3 * n * B), pdf(n * B), uv(2 * n * B * K), light_pdf(n * B * K);
     std::vector<int8_t> seen(n * B * K, not_asked);
     for (size_t i = 0; i < n; ++i) {
         const Path path = paths.path(int64_t(i));
         points[i] = path.points;
         for (int k = 0; k < path.points; ++k) {
             const size_t at = i * B + size_t(k);
-            face[at] = path.face_at(k), density[at] = k > 0 ? path.density_at(k) : 1;
+            face[at] = path.face_at(k), pdf[at] = k > 0 ? path.pdf_at(k) : 1;
             std::copy(path.b_at(k), path.b_at(k) + 3, &b[3 * at]);
             for (size_t j = 0; k > 0 && j < K; ++j) {
                 const LightPoint& p = path.drawn_at(k)[j];
-                index[at * K + j] = p.index, light_density[at * K + j] = p.density;
+                index[at * K + j] = p.index, light_pdf[at * K + j] = p.pdf;
                 uv[2 * (at * K + j)] = p.u, uv[2 * (at * K + j) + 1] = p.v;
                 seen[at * K + j] = path.seen_at(k)[j];
             }
@@ -49,9 +49,9 @@ nb::dict find_paths(const SceneArrays<T>& arrays, const LitArrays& lit, const Po
     nb::dict out;
     out["points"] = shaped(std::move(points), {n});
     out["face"] = shaped(std::move(face), {n, B}), out["b"] = shaped(std::move(b), {n, B, 3});
-    out["density"] = shaped(std::move(density), {n, B});
+    out["pdf"] = shaped(std::move(pdf), {n, B});
     out["index"] = shaped(std::move(index), {n, B, K}), out["uv"] = shaped(std::move(uv), {n, B, K, 2});
-    out["light_density"] = shaped(std::move(light_density), {n, B, K});
+    out["light_pdf"] = shaped(std::move(light_pdf), {n, B, K});
     out["seen"] = shaped(std::move(seen), {n, B, K});
     return out;
 }

@@ -35,12 +35,12 @@ struct Asked {
     const Camera& camera;
     const ImageOptions& image;
     const HitArrays<T>& hits;
-    const std::optional<In<uint8_t, 1>>& panes;
+    const std::optional<In<uint8_t, 1>>& transparent;
     double least;
     int threads;
 
-    // As records of arrays with their first point alone, and of BounceSamples the jumps (S, channels) and origins (S,
-    // 3), of which there are none where the camera sees the points. record(input, casters, team, samples)
+    // As records of arrays with their first point alone, and of SecondaryEdgeSamples the jumps (S, channels) and
+    // origins (S, 3), of which there are none where the camera sees the points. record(input, casters, team, samples)
     template <class Record>
     nb::tuple samples(const LitOptions& options, int further, GeometryWanted wanted, Record record) const {
         hits.check(arrays, camera), check_faces(arrays, lit);
@@ -48,12 +48,12 @@ struct Asked {
         if (further < 0 || options.bounces < 2 + further) refuse("bounces: expected at least 2 + further");
         const SceneView<T> scene = arrays.view(), casting = casters.view();
         std::vector<CurveRecords> found;
-        BounceSamples of_chunks;
+        SecondaryEdgeSamples of_chunks;
         unlocked(threads, [&](Team& team) {
             GeometryWork done;
             const auto geometry = arrays.geometry(wanted, team, done);
             found = record(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view(), nullptr,
-                                            marked_faces("panes", arrays, panes)},
+                                            marked_faces("transparent", arrays, transparent)},
                            casting, team, of_chunks);
         });
         return nb::make_tuple(curve_arrays(found, least, true, threads),
@@ -63,47 +63,49 @@ struct Asked {
 };
 
 template <class T>
-nb::tuple bounce_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const LitArrays& lit,
-                         const LitOptions& lit_options, int further, bool seen, const Camera& camera,
-                         const ImageOptions& image, const GradientOptions& options, int64_t samples, double least,
-                         int threads, const HitArrays<T>& hits, const std::optional<In<uint8_t, 1>>& panes) {
-    return Asked<T>{arrays, casters, lit, camera, image, hits, panes, least, threads}.samples(
+nb::tuple secondary_edge_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const LitArrays& lit,
+                                 const LitOptions& lit_options, int further, bool seen, const Camera& camera,
+                                 const ImageOptions& image, const GradientOptions& options, int64_t samples,
+                                 double least, int threads, const HitArrays<T>& hits,
+                                 const std::optional<In<uint8_t, 1>>& transparent) {
+    return Asked<T>{arrays, casters, lit, camera, image, hits, transparent, least, threads}.samples(
         lit_options, further, {.topology = true, .parts = true},
-        [&](const BackwardInput<T>& input, const SceneView<T>& casting, Team& team, BounceSamples& out) {
-            return record_bounces(input, casting, options, {lit.scene, lit_options, further, seen}, samples, team, out);
+        [&](const BackwardInput<T>& input, const SceneView<T>& casting, Team& team, SecondaryEdgeSamples& out) {
+            return record_secondary_edges(input, casting, options, {lit.scene, lit_options, further, seen}, samples,
+                                          team, out);
         });
 }
 
 template <class T>
-nb::tuple surface_border_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const LitArrays& lit,
-                                 const LitOptions& lit_options, int further, bool crossings, bool rims,
-                                 const Camera& camera, const ImageOptions& image, const GradientOptions& options,
-                                 int64_t samples, double least, int threads, const HitArrays<T>& hits,
-                                 const std::optional<In<uint8_t, 1>>& panes) {
-    return Asked<T>{arrays, casters, lit, camera, image, hits, panes, least, threads}.samples(
+nb::tuple surface_edge_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const LitArrays& lit,
+                               const LitOptions& lit_options, int further, bool crossings, bool alpha_edges,
+                               const Camera& camera, const ImageOptions& image, const GradientOptions& options,
+                               int64_t samples, double least, int threads, const HitArrays<T>& hits,
+                               const std::optional<In<uint8_t, 1>>& transparent) {
+    return Asked<T>{arrays, casters, lit, camera, image, hits, transparent, least, threads}.samples(
         lit_options, further, {.topology = true, .intersections = true},
-        [&](const BackwardInput<T>& input, const SceneView<T>& casting, Team& team, BounceSamples& out) {
-            return record_surface_borders(input, casting, options, {lit.scene, lit_options, further, false},
-                                          {crossings, rims}, samples, team, out);
+        [&](const BackwardInput<T>& input, const SceneView<T>& casting, Team& team, SecondaryEdgeSamples& out) {
+            return record_surface_edges(input, casting, options, {lit.scene, lit_options, further, false},
+                                        {crossings, alpha_edges}, samples, team, out);
         });
 }
 
 }  // namespace
 
 template <class T>
-void bind_scene_bounces(nb::class_<SceneArrays<T>>& scene) {
-    scene.def("bounce_samples", &bounce_samples<T>, "casters"_a, "lit"_a, "lit_options"_a, nb::kw_only(), "further"_a,
-              "seen"_a, "camera"_a, "image"_a, "options"_a, "samples"_a, "least"_a, "threads"_a, "hits"_a,
-              "panes"_a.none());
-    scene.def("surface_border_samples", &surface_border_samples<T>, "casters"_a, "lit"_a, "lit_options"_a,
-              nb::kw_only(), "further"_a, "crossings"_a, "rims"_a, "camera"_a, "image"_a, "options"_a, "samples"_a,
-              "least"_a, "threads"_a, "hits"_a, "panes"_a.none());
+void bind_scene_secondary_edges(nb::class_<SceneArrays<T>>& scene) {
+    scene.def("secondary_edge_samples", &secondary_edge_samples<T>, "casters"_a, "lit"_a, "lit_options"_a,
+              nb::kw_only(), "further"_a, "seen"_a, "camera"_a, "image"_a, "options"_a, "samples"_a, "least"_a,
+              "threads"_a, "hits"_a, "transparent"_a.none());
+    scene.def("surface_edge_samples", &surface_edge_samples<T>, "casters"_a, "lit"_a, "lit_options"_a, nb::kw_only(),
+              "further"_a, "crossings"_a, "alpha_edges"_a, "camera"_a, "image"_a, "options"_a, "samples"_a, "least"_a,
+              "threads"_a, "hits"_a, "transparent"_a.none());
 }
-template void bind_scene_bounces(nb::class_<SceneArrays<float>>&);
-template void bind_scene_bounces(nb::class_<SceneArrays<double>>&);
+template void bind_scene_secondary_edges(nb::class_<SceneArrays<float>>&);
+template void bind_scene_secondary_edges(nb::class_<SceneArrays<double>>&);
 
-void bind_bounces(nb::module_& m) {
-    m.def("most_bounce_samples", &most_bounce_samples, "width"_a, "height"_a, "spp"_a);
+void bind_secondary_edges(nb::module_& m) {
+    m.def("most_secondary_edge_samples", &most_secondary_edge_samples, "width"_a, "height"_a, "spp"_a);
 }
 
 }  // namespace edgegrad

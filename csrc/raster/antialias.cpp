@@ -160,7 +160,7 @@ std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& fra
     team.each(frames.count * bands, [&](int64_t k) {
         const int64_t item = k / bands, band = k % bands;
         const PairFinder<T> pairs(mesh, frames, sides.data() + (mesh.shared ? 0 : item * mesh.triangles), item, rast);
-        std::vector<Crossing> own;  // threads that write beside one another wait for each other's caches
+        std::vector<Crossing> own;  // threads that write next to one another wait for each other's caches
         for (int64_t y = band * rows; y < std::min(H, (band + 1) * rows); ++y)
             for (int64_t x = 0; x < frames.width; ++x) {
                 if (x + 1 < frames.width) pairs.visit(x, y, 0, own);
@@ -220,7 +220,7 @@ AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Tri
             const int axis = c->axis;
             const Neighbours pair{at % frames.width, at / frames.width, axis, step > 0 ? 1 : -1};
             const SideLine side(mesh, c->near / pixels, 3 * int64_t(c->triangle) + c->side);
-            // The place p* on the line n · p* = 0 moves along the axis by δx = −(δn · p*) / n.x, and with y alike.
+            // The place p* on the line n · p* = 0 moves along the axis by δx = −(δn · p*) / n.x, and with y likewise.
             Vec3 p = pair.center(frames);
             const double moved = pair.step * c->share * pair.size(frames);
             (axis == 0 ? p.x : p.y) += moved;

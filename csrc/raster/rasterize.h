@@ -3,7 +3,7 @@
 //
 // A point p = (x, y, 1) of the image is seen in the triangle (a, b, c), rows (x, y, w), with barycentrics e / (e₀ + e₁
 // + e₂), e₀ = p · (b × c), e₁ = p · (c × a), e₂ = p · (a × b); it lies before the eye where all e have the sign of a ·
-// (b × c). Signs are exact, and a centre on an edge is taken as lying beside it, on the same side for all triangles:
+// (b × c). Signs are exact, and a centre on an edge is taken as lying next to it, on the same side for all triangles:
 // each surface without a border covers each centre as often from the front as from the back.
 #pragma once
 

@@ -55,15 +55,15 @@ struct Taps {
 };
 
 // Axes of a cube's sides: the major one with its sign, and those that s and t run along.
-struct CubeSide {
+struct CubeFace {
     int major, s, t;
     double sign, s_sign, t_sign;
 };
-inline constexpr CubeSide cube_sides[6] = {{0, 2, 1, 1, -1, -1}, {0, 2, 1, -1, 1, -1}, {1, 0, 2, 1, 1, 1},
+inline constexpr CubeFace cube_faces[6] = {{0, 2, 1, 1, -1, -1}, {0, 2, 1, -1, 1, -1}, {1, 0, 2, 1, 1, 1},
                                            {1, 0, 2, -1, 1, -1}, {2, 0, 1, 1, 1, -1},  {2, 0, 1, -1, -1, -1}};
 
 // −1 where a direction has none: zero, or not finite.
-inline int cube_side_of(const double (&d)[3]) {
+inline int cube_face_of(const double (&d)[3]) {
     int axis = 0;
     for (int k = 0; k < 3; ++k) {
         if (!std::isfinite(d[k])) return -1;
@@ -73,7 +73,7 @@ inline int cube_side_of(const double (&d)[3]) {
     return 2 * axis + (d[axis] < 0);
 }
 
-// The texel (x, y) of a side of n by n, or beyond one of its edges the one beside it on the next side. Centres are at
+// The texel (x, y) of a side of n by n, or beyond one of its edges the one next to it on the next side. Centres are at
 // odd numbers in a cube from −n to n: a coordinate that leaves it becomes that of the next side, and what was the
 // side's becomes that of its outermost texels. −1 beyond a corner, where three sides meet.
 inline int64_t cube_texel(const TexelPlane& plane, int side, int64_t x, int64_t y) {
@@ -81,13 +81,13 @@ inline int64_t cube_texel(const TexelPlane& plane, int side, int64_t x, int64_t 
     const bool over_x = x < 0 || x >= n, over_y = y < 0 || y >= n;
     if (!over_x && !over_y) return plane.at(side, x, y);
     if (over_x && over_y) return -1;
-    const CubeSide& from = cube_sides[side];
+    const CubeFace& from = cube_faces[side];
     int64_t place[3];
     place[from.s] = int64_t(from.s_sign) * (2 * x + 1 - n), place[from.t] = int64_t(from.t_sign) * (2 * y + 1 - n);
     const int over = over_x ? from.s : from.t;
     place[from.major] = int64_t(from.sign) * (n - 1);
     const int next = 2 * over + (place[over] < 0);
-    const CubeSide& to = cube_sides[next];
+    const CubeFace& to = cube_faces[next];
     return plane.at(next, (int64_t(to.s_sign) * place[to.s] + n - 1) / 2,
                     (int64_t(to.t_sign) * place[to.t] + n - 1) / 2);
 }
@@ -137,7 +137,7 @@ inline Taps linear_taps(const TexelPlane& plane, const TexturePlace& at, Border 
         if (out.texel[k] < 0) corner = k;
     }
     if (corner < 0) return out;
-    // The missing texel is the mean of the three that meet there, from whichever side one looks.
+    // The missing texel is the mean of the three that meet there, from whichever side.
     for (int k = 0; k < 4; ++k) {
         if (k == corner) continue;
         out.weight[k] += out.weight[corner] / 3;

@@ -1,5 +1,5 @@
-// Faces that are cut out: a point of one is there where an alpha texture, at its texture coordinates, is at least a
-// cutoff. Elsewhere rays pass through.
+// Faces that are alpha-tested: a point of one is there where an alpha texture, at its texture coordinates, is at least
+// a cutoff. Elsewhere rays pass through.
 #pragma once
 
 #include "camera/face_map.h"
@@ -17,20 +17,20 @@ Vec2 interpolated_uv(const SceneView<T>& scene, int64_t face, Barycentrics b) {
     return uv0 + b.u * (uv(1) - uv0) + b.v * (uv(2) - uv0);
 }
 
-// Of a face that may be cut out.
+// Of a face that may be alpha-tested.
 template <class T>
 Texture<T> alpha_of(const SceneView<T>& scene, int64_t face) {
-    return texture_at(scene.cut_outs.alphas, scene.cut_outs.textures, scene.cut_outs.face[face]);
+    return texture_at(scene.alpha_masks.alphas, scene.alpha_masks.textures, scene.alpha_masks.face[face]);
 }
 template <class T>
 double cutoff_of(const SceneView<T>& scene, int64_t face) {
-    return scene.cut_outs.cutoffs[scene.cut_outs.face[face]];
+    return scene.alpha_masks.cutoffs[scene.alpha_masks.face[face]];
 }
 
 // Whether a face is there at a point of it.
 template <class T>
 bool shows(const SceneView<T>& scene, int64_t face, Barycentrics b) {
-    if (!scene.cut_outs.on(face)) return true;
+    if (!scene.alpha_masks.on(face)) return true;
     const Texture<T> alpha = alpha_of(scene, face);
     double value;
     eval<1>(alpha, footprint(alpha, interpolated_uv(scene, face, b)), 1, &value);
@@ -39,13 +39,14 @@ bool shows(const SceneView<T>& scene, int64_t face, Barycentrics b) {
 
 // What a camera's rays pass through.
 template <class T>
-class CutOuts final : public SeenThrough {
+class AlphaMasks final : public AlphaTest {
    public:
     // `q` (V,): the vertices in camera coordinates.
-    CutOuts(const SceneView<T>& scene, const Camera& camera, const Vec3* q) : scene_(scene), camera_(camera), q_(q) {}
+    AlphaMasks(const SceneView<T>& scene, const Camera& camera, const Vec3* q)
+        : scene_(scene), camera_(camera), q_(q) {}
 
     bool shows(int32_t face, Vec2 n) const override {
-        if (!scene_.cut_outs.on(face)) return true;
+        if (!scene_.alpha_masks.on(face)) return true;
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
         return edgegrad::shows(scene_, face, barycentrics_of_hit(face_map(camera_, corner), n));

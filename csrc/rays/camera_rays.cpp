@@ -5,9 +5,9 @@
 
 namespace edgegrad {
 
-CameraFrame::CameraFrame(const RayCaster& caster, const Camera& camera, const SeenThrough* through)
+CameraFrame::CameraFrame(const RayCaster& caster, const Camera& camera, const AlphaTest* alpha_test)
     : caster_(caster),
-      through_(through),
+      alpha_test_(alpha_test),
       frame_(caster.frame()),
       axis_x_(camera.R_inverse * Vec3{1, 0, 0}),
       axis_y_(camera.R_inverse * Vec3{0, 1, 0}),
@@ -15,10 +15,10 @@ CameraFrame::CameraFrame(const RayCaster& caster, const Camera& camera, const Se
       eye_(frame_.position(camera.R_inverse * -camera.t)),
       perspective_(camera.perspective),
       far_(!camera.perspective || frame_.is_far(eye_)),
-      straight_(camera.is_straight()) {}
+      undistorted_(camera.is_undistorted()) {}
 
 void CameraFrame::cast(CameraRays& rays, const RayCaster::Ignored* ignored) const {
-    if (through_) cast_through(rays, ignored, [](int32_t) { return true; });
+    if (alpha_test_) cast_with_alpha_test(rays, ignored, [](int32_t) { return true; });
     else caster_.cast(rays, ignored);
 }
 
@@ -54,7 +54,7 @@ template <int W>
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.t_far[i] = std::numeric_limits<float>::infinity();
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.geometry[i] = RayPacket<W>::nothing;
         // Where a lens shows nothing, there is no ray: one that ends before it starts.
-        if (!camera.straight_)
+        if (!camera.undistorted_)
             for (int i = 0; i < W; ++i)
                 if (!std::isfinite(x[i])) p.t_far[i] = -1;
         if (!camera.far_) {

@@ -10,12 +10,12 @@
 namespace edgegrad {
 
 // What rays pass through: faces that are not there where the ray at n meets them (rays/alpha_mask.h).
-class SeenThrough {
+class AlphaTest {
    public:
     virtual bool shows(int32_t face, Vec2 n) const = 0;
 
    protected:
-    ~SeenThrough() = default;
+    ~AlphaTest() = default;
 };
 
 class CameraRays;
@@ -24,19 +24,19 @@ class CameraRays;
 class CameraFrame {
    public:
     // `through`: null if all faces are there everywhere.
-    CameraFrame(const RayCaster& caster, const Camera& camera, const SeenThrough* through);
+    CameraFrame(const RayCaster& caster, const Camera& camera, const AlphaTest* alpha_test);
 
     // The nearest face along each ray that is there, of those that the ray does not ignore.
     void cast(CameraRays& rays, const RayCaster::Ignored* ignored = nullptr) const;
 
     // The same through what `meets(face)` refuses.
     template <class Meets>
-    void cast_through(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const;
+    void cast_with_alpha_test(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const;
 
     // World units by which a ray may miss a point p that it was aimed at: a few roundings of what Embree is given.
     double error(Vec3 p) const;
 
-    // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its rim a face
+    // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its border a face
     // may be hit that the ray misses: at a silhouette of a fine mesh that is a neighbour which is seen less wide than
     // floats are apart. `meets(face)` decides, in double where that matters; what it refuses is passed through.
     template <class Meets>
@@ -45,11 +45,11 @@ class CameraFrame {
    private:
     friend class CameraRays;
     const RayCaster& caster_;
-    const SeenThrough* through_;
+    const AlphaTest* alpha_test_;
     RayFrame frame_;
     Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
     Vec3 eye_;
-    bool perspective_, far_, straight_;
+    bool perspective_, far_, undistorted_;
 };
 
 // Rays by where they go in the image.
@@ -76,13 +76,13 @@ class CameraRays : public RayBatch {
 };
 
 template <class Meets>
-void CameraFrame::cast_through(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const {
+void CameraFrame::cast_with_alpha_test(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const {
     // The rays of a packet mostly ask for the same face together.
     int32_t latest = -1;
     bool met = false;
-    caster_.cast_through(rays, ignored, [&](int ray, int32_t face) {
+    caster_.cast_with_alpha_test(rays, ignored, [&](int ray, int32_t face) {
         if (face != latest) latest = face, met = meets(face);
-        return met && (!through_ || through_->shows(face, rays.n(ray)));
+        return met && (!alpha_test_ || alpha_test_->shows(face, rays.n(ray)));
     });
 }
 
@@ -92,7 +92,7 @@ int32_t CameraFrame::beyond_float(Vec2 n, int32_t face, RayCaster::Ignored ignor
     CameraRays ray(*this);
     ray.n_x[0] = n.x, ray.n_y[0] = n.y, ray.count = 1;
     ray.prepare();
-    cast_through(ray, &ignored, meets);
+    cast_with_alpha_test(ray, &ignored, meets);
     return ray.face[0];
 }
 

@@ -37,7 +37,7 @@ struct FilterArguments {
     unsigned N;
 };
 
-// RTCIntersectArguments and RTCOccludedArguments, which are laid out alike.
+// RTCIntersectArguments and RTCOccludedArguments, which are of one layout.
 struct IntersectArguments {
     int flags;
     unsigned feature_mask;

@@ -78,7 +78,7 @@ class KeptGeometry {
         find_intersections_ = wanted.intersections && !(geometry_ && geometry_->intersections_);
         if (find_intersections_ && geometry_) order_ = std::move(geometry_->order_);
         make_parts_ = wanted.parts && !(geometry_ && geometry_->parts_);
-        // Edges of other positions, which nobody looks at: taken, so that nobody else welds them at the same time.
+        // Edges of other positions, which nobody reads: taken, so that nobody else welds them at the same time.
         if (weld_ && geometry_) topology_ = std::move(geometry_->topology_);
         return here;
     }

@@ -24,13 +24,13 @@ Vec3 corner(const SceneView<T>& scene, int64_t face, int i) {
 struct Meeting {
     double u, v, t;
 
-    // What doubles cannot tell from the border of a face.
+    // What doubles cannot distinguish from the border of a face.
     static constexpr double rounding = 1e-12;
 
     bool exists() const { return std::isfinite(u + v + t); }
     // The least barycentric: below zero outside of the face.
     double margin() const { return std::min({u, v, 1 - u - v}); }
-    // Within the face, as far as doubles can tell.
+    // Within the face, to the precision of doubles.
     bool inside() const { return margin() >= -rounding; }
 };
 template <class T>

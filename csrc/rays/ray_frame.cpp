@@ -16,10 +16,10 @@ namespace edgegrad {
 // Its origin is where the detail is: the mean of the faces' centroids weighted with 1 / (longest side)². Floats are as
 // fine as their distance to the origin is short, so a small object on a wide ground plane keeps its shape.
 //
-// Its unit matters only where the scene spans many powers of ten, for floats round alike at any scale: but Embree takes
-// products of three lengths, which must not leave the range of floats, 1e-38 … 1e38. So where the farthest vertex lies
-// very many times the size of a face away, that size (its geometric mean) lies as far below the unit as that vertex
-// lies above it.
+// Its unit matters only where the scene spans many powers of ten, for floats round equally at any scale: but Embree
+// takes products of three lengths, which must not leave the range of floats, 1e-38 … 1e38. So where the farthest vertex
+// lies very many times the size of a face away, that size (its geometric mean) lies as far below the unit as that
+// vertex lies above it.
 RayFrame frame_of(const PlacedTriangles& triangles, Team& team) {
     const auto& [faces, n_faces, verts, n_verts, used] = triangles;
     const auto vertex = [&](int64_t v) { return Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]}; };

@@ -108,7 +108,7 @@ void reject(const FilterArguments* a) {
     const auto* face = static_cast<const unsigned*>(a->hit) + 5 * a->N;
     for (unsigned i = 0; i < a->N; ++i) {
         if (i % 4 == 0 && i + 4 <= a->N && !(a->valid[i] | a->valid[i + 1] | a->valid[i + 2] | a->valid[i + 3])) {
-            i += 3;  // a packet has rays in fours, of which most did not meet the face
+            i += 3;  // a packet has rays in antithetic sets, of which most did not meet the face
             continue;
         }
         if (!a->valid[i]) continue;

@@ -43,14 +43,14 @@ class RayCaster {
 
     // The same through what `meets(ray, face)` refuses; `ray` counts those of the batch.
     template <class Meets>
-    void cast_through(RayBatch& batch, const Ignored* ignored, const Meets& meets) const;
+    void cast_with_alpha_test(RayBatch& batch, const Ignored* ignored, const Meets& meets) const;
 
     // Whether a ray meets any face.
     void cast_occluded(RayBatch& batch, const Ignored* ignored = nullptr) const;
 
     // The same of the faces that `meets(ray, face)` does not refuse.
     template <class Meets>
-    void cast_occluded_through(RayBatch& batch, const Meets& meets) const;
+    void cast_occluded_with_alpha_test(RayBatch& batch, const Meets& meets) const;
 
     // Embree's part of cast() alone, to be timed.
     void trace(RayBatch& batch) const { trace(batch, Query::closest, nullptr, nullptr); }
@@ -89,12 +89,12 @@ RayCaster::Decision RayCaster::decision(const Meets& meets) {
 }
 
 template <class Meets>
-void RayCaster::cast_through(RayBatch& batch, const Ignored* ignored, const Meets& meets) const {
+void RayCaster::cast_with_alpha_test(RayBatch& batch, const Ignored* ignored, const Meets& meets) const {
     cast(batch, ignored, decision(meets));
 }
 
 template <class Meets>
-void RayCaster::cast_occluded_through(RayBatch& batch, const Meets& meets) const {
+void RayCaster::cast_occluded_with_alpha_test(RayBatch& batch, const Meets& meets) const {
     const Decision asked = decision(meets);
     cast_occluded(batch, nullptr, &asked);
 }

@@ -26,8 +26,8 @@ Vec3 point_on(const SceneView<T>& scene, int64_t face, const double* b) {
     return (1 - u - v) * corner(scene, face, 0) + u * corner(scene, face, 1) + v * corner(scene, face, 2);
 }
 
-// At its rim a face may be hit in float that the ray misses by a rounding: then it is hit at the rim, for its neighbour
-// may be missed as well.
+// At its border a face may be hit in float that the ray misses by a rounding: then it is hit at the border, for its
+// neighbour may be missed as well.
 Barycentrics onto_face(const Meeting& m) {
     double u = std::max(m.u, 0.0), v = std::max(m.v, 0.0);
     if (u + v > 1) u /= u + v, v = 1 - u;
@@ -83,7 +83,7 @@ void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& l
             contact[i] = lines.contact[k] / length(ray[i].direction);
             batch.set(i, caster.frame(), ray[i]);
         }
-        caster.cast_occluded_through(batch, [&](int i, int32_t face) {
+        caster.cast_occluded_with_alpha_test(batch, [&](int i, int32_t face) {
             const int32_t own = lines.face[first + i];
             if (face == own) return false;
             const Meeting m = meet(scene, face, ray[i]);

@@ -1,5 +1,5 @@
 // Any rays through a scene, from where a user says: what they hit, and whether a point sees another. Embree says in
-// float which face a ray may meet, double decides whether it does, and whether the face is there or cut out.
+// float which face a ray may meet, double decides whether it does, and whether the face is there or masked by alpha.
 #pragma once
 
 #include <cstdint>

@@ -48,7 +48,7 @@ class FacePair {
     enum class Kind { none, through, along };
 
     // Where `along`: which of the two, 0 or 1, lies on one side, the corner of it that does, and on which side.
-    int lies_beside = 0, corner = 0;
+    int lies_along = 0, corner = 0;
     bool before = false;
 
     Kind set(const PlacedFace& f, const PlacedFace& g) {
@@ -70,8 +70,8 @@ class FacePair {
         interval(g, distance_[1], second);
         if (!overlap(first, second)) return Kind::none;
         if (first_side == Side::both && second_side == Side::both) return Kind::through;
-        lies_beside = first_side == Side::edge ? 0 : 1;
-        const auto& distance = distance_[lies_beside];
+        lies_along = first_side == Side::edge ? 0 : 1;
+        const auto& distance = distance_[lies_along];
         corner = distance[0] != 0 ? 0 : distance[1] != 0 ? 1 : 2;
         before = distance[corner] > 0;
         return Kind::along;

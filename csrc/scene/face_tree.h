@@ -70,8 +70,8 @@ struct CornerGroup {
     int32_t vertex[3][size];  // −1: there is no face
 
     // Bit i: face i shares at most one vertex with a face, and its others lie neither all before the plane of that face
-    // nor all behind it, as far as floats tell, and by more than what touches may lie apart (contact.h) where no mesh
-    // is coarser than `spacing`. Of most neighbours this says all.
+    // nor all behind it, to the precision of floats, and by more than what touches may lie apart (contact.h) where no
+    // mesh is coarser than `spacing`. Of most neighbours this says all.
     unsigned may_cross(const FacePlane& plane, double spacing) const;
 };
 

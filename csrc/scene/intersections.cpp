@@ -16,9 +16,9 @@ namespace edgegrad {
 
 namespace {
 
-// A side of the face `beside` that lies in the face `through`, with that face itself on one side.
+// A side of the face `next to` that lies in the face `through`, with that face itself on one side.
 struct AlongEdge {
-    int32_t through, beside;
+    int32_t through, ending;
     int32_t edge[2];  // vertices, ascending
     bool before;
     bool drawn;  // false: it is only known to be there
@@ -28,13 +28,13 @@ struct AlongEdge {
         return through == o.through && edge[0] == o.edge[0] && edge[1] == o.edge[1];
     }
     bool operator<(const AlongEdge& o) const {
-        return std::tie(through, edge[0], edge[1], before, beside) <
-               std::tie(o.through, o.edge[0], o.edge[1], o.before, o.beside);
+        return std::tie(through, edge[0], edge[1], before, ending) <
+               std::tie(o.through, o.edge[0], o.edge[1], o.before, o.ending);
     }
 };
 
 // What was found among some faces.
-struct Found {
+struct FoundIntersections {
     std::vector<Intersection> through;
     std::vector<AlongEdge> along;
 };
@@ -64,9 +64,9 @@ struct DrawnPairs {
         return all() ? 1 : double(copies[face]) * double(copies[other]) / (double(share[face]) * share[by] * leaves);
     }
     double weight(int32_t face, int32_t other) const { return weight(face, other, other); }
-    // Of two faces beside an edge, that which stands for both.
+    // Of two faces next to an edge, that which stands for both.
     const AlongEdge& likelier(const AlongEdge& a, const AlongEdge& b) const {
-        return all() || share[a.beside] >= share[b.beside] ? a : b;
+        return all() || share[a.ending] >= share[b.ending] ? a : b;
     }
 };
 
@@ -84,7 +84,7 @@ PlacedFace placed(const PlacedFaces& faces, int32_t face) {
 }
 
 // Adds what two faces have in common.
-void add_pair(const Placed& one, const Placed& other, const DrawnPairs& drawn, Found& out) {
+void add_pair(const Placed& one, const Placed& other, const DrawnPairs& drawn, FoundIntersections& out) {
     // In the order of the faces, so that the same numbers are found whoever comes first.
     const auto [f, g] = one.face < other.face ? std::tie(one, other) : std::tie(other, one);
     FacePair pair;
@@ -93,11 +93,11 @@ void add_pair(const Placed& one, const Placed& other, const DrawnPairs& drawn, F
         out.through.push_back(
             {.face = {f.face, g.face}, .weight = drawn.weight(f.face, g.face), .a = pair.a, .b = pair.b});
     if (kind != FacePair::Kind::along) return;
-    const auto [beside, through] = pair.lies_beside ? std::tie(g, f) : std::tie(f, g);
-    const int32_t* v = beside.placed.vertex;
+    const auto [ending, through] = pair.lies_along ? std::tie(g, f) : std::tie(f, g);
+    const int32_t* v = ending.placed.vertex;
     const auto [low, high] = std::minmax(v[(pair.corner + 1) % 3], v[(pair.corner + 2) % 3]);
     out.along.push_back({.through = through.face,
-                         .beside = beside.face,
+                         .ending = ending.face,
                          .edge = {low, high},
                          .before = pair.before,
                          .drawn = true,
@@ -112,8 +112,8 @@ class PairFinder {
 
     // Calls found(other) for the leaves from this one on that overlap it, where drawn faces may pass through each
     // other.
-    template <class Found>
-    void each_overlapping(int64_t leaf, Found found) const {
+    template <class FoundIntersections>
+    void each_overlapping(int64_t leaf, FoundIntersections found) const {
         if (!drawn_.in(leaf) || !fields_.crossed(leaf)) return;
         tree_.each_leaf(tree_.bounds(leaf), leaf, fields_.but(leaf), [&](int64_t other) {
             if (drawn_.has(leaf, other) && fields_.crossed(leaf, other)) found(other);
@@ -122,7 +122,7 @@ class PairFinder {
     }
 
     // Adds the pairs with a face of either leaf.
-    void add(int64_t leaf, int64_t other, Found& out) {
+    void add(int64_t leaf, int64_t other, FoundIntersections& out) {
         if (leaf != leaf_) place(leaf);
         const BoxGroup &own = tree_.leaf(leaf), &others = tree_.leaf(other);
         unsigned any = 0, met_by[FaceTree::leaf_size];  // of the other leaf, each with those of this one
@@ -187,7 +187,7 @@ void find_faces(FacesAtEdges& at, const PlacedFaces& faces) {
         }
 }
 
-// Adds what else lies beside the same edges, whether it is drawn or not: one side tells of the surface that passes
+// Adds what else lies next to the same edges, whether it is drawn or not: one side tells of the surface that passes
 // through only together with the other, which is mostly hidden. So that which is drawn more often stands for both.
 void add_other_sides(std::vector<AlongEdge>& along, const PlacedFaces& faces, const DrawnPairs& drawn) {
     std::sort(along.begin(), along.end());
@@ -200,12 +200,12 @@ void add_other_sides(std::vector<AlongEdge>& along, const PlacedFaces& faces, co
         const int32_t through = along[i].through;
         const PlacedFace own = placed(faces, through);
         for (const int32_t f : at[{along[i].edge[0], along[i].edge[1]}]) {
-            if (std::any_of(along.begin() + i, along.begin() + end, [&](const AlongEdge& a) { return a.beside == f; }))
+            if (std::any_of(along.begin() + i, along.begin() + end, [&](const AlongEdge& a) { return a.ending == f; }))
                 continue;
-            Found found;
+            FoundIntersections found;
             add_pair({own, through}, {placed(faces, f), f}, drawn, found);
             for (AlongEdge& a : found.along)
-                if (a.beside == f && a.on_same_edge(along[i])) a.drawn = false, others.push_back(a);
+                if (a.ending == f && a.on_same_edge(along[i])) a.drawn = false, others.push_back(a);
         }
     }
     along.insert(along.end(), others.begin(), others.end());
@@ -215,11 +215,11 @@ void add_other_sides(std::vector<AlongEdge>& along, const PlacedFaces& faces, co
 void add_along(std::vector<AlongEdge>& along, const DrawnPairs& drawn, std::vector<Intersection>& out) {
     std::sort(along.begin(), along.end());
     const auto add = [&](const AlongEdge& own, const AlongEdge& next, const AlongEdge& by) {
-        const bool ascending = own.through < own.beside;
-        out.push_back({.face = {std::min(own.through, own.beside), std::max(own.through, own.beside)},
-                       .next = next.beside,
-                       .beside = ascending,
-                       .weight = 0.5 * drawn.weight(own.through, own.beside, by.beside),
+        const bool ascending = own.through < own.ending;
+        out.push_back({.face = {std::min(own.through, own.ending), std::max(own.through, own.ending)},
+                       .next = next.ending,
+                       .ending = ascending,
+                       .weight = 0.5 * drawn.weight(own.through, own.ending, by.ending),
                        .a = own.a,
                        .b = own.b});
     };
@@ -310,7 +310,7 @@ Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, 
         for (int64_t f = first; f < last; ++f)
             std::sort(all.begin() + (f ? end[f - 1] : 0), all.begin() + end[f],
                       [](const Intersection& a, const Intersection& b) {
-                          return std::tie(a.face[1], a.next, a.beside) < std::tie(b.face[1], b.next, b.beside);
+                          return std::tie(a.face[1], a.next, a.ending) < std::tie(b.face[1], b.next, b.ending);
                       });
     });
     return all;
@@ -320,18 +320,18 @@ Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, 
 Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces,
                           const DrawnPairs& drawn, Team& team) {
     const int64_t leaves = tree.n_leaves(), blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
-    std::vector<Found> of_block(blocks);
+    std::vector<FoundIntersections> of_block(blocks);
     team.each_with(
         blocks, [&] { return std::make_unique<PairFinder>(tree, fields, faces, drawn); },
         [&](PairFinder& pairs, int64_t block) {
-            Found part;
+            FoundIntersections part;
             for (int64_t leaf = block * leaves_in_block; leaf < std::min(leaves, (block + 1) * leaves_in_block); ++leaf)
                 pairs.each_overlapping(leaf, [&](int64_t other) { pairs.add(leaf, other, part); });
             of_block[block] = std::move(part);
         });
     std::vector<std::vector<Intersection>> parts(1);
     std::vector<AlongEdge> along;
-    for (Found& part : of_block) {
+    for (FoundIntersections& part : of_block) {
         parts.push_back(std::move(part.through));
         along.insert(along.end(), part.along.begin(), part.along.end());
     }
@@ -356,7 +356,7 @@ std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& fa
             int64_t others = 0;
             pairs.each_overlapping(leaf, [&](int64_t) { ++others; });
             const double part = std::min(1.0, double(most_in_pilot) / double(std::max<int64_t>(1, others)));
-            Found found;
+            FoundIntersections found;
             pairs.each_overlapping(leaf, [&](int64_t other) {
                 if (part == 1 || to_unit(hash(1, uint64_t(leaf), uint64_t(other))) < part)
                     pairs.add(leaf, other, found);

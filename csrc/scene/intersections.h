@@ -16,10 +16,10 @@ namespace edgegrad {
 
 struct Intersection {
     int32_t face[2];  // ascending
-    // Where the surface passes through a face exactly along an edge: face[beside] ends there, and `next` goes on on the
-    // other side. Moved one way, the one passes through, moved the other way, the other; so each counts half.
+    // Where the surface passes through a face exactly along an edge: face[next to] ends there, and `next` goes on on
+    // the other side. Moved one way, the one passes through, moved the other way, the other; so each counts half.
     int32_t next = -1;
-    int32_t beside = 0;
+    int32_t ending = 0;
     // The share of the gradient that goes to these two: copies of faces in the same place have the same segment. More
     // than 1 where they stand for others that were not drawn.
     double weight = 1;

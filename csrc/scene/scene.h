@@ -25,7 +25,7 @@ struct Spacing {
     bool operator==(const Spacing&) const = default;
 };
 
-// What a face shows beside its radiance (shading/attributes.h), one number a channel, in this order.
+// What a face shows besides its radiance (shading/attributes.h), one number a channel, in this order.
 struct Attributes {
     bool alpha = false;              // 1 wherever a face is seen
     const double* vertex = nullptr;  // (V, vertex_width) values at the vertices
@@ -41,7 +41,7 @@ struct Attributes {
     int channels() const { return alpha + vertex_width + face_width + 3 * barycentrics + 2 * uv; }
 };
 
-// How an image is looked up. Beyond its rim it is repeated, its outermost texels go on, or it is mirrored.
+// How an image is looked up. Beyond its border it is repeated, its outermost texels go on, or it is mirrored.
 enum class Wrap { repeat, clamp, mirror };
 enum class TextureFilter { linear, nearest };
 constexpr const char* wrap_names[] = {"repeat", "clamp", "mirror"};
@@ -56,9 +56,9 @@ struct Sampler {
 // A row of a table of textures: first texel, height, width, and the sampler's three numbers.
 constexpr int texture_columns = 6;
 
-// Faces that are cut out where an alpha texture is below a cutoff (rays/alpha_mask.h).
+// Faces that are alpha-tested where an alpha texture is below a cutoff (rays/alpha_mask.h).
 template <class T>
-struct CutOutArrays {
+struct AlphaMaskArrays {
     const T* alphas = nullptr;  // (Y,) all alpha textures, row by row
     int64_t n_alphas = 0;
     const int64_t* textures = nullptr;  // (M, 6)
@@ -92,7 +92,7 @@ struct SceneView {
     Attributes attributes = {};
     int radiance = channels;              // R
     const int32_t* uv_corners = corners;  // (F, 3) rows of uvs, for faces that have any
-    CutOutArrays<T> cut_outs = {};
+    AlphaMaskArrays<T> alpha_masks = {};
 
     const T* background_at(int64_t pixel) const {
         return background_is_image ? background + pixel * channels : background;

@@ -1,9 +1,9 @@
-// Rims of cut-outs on faces, cut into pieces at the borders of cells between texels.
+// AlphaEdges of alpha-tested faces on faces, cut into pieces at the borders of cells between texels.
 //
-// Between four texels a bilinear α is f + x f_x + y f_y + x y f_xy, so the rim F = α − cutoff = 0 is a hyperbola whose
-// axes are the texture's. A branch is monotonous and convex, so a line across its chord meets it once, and before the
-// other branch: how far along the chord, t, says where on it a point lies. Where the nearest texel is taken, rims are
-// borders of texels.
+// Between four texels a bilinear α is f + x f_x + y f_y + x y f_xy, so the alpha edge F = α − cutoff = 0 is a hyperbola
+// whose axes are the texture's. A branch is monotonous and convex, so a line across its chord meets it once, and before
+// the other branch: how far along the chord, t, says where on it a point lies. Where the nearest texel is taken, alpha
+// edges are borders of texels.
 #pragma once
 
 #include <algorithm>
@@ -20,8 +20,8 @@
 
 namespace edgegrad {
 
-// A piece of a rim: within one cell, and on one face.
-struct Rim {
+// A piece of an alpha edge: within one cell, and on one face.
+struct AlphaEdge {
     int32_t face;
     // 0: of a bilinear α. Else between nearest texels: the coordinate that changes across it, 1 or 2, with the sign of
     // the side on which the face is there.
@@ -31,8 +31,8 @@ struct Rim {
     double share;  // how many it stands for
 };
 
-// A place on a rim. In barycentrics, with κ: dp/dt = κ (−∂F/∂v, ∂F/∂u).
-struct RimPlace {
+// A place on an alpha edge. In barycentrics, with κ: dp/dt = κ (−∂F/∂v, ∂F/∂u).
+struct AlphaEdgePoint {
     Barycentrics b;
     Barycentrics slope;  // ∂F/∂b
     Vec2 by_uv;          // ∂F/∂uv
@@ -76,15 +76,15 @@ struct AlphaCell {
     double i, j, f[4];
 
     bool there(int k) const { return f[k] >= 0; }
-    bool has_rim() const { return there(0) != there(1) || there(0) != there(2) || there(0) != there(3); }
+    bool has_alpha_edge() const { return there(0) != there(1) || there(0) != there(2) || there(0) != there(3); }
     double both() const { return f[0] - f[1] - f[2] + f[3]; }
     double value(Vec2 q) const {
         const double x = q.x - i, y = q.y - j;
         return f[0] + x * (f[1] - f[0]) + y * (f[2] - f[0]) + x * y * both();
     }
     Vec2 gradient(Vec2 q) const { return {f[1] - f[0] + (q.y - j) * both(), f[2] - f[0] + (q.x - i) * both()}; }
-    // The nearest point of the rim across a chord through q.
-    Vec2 on_rim(Vec2 q, Vec2 chord) const {
+    // The nearest point of the alpha edge across a chord through q.
+    Vec2 on_alpha_edge(Vec2 q, Vec2 chord) const {
         const Vec2 across{-chord.y, chord.x}, g = gradient(q);
         const double c0 = value(q), c1 = g.x * across.x + g.y * across.y, c2 = across.x * across.y * both();
         const double root = std::sqrt(std::max(0.0, c1 * c1 - 4 * c2 * c0)), d = -0.5 * (c1 + (c1 > 0 ? root : -root));
@@ -93,30 +93,30 @@ struct AlphaCell {
 };
 
 template <class T>
-class RimFinder {
+class AlphaEdgeFinder {
    public:
-    explicit RimFinder(const SceneView<T>& scene) : scene_(scene) {}
+    explicit AlphaEdgeFinder(const SceneView<T>& scene) : scene_(scene) {}
 
     // All, but of very many cells or pieces those that a seed draws: these stand for all.
-    std::vector<Rim> find(uint64_t seed, Team& team) const {
-        std::vector<Rim> found;
-        if (!scene_.cut_outs.face) return found;
+    std::vector<AlphaEdge> find(uint64_t seed, Team& team) const {
+        std::vector<AlphaEdge> found;
+        if (!scene_.alpha_masks.face) return found;
         double cells = 0;
         for (int64_t f = 0; f < scene_.n_faces; ++f)
-            if (scene_.cut_outs.on(f)) cells += cells_of({scene_, int32_t(f)});
+            if (scene_.alpha_masks.on(f)) cells += cells_of({scene_, int32_t(f)});
         const double every = std::max(1.0, std::ceil(cells / most_cells));
         const auto parts = team.of_blocks(scene_.n_faces, [&](int64_t first, int64_t last) {
-            std::vector<Rim> part;
+            std::vector<AlphaEdge> part;
             for (int64_t f = first; f < last; ++f)
-                if (scene_.cut_outs.on(f)) add(int32_t(f), every, to_unit(hash(seed, uint64_t(f))), part);
+                if (scene_.alpha_masks.on(f)) add(int32_t(f), every, to_unit(hash(seed, uint64_t(f))), part);
             return part;
         });
         for (const auto& part : parts) found.insert(found.end(), part.begin(), part.end());
         const int64_t n = int64_t(found.size());
-        if (n <= most_rims) return found;
-        std::vector<Rim> some;
-        const double spacing = double(n) / double(most_rims), shift = to_unit(mix(seed));
-        for (int64_t k = 0; k < most_rims; ++k) {
+        if (n <= most_alpha_edges) return found;
+        std::vector<AlphaEdge> some;
+        const double spacing = double(n) / double(most_alpha_edges), shift = to_unit(mix(seed));
+        for (int64_t k = 0; k < most_alpha_edges; ++k) {
             some.push_back(found[std::min(int64_t((double(k) + shift) * spacing), n - 1)]);
             some.back().share *= spacing;
         }
@@ -124,17 +124,17 @@ class RimFinder {
     }
 
     // At the fraction t along the chord. False where rounding leaves no direction.
-    bool place(const Rim& rim, double t, RimPlace& out) const {
-        const FaceCells<T> cells(scene_, rim.face);
-        const Vec2 a = cells.place(rim.begin), b = cells.place(rim.end), chord = b - a;
+    bool place(const AlphaEdge& alpha_edge, double t, AlphaEdgePoint& out) const {
+        const FaceCells<T> cells(scene_, alpha_edge.face);
+        const Vec2 a = cells.place(alpha_edge.begin), b = cells.place(alpha_edge.end), chord = b - a;
         Vec2 q = a + t * chord, gradient;
-        if (rim.border == 0) {
-            const double i = rim.i, j = rim.j;
+        if (alpha_edge.border == 0) {
+            const double i = alpha_edge.i, j = alpha_edge.j;
             const AlphaCell cell{
                 i, j, {cells.alpha(i, j), cells.alpha(i + 1, j), cells.alpha(i, j + 1), cells.alpha(i + 1, j + 1)}};
-            q = cell.on_rim(q, chord), gradient = cell.gradient(q);
+            q = cell.on_alpha_edge(q, chord), gradient = cell.gradient(q);
             out.alpha = footprint_at(cells.texture, cell.i, cell.j, q.x - cell.i, q.y - cell.j);
-        } else gradient = gradient_across(rim.border);
+        } else gradient = gradient_across(alpha_edge.border);
         out.b = cells.at(q);
         out.by_uv = {gradient.x * double(cells.texture.width), -gradient.y * double(cells.texture.height)};
         out.slope = {dot(gradient, cells.side[0]), dot(gradient, cells.side[1])};
@@ -145,7 +145,7 @@ class RimFinder {
 
    private:
     static constexpr double most_cells = 0x1p22;
-    static constexpr int64_t most_rims = 1 << 16;
+    static constexpr int64_t most_alpha_edges = 1 << 16;
 
     static double dot(Vec2 a, Vec2 b) { return a.x * b.x + a.y * b.y; }
     static Vec2 gradient_across(int border) {
@@ -159,7 +159,7 @@ class RimFinder {
     }
 
     // Every so many rows of cells, from a random one on.
-    void add(int32_t face, double every, double random, std::vector<Rim>& out) const {
+    void add(int32_t face, double every, double random, std::vector<AlphaEdge>& out) const {
         const FaceCells<T> cells(scene_, face);
         if (!(std::fabs(cells.area) > 0) || !std::isfinite(cells.area)) return;
         const Vec2* p = cells.corner;
@@ -190,8 +190,8 @@ class RimFinder {
     }
 
     void add_cell(int32_t face, const FaceCells<T>& cells, const AlphaCell& c, double every,
-                  std::vector<Rim>& out) const {
-        if (!c.has_rim()) return;
+                  std::vector<AlphaEdge>& out) const {
+        if (!c.has_alpha_edge()) return;
         // Where it meets the sides of the cell; of two branches one is on either side of the middle, across.
         const auto between = [&](int k, int m) { return c.f[k] / (c.f[k] - c.f[m]); };
         Vec2 left[2], right[2];
@@ -212,16 +212,16 @@ class RimFinder {
     }
 
     void add_texel(int32_t face, const FaceCells<T>& cells, double i, double j, double every,
-                   std::vector<Rim>& out) const {
+                   std::vector<AlphaEdge>& out) const {
         const bool here = cells.alpha(i, j) >= 0;
         const Vec2 across[2] = {{i, j}, {i, j + 1}}, down[2] = {{i, j}, {i + 1, j}};
         if ((cells.alpha(i - 1, j) >= 0) != here) clip(face, cells, nullptr, here ? 1 : -1, across, every, out);
         if ((cells.alpha(i, j - 1) >= 0) != here) clip(face, cells, nullptr, here ? 2 : -2, down, every, out);
     }
 
-    // Adds what of a piece of rim lies on the face.
+    // Adds what of a piece of alpha edge lies on the face.
     void clip(int32_t face, const FaceCells<T>& cells, const AlphaCell* cell, int border, const Vec2 (&end)[2],
-              double every, std::vector<Rim>& out) const {
+              double every, std::vector<AlphaEdge>& out) const {
         const Vec2 chord = end[1] - end[0];
         const double squared = dot(chord, chord);
         if (!(squared > 0)) return;
@@ -247,7 +247,7 @@ class RimFinder {
         }
         const auto at = [&](double t) {
             const Vec2 q = end[0] + t * chord;
-            return cell ? cell->on_rim(q, chord) : q;
+            return cell ? cell->on_alpha_edge(q, chord) : q;
         };
         for (int k = 1; k < n; ++k) {
             if (!(part[k] > part[k - 1])) continue;
@@ -258,8 +258,8 @@ class RimFinder {
         }
     }
 
-    // Whether a point of the rim lies on the face. A rim along a side of it belongs to the face that is cut out there;
-    // between nearest texels it is the edge that casts the shadow.
+    // Whether a point of the alpha edge lies on the face. An alpha edge along a side of it belongs to the face that is
+    // alpha-tested there; between nearest texels it is the edge that casts the shadow.
     static bool lies_on(const FaceCells<T>& cells, Vec2 q, Vec2 gradient) {
         const double turn = cells.area > 0 ? 1 : -1;
         for (int k = 0; k < 3; ++k) {

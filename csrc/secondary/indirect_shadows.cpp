@@ -61,7 +61,7 @@ struct BorderOnFace {
         for (int i = 0; i < 3; ++i) add_vertex(scene.faces[3 * int64_t(point.face) + i], point.on[i]);
         const Occluder& caster = point.caster;
         for (int i = 0; i < caster.count; ++i) add_vertex(caster.vertex[i], -border.by_caster[i]);
-        caster.append_rim(border.by_rim, sample, records);
+        caster.append_alpha_edge(border.by_alpha_edge, sample, records);
         const Vec3 by_light = -border.by_light * border.N;
         records.light.push_back(point.part), append(records.light_uv, {point.uv.x, point.uv.y});
         append(records.by_light, {by_light.x, by_light.y, by_light.z});
@@ -71,13 +71,13 @@ struct BorderOnFace {
 }  // namespace
 
 template <class T>
-void add_unseen_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
-                        int64_t samples, Destination& to) {
+void add_indirect_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
+                          int64_t samples, GradientSink& to) {
     const ShadowCasters<T> edges(view, casters, light, samples);
     if (edges.empty() || samples == 0) return;
-    std::vector<Found> of_interval(edges.intervals());
+    std::vector<ShadowStatistics> of_interval(edges.intervals());
     const uint64_t pilot_seed = hash(view.options.seed, 15, gradient_stream);
-    edges.ask_pilots(pilot_seed, [&](auto ask) {
+    edges.draw_pilots(pilot_seed, [&](auto ask) {
         ShadowChunk chunk(edges.scene(), mix(pilot_seed), [&](const ShadowPoint& point, double weight) {
             const BorderOnFace<T> on(view.scene, light, point);
             const double cosine = std::fabs(dot(on.g, on.border.d)) / length(on.border.d);
@@ -93,7 +93,7 @@ void add_unseen_shadows(const BackwardView<T>& view, const SceneView<T>& casters
     const Places drawn(edges.scene().pieces, density, places, light.extended,
                        hash(view.options.seed, 16, gradient_stream), view.team);
     double seconds[2] = {};
-    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
         ShadowChunk chunk(edges.scene(), hash(view.options.seed, 14, gradient_stream),
                           [&](const ShadowPoint& point, double weight) {
                               BorderOnFace<T>(view.scene, light, point).append_to(grad.records.curves, weight);
@@ -107,9 +107,9 @@ void add_unseen_shadows(const BackwardView<T>& view, const SceneView<T>& casters
     });
 }
 
-template void add_unseen_shadows(const BackwardView<float>&, const SceneView<float>&, const LightParts&, int64_t,
-                                 Destination&);
-template void add_unseen_shadows(const BackwardView<double>&, const SceneView<double>&, const LightParts&, int64_t,
-                                 Destination&);
+template void add_indirect_shadows(const BackwardView<float>&, const SceneView<float>&, const LightParts&, int64_t,
+                                   GradientSink&);
+template void add_indirect_shadows(const BackwardView<double>&, const SceneView<double>&, const LightParts&, int64_t,
+                                   GradientSink&);
 
 }  // namespace edgegrad

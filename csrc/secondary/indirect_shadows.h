@@ -10,7 +10,7 @@ namespace edgegrad {
 // Records so many samples on the borders of a light's shadows, by area of the surface that they sweep. Their positions
 // in the image are not set, and velocities are by places of vertices and of the light in the world.
 template <class T>
-void add_unseen_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
-                        int64_t samples, Destination& to);
+void add_indirect_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
+                          int64_t samples, GradientSink& to);
 
 }  // namespace edgegrad

@@ -1,4 +1,4 @@
-// Where light goes on past the edges and rims that cast shadows.
+// Where light goes on past the edges and alpha edges that cast shadows.
 #pragma once
 
 #include <algorithm>
@@ -17,17 +17,18 @@
 
 namespace edgegrad {
 
-// Rays from points of a light past edges and rims, in batches, and what they meet behind.
+// Rays from points of a light past edges and alpha edges, in batches, and what they meet behind.
 template <class T>
 class LightRays {
    public:
     LightRays(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
-              const std::vector<Rim>& rims)
-        : view_(view), casters_(casters), light_(light), rims_(rims) {}
+              const std::vector<AlphaEdge>& alpha_edges)
+        : view_(view), casters_(casters), light_(light), alpha_edges_(alpha_edges) {}
 
-    // The place t of an edge or a rim before a point of the light, for whoever knows the segment by this number.
+    // The place t of an edge or an alpha edge before a point of the light, for whoever knows the segment by this
+    // number.
     void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
-        Waiting& w = waiting_[count_];
+        Pending& w = pending_[count_];
         w.point = {.caster = {},
                    .part = piece.part,
                    .uv = from.uv,
@@ -36,7 +37,9 @@ class LightRays {
                    .segment = segment};
         w.weight = weight;
         w.edge = piece.edge;
-        if (!(piece.is_rim() ? set_rim(rims_[piece.rim()], t, w) : set_edge(piece.edge, t, w))) return;
+        if (!(piece.is_alpha_edge() ? set_alpha_edge(alpha_edges_[piece.alpha_edge()], t, w)
+                                    : set_edge(piece.edge, t, w)))
+            return;
         const Vec3 light = w.point.light;
         if (light_.infinite) {
             // From outside of the scene.
@@ -48,8 +51,8 @@ class LightRays {
             w.ray = {light, w.p - light};
         }
         auto& without = without_[count_];
-        const auto beside = faces_beside(w);
-        without.assign(beside.begin(), beside.end());
+        const auto adjacent = adjacent_faces(w);
+        without.assign(adjacent.begin(), adjacent.end());
         if (const int32_t own = light_.face[piece.part]; own >= 0) without.push_back(own);
         std::sort(without.begin(), without.end());
         ++count_;
@@ -64,29 +67,29 @@ class LightRays {
             int32_t face[RayBatch::size];
             Meeting met[RayBatch::size];
             cast_each(
-                view_.geometry.caster(), count_, face, without_, [&](int i) { return waiting_[i].ray; },
-                [&](int i, int32_t f) { return accept(waiting_[i], f, met[i]); });
+                view_.geometry.caster(), count_, face, without_, [&](int i) { return pending_[i].ray; },
+                [&](int i, int32_t f) { return accept(pending_[i], f, met[i]); });
             int going_on = 0;
             for (int i = 0; i < count_; ++i) {
                 if (face[i] < 0) continue;
-                Waiting& w = waiting_[i];
+                Pending& w = pending_[i];
                 w.point.face = face[i], w.point.on = inside({met[i].u, met[i].v});
                 w.point.along = light_.infinite ? met[i].t - w.before : met[i].t;
                 // What lies before the edge, or touches it, bears no border: the shadow begins there, along a curve
                 // that the camera sees as an edge.
                 if (met[i].t > w.before + touching(w, face[i])) body(w.point, w.weight);
-                if (casters_.cut_outs.on(face[i]) && !shows(casters_, face[i], w.point.on)) go_on(going_on++, i);
+                if (casters_.alpha_masks.on(face[i]) && !shows(casters_, face[i], w.point.on)) go_on(going_on++, i);
             }
             count_ = going_on;
         }
     }
 
    private:
-    struct Waiting {
+    struct Pending {
         ShadowPoint point;
         double weight;
         int64_t edge;
-        int32_t face;  // of a rim
+        int32_t face;  // of an alpha edge
         Vec3 p;        // of the edge, world coordinates
         Ray ray;
         double before;  // where the edge lies on the ray, in lengths of its direction
@@ -95,48 +98,48 @@ class LightRays {
     // The i-th ray goes on behind the face that it met, as the k-th.
     void go_on(int k, int i) {
         std::vector<int32_t>& without = without_[i];
-        without.insert(std::upper_bound(without.begin(), without.end(), waiting_[i].point.face),
-                       waiting_[i].point.face);
+        without.insert(std::upper_bound(without.begin(), without.end(), pending_[i].point.face),
+                       pending_[i].point.face);
         if (k == i) return;
-        waiting_[k] = waiting_[i];
+        pending_[k] = pending_[i];
         without_[k].swap(without);
     }
 
-    bool set_edge(int64_t edge, double t, Waiting& w) const {
+    bool set_edge(int64_t edge, double t, Pending& w) const {
         if (!casts(edge, t, w.point)) return false;
         w.point.caster = occluder_of(view_.scene, view_.geometry.topology().half_edges(edge)[0], t);
         w.p = w.point.caster.sum(w.point.caster.weight, vertices());
         return true;
     }
 
-    bool set_rim(const Rim& rim, double t, Waiting& w) const {
-        RimPlace place{};
-        if (!RimFinder<T>(casters_).place(rim, t, place)) return false;
-        w.point.caster = occluder_of(casters_, rim, place);
+    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, Pending& w) const {
+        AlphaEdgePoint place{};
+        if (!AlphaEdgeFinder<T>(casters_).place(alpha_edge, t, place)) return false;
+        w.point.caster = occluder_of(casters_, alpha_edge, place);
         // It is dark where f > 0.
         const Vec3 p = w.point.caster.sum(w.point.caster.weight, vertices());
         const double turned = w.point.caster.turned(light_.infinite ? -w.point.light : p - w.point.light, vertices());
         if (!(std::fabs(turned) > 0)) return false;
         w.point.side = turned > 0 ? 1 : -1;
-        w.p = beside_rim(casters_, rim, place);
-        w.face = rim.face;
+        w.p = next_to_alpha_edge(casters_, alpha_edge, place);
+        w.face = alpha_edge.face;
         return true;
     }
 
     auto vertices() const {
         return [&](int32_t i) { return vec(view_.scene.verts + 3 * int64_t(i)); };
     }
-    // Of the edge, or that of the rim.
-    std::span<const int32_t> faces_beside(const Waiting& w) const {
+    // Of the edge, or that of the alpha edge.
+    std::span<const int32_t> adjacent_faces(const Pending& w) const {
         return w.edge < 0 ? std::span<const int32_t>(&w.face, 1) : view_.geometry.topology().faces(w.edge);
     }
 
-    // Whether a face beside the edge casts a shadow from that place of it: where none does, light passes on both sides.
-    // Where some are there and others cut out, those that are must lie on one side, which then is known.
+    // Whether a face next to the edge casts a shadow from that place of it: where none does, light passes on both
+    // sides. Where some are there and others cut out, those that are must lie on one side, which then is known.
     bool casts(int64_t edge, double t, ShadowPoint& point) const {
         const auto halves = view_.geometry.topology().half_edges(edge);
         const auto there = [&](const HalfEdge& h) { return is_there(casters_, h, t); };
-        if (!cut_outs_jump(casters_, view_.geometry.topology(), edge))
+        if (!alpha_masks_jump(casters_, view_.geometry.topology(), edge))
             return std::any_of(halves.begin(), halves.end(), there);
         bool on_side[2] = {};
         for (const HalfEdge& h : halves) {
@@ -149,7 +152,7 @@ class LightRays {
         return on_side[0] != on_side[1];
     }
 
-    bool accept(const Waiting& w, int32_t face, Meeting& m) const {
+    bool accept(const Pending& w, int32_t face, Meeting& m) const {
         m = meet(view_.scene, face, w.ray);
         if (!m.exists() || m.t <= 0 || m.margin() < -Meeting::rounding) return false;
         // On the border of a face, as that of a box in whose side the light lies, it goes by or not as it would had the
@@ -158,19 +161,19 @@ class LightRays {
             constexpr double little = 1e-7;
             const Vec3 moved = (little * length(w.ray.direction)) * FacesBeforeLight<T>::aside;
             const Vec3 origin = w.ray.origin + (light_.infinite ? w.before : 1) * moved;
-            const Meeting beside = meet(view_.scene, face, {origin, w.p - origin});
-            if (!beside.exists() || beside.margin() < 0) return false;
+            const Meeting adjacent = meet(view_.scene, face, {origin, w.p - origin});
+            if (!adjacent.exists() || adjacent.margin() < 0) return false;
         }
-        // The light itself, of which the point lies on this face or one beside it.
+        // The light itself, of which the point lies on this face or one next to it.
         if (light_.face[w.point.part] >= 0 && m.t <= touching(w, face)) return false;
         return shows(view_.scene, face, inside({m.u, m.v}));
     }
 
     // How far along its ray an edge may lie from a face that it touches, up to the rounding of the input.
-    double touching(const Waiting& w, int32_t face) const {
+    double touching(const Pending& w, int32_t face) const {
         const SceneView<T>& scene = view_.scene;
-        for (const int32_t beside : faces_beside(w))
-            if (share_vertex(scene, face, beside)) return Meeting::rounding * w.before;
+        for (const int32_t adjacent : adjacent_faces(w))
+            if (share_vertex(scene, face, adjacent)) return Meeting::rounding * w.before;
         const int32_t* v = scene.faces + 3 * int64_t(face);
         double size = 0;
         for (int i = 0; i < 3; ++i)
@@ -186,8 +189,8 @@ class LightRays {
     const BackwardView<T>& view_;
     const SceneView<T>& casters_;
     const LightParts& light_;
-    const std::vector<Rim>& rims_;
-    Waiting waiting_[RayBatch::size];
+    const std::vector<AlphaEdge>& alpha_edges_;
+    Pending pending_[RayBatch::size];
     std::vector<int32_t> without_[RayBatch::size];
     int count_ = 0;
 };

@@ -1,7 +1,7 @@
 // The part of a light's triangle from which an edge is a silhouette: the wedges between the planes of its faces.
 //
 // All is done in the triangle's last two barycentrics, where a plane is a line and areas are fractions of twice the
-// unit triangle's. A face's height over a point of the light is affine, so its values at the corners tell it. From
+// unit triangle's. A face's height over a point of the light is affine, so its values at the corners say it. From
 // where all heights, taken as the faces run along the edge, have one sign, the edge is a silhouette.
 #pragma once
 

@@ -15,27 +15,27 @@
 
 namespace edgegrad {
 
-// What lights the senders of lines. `casters`: the scene as light meets it.
+// What lights the reflectors of lines. `casters`: the scene as light meets it.
 template <class T>
 struct LineLight {
     const BackwardView<T>& view;
     const SceneView<T>& casters;
     const LitPaths& lit;
-    LitOptions at_sender;  // how often light may be scattered up to there
+    LitOptions at_reflector;  // how often light may be scattered up to there
 
     LineLight(const BackwardView<T>& view_, const SceneView<T>& casters_, const LitPaths& lit_)
-        : view(view_), casters(casters_), lit(lit_), at_sender(lit_.options) {
-        at_sender.bounces -= 1 + lit.further;
+        : view(view_), casters(casters_), lit(lit_), at_reflector(lit_.options) {
+        at_reflector.bounces -= 1 + lit.further;
     }
     bool is_seen() const { return lit.seen; }
 };
 
-// Pairs of points, a receiver and a sender of light each.
+// Pairs of points, a receiver and a reflector of light each.
 class Ends {
    public:
     int64_t size() const { return int64_t(face_[0].size()); }
-    void add(int receiver_or_sender, int64_t face, double u, double v) {
-        face_[receiver_or_sender].push_back(face), append(b_[receiver_or_sender], {1 - u - v, u, v});
+    void add(int receiver_or_reflector, int64_t face, double u, double v) {
+        face_[receiver_or_reflector].push_back(face), append(b_[receiver_or_reflector], {1 - u - v, u, v});
     }
 
     // (N, channels) what passes between them (transfer.h), with the numbers of so many pairs from `first` on.
@@ -59,7 +59,7 @@ class Ends {
         return out;
     }
 
-    // (N, 3) unit directions from receivers to senders.
+    // (N, 3) unit directions from receivers to reflectors.
     template <class T>
     std::vector<double> directions(const LineLight<T>& scene) const {
         std::vector<double> out;
@@ -82,18 +82,18 @@ class Ends {
     std::vector<double> b_[2];
 };
 
-// For samples of records from `begin` on, whose first two surfaces are a receiver and a sender, and whose first factor
-// is what is drawn: by how much the image jumps, or what comes to the receiver, and from where.
+// For samples of records from `begin` on, whose first two surfaces are a receiver and a reflector, and whose first
+// factor is what is drawn: by how much the image jumps, or what comes to the receiver, and from where.
 template <class T>
-void ask_senders(const LineLight<T>& light, const std::vector<CurveRecords>& records, size_t begin, uint64_t stream,
-                 BounceSamples& out) {
+void light_reflectors(const LineLight<T>& light, const std::vector<CurveRecords>& records, size_t begin,
+                      uint64_t stream, SecondaryEdgeSamples& out) {
     std::vector<int64_t> first(records.size() + 1, 0);
     for (size_t k = begin; k < records.size(); ++k) first[k + 1] = first[k] + records[k].size();
     out.jump.resize(records.size()), out.origin.resize(records.size());
     constexpr int surfaces = CurveRecords::surfaces;
     const int C = light.lit.lit.channels;
     light.view.team.each_with(
-        int64_t(records.size() - begin), [&] { return path_buffers(light.lit.lit, light.at_sender); },
+        int64_t(records.size() - begin), [&] { return path_buffers(light.lit.lit, light.at_reflector); },
         [&](Paths& paths, int64_t block) {
             light.view.team.check();
             const size_t k = begin + size_t(block);

@@ -1,10 +1,10 @@
-// How densely lines past edges and rims of cut-outs are drawn: by how much light passes along them, as far as it is
+// How densely lines past edges and alpha edges are drawn: by how much light passes along them, as far as it is
 // known.
 //
-// Edges of one connected part of a scene see alike along parallel lines, and each of many has few lines of its own. So
-// what is found of some lines is pooled: by their parts, and by cells of directions. Where there are glossy faces, some
-// lines are drawn by how these mirror (specular_lines.h); as all lines could come by either way, their densities are
-// mixed.
+// Edges of one connected part of a scene see almost the same along parallel lines, and each of many has few lines of
+// its own. So what is found of some lines is pooled: by their parts, and by cells of directions. Where there are glossy
+// faces, some lines are drawn by how these mirror (specular_lines.h); as all lines could come by either way, their
+// densities are mixed.
 #pragma once
 
 #include <algorithm>
@@ -76,20 +76,25 @@ class PooledLines {
     std::vector<int64_t> lines_;
 };
 
-// The lines past one edge or rim after another, cut into cells of even density.
+// The lines past one edge or alpha edge after another, cut into cells of even pdf.
 template <class T>
 class EdgeLines {
    public:
-    // `means`: of the cells of `pooled`; empty: all are alike.
-    EdgeLines(const SceneView<T>& casters, const Topology& topology, const std::vector<Rim>& rims,
+    // `means`: of the cells of `pooled`; empty: all are equal.
+    EdgeLines(const SceneView<T>& casters, const Topology& topology, const std::vector<AlphaEdge>& alpha_edges,
               const PooledLines& pooled, const std::vector<double>& means, const Mirrors& mirrors)
-        : scene_(casters), topology_(topology), rims_(rims), pooled_(pooled), means_(means), mirrors_(mirrors) {}
+        : scene_(casters),
+          topology_(topology),
+          alpha_edges_(alpha_edges),
+          pooled_(pooled),
+          means_(means),
+          mirrors_(mirrors) {}
 
-    // How many lines of an edge, or, numbered after all edges, of a rim are drawn, relative to others.
+    // How many lines of an edge, or, numbered after all edges, of an alpha edge are drawn, relative to others.
     double set(int64_t piece) {
         opposite_.clear(), stands_for_ = 1;
         if (piece < topology_.n_edges()) set_edge(piece);
-        else set_rim(rims_[piece - topology_.n_edges()]);
+        else set_alpha_edge(alpha_edges_[piece - topology_.n_edges()]);
         lune_ = {a_, b_, opposite_};
         across_ = means_.empty() ? 1 : int(std::clamp(std::ceil(lune_.width() / widest), 1.0, most_across));
         sum_.clear();
@@ -129,29 +134,30 @@ class EdgeLines {
             place = dot(w, w) > 0 ? lune_.locate(w) : Lune::Place();
             if (!place.is_there()) return {t, place.w, 0};
         }
-        double density = (1 - share) / area(place);
-        if (share > 0) density += share * mirrored_.density(place.w);
-        return {t, place.w, stands_for_ / density};
+        double pdf = (1 - share) / area(place);
+        if (share > 0) pdf += share * mirrored_.pdf(place.w);
+        return {t, place.w, stands_for_ / pdf};
     }
     int64_t cell(Vec3 w) const { return pooled_.cell(vertex_, w); }
 
    private:
-    // Where one of its faces may be there and others not, lines may pass in all directions (BounceLines).
+    // Where one of its faces may be there and others not, lines may pass in all directions (EdgeLines).
     void set_edge(int64_t edge) {
         const auto halves = topology_.half_edges(edge);
         const HalfEdge& h = halves[0];
-        const bool any = cut_outs_jump(scene_, topology_, edge);
+        const bool any = alpha_masks_jump(scene_, topology_, edge);
         for (const HalfEdge& o : any ? halves.first(1) : halves)
             opposite_.push_back(corner(scene_, o.face, (o.corner + 2) % 3));
         vertex_ = vertex(scene_, h, h.first());
         a_ = corner(scene_, h.face, h.first()), b_ = corner(scene_, h.face, h.second());
     }
-    // Its chord: a rim is passed in all directions, but for those in its plane.
-    void set_rim(const Rim& rim) {
-        const Vec3 v[3] = {corner(scene_, rim.face, 0), corner(scene_, rim.face, 1), corner(scene_, rim.face, 2)};
+    // Its chord: an alpha edge is passed in all directions, but for those in its plane.
+    void set_alpha_edge(const AlphaEdge& alpha_edge) {
+        const Vec3 v[3] = {corner(scene_, alpha_edge.face, 0), corner(scene_, alpha_edge.face, 1),
+                           corner(scene_, alpha_edge.face, 2)};
         const auto at = [&](Barycentrics b) { return b[0] * v[0] + b[1] * v[1] + b[2] * v[2]; };
-        vertex_ = scene_.faces[3 * int64_t(rim.face)], stands_for_ = rim.share;
-        a_ = at(rim.begin), b_ = at(rim.end);
+        vertex_ = scene_.faces[3 * int64_t(alpha_edge.face)], stands_for_ = alpha_edge.share;
+        a_ = at(alpha_edge.begin), b_ = at(alpha_edge.end);
         const auto apart = [&](Vec3 p) { return length(cross(p - a_, b_ - a_)); };
         opposite_.push_back(*std::max_element(v, v + 3, [&](Vec3 p, Vec3 q) { return apart(p) < apart(q); }));
     }
@@ -168,7 +174,7 @@ class EdgeLines {
         return angles[j];
     }
     double before(int64_t k) const { return k ? sum_[k - 1] : 0; }
-    // One over the density of lines that cells draw.
+    // One over the pdf of lines that cells draw.
     double area(const Lune::Place& place) const {
         const double all = lune_.weight(place.w);
         if (sum_.empty()) return all;
@@ -179,7 +185,7 @@ class EdgeLines {
 
     const SceneView<T>& scene_;
     const Topology& topology_;
-    const std::vector<Rim>& rims_;
+    const std::vector<AlphaEdge>& alpha_edges_;
     const PooledLines& pooled_;
     const std::vector<double>& means_;
     const Mirrors& mirrors_;
@@ -188,7 +194,7 @@ class EdgeLines {
     double stands_for_ = 1;
     Vec3 a_, b_;
     Lune lune_;
-    MirroredLines mirrored_;
+    SpecularLines mirrored_;
     int across_ = 1;
     std::vector<double> sum_;  // of the means of its cells
 };

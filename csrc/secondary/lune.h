@@ -18,7 +18,7 @@ class Lune {
    public:
     Lune() = default;
 
-    // Of the edge from a to b, whose faces have these corners beside it. Faces without area are not there.
+    // Of the edge from a to b, whose faces have these corners next to it. Faces without area are not there.
     Lune(Vec3 a, Vec3 b, std::span<const Vec3> opposite) {
         length_ = length(b - a);
         if (!(length_ > 0)) return;
@@ -46,7 +46,7 @@ class Lune {
     double measure() const { return length_ * width_; }
     bool empty() const { return !(measure() > 0); }
 
-    // For numbers in [0, 1): with the density 2 sin θ / (π width) by solid angle. The faces lie where
+    // For numbers in [0, 1): with the pdf 2 sin θ / (π width) by solid angle. The faces lie where
     // ((b − a) × w) · (corner − a) < 0.
     Vec3 direction(double u, double v) const { return at(polar_angle(u), v); }
     Vec3 at(double theta, double v) const {
@@ -73,7 +73,7 @@ class Lune {
         }
         return {};
     }
-    // One over that density.
+    // One over that pdf.
     double weight(Vec3 w) const { return M_PI / 2 * width_ / length(cross(e_, w)); }
 
     // θ − sin θ cos θ = π u, by Newton's method where it stays between bounds.

@@ -1,9 +1,9 @@
-// Places of curves that hide what lies behind them: edges, and rims of cut-outs.
+// Places of curves that hide what lies behind them: edges, and alpha edges.
 //
 // Seen along d, a curve p(t) hides what lies on one side of the plane through p that d and dp/dt span, F = N · (y − p)
-// with N = dp/dt × d. A rim f(b; uv, α) = 0 on a face with the sides e₁, e₂ has ∂p/∂t = κ (−f_v e₁ + f_u e₂) as it
-// stands, N·e₁ = κ D f_u and N·e₂ = κ D f_v with D = d · (e₁ × e₂). So where f grows by δf, the rim gives way by
-// N·δp = −κ D δf, beside the motion N · Σ b_i δv_i of the face; and the face is there where F has the sign of κ D.
+// with N = dp/dt × d. An alpha edge f(b; uv, α) = 0 on a face with the sides e₁, e₂ has ∂p/∂t = κ (−f_v e₁ + f_u e₂) as
+// it stands, N·e₁ = κ D f_u and N·e₂ = κ D f_v with D = d · (e₁ × e₂). So where f grows by δf, the alpha edge gives way
+// by N·δp = −κ D δf, next to the motion N · Σ b_i δv_i of the face; and the face is there where F has the sign of κ D.
 #pragma once
 
 #include <algorithm>
@@ -20,19 +20,19 @@
 namespace edgegrad {
 
 // A place p of such a curve, and dp/dt along it, as sums of vertices: of the two of an edge, (1 − t) a + t b and b − a,
-// or of the three of a face with a rim.
+// or of the three of a face with an alpha edge.
 struct Occluder {
     int count = 2;
     int32_t vertex[3];
     double weight[3], tangent[3];
-    // Of a rim.
+    // Of an alpha edge.
     int32_t uv_row[3];
     double kappa = 0;
     Vec2 by_uv;       // ∂f/∂uv
     Footprint alpha;  // of which f is made, if it is
     bool of_alpha = false;
 
-    bool is_rim() const { return count == 3; }
+    bool is_alpha_edge() const { return count == 3; }
     // Of one vector a vertex.
     template <class Values>
     Vec3 sum(const double (&by)[3], Values values) const {
@@ -49,9 +49,9 @@ struct Occluder {
 
     // -- how f depends on texture coordinates and alpha texels ---------------------------------------------------
 
-    double rim_jvp(const Tangents& tangents) const {
+    double alpha_edge_jvp(const Tangents& tangents) const {
         double f_dot = 0;
-        if (const double* uvs = tangents.uvs; uvs && is_rim())
+        if (const double* uvs = tangents.uvs; uvs && is_alpha_edge())
             for (int i = 0; i < 3; ++i) {
                 const double* uv_dot = uvs + 2 * int64_t(uv_row[i]);
                 f_dot += weight[i] * (by_uv.x * uv_dot[0] + by_uv.y * uv_dot[1]);
@@ -60,8 +60,8 @@ struct Occluder {
             for (int k = 0; k < 4; ++k) f_dot += alpha.weight(k) * alphas[alpha.texel[k]];
         return f_dot;
     }
-    void rim_vjp(double f_bar, ChunkGrad& grad) const {
-        if (is_rim() && grad.uvs.is_wanted())
+    void alpha_edge_vjp(double f_bar, LocalGradients& grad) const {
+        if (is_alpha_edge() && grad.uvs.is_wanted())
             for (int i = 0; i < 3; ++i) {
                 const Vec2 uv_bar = (f_bar * weight[i]) * by_uv;
                 grad.uvs.add<2>(uv_row[i], &uv_bar.x);
@@ -72,18 +72,18 @@ struct Occluder {
                 grad.alphas.add<1>(alpha.texel[k], &alpha_bar);
             }
     }
-    // Rows of a sample whose border moves by `by_rim` times f.
-    void append_rim(double by_rim, int64_t sample, CurveRecords& records) const {
-        if (is_rim())
+    // Rows of a sample whose border moves by `by_alpha_edge` times f.
+    void append_alpha_edge(double by_alpha_edge, int64_t sample, CurveRecords& records) const {
+        if (is_alpha_edge())
             for (int i = 0; i < 3; ++i) {
-                const Vec2 by = (by_rim * weight[i]) * by_uv;
+                const Vec2 by = (by_alpha_edge * weight[i]) * by_uv;
                 records.uv_row_of.push_back(sample), records.uv.push_back(uv_row[i]);
                 append(records.by_uv, {by.x, by.y});
             }
         if (of_alpha)
             for (int k = 0; k < 4; ++k) {
                 records.alpha_row_of.push_back(sample), records.alpha.push_back(alpha.texel[k]);
-                records.by_alpha.push_back(by_rim * alpha.weight(k));
+                records.by_alpha.push_back(by_alpha_edge * alpha.weight(k));
             }
     }
 };
@@ -98,43 +98,44 @@ Occluder occluder_of(const SceneView<T>& scene, const HalfEdge& h, double t) {
     o.tangent[0] = -1, o.tangent[1] = 1, o.tangent[2] = 0;
     return o;
 }
-// The same of a rim.
+// The same of an alpha edge.
 template <class T>
-Occluder occluder_of(const SceneView<T>& scene, const Rim& rim, const RimPlace& place) {
+Occluder occluder_of(const SceneView<T>& scene, const AlphaEdge& alpha_edge, const AlphaEdgePoint& place) {
     Occluder o;
     o.count = 3;
     for (int i = 0; i < 3; ++i) {
-        o.vertex[i] = scene.faces[3 * int64_t(rim.face) + i];
-        o.uv_row[i] = scene.uv_corners[3 * int64_t(rim.face) + i];
+        o.vertex[i] = scene.faces[3 * int64_t(alpha_edge.face) + i];
+        o.uv_row[i] = scene.uv_corners[3 * int64_t(alpha_edge.face) + i];
         o.weight[i] = place.b[i];
     }
     const Barycentrics tangent{-place.kappa * place.slope.v, place.kappa * place.slope.u};
     o.tangent[0] = -tangent.u - tangent.v, o.tangent[1] = tangent.u, o.tangent[2] = tangent.v;
-    o.kappa = place.kappa, o.by_uv = place.by_uv, o.alpha = place.alpha, o.of_alpha = rim.border == 0;
+    o.kappa = place.kappa, o.by_uv = place.by_uv, o.alpha = place.alpha, o.of_alpha = alpha_edge.border == 0;
     return o;
 }
-// Where rays past a rim go by, world coordinates: a little to where the face is cut out, for a neighbour that has the
-// rim in common, where it runs along their edge, is cut out there too, or not met.
+// Where rays past an alpha edge go by, world coordinates: a little to where the face is alpha-tested, for a neighbour
+// that has the alpha edge in common, where it runs along their edge, is alpha-tested there too, or not met.
 template <class T>
-Vec3 beside_rim(const SceneView<T>& scene, const Rim& rim, const RimPlace& place) {
+Vec3 next_to_alpha_edge(const SceneView<T>& scene, const AlphaEdge& alpha_edge, const AlphaEdgePoint& place) {
     constexpr double aside = 1e-7;
-    const Vec3 v = corner(scene, rim.face, 0), e1 = corner(scene, rim.face, 1) - v, e2 = corner(scene, rim.face, 2) - v;
+    const Vec3 v = corner(scene, alpha_edge.face, 0), e1 = corner(scene, alpha_edge.face, 1) - v,
+               e2 = corner(scene, alpha_edge.face, 2) - v;
     const double step = aside / length(Vec2{place.slope.u, place.slope.v});
     return v + (place.b.u - step * place.slope.u) * e1 + (place.b.v - step * place.slope.v) * e2;
 }
 
 // Whether of two faces on an edge one may be there and the other cut out along it.
 template <class T>
-bool cut_outs_jump(const SceneView<T>& casters, const Topology& topology, int64_t edge) {
-    if (!casters.cut_outs.face) return false;
+bool alpha_masks_jump(const SceneView<T>& casters, const Topology& topology, int64_t edge) {
+    if (!casters.alpha_masks.face) return false;
     const auto halves = topology.half_edges(edge);
     return std::any_of(halves.begin() + 1, halves.end(),
-                       [&](const HalfEdge& h) { return cut_outs_jump(casters, halves[0], h); });
+                       [&](const HalfEdge& h) { return alpha_masks_jump(casters, halves[0], h); });
 }
-// Whether a face is there beside a place of its edge.
+// Whether a face is there next to a place of its edge.
 template <class T>
 bool is_there(const SceneView<T>& casters, const HalfEdge& h, double t) {
-    return shows(casters, h.face, beside_edge(casters, h, t));
+    return shows(casters, h.face, next_to_edge(casters, h, t));
 }
 
 }  // namespace edgegrad

@@ -1,8 +1,8 @@
 // Samples on the borders of what surfaces of a path see of one another.
 //
-// Edges and rims of cut-outs are laid end to end by their length times the azimuths of lines past them (lune.h). Some
+// Edges and alpha edges are laid end to end by their length times the azimuths of lines past them (lune.h). Some
 // lines, pilots, say how much light passes by those of each connected part of the scene, direction by direction; the
-// samples go in proportion to that, with a floor (line_pdf.h).
+// samples go in proportion to that, with a lower bound (line_pdf.h).
 
 #include "secondary/secondary_edges.h"
 
@@ -15,7 +15,7 @@
 #include "core/sampler.h"
 #include "core/systematic.h"
 #include "secondary/edge_line_source.h"
-#include "secondary/edge_lines.h"
+#include "secondary/traced_edge_lines.h"
 #include "secondary/line_ends.h"
 #include "secondary/line_pdf.h"
 #include "shading/lit/indirect.h"
@@ -33,19 +33,22 @@ template <class T>
 struct LineScene : LineLight<T> {
     PooledLines& pooled;
     Mirrors mirrors;
-    const std::vector<Rim> rims;
+    const std::vector<AlphaEdge> alpha_edges;
     std::vector<double> means = {};  // of its cells; empty: not known yet
 
     LineScene(const LineLight<T>& light, PooledLines& pooled_)
         : LineLight<T>(light),
           pooled(pooled_),
           mirrors(this->lit.lit, this->is_seen()),
-          rims(RimFinder<T>(this->casters).find(hash(this->view.options.seed, 13, gradient_stream), this->view.team)) {}
-    EdgeLines<T> lines() const { return {this->casters, this->view.geometry.topology(), rims, pooled, means, mirrors}; }
+          alpha_edges(AlphaEdgeFinder<T>(this->casters)
+                          .find(hash(this->view.options.seed, 13, gradient_stream), this->view.team)) {}
+    EdgeLines<T> lines() const {
+        return {this->casters, this->view.geometry.topology(), alpha_edges, pooled, means, mirrors};
+    }
 
-    // What is drawn of each edge and rim, relative to others.
+    // What is drawn of each edge and alpha edge, relative to others.
     Array<double> measure() const {
-        const int64_t n = this->view.geometry.topology().n_edges() + int64_t(rims.size());
+        const int64_t n = this->view.geometry.topology().n_edges() + int64_t(alpha_edges.size());
         Array<double> out(n);
         this->view.team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
             EdgeLines<T> edge = lines();
@@ -61,21 +64,21 @@ struct Pilots {
     std::vector<double> value;
     Ends ends;
 
-    void add(const BounceLine& line, double size) {
+    void add(const EdgeLine& line, double size) {
         if (!(size > 0)) return;
         cell.push_back(line.segment), value.push_back(size);
-        ends.add(0, line.receiver, line.at.u, line.at.v), ends.add(1, line.sender, line.asked.u, line.asked.v);
+        ends.add(0, line.receiver, line.at.u, line.at.v), ends.add(1, line.reflector, line.asked.u, line.asked.v);
     }
 };
 
-// Their contraction: which of them are seen, and how much the border of each moves, with its edge or the receiver.
+// Their accumulation: which of them are seen, and how much the border of each moves, with its edge or the receiver.
 template <class T>
 class SeenPilots {
    public:
     SeenPilots(const BackwardView<T>& view, Pilots& found) : view_(view), found_(found) {}
 
     bool wants(int, Vec2) const { return true; }
-    void add(int, BounceSource<T>&, typename BounceSource<T>::Sample& sample) {
+    void add(int, EdgeLineSource<T>&, typename EdgeLineSource<T>::Sample& sample) {
         const double moved = length(sample.N) + length(sample.m), look = view_.importance.mean(sample.x, sample.x);
         found_.add(sample.line, sample.weight * sample.scale * sample.area_scale * moved * look);
     }
@@ -95,7 +98,7 @@ class LineChunk {
           sequence_(seed),
           body_(body),
           edge_lines_(scene.lines()),
-          lines_(scene.view, scene.casters, scene.rims) {}
+          lines_(scene.view, scene.casters, scene.alpha_edges) {}
 
     // The i-th line, at a position along the edges; these ascend. The cell that it is pooled in.
     int64_t add(int64_t i, double position) {
@@ -118,15 +121,16 @@ class LineChunk {
     const Body body_;
     int64_t edge_ = -1;
     EdgeLines<T> edge_lines_;
-    BounceLines<T> lines_;
+    TracedEdgeLines<T> lines_;
 };
 
-// Calls lines(body) with a body that gives the contraction those of which the camera sees an end.
-template <class T, class Contraction, class Lines>
-void each_seen(const BackwardView<T>& view, double near, Contraction& contraction, ChunkGrad& grad, Lines lines) {
-    BounceSource<T> source(view, near);
-    CurveSamples samples(view, source, contraction);
-    lines([&](const BounceLine& line, double weight) {
+// Calls lines(body) with a body that gives the accumulation those of which the camera sees an end.
+template <class T, class Accumulation, class Lines>
+void each_seen(const BackwardView<T>& view, double near, Accumulation& accumulation, LocalGradients& grad,
+               Lines lines) {
+    EdgeLineSource<T> source(view, near);
+    CurveSamples samples(view, source, accumulation);
+    lines([&](const EdgeLine& line, double weight) {
         if (is_in_view(view, source.place_of(line))) samples.add(line, 0, weight);
     });
     samples.finish(grad);
@@ -137,19 +141,19 @@ auto places_of(const BackwardView<T>& view) {
     return [&](int32_t i) { return vec(view.scene.verts + 3 * int64_t(i)); };
 }
 template <class T>
-Vec3 normal_of(const BackwardView<T>& view, const BounceLine& line) {
+Vec3 normal_of(const BackwardView<T>& view, const EdgeLine& line) {
     return cross(line.occluder.sum(line.occluder.tangent, places_of(view)), line.w);
 }
 
 // A line of which no end need be seen: F by places in the world, y₁ stays at its barycentrics (edge_line_source.h).
 template <class T>
-void append_unseen(const BackwardView<T>& view, const BounceLine& line, double weight, CurveRecords& records) {
+void append_indirect(const BackwardView<T>& view, const EdgeLine& line, double weight, CurveRecords& records) {
     const int64_t sample = records.size();
     const Vec3 N = normal_of(view, line);
     append(records.x, {0.0, 0.0});
     for (int k = 0; k < CurveRecords::surfaces; ++k) {
         const Barycentrics b = k == 0 ? line.at : line.asked;
-        records.face.push_back(k == 0 ? line.receiver : k == 1 ? line.sender : -2);
+        records.face.push_back(k == 0 ? line.receiver : k == 1 ? line.reflector : -2);
         records.factor.push_back(k == 0 ? weight : 0), append(records.b, {b.u, b.v});
     }
     const auto add = [&](int32_t vertex, double by) {
@@ -158,11 +162,11 @@ void append_unseen(const BackwardView<T>& view, const BounceLine& line, double w
     };
     for (int i = 0; i < 3; ++i) {
         add(view.scene.faces[3 * int64_t(line.receiver) + i], line.share * line.at[i]);
-        add(view.scene.faces[3 * int64_t(line.sender) + i], (1 - line.share) * line.from[i]);
+        add(view.scene.faces[3 * int64_t(line.reflector) + i], (1 - line.share) * line.from[i]);
     }
     const Occluder& occluder = line.occluder;
     for (int i = 0; i < occluder.count; ++i) add(occluder.vertex[i], -occluder.weight[i]);
-    if (occluder.is_rim()) occluder.append_rim(occluder.turned(line.w, places_of(view)), sample, records);
+    if (occluder.is_alpha_edge()) occluder.append_alpha_edge(occluder.turned(line.w, places_of(view)), sample, records);
 }
 
 // Fills what is pooled.
@@ -173,18 +177,18 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
     Systematic edges(measure, view.team);
     if (!(edges.total() > 0)) return;
     edges.draw(n, to_unit(hash(view.options.seed, 17, gradient_stream)));
-    struct Found {
+    struct PilotStatistics {
         std::vector<int64_t> lines, cell;  // cells of all lines, and of those that give something
         std::vector<double> value;
     };
-    std::vector<Found> found((n + pilots_of_block - 1) / pilots_of_block);
+    std::vector<PilotStatistics> found((n + pilots_of_block - 1) / pilots_of_block);
     const int C = scene.lit.lit.channels;
     view.team.each_with(
-        int64_t(found.size()), [&] { return path_buffers(scene.lit.lit, scene.at_sender); },
+        int64_t(found.size()), [&] { return path_buffers(scene.lit.lit, scene.at_reflector); },
         [&](Paths& paths, int64_t block) {
             view.team.check();
             Pilots pilots;
-            Found& own = found[block];
+            PilotStatistics& own = found[block];
             const int64_t first = block * pilots_of_block, last = std::min(first + pilots_of_block, n);
             const auto lines = [&](auto body) {
                 LineChunk chunk(scene, edges, hash(view.options.seed, 18, gradient_stream), body);
@@ -192,11 +196,11 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
                 chunk.cast();
             };
             if (scene.is_seen()) {
-                ChunkGrad unused;
+                LocalGradients unused;
                 SeenPilots seen(view, pilots);
                 each_seen(view, scene.lit.options.near, seen, unused, lines);
             } else {
-                lines([&](const BounceLine& line, double weight) {
+                lines([&](const EdgeLine& line, double weight) {
                     pilots.add(line, weight * length(normal_of(view, line)));
                 });
             }
@@ -208,7 +212,7 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
                 own.value[i] *= most;
             }
         });
-    for (const Found& own : found) {
+    for (const PilotStatistics& own : found) {
         for (const int64_t cell : own.lines) scene.pooled.add_line(cell);
         for (size_t i = 0; i < own.cell.size(); ++i) scene.pooled.add(own.cell[i], own.value[i]);
     }
@@ -217,15 +221,15 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
 
 }  // namespace
 
-int64_t most_bounce_samples(int64_t width, int64_t height, int spp) {
+int64_t most_secondary_edge_samples(int64_t width, int64_t height, int spp) {
     return std::clamp(width * height * spp / 8, fewest_samples, most_samples);
 }
 
 template <class T>
-void add_bounces(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& lit, int64_t samples,
-                 const Record& record, Destination& to, BounceSamples& out) {
+void add_secondary_edges(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& lit, int64_t samples,
+                         const Record& record, GradientSink& to, SecondaryEdgeSamples& out) {
     const int64_t n =
-        samples >= 0 ? samples : most_bounce_samples(view.camera.width, view.camera.height, view.image.spp);
+        samples >= 0 ? samples : most_secondary_edge_samples(view.camera.width, view.camera.height, view.image.spp);
     if (n == 0) return;
     PooledLines pooled(view.geometry.parts());
     LineScene<T> scene({view, casters, lit}, pooled);
@@ -236,25 +240,25 @@ void add_bounces(const BackwardView<T>& view, const SceneView<T>& casters, const
     edges.draw(n, to_unit(hash(view.options.seed, 14, gradient_stream)));
     double seconds[2] = {};
     const size_t before = to.records->curves.size();
-    view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
         const auto lines = [&](auto body) {
             LineChunk chunk(scene, edges, hash(view.options.seed, 16, gradient_stream), body);
             for (int64_t i = first; i < last; ++i) chunk.add(i, edges.position(i));
             chunk.cast();
         };
         if (scene.is_seen()) {
-            each_seen(view, lit.options.near, *contract_curves(view, record, grad), grad, lines);
+            each_seen(view, lit.options.near, *accumulate_curves(view, record, grad), grad, lines);
         } else {
             lines(
-                [&](const BounceLine& line, double weight) { append_unseen(view, line, weight, grad.records.curves); });
+                [&](const EdgeLine& line, double weight) { append_indirect(view, line, weight, grad.records.curves); });
         }
     });
-    ask_senders(scene, to.records->curves, before, 15, out);
+    light_reflectors(scene, to.records->curves, before, 15, out);
 }
 
-template void add_bounces(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, int64_t, const Record&,
-                          Destination&, BounceSamples&);
-template void add_bounces(const BackwardView<double>&, const SceneView<double>&, const LitPaths&, int64_t,
-                          const Record&, Destination&, BounceSamples&);
+template void add_secondary_edges(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, int64_t,
+                                  const Record&, GradientSink&, SecondaryEdgeSamples&);
+template void add_secondary_edges(const BackwardView<double>&, const SceneView<double>&, const LitPaths&, int64_t,
+                                  const Record&, GradientSink&, SecondaryEdgeSamples&);
 
 }  // namespace edgegrad

@@ -1,5 +1,5 @@
-// Edges that cast shadows: those at which all faces lie on one side, as seen from a point of a light. And rims of
-// cut-outs, which do before all points that do not lie in the plane of their face.
+// Edges that cast shadows: those at which all faces lie on one side, as seen from a point of a light. And alpha edges
+// of alpha-tested faces, which do before all points that do not lie in the plane of their face.
 #pragma once
 
 #include <algorithm>
@@ -16,17 +16,17 @@
 
 namespace edgegrad {
 
-// A part of an edge or a rim before those points of a part of a light from which it casts a shadow.
+// A part of an edge or an alpha edge before those points of a part of a light from which it casts a shadow.
 struct ShadowPiece {
-    int64_t edge;  // or, where it is negative, a rim
+    int64_t edge;  // or, where it is negative, an alpha edge
     int32_t part;
     float t0, t1;    // on it
     double share;    // what it stands for: of all points of the light, and of the edge
     double measure;  // of its shadows, as far as they are known without a ray
 
-    bool is_rim() const { return edge < 0; }
-    int64_t rim() const { return -1 - edge; }
-    static int64_t of_rim(int64_t rim) { return -1 - rim; }
+    bool is_alpha_edge() const { return edge < 0; }
+    int64_t alpha_edge() const { return -1 - edge; }
+    static int64_t of_alpha_edge(int64_t alpha_edge) { return -1 - alpha_edge; }
 };
 
 // A light's parts as many edges ask for them.
@@ -103,20 +103,21 @@ class FacesBeforeLight {
     Array<Plane> plane_;
 };
 
-// The wedges of edges and rims before parts of a light, one after another; each thread has its own.
+// The wedges of edges and alpha edges before parts of a light, one after another; each thread has its own.
 template <class T>
 class EdgeWedge {
    public:
     EdgeWedge(const BackwardView<T>& view, const SceneView<T>& casters, const FacesBeforeLight<T>& faces,
-              const std::vector<Rim>& rims)
-        : view_(view), casters_(casters), faces_(faces), rims_(rims) {}
+              const std::vector<AlphaEdge>& alpha_edges)
+        : view_(view), casters_(casters), faces_(faces), alpha_edges_(alpha_edges) {}
 
     bool set(const ShadowPiece& piece) {
-        return piece.is_rim() ? set_rim(rims_[piece.rim()].face, piece.part) : set(piece.edge, piece.part);
+        return piece.is_alpha_edge() ? set_alpha_edge(alpha_edges_[piece.alpha_edge()].face, piece.part)
+                                     : set(piece.edge, piece.part);
     }
 
     // False where the light lies in the plane of the face.
-    bool set_rim(int64_t face, int64_t part) {
+    bool set_alpha_edge(int64_t face, int64_t part) {
         const auto h = faces_.heights(face, part);
         if (h.flat() || h.edge_on) return false;
         wedge_.all();
@@ -135,7 +136,7 @@ class EdgeWedge {
             heights_.push_back(half.backwards ? -h.at : h.at);
         }
         if (!known) return false;
-        if (cut_outs_jump(casters_, view_.geometry.topology(), edge)) wedge_.all();
+        if (alpha_masks_jump(casters_, view_.geometry.topology(), edge)) wedge_.all();
         else wedge_.clip(heights_);
         return wedge_.fraction() > 0;
     }
@@ -146,20 +147,20 @@ class EdgeWedge {
     const BackwardView<T>& view_;
     const SceneView<T>& casters_;
     const FacesBeforeLight<T>& faces_;
-    const std::vector<Rim>& rims_;
+    const std::vector<AlphaEdge>& alpha_edges_;
     std::vector<Vec3> heights_;
     LightWedge wedge_;
 };
 
-// The edges and rims of a scene that cast shadows of a light. Each edge between whose faces some of the light may lie
-// is asked before as many of its parts, spread evenly over their order, as give about `tests` pairs in all; rims, a
-// quarter as many.
+// The edges and alpha edges of a scene that cast shadows of a light. Each edge between whose faces some of the light
+// may lie is asked before as many of its parts, spread evenly over their order, as give about `tests` pairs in all;
+// alpha edges, a quarter as many.
 template <class T>
 class ShadowEdgeFinder {
    public:
     ShadowEdgeFinder(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
-                     const FacesBeforeLight<T>& faces, const std::vector<Rim>& rims)
-        : view_(view), casters_(casters), light_(light), faces_(faces), rims_(rims) {}
+                     const FacesBeforeLight<T>& faces, const std::vector<AlphaEdge>& alpha_edges)
+        : view_(view), casters_(casters), light_(light), faces_(faces), alpha_edges_(alpha_edges) {}
 
     std::vector<ShadowPiece> find(int64_t tests) const {
         const int64_t edges = view_.geometry.topology().n_edges();
@@ -174,17 +175,17 @@ class ShadowEdgeFinder {
         const int64_t asked = std::clamp<int64_t>(tests / std::max<int64_t>(asking, 1), 1, light_.count);
         std::vector<std::vector<ShadowPiece>> parts(may.size());
         view_.team.each(int64_t(may.size()), [&](int64_t k) {
-            EdgeWedge<T> wedge(view_, casters_, faces_, rims_);
+            EdgeWedge<T> wedge(view_, casters_, faces_, alpha_edges_);
             std::vector<ShadowPiece> part;
             for (const int64_t e : may[k]) add(e, asked, wedge, part);
             parts[k] = std::move(part);
         });
-        for (auto& block : of_rims(tests / 4)) parts.push_back(std::move(block));
+        for (auto& block : of_alpha_edges(tests / 4)) parts.push_back(std::move(block));
         int64_t edges_found = 0;
         for (const auto& block : parts)
             for (size_t i = 0; i < block.size(); ++i) edges_found += i == 0 || block[i].edge != block[i - 1].edge;
-        // Neighbours see alike. Of many edges these are neighbours on the mesh before the same part of the light, so
-        // part after part; of few the parts of the light before the same edge.
+        // Neighbours see almost the same. Of many edges these are neighbours on the mesh before the same part of the
+        // light, so part after part; of few the parts of the light before the same edge.
         if (edges_found <= light_.count) {
             std::vector<ShadowPiece> found;
             for (const auto& block : parts) found.insert(found.end(), block.begin(), block.end());
@@ -206,9 +207,9 @@ class ShadowEdgeFinder {
     // False where all of the light surely sees both faces of an edge from the same sides.
     bool may_cast(int64_t edge) const {
         if (!view_.geometry.topology().joins_two(edge)) return true;
-        if (cut_outs_jump(casters_, view_.geometry.topology(), edge)) return true;
-        const auto beside = view_.geometry.topology().faces(edge);
-        const int one = faces_.side(beside[0]), other = faces_.side(beside[1]);
+        if (alpha_masks_jump(casters_, view_.geometry.topology(), edge)) return true;
+        const auto adjacent = view_.geometry.topology().faces(edge);
+        const int one = faces_.side(adjacent[0]), other = faces_.side(adjacent[1]);
         return one == 0 || other == 0 || one != other;
     }
 
@@ -244,29 +245,30 @@ class ShadowEdgeFinder {
         if (std::isfinite(measure) && measure > 0) out.push_back({e, int32_t(part), 0, 1, share, measure});
     }
 
-    std::vector<std::vector<ShadowPiece>> of_rims(int64_t tests) const {
-        const int64_t asked = std::clamp<int64_t>(tests / std::max<int64_t>(int64_t(rims_.size()), 1), 1, light_.count);
+    std::vector<std::vector<ShadowPiece>> of_alpha_edges(int64_t tests) const {
+        const int64_t asked =
+            std::clamp<int64_t>(tests / std::max<int64_t>(int64_t(alpha_edges_.size()), 1), 1, light_.count);
         const Hash random(hash(view_.options.seed, 12, gradient_stream), 0);
         const double step = double(light_.count) / double(asked);
-        return view_.team.of_blocks(int64_t(rims_.size()), [&](int64_t begin, int64_t end) {
-            EdgeWedge<T> wedge(view_, casters_, faces_, rims_);
+        return view_.team.of_blocks(int64_t(alpha_edges_.size()), [&](int64_t begin, int64_t end) {
+            EdgeWedge<T> wedge(view_, casters_, faces_, alpha_edges_);
             std::vector<ShadowPiece> out;
             for (int64_t k = begin; k < end; ++k) {
-                const Rim& rim = rims_[k];
-                const Vec3 a = on_face(rim, rim.begin), b = on_face(rim, rim.end);
+                const AlphaEdge& alpha_edge = alpha_edges_[k];
+                const Vec3 a = on_face(alpha_edge, alpha_edge.begin), b = on_face(alpha_edge, alpha_edge.end);
                 const double shift = to_unit(random(uint64_t(k)));
                 for (int64_t i = 0; i < asked; ++i) {
                     const int64_t part = std::min(int64_t((double(i) + shift) * step), light_.count - 1);
-                    if (lies_in_plane(part, a, b) || !wedge.set_rim(rim.face, part)) continue;
-                    add(ShadowPiece::of_rim(k), part, a, b, step * rim.share, *wedge, out);
+                    if (lies_in_plane(part, a, b) || !wedge.set_alpha_edge(alpha_edge.face, part)) continue;
+                    add(ShadowPiece::of_alpha_edge(k), part, a, b, step * alpha_edge.share, *wedge, out);
                 }
             }
             return out;
         });
     }
-    Vec3 on_face(const Rim& rim, Barycentrics b) const {
+    Vec3 on_face(const AlphaEdge& alpha_edge, Barycentrics b) const {
         Vec3 p;
-        for (int i = 0; i < 3; ++i) p += b[i] * corner(view_.scene, rim.face, i);
+        for (int i = 0; i < 3; ++i) p += b[i] * corner(view_.scene, alpha_edge.face, i);
         return p;
     }
 
@@ -274,7 +276,7 @@ class ShadowEdgeFinder {
     const SceneView<T>& casters_;
     const LightParts& light_;
     const FacesBeforeLight<T>& faces_;
-    const std::vector<Rim>& rims_;
+    const std::vector<AlphaEdge>& alpha_edges_;
 };
 
 }  // namespace edgegrad

@@ -1,5 +1,5 @@
 // Where samples on the borders of shadows lie: the pieces of edges before parts of a light (shadow_edges.h), end to end
-// by what is known of their shadows without a ray, and the density along them that pilots tell.
+// by what is known of their shadows without a ray, and the density along them that pilots say.
 #pragma once
 
 #include <algorithm>
@@ -79,7 +79,7 @@ class Pieces {
 };
 
 // What pilots find of an interval: sums over them.
-struct Found {
+struct ShadowStatistics {
     double squares = 0;  // (swept area · light)²
     double length = 0;   // px
 };
@@ -155,7 +155,7 @@ struct ShadowScene {
     const SceneView<T>& casters;
     const LightParts& light;
     const FacesBeforeLight<T>& faces;
-    const std::vector<Rim>& rims;
+    const std::vector<AlphaEdge>& alpha_edges;
     const Pieces& pieces;
 };
 
@@ -167,8 +167,8 @@ class ShadowChunk {
     ShadowChunk(const ShadowScene<T>& scene, uint64_t seed, Body body)
         : scene_(scene),
           sequence_(seed),
-          wedge_(scene.view, scene.casters, scene.faces, scene.rims),
-          light_rays_(scene.view, scene.casters, scene.light, scene.rims),
+          wedge_(scene.view, scene.casters, scene.faces, scene.alpha_edges),
+          light_rays_(scene.view, scene.casters, scene.light, scene.alpha_edges),
           body_(std::move(body)) {}
 
     // The i-th of places that ascend, with so many samples: a second one mirrors the first on the edge. How samples
@@ -200,7 +200,7 @@ class ShadowChunk {
     Body body_;
 };
 
-// The edges and rims that cast shadows of a light.
+// The edges and alpha edges that cast shadows of a light.
 template <class T>
 class ShadowCasters {
    public:
@@ -208,9 +208,9 @@ class ShadowCasters {
     ShadowCasters(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t expected)
         : intervals_(std::clamp(expected / samples_of_interval, fewest_intervals, most_intervals)),
           faces_(view.scene, light, view.team),
-          rims_(RimFinder<T>(casters).find(hash(view.options.seed, 13, gradient_stream), view.team)),
+          alpha_edges_(AlphaEdgeFinder<T>(casters).find(hash(view.options.seed, 13, gradient_stream), view.team)),
           pieces_(find(view, casters, light), view.team),
-          scene_{view, casters, light, faces_, rims_, pieces_} {}
+          scene_{view, casters, light, faces_, alpha_edges_, pieces_} {}
 
     bool empty() const { return pieces_.empty(); }
     const ShadowScene<T>& scene() const { return scene_; }
@@ -218,7 +218,7 @@ class ShadowCasters {
 
     // Has places of each interval asked: body(ask) is called for some at a time, and calls ask(chunk) of a ShadowChunk.
     template <class Body>
-    void ask_pilots(uint64_t seed, Body body) const {
+    void draw_pilots(uint64_t seed, Body body) const {
         scene_.view.team.each((intervals_ + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
             const int64_t first = block * intervals_of_block, last = std::min(first + intervals_of_block, intervals_);
             body([&](auto& chunk) {
@@ -235,28 +235,29 @@ class ShadowCasters {
    private:
     std::vector<ShadowPiece> find(const BackwardView<T>& view, const SceneView<T>& casters,
                                   const LightParts& light) const {
-        std::vector<ShadowPiece> found = ShadowEdgeFinder<T>(view, casters, light, faces_, rims_).find(pair_tests);
+        std::vector<ShadowPiece> found =
+            ShadowEdgeFinder<T>(view, casters, light, faces_, alpha_edges_).find(pair_tests);
         return light.extended ? cut(found, double(intervals_)) : found;
     }
 
     const int64_t intervals_;
     const FacesBeforeLight<T> faces_;
-    const std::vector<Rim> rims_;
+    const std::vector<AlphaEdge> alpha_edges_;
     const Pieces pieces_;
     const ShadowScene<T> scene_;
 };
 
 // The density of samples in each interval, from what pilots found: what those of one interval miss, those of its
 // neighbours may have met, so most of the mean square is theirs.
-inline Array<double> density_of(const std::vector<Found>& of_interval) {
+inline Array<double> density_of(const std::vector<ShadowStatistics>& of_interval) {
     const auto count = int64_t(of_interval.size());
     Array<double> measure(count);
     double known = 0;
     for (int64_t i = 0; i < count; ++i) {
-        double window = 0;
+        double sub_camera = 0;
         const int64_t low = std::max<int64_t>(i - neighbours, 0), high = std::min(i + neighbours, count - 1);
-        for (int64_t k = low; k <= high; ++k) window += of_interval[k].squares / double(high - low + 1);
-        measure[i] = std::sqrt((own_share * of_interval[i].squares + (1 - own_share) * window) / pilots),
+        for (int64_t k = low; k <= high; ++k) sub_camera += of_interval[k].squares / double(high - low + 1);
+        measure[i] = std::sqrt((own_share * of_interval[i].squares + (1 - own_share) * sub_camera) / pilots),
         known += measure[i] / double(count);
     }
     for (int64_t i = 0; i < count; ++i) measure[i] += floor_share * (known > 0 ? known : 1);

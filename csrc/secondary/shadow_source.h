@@ -14,7 +14,7 @@
 // δq(x) at a fixed depth. The last factor is also ∇F, by the place in the image. Per unit of t on the edge the border
 // has the length |y′| with y′ = S / (m·d) · m × N, S = |y − l| / |p − l|, or 1 if the light is at infinity: so all that
 // is asked of the place on the edge is that rays go there. A light at infinity moves by its direction towards it.
-// A rim of a cut-out does the same by its tangent in place of b − a (occluder.h).
+// A alpha edges does the same by its tangent in place of b − a (occluder.h).
 #pragma once
 
 #include <algorithm>
@@ -27,7 +27,7 @@
 
 namespace edgegrad {
 
-// Where the ray of a light past an edge or a rim meets a face.
+// Where the ray of a light past an edge or an alpha edge meets a face.
 struct ShadowPoint {
     Occluder caster;
     int32_t part;         // of the light
@@ -45,7 +45,7 @@ struct ShadowBorder {
     Vec3 N, d;
     double S;
     double by_caster[3] = {}, by_light;  // by its vertices, and by the light
-    double by_rim = 0;                   // ∂F/∂f
+    double by_alpha_edge = 0;            // ∂F/∂f
 
     // at(i): a vertex; `light`: the point, or the direction towards it.
     template <class At>
@@ -56,13 +56,13 @@ struct ShadowBorder {
         o.d = infinite ? -light : p - light, o.N = cross(along, o.d), o.S = infinite ? 1 : point.along;
         for (int i = 0; i < caster.count; ++i) o.by_caster[i] = o.S * caster.weight[i];
         o.by_light = infinite ? -point.along : 1 - point.along;
-        if (caster.is_rim()) o.by_rim = o.S * caster.turned(o.d, at);
+        if (caster.is_alpha_edge()) o.by_alpha_edge = o.S * caster.turned(o.d, at);
         return o;
     }
     // What is swept where F may change by `most` times the length of how what casts the border moves along N.
     double swept(double most, const Occluder& caster) const {
         double sum = by_caster[0] + by_caster[1];
-        if (caster.is_rim()) sum += by_caster[2];
+        if (caster.is_alpha_edge()) sum += by_caster[2];
         return most * sum * length(N);
     }
 };
@@ -79,7 +79,7 @@ class ShadowSource {
         ShadowBorder border;
         Vec3 m;          // times c
         Vec2 by_n;       // ∂F/∂n
-        double speed;    // |du/dt|, px of the straight image
+        double speed;    // |du/dt|, px of the undistorted image
         double scale;    // that over |∇F|
         bool lit_ahead;  // whether the lit side is where F > 0
     };
@@ -156,11 +156,11 @@ class ShadowSource {
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
         double F_dot =
             dot(sample.m, receiver) - dot(sample.border.N, caster) + sample.by_n.x * n_dot.x + sample.by_n.y * n_dot.y;
-        F_dot += sample.border.by_rim * edge.rim_jvp(direction.tangents);
+        F_dot += sample.border.by_alpha_edge * edge.alpha_edge_jvp(direction.tangents);
         return {sample.scale * sample.area_scale * F_dot, 0};
     }
 
-    void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) const {
+    void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) const {
         const double F_bar = sample.scale * sample.area_scale * jumps.first;
         const int32_t* vertex = view_.scene.faces + 3 * int64_t(sample.receiver);
         for (int i = 0; i < 3; ++i) {
@@ -172,13 +172,13 @@ class ShadowSource {
             const Vec3 bar = (-F_bar * sample.border.by_caster[i]) * sample.border.N;
             grad.q.add<3>(caster.vertex[i], &bar.x);
         }
-        caster.rim_vjp(F_bar * sample.border.by_rim, grad);
+        caster.alpha_edge_vjp(F_bar * sample.border.by_alpha_edge, grad);
         grad.light = {sample.shadow.part, sample.shadow.uv, (-F_bar * sample.border.by_light) * sample.border.N};
         normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
     }
 
     void cast() {}
-    void finish(ChunkGrad&) {}
+    void finish(LocalGradients&) {}
 
    private:
     // In camera coordinates.

@@ -4,7 +4,7 @@
 // without a ray. Equal intervals of that measure take some rays each, pilots, from the light past the edge to whatever
 // they meet, and from the camera to there, which say how long the border's image is, how far it moves with the edge,
 // and how much light ends there. The samples go in proportion to the root mean square of that product over an interval,
-// with a floor.
+// with a lower bound.
 
 #include "secondary/shadows.h"
 
@@ -24,11 +24,11 @@ namespace {
 
 constexpr double samples_a_pixel = 24;  // of the border of a point's shadow
 
-// The contraction of pilots.
+// The accumulation of pilots.
 template <class T>
 class Pilots {
    public:
-    Pilots(const BackwardView<T>& view, const LightParts& light, std::vector<Found>& found)
+    Pilots(const BackwardView<T>& view, const LightParts& light, std::vector<ShadowStatistics>& found)
         : view_(view), light_(light), found_(found) {}
 
     bool wants(int, Vec2) const { return true; }
@@ -54,7 +54,7 @@ class Pilots {
    private:
     const BackwardView<T>& view_;
     const LightParts& light_;
-    std::vector<Found>& found_;
+    std::vector<ShadowStatistics>& found_;
 };
 
 }  // namespace
@@ -65,7 +65,7 @@ int64_t most_shadow_samples(int64_t width, int64_t height, int spp) {
 
 template <class T>
 void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t samples,
-                 const Record& record, Destination& to, BackwardProfile& profile) {
+                 const Record& record, GradientSink& to, BackwardProfile& profile) {
     // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
     // where the light has an extent, for each of its points casts a shadow of its own.
     const int64_t most = most_shadow_samples(view.camera.width, view.camera.height, view.image.spp);
@@ -78,10 +78,10 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
         });
     };
 
-    std::vector<Found> of_interval(edges.intervals());
+    std::vector<ShadowStatistics> of_interval(edges.intervals());
     const uint64_t pilot_seed = hash(view.options.seed, 10, gradient_stream);
-    edges.ask_pilots(pilot_seed, [&](auto ask) {
-        ChunkGrad unused;
+    edges.draw_pilots(pilot_seed, [&](auto ask) {
+        LocalGradients unused;
         Pilots pilots_of_block(view, light, of_interval);
         ShadowSource<T> source(view, light.infinite);
         CurveSamples samples_of_block(view, source, pilots_of_block);
@@ -90,7 +90,7 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
         samples_of_block.finish(unused);
     });
     double length = 0;  // of the border, px, a mean over the light
-    for (const Found& found : of_interval) length += found.length / double(pilots * edges.intervals());
+    for (const ShadowStatistics& found : of_interval) length += found.length / double(pilots * edges.intervals());
     Array<double> density = density_of(of_interval);
     const int64_t wanted = light.extended ? most : int64_t(std::min(samples_a_pixel * length, 1e15));
     const int64_t n = samples >= 0 ? samples : std::clamp(wanted, fewest_samples, most);
@@ -101,8 +101,8 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
     const Places drawn(edges.scene().pieces, density, places, light.extended,
                        hash(view.options.seed, 11, gradient_stream), view.team);
     double seconds[2] = {};
-    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        const std::unique_ptr<CurveContraction> to_chunk = contract_curves(view, record, grad);
+    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
+        const std::unique_ptr<CurveAccumulation> to_chunk = accumulate_curves(view, record, grad);
         ShadowSource<T> source(view, light.infinite);
         CurveSamples samples_of_chunk(view, source, *to_chunk);
         auto chunk = chunk_of(hash(view.options.seed, 9, gradient_stream), source, samples_of_chunk);
@@ -117,8 +117,8 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
 }
 
 template void add_shadows(const BackwardView<float>&, const SceneView<float>&, const LightParts&, int64_t,
-                          const Record&, Destination&, BackwardProfile&);
+                          const Record&, GradientSink&, BackwardProfile&);
 template void add_shadows(const BackwardView<double>&, const SceneView<double>&, const LightParts&, int64_t,
-                          const Record&, Destination&, BackwardProfile&);
+                          const Record&, GradientSink&, BackwardProfile&);
 
 }  // namespace edgegrad

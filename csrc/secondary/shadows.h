@@ -13,6 +13,6 @@ int64_t most_shadow_samples(int64_t width, int64_t height, int spp);
 // `casters`: the scene as light meets it, of which less may be there than the camera sees.
 template <class T>
 void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t samples,
-                 const Record& record, Destination& to, BackwardProfile& profile);
+                 const Record& record, GradientSink& to, BackwardProfile& profile);
 
 }  // namespace edgegrad

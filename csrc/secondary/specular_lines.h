@@ -7,7 +7,7 @@
 // 2 between the face's normal and the half vector at the place it then meets, where the lobe at y alone would have ε /
 // 2: so the lobe is that of a face smoother by the factor |e − y| / (|p − y| + |e − y|).
 //
-// All of it is a density of directions and no more: faces that bend, are textured or are hidden only make it a worse
+// All of it is a pdf of directions and no more: faces that bend, are textured or are hidden only make it a worse
 // one.
 #pragma once
 
@@ -28,7 +28,7 @@ class Mirrors {
    public:
     Mirrors(const LitScene& lit, bool viewer) {
         if (viewer) targets_.push_back({lit.tables[lit.eye].vector_at<double>(0), !lit.perspective, 0});
-        for (const Lamp& lamp : lit.lamps) add_target(lit, lamp);
+        for (const Light& light : lit.lights) add_target(lit, light);
         if (targets_.size() > most_pairs / 4) targets_.resize(most_pairs / 4);
         for (const LitMesh& mesh : lit.meshes)
             if (mesh.has_material && !mesh.lambertian)
@@ -44,7 +44,7 @@ class Mirrors {
     bool empty() const { return faces_.empty(); }
 
    private:
-    friend class MirroredLines;
+    friend class SpecularLines;
     static constexpr size_t most_pairs = 32;  // of faces, the largest ones, and what they mirror
 
     struct Target {
@@ -58,16 +58,16 @@ class Mirrors {
         bool two_sided;
     };
 
-    void add_target(const LitScene& lit, const Lamp& lamp) {
+    void add_target(const LitScene& lit, const Light& light) {
         const std::vector<Table>& tables = lit.tables;
-        switch (lamp.kind) {
-            case Lamp::Kind::directional:
-                return targets_.push_back({-unit(tables[lamp.direction].vector_at<double>(0)), true, 0});
-            case Lamp::Kind::point:
-            case Lamp::Kind::spot:
-                return targets_.push_back({tables[lamp.position].vector_at<double>(0), false, 0});
-            case Lamp::Kind::mesh: {
-                const LitMesh& mesh = lit.meshes[lamp.mesh];
+        switch (light.kind) {
+            case Light::Kind::directional:
+                return targets_.push_back({-unit(tables[light.direction].vector_at<double>(0)), true, 0});
+            case Light::Kind::point:
+            case Light::Kind::spot:
+                return targets_.push_back({tables[light.position].vector_at<double>(0), false, 0});
+            case Light::Kind::mesh: {
+                const LitMesh& mesh = lit.meshes[light.mesh];
                 Vec3 low{1e300, 1e300, 1e300}, high = -low;
                 for (int64_t k = 3 * mesh.first_face; k < 3 * (mesh.first_face + mesh.faces); ++k) {
                     const Vec3 v = tables[lit.verts].vector_at<double>(lit.faces[k]);
@@ -98,8 +98,8 @@ class Mirrors {
     std::vector<Face> faces_;
 };
 
-// Those past one point, unit directions of lines whichever way they run: drawn, and their density by solid angle.
-class MirroredLines {
+// Those past one point, unit directions of lines whichever way they run: drawn, and their pdf by solid angle.
+class SpecularLines {
    public:
     // `lune`: of the edge on which the point p lies; lines that are not in it are drawn seldom.
     void set(const Mirrors& mirrors, Vec3 p, const Lune& lune) {
@@ -121,11 +121,11 @@ class MirroredLines {
         const Vec3 l = lobes_[k].by.draw(u.x, u.y);
         return dot(lobes_[k].n, l) > 0 ? l : Vec3{};
     }
-    double density(Vec3 w) const {
+    double pdf(Vec3 w) const {
         double total = 0, before = 0;
         for (size_t k = 0; k < lobes_.size(); ++k) {
             const Vec3 l = dot(lobes_[k].n, w) > 0 ? w : -w;
-            total += (sum_[k] - before) * lobes_[k].by.density(l), before = sum_[k];
+            total += (sum_[k] - before) * lobes_[k].by.pdf(l), before = sum_[k];
         }
         return total / before;
     }

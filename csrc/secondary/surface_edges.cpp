@@ -7,12 +7,12 @@
 //
 //     δI = ∫ [Φ(F > 0) − Φ(F < 0)] δF / sin θ dℓ,   F(y) = n_B · (y − b),   δF = n_B · (Σ α_i δv_i − Σ β_i δw_i)
 //
-// with θ the angle between the planes, for |∇F| on A is its sine; and the same of B. A face that is cut out is there
-// where f > 0 (occluder.h): along its rim dℓ / |∇f| = |κ M| dt with M the cross product of the sides of the face, and
-// f is moved by texture coordinates and alpha alone.
+// with θ the angle between the planes, for |∇F| on A is its sine; and the same of B. A face that is alpha-tested is
+// there where f > 0 (occluder.h): along its alpha edge dℓ / |∇f| = |κ M| dt with M the cross product of the sides of
+// the face, and f is moved by texture coordinates and alpha alone.
 //
 // The camera sees some of these points, and for them there are curves in the image. Of Φ this is what goes on to other
-// surfaces: a direction is drawn by the cosine, what it meets gets light from a point that lies a little beside the
+// surfaces: a direction is drawn by the cosine, what it meets gets light from a point that lies a little next to the
 // curve, and from there light goes to the camera (light_tracing.h). Each side of a face counts, and each of its two
 // parts.
 
@@ -34,10 +34,10 @@ namespace edgegrad {
 namespace {
 
 constexpr int64_t fewest_places = 256, places_of_samples = 4;
-// How far beside the curve light is asked for, in lengths of its piece, and in roundings of the input.
+// How far next to the curve light is asked for, in lengths of its piece, and in roundings of the input.
 constexpr double little = 1e-5, roundings = 64;
 
-// One part of a face beside a place of a curve.
+// One part of a face next to a place of a curve.
 struct Part {
     int32_t face;
     int of;         // which of the faces that meet there
@@ -55,7 +55,7 @@ struct Place {
     Vec3 p;
     std::vector<Part> parts;
     std::vector<Row> rows;  // how F moves with vertices, of each face
-    Occluder rim;           // and f with the texture
+    Occluder alpha_edge;    // and f with the texture
 
     void append_motion(const Part& part, int64_t sample, CurveRecords& records) const {
         for (const Row& row : rows) {
@@ -63,7 +63,7 @@ struct Place {
             records.row_of.push_back(sample), records.vertex.push_back(row.vertex);
             append(records.by_q, {row.by.x, row.by.y, row.by.z});
         }
-        rim.append_rim(1, sample, records);
+        alpha_edge.append_alpha_edge(1, sample, records);
     }
 };
 
@@ -71,7 +71,7 @@ struct Place {
 template <class T>
 class BorderPieces {
    public:
-    BorderPieces(const BackwardView<T>& view, const SceneView<T>& casters, MovingBorders moving)
+    BorderPieces(const BackwardView<T>& view, const SceneView<T>& casters, MovingEdges moving)
         : view_(view), casters_(casters) {
         const uint64_t seed = view.options.seed;
         if (moving.crossings) {
@@ -79,12 +79,13 @@ class BorderPieces {
             if (found.are_drawn()) drawn_ = draw_all(found, hash(seed, 20, gradient_stream));
             crossings_ = found.are_drawn() ? &drawn_ : &found.all();
         }
-        if (moving.rims) rims_ = RimFinder<T>(casters).find(hash(seed, 13, gradient_stream), view.team);
+        if (moving.alpha_edges)
+            alpha_edges_ = AlphaEdgeFinder<T>(casters).find(hash(seed, 13, gradient_stream), view.team);
     }
 
     // How many samples each piece gets, relative to others.
     Array<double> measure() const {
-        const auto n = int64_t(crossings_->size() + rims_.size());
+        const auto n = int64_t(crossings_->size() + alpha_edges_.size());
         Array<double> out(n);
         for (int64_t k = 0; k < n; ++k) {
             const auto [a, b, stands_for] = piece(k);
@@ -95,9 +96,9 @@ class BorderPieces {
 
     // The place t of a piece. False where nothing ends.
     bool set(int64_t k, double t, Place& out) const {
-        out.parts.clear(), out.rim = {};
+        out.parts.clear(), out.alpha_edge = {};
         if (k < int64_t(crossings_->size())) return set_crossing((*crossings_)[k], t, out);
-        return set_rim(rims_[k - int64_t(crossings_->size())], t, out);
+        return set_alpha_edge(alpha_edges_[k - int64_t(crossings_->size())], t, out);
     }
 
     // Of a place in the plane of a face.
@@ -111,7 +112,7 @@ class BorderPieces {
         const Vec3 q = corner(view_.scene, face, 0);
         return cross(corner(view_.scene, face, 1) - q, corner(view_.scene, face, 2) - q);
     }
-    // How far beside it light is asked for.
+    // How far next to it light is asked for.
     double aside(int64_t k, int32_t face) const {
         double size = 0;
         for (int i = 0; i < 3; ++i) {
@@ -133,8 +134,8 @@ class BorderPieces {
             const Intersection& o = (*crossings_)[k];
             return {o.a, o.b, o.weight};
         }
-        const Rim& rim = rims_[k - int64_t(crossings_->size())];
-        return {place(rim.face, rim.begin), place(rim.face, rim.end), rim.share};
+        const AlphaEdge& alpha_edge = alpha_edges_[k - int64_t(crossings_->size())];
+        return {place(alpha_edge.face, alpha_edge.begin), place(alpha_edge.face, alpha_edge.end), alpha_edge.share};
     }
     Array<Intersection> draw_all(const Intersections& found, uint64_t seed) const {
         Array<float> share(view_.scene.n_faces);
@@ -169,14 +170,16 @@ class BorderPieces {
         }
         return true;
     }
-    bool set_rim(const Rim& rim, double t, Place& out) const {
-        RimPlace there{};
-        if (!RimFinder<T>(casters_).place(rim, t, there)) return false;
-        const Vec3 q = corner(view_.scene, rim.face, 0), e1 = corner(view_.scene, rim.face, 1) - q,
-                   e2 = corner(view_.scene, rim.face, 2) - q, M = cross(e1, e2);
+    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, Place& out) const {
+        AlphaEdgePoint there{};
+        if (!AlphaEdgeFinder<T>(casters_).place(alpha_edge, t, there)) return false;
+        const Vec3 q = corner(view_.scene, alpha_edge.face, 0), e1 = corner(view_.scene, alpha_edge.face, 1) - q,
+                   e2 = corner(view_.scene, alpha_edge.face, 2) - q, M = cross(e1, e2);
         const Vec3 gradient = there.slope.u * cross(e2, M) + there.slope.v * cross(M, e1);  // of f, times |M|²
-        out.p = place(rim.face, there.b), out.rows.clear(), out.rim = occluder_of(casters_, rim, there);
-        out.parts.push_back({rim.face, 0, unit(gradient), rim.share * std::fabs(there.kappa) * length(M)});
+        out.p = place(alpha_edge.face, there.b), out.rows.clear(),
+        out.alpha_edge = occluder_of(casters_, alpha_edge, there);
+        out.parts.push_back(
+            {alpha_edge.face, 0, unit(gradient), alpha_edge.share * std::fabs(there.kappa) * length(M)});
         return true;
     }
 
@@ -187,15 +190,15 @@ class BorderPieces {
     const Array<Intersection> none_{0};
     Array<Intersection> drawn_{0};
     const Array<Intersection>* crossings_ = &none_;
-    std::vector<Rim> rims_;
+    std::vector<AlphaEdge> alpha_edges_;
 };
 
-// Rays from both sides of all parts of faces beside a place, and what gets light along them.
+// Rays from both sides of all parts of faces next to a place, and what gets light along them.
 template <class T>
 class LeavingRays {
    public:
     LeavingRays(const LineLight<T>& light, const BorderPieces<T>& pieces) : light_(light), pieces_(pieces) {
-        for (const Lamp& lamp : light.lit.lit.lamps) eps_ = std::max(eps_, lamp.eps);
+        for (const Light& light : light.lit.lit.lights) eps_ = std::max(eps_, light.eps);
     }
 
     void add(int64_t piece, double t, Vec2 u, double weight, CurveRecords& records) {
@@ -245,10 +248,10 @@ class LeavingRays {
 }  // namespace
 
 template <class T>
-void add_surface_borders(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& lit,
-                         MovingBorders moving, int64_t samples, Destination& to, BounceSamples& out) {
+void add_surface_edges(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& lit,
+                       MovingEdges moving, int64_t samples, GradientSink& to, SecondaryEdgeSamples& out) {
     const int64_t all =
-        samples >= 0 ? samples : most_bounce_samples(view.camera.width, view.camera.height, view.image.spp);
+        samples >= 0 ? samples : most_secondary_edge_samples(view.camera.width, view.camera.height, view.image.spp);
     if (all == 0) return;
     const int64_t places = std::max(all / places_of_samples, fewest_places);
     const LineLight<T> light(view, casters, lit);
@@ -259,7 +262,7 @@ void add_surface_borders(const BackwardView<T>& view, const SceneView<T>& caster
     drawn.draw(places, to_unit(hash(view.options.seed, 21, gradient_stream)));
     double seconds[2] = {};
     const size_t before = to.records->curves.size();
-    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
         const ShiftedSequence sequence(hash(view.options.seed, 22, gradient_stream));
         LeavingRays rays(light, pieces);
         int64_t k = -1;
@@ -270,12 +273,12 @@ void add_surface_borders(const BackwardView<T>& view, const SceneView<T>& caster
             rays.add(k, t, sequence(uint64_t(i)), drawn.weight(k), grad.records.curves);
         }
     });
-    ask_senders(light, to.records->curves, before, 23, out);
+    light_reflectors(light, to.records->curves, before, 23, out);
 }
 
-template void add_surface_borders(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, MovingBorders,
-                                  int64_t, Destination&, BounceSamples&);
-template void add_surface_borders(const BackwardView<double>&, const SceneView<double>&, const LitPaths&, MovingBorders,
-                                  int64_t, Destination&, BounceSamples&);
+template void add_surface_edges(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, MovingEdges,
+                                int64_t, GradientSink&, SecondaryEdgeSamples&);
+template void add_surface_edges(const BackwardView<double>&, const SceneView<double>&, const LitPaths&, MovingEdges,
+                                int64_t, GradientSink&, SecondaryEdgeSamples&);
 
 }  // namespace edgegrad

@@ -1,4 +1,4 @@
-// What a face shows beside its radiance: alpha, values at its vertices or of all of it, barycentrics, texture
+// What a face shows besides its radiance: alpha, values at its vertices or of all of it, barycentrics, texture
 // coordinates. All are affine in the barycentrics b, but for a direction m that is given the length 1 after it is
 // interpolated: n = m / |m|, δn = (δm − n (n · δm)) / |m|.
 #pragma once
@@ -112,8 +112,8 @@ void shade_attributes_jvp(const SceneView<T>& scene, int64_t face, Barycentrics 
 
 // Adds cotangents of the values at the corners of a face, (3, attributes), to those of the arrays.
 template <class T>
-void add_attribute_rows(const SceneView<T>& scene, int64_t face, const double* rows, const Destination& to,
-                        ChunkGrad& grad) {
+void add_attribute_rows(const SceneView<T>& scene, int64_t face, const double* rows, const GradientSink& to,
+                        LocalGradients& grad) {
     const Attributes& a = scene.attributes;
     const int n = scene.channels - scene.radiance, of_face = a.alpha + a.vertex_width;
     if (to.vertex_attributes)

@@ -32,7 +32,7 @@ Texture<T> texture_of(const SceneView<T>& scene, int64_t face) {
 template <class T>
 bool takes_nearest(const SceneView<T>& scene, int64_t face) {
     return (is_textured(scene, face) && texture_of(scene, face).sampler.filter == TextureFilter::nearest) ||
-           (scene.cut_outs.on(face) && alpha_of(scene, face).sampler.filter == TextureFilter::nearest);
+           (scene.alpha_masks.on(face) && alpha_of(scene, face).sampler.filter == TextureFilter::nearest);
 }
 
 // How many channels there are, and how many of radiance. N: see core/channels.h.
@@ -122,7 +122,7 @@ struct CornerGrad {
         value.assign(3 * size_t(width), 0.0), attributes.assign(3 * size_t(scene.channels - scene.radiance), 0.0);
     }
     template <class T>
-    void add_to(const SceneView<T>& scene, int64_t face, const Destination& to, ChunkGrad& grad) const {
+    void add_to(const SceneView<T>& scene, int64_t face, const GradientSink& to, LocalGradients& grad) const {
         const bool textured = is_textured(scene, face);
         if (textured ? to.uvs : to.colors)
             for (int i = 0; i < 3; ++i)
@@ -134,7 +134,7 @@ struct CornerGrad {
 // Returns the cotangent of the barycentrics; adds those of the corners to `corners`, those of texels to `grad`.
 template <int N, class T>
 Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, const double* bar, bool want_texels,
-                       CornerGrad& corners, ChunkGrad& grad) {
+                       CornerGrad& corners, LocalGradients& grad) {
     const int C = radiance_of<N>(scene);
     const int32_t* row = scene.corners + 3 * face;
     Barycentrics b_bar;

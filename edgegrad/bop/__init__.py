@@ -1,6 +1,6 @@
-"""BOP, the benchmark for 6D object pose estimation: its data sets and results, its errors, and poses refined.
+"""BOP, the benchmark for 6D object pose estimation: data sets and result files, pose errors, and refined poses.
 
-Everything is as BOP has it: millimetres, poses from the mesh to the camera (+X right, +Y down, +Z forward), angles in degrees.
+All is as BOP defines it: millimetres, poses from the mesh to the camera (+X right, +Y down, +Z forward), angles in degrees.
 
 Hodaň et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV 2018; "BOP Challenge 2020 on 6D Object Localization", ECCVW
 2020; https://bop.felk.cvut.cz

@@ -1,10 +1,10 @@
-"""A data set in BOP's layout, read as it is asked for.
+"""Data sets in BOP's layout, whose files are read when they are asked for.
 
     DATASET/models/models_info.json, obj_000001.ply …           millimetres; diameter and symmetries
-    DATASET/models_eval/…                                       likewise, coarser: of these are errors measured
+    DATASET/models_eval/…                                       likewise, coarser: errors are measured on these
     DATASET/test_targets_bop19.json                             which objects are to be found where
     DATASET/SPLIT/000001/scene_camera.json                      K and the scale of depth, by image
-    DATASET/SPLIT/000001/scene_gt.json, scene_gt_info.json      poses, and how much is seen of each, by image
+    DATASET/SPLIT/000001/scene_gt.json, scene_gt_info.json      poses, and the visible share of each, by image
     DATASET/SPLIT/000001/rgb/000000.png (or gray/, .jpg, .tif), depth/000000.png, mask/000000_000000.png, mask_visib/…
 
 https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
@@ -23,12 +23,12 @@ from .model import Model
 
 TARGETS = "test_targets_bop19.json"
 INFO, EVALUATION = "models_info.json", "models_eval"
-LEAST_VISIBLE = 0.1  # BOP19's targets are objects of which so much is seen
-KEPT = 4  # scenes whose files stay in memory; each may have thousands of poses
+LEAST_VISIBLE = 0.1  # visible share of BOP19's targets
+KEPT_SCENES = 4  # whose files stay in memory; each may have thousands of poses
 
 
 class Target(NamedTuple):
-    """What is to be found: how many instances of an object in an image."""
+    """A number of instances of an object to find in an image."""
 
     scene_id: int
     im_id: int
@@ -37,14 +37,15 @@ class Target(NamedTuple):
 
 
 class Dataset:
-    """A data set in a folder. Nothing but names of folders is read before it is asked for.
+    """A data set in a folder.
 
-    folder  with models/ and one folder a split
-    split   its name, such as "test", "val" or "train_pbr"; when None "test", or the only one that begins with it, or the only one
-    models  the folder of meshes, such as "models_cad" or "models_reconst" of T-LESS; when None "models", or the only one but
+    folder  with models/ and one folder for each split
+    split   name, such as "test", "val" or "train_pbr"; None: "test", or the only one that begins with it, or the only one
+    models  folder of meshes, such as "models_cad" or "models_reconst" of T-LESS; None: "models", or the only one but
             "models_eval"
 
-    Raises FileNotFoundError or ValueError that names what is missing and lists what is there; so does what is asked for later.
+    Files are read when they are asked for. Raises FileNotFoundError or ValueError that names what is missing and lists what is
+    there.
     """
 
     def __init__(self, folder: PathLike, split: str | None = None, models: str | None = None) -> None:
@@ -57,7 +58,7 @@ class Dataset:
         self._models: dict[tuple[int, bool], Model] = {}
 
     def _chosen(self, split: str | None) -> str:
-        """The name of a split. Raises ValueError that lists them."""
+        """Return the name of a split. Raises ValueError that lists them."""
         names = sorted(path.name for path in self.folder.iterdir() if path.is_dir() and _scene_folders(path))
         if not names:
             raise ValueError(
@@ -84,7 +85,7 @@ class Dataset:
         return sorted(self._model_infos(self._models_folder(False)))
 
     def model(self, obj_id: int, evaluation: bool = False) -> Model:
-        """An object; with `evaluation` from models_eval/, if there is such a folder. Raises ValueError that lists the objects."""
+        """Return an object; with `evaluation` from models_eval/, if that exists. Raises ValueError that lists the objects."""
         if (obj_id, evaluation) not in self._models:
             folder = self._models_folder(evaluation)
             infos, path = self._model_infos(folder), folder / INFO
@@ -95,7 +96,7 @@ class Dataset:
         return self._models[obj_id, evaluation]
 
     def _models_folder(self, evaluation: bool) -> Path:
-        """Raises FileNotFoundError that lists what is there."""
+        """Return the folder of meshes. Raises FileNotFoundError that lists what is there."""
         if evaluation and (self.folder / EVALUATION).is_dir():
             return self.folder / EVALUATION
         names = sorted(path.parent.name for path in self.folder.glob(f"*/{INFO}"))
@@ -120,11 +121,11 @@ class Dataset:
         return sorted(self._paths)
 
     def images(self, scene_id: int) -> list[int]:
-        """Ids of a scene's images. Raises ValueError."""
+        """Return the ids of a scene's images. Raises ValueError."""
         return sorted(self._scene(scene_id).cameras)
 
     def frame(self, scene_id: int, im_id: int) -> Frame:
-        """Raises ValueError that lists the scenes, or the images."""
+        """Return an image. Raises ValueError that lists the scenes, or the images."""
         return Frame(self._scene(scene_id), im_id)
 
     def _scene(self, scene_id: int) -> SceneFiles:
@@ -134,25 +135,25 @@ class Dataset:
             )
         scene = self._scenes.pop(scene_id, None) or SceneFiles(self._paths[scene_id])
         self._scenes[scene_id] = scene  # the last one used stands last
-        while len(self._scenes) > KEPT:
+        while len(self._scenes) > KEPT_SCENES:
             del self._scenes[next(iter(self._scenes))]
         return scene
 
-    # -- what is to be found ------------------------------------------------------------------------------------------------
+    # -- targets ------------------------------------------------------------------------------------------------------------
 
     def targets(self, file: str = TARGETS) -> list[Target]:
-        """Those of a file beside the splits, which is about test splits; without it, or of another split, all instances of which
-        at least 10 % are seen, as BOP19 chose them. Raises FileNotFoundError or ValueError."""
+        """Return the targets of a file in the data set's folder, which lists those of test splits.
+
+        Without the file, or for another split, these are all instances of which at least 10 % are visible, as BOP19 chose them.
+        Raises FileNotFoundError or ValueError.
+        """
         path = self.folder / file
         if path.exists() and (file != TARGETS or self.split.startswith("test")):
-            entries = read_json(path, list)
-            found = []
-            for i, entry in enumerate(entries):
-                ids = [
-                    int(numbers(f"{path}, entry {i}", entry, key))
-                    for key in ("scene_id", "im_id", "obj_id", "inst_count")
-                ]
-                found.append(Target(*ids))
+            keys = "scene_id", "im_id", "obj_id", "inst_count"
+            found = [
+                Target(*(int(numbers(f"{path}, entry {i}", entry, key)) for key in keys))
+                for i, entry in enumerate(read_json(path, list))
+            ]
             return [target for target in found if target.scene_id in self._paths]
         if file != TARGETS:
             raise FileNotFoundError(f"{path}: expected a list of targets, got no such file; leave out its name")

@@ -1,4 +1,4 @@
-"""Depth images of a mesh in a pose, by one ray through the centre of each pixel."""
+"""Depth images of a mesh in a pose, with one ray through the centre of each pixel."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from ..camera.camera import Camera
 from ..points.rays import trace
 from ..scene.mesh import Mesh
 
-BESIDE = 2  # pixels around the box of the projected vertices
+MARGIN = 2  # pixels around the box of the projected vertices
 
 
 def depth_image(mesh: Mesh, pose: Tensor, camera: Camera) -> Tensor:
-    """(H, W) float64: depth along the optical axis at the centres of the pixels, in units of the mesh; 0 where it is not seen.
+    """Return the depth (H, W) float64 along the optical axis at the pixels' centres, in units of the mesh, 0 where it is not
+    seen.
 
     pose    (4, 4) rigid, mesh to camera
-    camera  a pinhole at the origin, as Frame.camera
+    camera  pinhole camera at the origin, as Frame.camera
     """
     H, W = camera.size
     depth = torch.zeros(H, W, dtype=torch.float64)
@@ -24,7 +25,7 @@ def depth_image(mesh: Mesh, pose: Tensor, camera: Camera) -> Tensor:
     left, top, right, bottom = 0, 0, W, H
     if float(verts[:, 2].min()) > 0.0:
         xy = camera.project(verts)
-        low, high = xy.amin(0).floor() - BESIDE, xy.amax(0).ceil() + BESIDE
+        low, high = xy.amin(0).floor() - MARGIN, xy.amax(0).ceil() + MARGIN
         left, top = (max(0, int(value)) for value in low.clamp(max=2**30))
         right, bottom = (min(size, int(value)) for value, size in zip(high.clamp(min=0), (W, H), strict=True))
     if left >= right or top >= bottom:
@@ -33,13 +34,13 @@ def depth_image(mesh: Mesh, pose: Tensor, camera: Camera) -> Tensor:
     moved = mesh.detach().to("cpu").replace(verts=verts)
     hits = trace(moved, directions.new_zeros(3), directions)
     part = torch.zeros(len(directions), dtype=torch.float64)
-    part[hits.ray] = hits.depth.double()  # in lengths of the direction, whose Z is 1
+    part[hits.ray] = hits.depth.double()  # in multiples of the direction, whose Z is 1
     depth[top:bottom, left:right] = part.reshape(bottom - top, right - left)
     return depth
 
 
 def pixel_rays(camera: Camera) -> Tensor:
-    """(H, W, 3) float64: directions through the centres of the pixels, in camera coordinates, with Z = 1. Of a pinhole."""
+    """Return directions (H, W, 3) float64 through the pixels' centres in camera coordinates, with Z = 1, of a pinhole camera."""
     H, W = camera.size
     y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
     pixels = torch.stack([x, y, torch.ones_like(x)], -1).double()

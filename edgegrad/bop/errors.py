@@ -1,4 +1,4 @@
-"""Errors of a pose: ADD, ADI, MSSD, MSPD and VSD.
+"""Pose errors: ADD, ADI, MSSD, MSPD and VSD.
 
 Poses are (4, 4) from the mesh to the camera, points (N, 3) vertices of the mesh, all in float64 and millimetres (or any one
 unit).
@@ -21,26 +21,26 @@ from ..camera.camera import Camera
 from ..optional import require
 from .depth import pixel_rays
 
-FEW = 256  # points for bounds
+BOUND_POINTS = 256  # for lower bounds
 
 
 def add(estimate: Tensor, truth: Tensor, points: Tensor) -> float:
-    """Average distance of points, of objects without symmetries: the mean over the points of |E x − T x|."""
+    """Return the average distance of points, for objects without symmetries: the mean over the points of |E x − T x|."""
     return float((_moved(estimate, points) - _moved(truth, points)).norm(dim=-1).mean())
 
 
 def adi(estimate: Tensor, truth: Tensor, points: Tensor) -> float:
-    """Average distance to the nearest point, of objects with symmetries: the mean over x of the least |E y − T x|. Raises
-    ImportError without SciPy."""
+    """Return the average distance to the nearest point, for objects with symmetries: the mean over x of the least |E y − T x|.
+    Raises ImportError without SciPy."""
     spatial: Any = require("scipy.spatial", "edgegrad[fit]", "ADI")
     tree = spatial.cKDTree(_moved(estimate, points).numpy())
     return float(tree.query(_moved(truth, points).numpy())[0].mean())
 
 
 def mssd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor) -> float:
-    """Maximum symmetry-aware surface distance: the least over the symmetries S of the largest |E x − T S x|.
+    """Return the maximum symmetry-aware surface distance: the least over symmetries S of the largest |E x − T S x|.
 
-    symmetries  (T, 4, 4), the identity among them, as Symmetries.transforms() gives them
+    symmetries  (T, 4, 4) with the identity, as Symmetries.transforms() returns them
     """
 
     def apart(some: Tensor, x: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ def mssd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor) ->
 
 
 def mspd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor, camera: Camera) -> float:
-    """Maximum symmetry-aware projection distance, in pixels: as mssd, between the points' places in the image."""
+    """Return the maximum symmetry-aware projection distance in pixels: as mssd, of the points' projections."""
 
     def apart(some: Tensor, x: Tensor) -> Tensor:
         return (camera.project(_moved(estimate, x)) - camera.project(_moved(truth @ some, x))).norm(dim=-1)
@@ -61,15 +61,17 @@ def mspd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor, ca
 def vsd(
     estimate: Tensor, truth: Tensor, measured: Tensor, camera: Camera, diameter: float, taus: Sequence[float], delta: float = 15.0
 ) -> list[float]:  # fmt: skip
-    """Visible surface discrepancy, 0 … 1, one for each tau: of the pixels in which the object is seen in either pose, the share
-    where it is not seen in both, or the distances differ by tau diameters or more. Symmetries need no mention: only what is seen
-    counts.
+    """Return the visible surface discrepancy, 0 … 1, for each tau.
 
-    estimate, truth  (H, W) depth images of the object in the two poses, as depth_image makes them
-    measured         (H, W) the scene's; 0 where the sensor measured nothing: there the object counts as seen, as in BOP19
-    delta            mm: where the object is at most so much behind what was measured, it is seen
+    Of the pixels in which the object is visible in either pose, it is the share in which it is not visible in both, or the
+    distances differ by tau diameters or more. Symmetries need no mention, for only what is visible counts.
+
+    estimate, truth  (H, W) depth images of the object in the two poses, by depth_image()
+    measured         (H, W) depth image of the scene; 0 where the sensor measured nothing: the object counts as visible there,
+                     as in BOP19
+    delta            mm; the object is visible where it is at most so far behind the measured depth
     """
-    length = pixel_rays(camera).norm(dim=-1)  # distances from the eye, not depths, are compared
+    length = pixel_rays(camera).norm(dim=-1)  # distances from the eye are compared, not depths
     mine, theirs, scene = (depth.double() * length for depth in (estimate, truth, measured))
     unknown = scene == 0
     seen_truly = (theirs > 0) & ((theirs - scene <= delta) | unknown)
@@ -84,16 +86,15 @@ def vsd(
 
 
 def _moved(pose: Tensor, points: Tensor) -> Tensor:
-    """(…, N, 3) of poses (…, 4, 4)."""
+    """Return points (…, N, 3) moved by poses (…, 4, 4)."""
     return points @ pose[..., :3, :3].mT + pose[..., None, :3, 3]
 
 
 def _least_largest(apart: Callable[[Tensor, Tensor], Tensor], symmetries: Tensor, points: Tensor) -> float:
-    """The least over the symmetries (T, 4, 4) of the largest of the distances (T, N) that `apart` gives for points (N, 3).
-
-    The largest of a few points is a lower bound. Symmetries are looked at with all points in the order of their bounds, until the
-    bound of the next is above the least that was found: exact, and of hundreds of symmetries a few are left."""
-    few = points[:: max(1, len(points) // FEW)]
+    """Return the least over symmetries (T, 4, 4) of the largest distance (T, N) that `apart` returns for points (N, 3). The
+    largest distance of a few points is a lower bound. Symmetries are tried with all points in the order of their bounds,
+    until the next bound exceeds the least distance found. This is exact and tries few of hundreds of symmetries."""
+    few = points[:: max(1, len(points) // BOUND_POINTS)]
     bounds, order = apart(symmetries, few).amax(-1).sort()
     best = math.inf
     for bound, i in zip(bounds.tolist(), order.tolist(), strict=True):

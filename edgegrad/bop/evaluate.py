@@ -1,11 +1,11 @@
-"""Results against the poses that are known: the errors of each estimate, and the recalls of BOP19.
+"""Evaluation of estimates against known poses: the errors of each estimate, and the recalls of BOP19.
 
-For each target, n instances of an object in an image, the n estimates with the highest scores count, and the n instances of
-which most is seen. In the order of their scores, estimates take of the instances that are left the one with the lowest error, if
-that is below a threshold; the recall is the share of all instances that are taken. AR_VSD is the mean over ten misalignments tau,
-5 … 50 % of the diameter, and ten thresholds 0.05 … 0.5; AR_MSSD that over thresholds 5 … 50 % of the diameter; AR_MSPD that over
-5 … 50 pixels of an image 640 pixels wide; AR the mean of the three. ADD(-S) is the recall below 10 % of the diameter, by ADI
-where the object has symmetries.
+For each target, n instances of an object in an image, the n estimates with the highest scores count, and the n most visible
+instances. In the order of their scores, each estimate takes the remaining instance with the lowest error, if that is below a
+threshold. The recall is the share of instances that are taken. AR_VSD is the mean over ten misalignments tau, 5 … 50 % of the
+diameter, and ten thresholds 0.05 … 0.5; AR_MSSD over thresholds 5 … 50 % of the diameter; AR_MSPD over 5 … 50 pixels of an
+image 640 pixels wide; AR the mean of the three. ADD(-S) is the recall below 10 % of the diameter, by ADI if the object has
+symmetries.
 
 Hodaň et al., "BOP Challenge 2020 on 6D Object Localization", ECCVW 2020
 """
@@ -33,57 +33,57 @@ from .frame import Frame, Truth
 from .model import Model
 from .results import Estimate
 
-STEP = 0.01  # of continuous symmetries, as bop_toolkit's max_sym_disc_step
+SYMMETRY_STEP = 0.01  # of continuous symmetries: bop_toolkit's max_sym_disc_step
 TENTHS = [0.05 * k for k in range(1, 11)]  # of VSD's tau and threshold, and of MSSD's in diameters
 PIXELS = [5.0 * k for k in range(1, 11)]  # of MSPD's threshold
-WIDTH = 640.0  # of the image that these pixels are of
+WIDTH = 640.0  # of the image for these pixels
 ADD_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class PairErrors:
-    """Of an estimate to an instance. mm, but for mspd (pixels), degrees and vsd (0 … 1)."""
+    """The errors of an estimate for an instance, in mm; mspd in pixels, vsd 0 … 1."""
 
     mssd: float
     mspd: float
     add: float
     adi: float
     degrees: float  # of the rotation, up to symmetry
-    distance: float  # of the translation, with the symmetry that makes the rotation's error least
-    vsd: tuple[float, ...] = ()  # one for each tau, 5 … 50 % of the diameter; empty where it was left out
+    distance: float  # of the translation, with the symmetry that minimizes the rotation's error
+    vsd: tuple[float, ...] = ()  # one for each tau, 5 … 50 % of the diameter; empty without VSD
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """An estimate that counts, and the instance that it is nearest to by MSSD."""
+    """An estimate that counts, and the instance nearest to it by MSSD."""
 
     estimate: Estimate
-    truth: Truth | None  # None where the image has no such object
+    truth: Truth | None  # None if the image has no such object
     errors: PairErrors | None
 
 
 @dataclass(frozen=True)
 class Recalls:
-    """Of an object or of all; 0 … 1."""
+    """The recalls, 0 … 1, of one object or of all."""
 
     instances: int  # to be found
     estimates: int  # that count
-    ar_vsd: float | None  # None where it was left out
+    ar_vsd: float | None  # None without VSD
     ar_mssd: float
     ar_mspd: float
     add_s: float
-    degrees: float  # median errors of the estimates; nan where there are none
+    degrees: float  # median errors of the estimates; nan if there are none
     distance: float
 
     @property
     def ar(self) -> float | None:
-        """The mean of the three."""
+        """The mean of the three average recalls."""
         return None if self.ar_vsd is None else (self.ar_vsd + self.ar_mssd + self.ar_mspd) / 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What evaluate found."""
+    """The result of evaluate()."""
 
     overall: Recalls
     objects: dict[int, Recalls]  # by id
@@ -91,19 +91,20 @@ class Evaluation:
     ignored: int = 0  # estimates that belong to no target, or exceed its count
 
     def table(self) -> str:
-        """As text: a line for each object, and one for all."""
+        """Return a table as text, with a line for each object and one for all."""
         lines = ["object  instances  found  AR_VSD  AR_MSSD  AR_MSPD      AR  ADD(-S)  median °  median mm"]
-        for name, of in [*((str(key), value) for key, value in self.objects.items()), ("all", self.overall)]:
-            numbers = (of.ar_vsd, of.ar_mssd, of.ar_mspd, of.ar, of.add_s)
+        for name, row in [*((str(key), value) for key, value in self.objects.items()), ("all", self.overall)]:
+            numbers = (row.ar_vsd, row.ar_mssd, row.ar_mspd, row.ar, row.add_s)
             shares = ["-" if number is None else f"{number:.3f}" for number in numbers]
-            medians = ["-" if math.isnan(number) else f"{number:.2f}" for number in (of.degrees, of.distance)]
+            medians = ["-" if math.isnan(number) else f"{number:.2f}" for number in (row.degrees, row.distance)]
             widths = (6, 7, 7, 6, 7, 8, 9)
             cells = "  ".join(f"{text:>{width}}" for text, width in zip([*shares, *medians], widths, strict=True))
-            lines.append(f"{name:>6}  {of.instances:>9}  {of.estimates:>5}  {cells}")
+            lines.append(f"{name:>6}  {row.instances:>9}  {row.estimates:>5}  {cells}")
         return "\n".join(lines)
 
     def to_json(self) -> str:
-        """Recalls, by BOP's names, of all and of each object; and each estimate's errors, in mm, pixels and degrees."""
+        """Return JSON with recalls, by BOP's names, of all and of each object, and each estimate's errors in mm, pixels and
+        degrees."""
         rows = [
             {
                 "scene_id": row.estimate.scene_id, "im_id": row.estimate.im_id, "obj_id": row.estimate.obj_id,
@@ -126,9 +127,9 @@ def evaluate(
     delta: float = 15.0,
     progress: bool = True,
 ) -> Evaluation:
-    """Errors and recalls of estimates.
+    """Compute errors and recalls of estimates.
 
-    targets   what is to be found; when None, dataset.targets()
+    targets   what is to be found; None: dataset.targets()
     with_vsd  False leaves out VSD, which needs depth images and takes most of the time
     delta     of VSD, in mm: BOP19 takes 15, and 5 for ITODD
     progress  show a bar on standard error
@@ -163,20 +164,20 @@ def evaluate(
 
 
 class _Found(NamedTuple):
-    """Of a target."""
+    """The estimates and matches of a target."""
 
     instances: int
     rows: list[Row]
-    matches: dict[str, np.ndarray]  # how many instances are taken, by threshold; nothing where none can be
+    matches: dict[str, np.ndarray]  # counts of taken instances by threshold; empty if none can be taken
 
 
 def _errors(
     frame: Frame, model: Model, estimates: list[Estimate], truths: list[Truth], delta: float | None
 ) -> list[list[PairErrors]]:
-    """A row for each estimate."""
+    """Return a row of errors for each estimate."""
     if not estimates or not truths:
         return [[] for _ in estimates]
-    camera, points, symmetries = frame.camera, model.points, model.symmetries.transforms(STEP)
+    camera, points, symmetries = frame.camera, model.points, model.symmetries.transforms(SYMMETRY_STEP)
     measured = None if delta is None else frame.depth()
     views: dict[Tensor, Tensor] = {}
     if measured is not None:
@@ -202,7 +203,7 @@ def _row(estimate: Estimate, truths: list[Truth], errors: list[PairErrors]) -> R
 
 
 def _matches(errors: list[list[PairErrors]], model: Model, width: int) -> dict[str, np.ndarray]:
-    """How many instances are taken: by VSD (10, 10) by tau and threshold, MSSD (10,), MSPD (10,), ADD(-S) ()."""
+    """Count the instances taken: by VSD (10, 10) by tau and threshold, MSSD (10,), MSPD (10,), ADD(-S) (1,)."""
 
     def taken(error: Callable[[PairErrors], float], thresholds: Sequence[float]) -> np.ndarray:
         table = np.array([[error(pair) for pair in row] for row in errors])
@@ -220,8 +221,8 @@ def _matches(errors: list[list[PairErrors]], model: Model, width: int) -> dict[s
 
 
 def matched(errors: np.ndarray, threshold: float) -> int:
-    """How many of the instances (columns) the estimates take, rows in the order of their scores: each the one with the lowest
-    error of those that are left, if below the threshold."""
+    """Count the instances (columns) that estimates take, as rows in the order of their scores: each takes the one with the
+    lowest error of those left, if below the threshold."""
     left = errors.astype(np.float64).copy()
     count = 0
     for row in left:
@@ -249,14 +250,14 @@ def _recalls(found: list[_Found], with_vsd: bool) -> Recalls:
 
 
 def _finite(errors: dict[str, Any]) -> dict[str, Any]:
-    """null, for JSON has no infinity, which the projection of a point beside the eye may reach."""
+    """Replace infinity, which JSON does not have, by None. The projection of a point close to the eye may reach it."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in errors.items()
     }
 
 
 def _named(recalls: Recalls) -> dict[str, Any]:
-    """By the names of bop_toolkit's scores_bop19.json, and others beside them."""
+    """Return recalls by the names of bop_toolkit's scores_bop19.json, and further numbers."""
     return {
         "bop19_average_recall_vsd": recalls.ar_vsd, "bop19_average_recall_mssd": recalls.ar_mssd,
         "bop19_average_recall_mspd": recalls.ar_mspd, "bop19_average_recall": recalls.ar, "add_s_recall": recalls.add_s,

@@ -1,4 +1,4 @@
-"""An image of a scene: its camera, the poses of what it shows, and its files."""
+"""An image of a scene: its camera, the poses in it, and its files."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from ..files.paths import StoredPath
 from .json_files import by_number, listed, numbers, read_json, rigid
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-ROUNDED = 1e-2  # how far R Rᵀ may be from 1 in files
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
     """An instance of an object in an image, as scene_gt.json has it."""
 
-    index: int  # its place in the image's list, by which masks are named
+    index: int  # position in the image's list, by which masks are named
     obj_id: int
     pose: Tensor  # (4, 4) float64, mesh to camera, mm
-    visible: float | None  # the share of its silhouette that is seen, 0 … 1; None without scene_gt_info.json
+    visible: float | None  # visible share of the silhouette, 0 … 1; None without scene_gt_info.json
 
 
 class Frame:
-    """An image of a scene: what is known of it, and its files, read when they are asked for.
+    """An image of a scene, whose files are read when they are asked for.
 
-    scene_id, im_id; truths: the instances in it, in the order of scene_gt.json
+    scene_id, im_id  numbers of scene and image
+    truths           the instances in it, in the order of scene_gt.json
     """
 
     def __init__(self, scene: SceneFiles, im_id: int) -> None:
@@ -45,35 +45,36 @@ class Frame:
 
     @property
     def K(self) -> Tensor:
-        """(3, 3) float64 as the file has it: the centre of the first pixel at (0, 0)."""
+        """K (3, 3) float64 as the file has it: the centre of the first pixel is at (0, 0)."""
         return numbers(self._where, self._camera, "cam_K", 3, 3)
 
     @cached_property
     def camera(self) -> Camera:
-        """At the origin, looking along +Z, in float64: poses are from the mesh to it. Its size is that of the picture."""
+        """The camera at the origin, looking along +Z, in float64, for poses from the mesh to it. It has the picture's size."""
         one = torch.eye(3, dtype=torch.float64)
         return Camera.from_opencv(one, one.new_zeros(3), self.K, read_size(self.picture_path))
 
     @cached_property
     def truths(self) -> list[Truth]:
-        """Raises FileNotFoundError where the split has no public poses."""
+        """The instances in the image. Raises FileNotFoundError if the split has no public poses."""
         return self._scene.truths(self.im_id)
 
     def truths_of(self, obj_id: int) -> list[Truth]:
-        """Of one object."""
+        """Return the instances of one object."""
         return [truth for truth in self.truths if truth.obj_id == obj_id]
 
     @property
     def picture_path(self) -> Path:
-        """Of the colour image, or else the grey one, or else the depth image. Raises FileNotFoundError."""
+        """The path of the colour image, or else of the grey one, or else of the depth image. Raises FileNotFoundError."""
         return self._file(("rgb", "gray", "depth"), f"{self.im_id:06d}")
 
     def picture(self) -> Tensor:
-        """(H, W, 3) linear radiance, also of a grey image. Raises FileNotFoundError, or what read_image raises."""
+        """Return (H, W, 3) linear radiance, also of a grey image. Raises FileNotFoundError, or what read_image raises."""
         return read_image(self._file(("rgb", "gray"), f"{self.im_id:06d}"), channels=3)
 
     def depth(self) -> Tensor:
-        """(H, W) float64 along the optical axis, mm; 0 where the sensor measured none. Raises FileNotFoundError or ValueError."""
+        """Return (H, W) float64 along the optical axis in mm, 0 where nothing was measured. Raises FileNotFoundError or
+        ValueError."""
         path = self._file(("depth",), f"{self.im_id:06d}")
         color, _, largest = read_stored(path)
         if largest is None or color.shape[-1] != 1:
@@ -82,18 +83,18 @@ class Frame:
         return (color[..., 0].double() * largest).round() * scale
 
     def mask(self, index: int) -> Tensor:
-        """(H, W), 1 on the silhouette of truths[index], also where something covers it. Raises FileNotFoundError."""
+        """Return (H, W), 1 on the silhouette of truths[index], also where it is covered. Raises FileNotFoundError."""
         return read_mask(self._file(("mask",), f"{self.im_id:06d}_{index:06d}"))
 
     def mask_visible(self, index: int) -> Tensor:
-        """(H, W), 1 where truths[index] is seen. Raises FileNotFoundError."""
+        """Return (H, W), 1 where truths[index] is visible. Raises FileNotFoundError."""
         return read_mask(self._file(("mask_visib",), f"{self.im_id:06d}_{index:06d}"))
 
     def _file(self, folders: tuple[str, ...], name: str) -> Path:
         for folder in folders:
             for suffix in PICTURES:
                 if (path := self._scene.folder / folder / (name + suffix)).is_file():
-                    return StoredPath(path)  # K and poses speak of these pixels
+                    return StoredPath(path)  # K and poses refer to stored pixels
         raise FileNotFoundError(
             f"{self._scene.folder}: expected {name}.png (or .jpg, .tif) in {' or '.join(folders)}, got no such file; "
             "download the images of this split"
@@ -143,5 +144,5 @@ class SceneFiles:
                 at = f"{self.folder / 'scene_gt_info.json'}, image {im_id}, entry {i}"
                 visible = float(numbers(at, info[i], "visib_fract"))
             obj_id = int(numbers(where, entry, "obj_id"))
-            found.append(Truth(i, obj_id, rigid(f"{where}, cam_R_m2c", R, t, ROUNDED), visible))
+            found.append(Truth(i, obj_id, rigid(f"{where}, cam_R_m2c", R, t), visible))
         return found

@@ -1,4 +1,4 @@
-"""BOP's JSON files: objects by numbers, and what is wrong with them."""
+"""BOP's JSON files: objects with numbers as keys, and errors that say what is wrong with them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from torch import Tensor
 
 from ..files.paths import check_readable
 
-SHOWN = 20  # ids in a message
+LISTED = 20  # ids in a message
+ROUNDING = 1e-2  # largest deviation of R Rᵀ from 1 in files
 
 
 def read_json(path: Path, kind: type) -> Any:
-    """An object or a list. Raises FileNotFoundError or ValueError that names the file."""
+    """Read an object or a list. Raises FileNotFoundError or ValueError that names the file."""
     file = check_readable(path, (".json",))
     try:
         found = json.loads(file.read_bytes())
@@ -29,7 +30,7 @@ def read_json(path: Path, kind: type) -> Any:
 
 
 def by_number(path: Path, found: dict[str, Any]) -> dict[int, Any]:
-    """With keys that are whole numbers. Raises ValueError."""
+    """Return the object with its keys as whole numbers. Raises ValueError."""
     for key in found:
         if not key.isdecimal():
             raise ValueError(f"{path}: expected ids as keys, got {key!r}; is it another file of BOP's?")
@@ -37,7 +38,7 @@ def by_number(path: Path, found: dict[str, Any]) -> dict[int, Any]:
 
 
 def numbers(where: str, entry: Any, key: str, *shape: int) -> Tensor:
-    """Those under a key, by rows, float64. Raises ValueError."""
+    """Return the numbers under a key as float64 of that shape. Raises ValueError."""
     if not isinstance(entry, dict) or key not in entry:
         got = ", ".join(entry) or "none" if isinstance(entry, dict) else type(entry).__name__
         raise ValueError(f"{where}: expected the key {key!r}, got {got}; add it")
@@ -51,10 +52,10 @@ def numbers(where: str, entry: Any, key: str, *shape: int) -> Tensor:
     return value.reshape(shape)
 
 
-def rigid(where: str, R: Tensor, t: Tensor, most: float) -> Tensor:
-    """(4, 4) of (3, 3) and (3,). Raises ValueError where R Rᵀ is further than `most` from 1, or R is a mirror image."""
+def rigid(where: str, R: Tensor, t: Tensor) -> Tensor:
+    """Return (4, 4) from a file's R (3, 3) and t (3,). Raises ValueError if R is no rotation up to rounding."""
     off = float((R @ R.T - torch.eye(3)).abs().max())
-    if off > most or float(torch.linalg.det(R)) < 0.0:
+    if off > ROUNDING or float(torch.linalg.det(R)) < 0.0:
         raise ValueError(f"{where}: expected a rotation matrix by rows, got |R Rᵀ − 1| up to {off:.2g} and determinant "
                          f"{float(torch.linalg.det(R)):.3g}")  # fmt: skip
     pose = torch.eye(4, dtype=torch.float64)
@@ -63,6 +64,6 @@ def rigid(where: str, R: Tensor, t: Tensor, most: float) -> Tensor:
 
 
 def listed(ids: Collection[int]) -> str:
-    """Ids in a message; of many the first."""
-    first = sorted(ids)[:SHOWN]
-    return (", ".join(map(str, first)) or "none") + (f" … ({len(ids)} in all)" if len(ids) > SHOWN else "")
+    """Return ids as text for a message; the first of many."""
+    first = sorted(ids)[:LISTED]
+    return (", ".join(map(str, first)) or "none") + (f" … ({len(ids)} in all)" if len(ids) > LISTED else "")

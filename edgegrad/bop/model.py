@@ -1,4 +1,4 @@
-"""An object of a data set."""
+"""The objects of a data set."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..files.formats.part import Wanted, naming
+from ..files.formats.part import LoadOptions, errors_with_path
 from ..files.load import load_mesh
-from ..files.parts import read_model
+from ..files.parts import read_mesh_file
 from ..scene.mesh import Mesh
 from ..scene.symmetries import Symmetries
 from .json_files import numbers
@@ -20,7 +20,10 @@ from .json_files import numbers
 class Model:
     """An object: its mesh in millimetres, its diameter and its symmetries.
 
-    obj_id; path of its PLY; diameter in mm, the largest distance between two vertices; symmetries
+    obj_id      its number
+    path        of its PLY file
+    diameter    mm, the largest distance between two vertices
+    symmetries  of the object
     """
 
     def __init__(self, obj_id: int, path: Path, info: dict[str, Any], where: str) -> None:
@@ -33,15 +36,15 @@ class Model:
 
     @cached_property
     def mesh(self) -> Mesh:
-        """With its colours or texture, as radiance. Read once. Raises what load_mesh raises."""
+        """The mesh with its colours or texture as radiance, read once. Raises what load_mesh raises."""
         return load_mesh(self.path)
 
     @cached_property
     def points(self) -> Tensor:
-        """(N, 3) float64, mm: the vertices as the file has them, also where it repeats one, for means over them. Raises what
-        load_mesh raises."""
-        with naming(self.path):
-            model = read_model(self.path, Wanted(materials=False))
+        """The vertices (N, 3) float64 in mm as the file has them, with repetitions, for means over them. Raises what load_mesh
+        raises."""
+        with errors_with_path(self.path):
+            model = read_mesh_file(self.path, LoadOptions(materials=False))
         return torch.cat([torch.from_numpy(part.verts).double() for part in model.parts])
 
     def __repr__(self) -> str:

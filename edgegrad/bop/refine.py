@@ -1,4 +1,4 @@
-"""An estimate made better by fit_pose, from the colour image alone."""
+"""Refine an estimate by fit_pose, from the colour image alone."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from ..fit.pose.result import PoseFit
 from .dataset import Dataset
 from .results import Estimate
 
-SMALLEST = 16  # pixels of the crop on its longer side
+MIN_CROP = 16  # pixels of the crop on its longer side
 
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """What became of an estimate."""
+    """The result of refine()."""
 
-    estimate: Estimate  # with the pose found; with its own where `kept` is True. Its time is that of before
-    fit: PoseFit | None  # None where none could be made
-    kept: bool  # whether the pose stayed as it was
-    why: str  # in words
-    degrees: float  # by which the pose was turned
-    distance: float  # mm by which the mesh's origin was moved
+    estimate: Estimate  # with the pose found, or its own if `kept`; the time is that of the given one
+    fit: PoseFit | None  # None if none could be made
+    kept: bool  # whether the pose is the given one
+    why: str  # the fit's reason, or why there is none
+    degrees: float  # rotation between both poses
+    distance: float  # mm between the mesh's origins in both
     seconds: float
 
 
@@ -46,16 +46,16 @@ def refine(
     progress: bool = False,
     callback: Callable[[PoseFit], None] | None = None,
 ) -> Refined:
-    """Fits the object's mesh, with its colours, to the image around where the estimate has it.
+    """Fit the object's mesh, with its colours, to the image around the estimate.
 
-    margin       how much of the image around the object is looked at, in sizes of its box in the image
-    size         most pixels on the longer side of that part: a larger one is reduced
-    steps, seed, progress, callback  as of fit_pose
-    unconverged  take the pose also of a fit that did not converge; else the estimate's own is kept
+    margin       part of the image around the object that is used, in sizes of the object's box in the image
+    size         largest number of pixels on the longer side of that part; a larger one is reduced
+    steps, seed, progress, callback  as in fit_pose
+    unconverged  take the pose also of a fit that did not converge; False: keep the estimate's own
 
-    Of the poses that symmetries make the same, the one nearest to the estimate's comes out. A fit that cannot be made, since the
-    object is not in the image, say, keeps the pose and says why. Raises FileNotFoundError or ValueError that names what the data
-    set lacks.
+    Of the poses that symmetries make equal, the one nearest to the estimate's is returned. If no fit can be made, since the
+    object is outside the image, say, the pose is kept with the reason. Raises FileNotFoundError or ValueError that names what
+    the data set lacks.
     """
     check_positive("margin", margin, least=0.0, most=100.0)
     for name, value in (("size", size), ("steps", steps)):
@@ -93,7 +93,7 @@ def refine(
 
 
 def _box(verts: Tensor, pose: Tensor, camera: Camera, margin: float) -> tuple[int, int, int, int] | None:
-    """Top, left, height and width of the part of the image around the object; None where it is not in it."""
+    """Return top, left, height and width of the part of the image around the object; None if it is outside."""
     q = verts @ pose[:3, :3].T + pose[:3, 3]
     if float(q[:, 2].min()) <= 0.0:
         return None
@@ -103,15 +103,15 @@ def _box(verts: Tensor, pose: Tensor, camera: Camera, margin: float) -> tuple[in
     limit = low.new_tensor([W, H])
     if bool((high <= 0).any() or (low >= limit).any()):
         return None
-    beside = margin * float((high - low).max()) + 0.5 * SMALLEST
+    border = margin * float((high - low).max()) + 0.5 * MIN_CROP
     (left, top), (right, bottom) = (
-        (low - beside).floor().clamp(min=0).int().tolist(), (high + beside).ceil().minimum(limit).int().tolist(),
+        (low - border).floor().clamp(min=0).int().tolist(), (high + border).ceil().minimum(limit).int().tolist(),
     )  # fmt: skip
     return top, left, bottom - top, right - left
 
 
 def _orthonormal(pose: Tensor) -> Tensor:
-    """With the rotation that is nearest to what a file rounded."""
+    """Replace a rounded rotation by the nearest rotation matrix."""
     U, _, Vh = torch.linalg.svd(pose[:3, :3])
     found = pose.clone()
     found[:3, :3] = U @ Vh

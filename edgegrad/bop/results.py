@@ -1,7 +1,7 @@
 """BOP's result files: CSV with a header and the columns scene_id, im_id, obj_id, score, R, t, time.
 
-R has 9 numbers by rows and t 3 in mm, parted by spaces; time is that of all estimates of an image together, in seconds, -1 where
-it is not known. https://bop.felk.cvut.cz/challenges/bop-challenge-2019/#formatofresults
+R has 9 numbers by rows and t 3 in mm, separated by spaces. time is that of all estimates of an image together, in seconds, or
+−1 if it is unknown. https://bop.felk.cvut.cz/challenges/bop-challenge-2019/#formatofresults
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from ..files.paths import PathLike, check_readable, check_suffix, replacing
 from .json_files import rigid
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
-ROUNDED = 1e-2  # how far R Rᵀ may be from 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +29,11 @@ class Estimate:
     obj_id: int
     score: float
     pose: Tensor  # (4, 4) float64, mesh to camera, mm
-    seconds: float = -1.0  # that all estimates of the image took; -1: not known
+    seconds: float = -1.0  # of all estimates of the image together; −1: unknown
 
 
 def read_results(path: PathLike) -> list[Estimate]:
-    """In the order of the file. Raises FileNotFoundError, or ValueError that names file, line and column."""
+    """Return the rows in the order of the file. Raises FileNotFoundError, or ValueError that names file, line and column."""
     file = check_readable(path, (".csv",))
     found = []
     with file.open(newline="", encoding="utf-8-sig") as stream:
@@ -53,12 +52,13 @@ def read_results(path: PathLike) -> list[Estimate]:
             R = torch.tensor(_floats(where, "R", row["R"], 9), dtype=torch.float64).reshape(3, 3)
             t = torch.tensor(_floats(where, "t", row["t"], 3), dtype=torch.float64)
             (score,), (seconds,) = _floats(where, "score", row["score"], 1), _floats(where, "time", row["time"], 1)
-            found.append(Estimate(ids[0], ids[1], ids[2], score, rigid(f"{where}, R", R, t, ROUNDED), seconds))
+            found.append(Estimate(ids[0], ids[1], ids[2], score, rigid(f"{where}, R", R, t), seconds))
     return found
 
 
 def write_results(path: PathLike, estimates: Iterable[Estimate]) -> None:
-    """As read_results reads them, to the last bit; the file appears whole or not at all. Raises ValueError or OSError."""
+    """Write rows as read_results reads them, to the last bit; the file is written whole or not at all. Raises ValueError or
+    OSError."""
     file = check_suffix(path, (".csv",))
     with replacing(file) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")

@@ -1,4 +1,4 @@
-"""A data set in BOP's layout, rendered: for tests of methods, or to learn from."""
+"""Write a rendered data set in BOP's layout, to test methods or to learn from."""
 
 from __future__ import annotations
 
@@ -16,26 +16,27 @@ from torch import Tensor
 from ..camera.camera import Camera
 from ..check import check_int
 from ..files.image import srgb_to_linear, write_image
-from ..files.paths import PathLike, replacing
+from ..files.paths import PathLike, replacing, write_json
 from ..files.save import save_mesh
 from ..optional import require
 from ..render import render
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..scene.symmetries import Symmetries
-from .dataset import TARGETS
+from .dataset import LEAST_VISIBLE, TARGETS
 from .depth import depth_image
 
-DEPTH_SCALE = 0.1  # mm a step of the depth images: up to 6.5 m
+DEPTH_SCALE = 0.1  # mm per level of the depth images, which reach 6.5 m
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """An image to be made.
+    """An image to write.
 
-    camera   a pinhole at the origin, as Camera.from_opencv makes it of the identity, zeros and K
-    objects  (obj_id, pose) of each instance, the pose (4, 4) from the mesh to the camera, in mm
-    picture  (H, W, C) linear radiance; when None the meshes are rendered with their colours, before `background`
+    camera      pinhole camera at the origin, as Camera.from_opencv makes it of the identity, zeros and K
+    objects     (obj_id, pose) of each instance; the pose (4, 4) is from the mesh to the camera, in mm
+    picture     (H, W, C) linear radiance; None: the meshes are rendered with their colours
+    background  radiance behind rendered meshes: one number, or a background of Scene
     """
 
     camera: Camera
@@ -47,8 +48,8 @@ class Shot:
 def write_models(
     folder: PathLike, meshes: Mapping[int, Mesh], symmetries: Mapping[int, Symmetries] | None = None
 ) -> None:
-    """models/obj_000001.ply … and models_info.json with boxes, diameters and symmetries, of meshes in mm by their ids. Missing
-    folders are made. Raises TypeError, ValueError, OSError, or ImportError without SciPy."""
+    """Write models/obj_000001.ply … and models_info.json with boxes, diameters and symmetries, for meshes in mm by their ids.
+    Missing folders are made. Raises TypeError, ValueError, OSError, or ImportError without SciPy."""
     info = {}
     for obj_id, mesh in meshes.items():
         check_int("obj_id", obj_id, 0, 999_999)
@@ -59,16 +60,18 @@ def write_models(
         box |= {f"size_{axis}": b - a for axis, a, b in zip("xyz", low, high, strict=True)}
         own = (symmetries or {}).get(obj_id, Symmetries())
         info[str(obj_id)] = {"diameter": _diameter(points.numpy()), **box, **own.to_bop()}
-    _write_json(Path(folder) / "models" / "models_info.json", info)
+    write_json(Path(folder) / "models" / "models_info.json", info, indent=1)
 
 
 def write_scene(
     folder: PathLike, scene_id: int, shots: Sequence[Shot], meshes: Mapping[int, Mesh], split: str = "test", spp: int = 64
 ) -> None:  # fmt: skip
-    """SPLIT/000001/ with rgb/, depth/, mask/, mask_visib/, scene_camera.json, scene_gt.json and scene_gt_info.json of images
-    numbered from 0. Of a test split also the scene's targets (instances of which at least 10 % are seen), in
-    test_targets_bop19.json, in place of those that this scene has there. Masks and depth are those at the centres of the pixels.
-    Raises TypeError, ValueError or OSError."""
+    """Write SPLIT/000001/ with rgb/, depth/, mask/, mask_visib/, scene_camera.json, scene_gt.json and scene_gt_info.json.
+
+    Images are numbered from 0; masks and depth are those at the pixels' centres. In a test split, test_targets_bop19.json gets
+    the scene's targets, the instances that are visible by 10 % or more, in place of earlier ones of this scene. Raises
+    TypeError, ValueError or OSError.
+    """
     check_int("scene_id", scene_id, 0, 999_999)
     base = Path(folder) / split / f"{scene_id:06d}"
     cameras: dict[str, Any] = {}
@@ -105,7 +108,7 @@ def write_scene(
             )  # fmt: skip
             for kind, area in (("mask", mask), ("mask_visib", visible)):
                 write_image(base / kind / f"{im_id:06d}_{i:06d}.png", srgb_to_linear(area.float()))
-            if share >= 0.1:
+            if share >= LEAST_VISIBLE:
                 seen[obj_id] = seen.get(obj_id, 0) + 1
         targets += [
             {"scene_id": scene_id, "im_id": im_id, "obj_id": o, "inst_count": n} for o, n in sorted(seen.items())
@@ -114,12 +117,12 @@ def write_scene(
         write_image(base / "rgb" / f"{im_id:06d}.png", picture)
         _write_depth(base / "depth" / f"{im_id:06d}.png", torch.where(torch.isfinite(nearest), nearest, 0.0))
     for name, content in (("scene_camera", cameras), ("scene_gt", poses), ("scene_gt_info", infos)):
-        _write_json(base / f"{name}.json", content)
+        write_json(base / f"{name}.json", content, indent=1)
     if not split.startswith("test"):
         return
     file = Path(folder) / TARGETS
     others = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
-    _write_json(file, [one for one in others if one["scene_id"] != scene_id] + targets)
+    write_json(file, [one for one in others if one["scene_id"] != scene_id] + targets, indent=1)
 
 
 def _rendered(shot: Shot, meshes: Mapping[int, Mesh], spp: int) -> Tensor:
@@ -134,7 +137,7 @@ def _rendered(shot: Shot, meshes: Mapping[int, Mesh], spp: int) -> Tensor:
 
 
 def _diameter(points: np.ndarray) -> float:
-    """The largest distance between two points: corners of their convex hull."""
+    """Return the largest distance between two points, which are corners of their convex hull."""
     spatial: Any = require("scipy.spatial", "edgegrad[fit]", "diameters")
     with suppress(spatial.QhullError):  # flat, or fewer than four
         points = points[spatial.ConvexHull(points).vertices]
@@ -142,7 +145,7 @@ def _diameter(points: np.ndarray) -> float:
 
 
 def _box(area: Tensor) -> list[int]:
-    """x, y, width and height."""
+    """Return x, y, width and height."""
     if not bool(area.any()):
         return [-1, -1, -1, -1]
     rows, columns = area.any(1).nonzero()[:, 0], area.any(0).nonzero()[:, 0]
@@ -151,7 +154,7 @@ def _box(area: Tensor) -> list[int]:
 
 
 def _write_depth(path: Path, depth: Tensor) -> None:
-    """16 bits in one channel."""
+    """Write 16 bits in one channel."""
     oiio: Any = require("OpenImageIO", "OpenImageIO", "writing images")
     steps = (depth / DEPTH_SCALE).round()
     if float(steps.max()) > 65535:
@@ -164,8 +167,3 @@ def _write_depth(path: Path, depth: Tensor) -> None:
         image.set_pixels(oiio.ROI(), values)
         if not image.write(str(temporary)):
             raise OSError(f"{path}: expected to write it, got: {image.geterror()}")
-
-
-def _write_json(path: Path, content: Any) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -1,1 +1,1 @@
-"""Where a point lands in the image: cameras, their lenses, and how other libraries describe them."""
+"""Projection of points into the image: cameras, their lenses, and the conventions of other libraries."""

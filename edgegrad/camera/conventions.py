@@ -1,7 +1,7 @@
 """Cameras as other libraries describe them.
 
-What differs is which way the axes of a camera point, where pixel centres lie, on which side of a matrix a vector stands, and in
-which units focal lengths are. Here: +X right, +Y down, +Z forward; centres at +0.5; `q = R p + t`; pixels.
+They differ in the directions of a camera's axes, the place of pixel centres, the side of a matrix on which a vector stands, and
+the unit of focal lengths. Here: +X right, +Y down, +Z forward; centres at +0.5; `q = R p + t`; pixels.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_finite, check_float, check_shape, values_visible
+from ..check import as_real, as_tensor, check_finite, check_float, check_shape, values_visible
 from .fields import CameraFields, CameraT
 from .poses import (  # fmt: skip
     Vector,
@@ -23,7 +23,7 @@ from .poses import (  # fmt: skip
     rotation,
 )
 
-# Of COLMAP (src/colmap/sensor/models.h): projection, number of focal lengths, number of coefficients after the principal point.
+# COLMAP's models (src/colmap/sensor/models.h) by projection and numbers of focal lengths and of further coefficients.
 COLMAP_MODELS = {
     "SIMPLE_PINHOLE": ("perspective", 1, 0),
     "PINHOLE": ("perspective", 2, 0),
@@ -44,16 +44,24 @@ MIRRORED = (
 
 
 class Conventions(CameraFields):
-    """What Camera has of them."""
+    """Constructors of Camera from other libraries' conventions."""
 
     @classmethod
     def from_opencv(
         cls: type[CameraT], R: Vector, t: Vector, K: Vector, size: tuple[int, int], distortion: Vector | None = None
     ) -> CameraT:
-        """From OpenCV's extrinsics: R (3, 3), or a rotation vector (3,) in radians, and t (3,) with `q = R p + t`, K (3, 3) in
-        pixels, and, of a lens that distorts, k1, k2, p1, p2[, k3[, k4, k5, k6]], as cv2.calibrateCamera returns them.
+        """Return a camera from OpenCV's extrinsics and intrinsics, as cv2.calibrateCamera returns them.
 
         OpenCV puts the centre of the first pixel at 0, edgegrad at 0.5: K's principal point is shifted by half a pixel.
+
+        Parameters
+        ----------
+        R : (3, 3), or a rotation vector (3,) in radians
+        t : (3,)
+            With `q = R p + t`.
+        K : (3, 3) in pixels
+        size : (H, W)
+        distortion : k1, k2, p1, p2[, k3[, k4, k5, k6]]
         """
         return _from_opencv(cls, R, t, K, size, "perspective", distortion)
 
@@ -61,8 +69,8 @@ class Conventions(CameraFields):
     def fisheye(
         cls: type[CameraT], R: Vector, t: Vector, K: Vector, size: tuple[int, int], distortion: Vector | None = None
     ) -> CameraT:
-        """A fisheye from OpenCV's R (3, 3) or (3,), t (3,), K (3, 3) in pixels and k1, k2, k3, k4, as cv2.fisheye.calibrate
-        returns them; see from_opencv. It may show more than a half space, up to 180° from the axis."""
+        """Return a fisheye from OpenCV's R (3, 3) or (3,), t (3,), K (3, 3) in pixels and k1, k2, k3, k4, as
+        cv2.fisheye.calibrate returns them. It may show more than a half space, up to 180° from the axis. See from_opencv."""
         return _from_opencv(cls, R, t, K, size, "fisheye", distortion)
 
     @classmethod
@@ -74,14 +82,20 @@ class Conventions(CameraFields):
         K: Vector | None = None,
         fov_x: float | Tensor | None = None,
     ) -> CameraT:
-        """From OpenGL's or Blender's poses: camera_to_world (4, 4) or (B, 4, 4), +X right, +Y up, looking along −Z.
+        """Return a camera from a pose of OpenGL or Blender.
 
-        Give fov_y or fov_x (degrees, square pixels, centred), or K (3, 3) or (B, 3, 3) in pixels with pixel centres at +0.5.
         Raises TypeError or ValueError.
+
+        Parameters
+        ----------
+        camera_to_world : (4, 4) or (B, 4, 4)
+            +X right, +Y up, looking along −Z.
+        size : (H, W)
+        fov_y, fov_x : float, degrees
+            Full field of view of square pixels, centred. Give one of these or K.
+        K : (3, 3) or (B, 3, 3) in pixels, pixel centres at +0.5
         """
-        pose = as_tensor("camera_to_world", camera_to_world, floating=True)
-        check_float("camera_to_world", pose)
-        check_shape("camera_to_world", pose, (4, 4), ("B", 4, 4))
+        pose = as_real("camera_to_world", camera_to_world, (4, 4), ("B", 4, 4))
         given = [name for name, value in (("fov_y", fov_y), ("fov_x", fov_x), ("K", K)) if value is not None]
         if len(given) != 1:
             raise TypeError(
@@ -106,19 +120,23 @@ class Conventions(CameraFields):
         principal_point: Vector = (0.0, 0.0),
         in_ndc: bool = True,
     ) -> CameraT:
-        """From PyTorch3D's PerspectiveCameras: points are rows, `p R + T`, +X left, +Y up, +Z forward.
-
-        R                (3, 3) or (N, 3, 3), T (3,) or (N, 3), as its cameras hold them
-        size             (H, W)
-        focal_length     a number, (2,), (N,) or (N, 2): of x and y. In normalised coordinates, where the shorter side of the
-                         image is from −1 to 1; with in_ndc=False in pixels. Of FoVPerspectiveCameras it is 1 / tan(fov / 2)
-        principal_point  (2,) or (N, 2), likewise; in normalised coordinates x runs to the left and y up
+        """Return a camera from PyTorch3D's PerspectiveCameras: points are rows, `p R + T`, +X left, +Y up, +Z forward.
 
         Raises TypeError or ValueError.
+
+        Parameters
+        ----------
+        R, T : (3, 3) or (N, 3, 3), and (3,) or (N, 3)
+            As its cameras hold them.
+        size : (H, W)
+        focal_length : float, (2,), (N,) or (N, 2), default 1
+            Of x and y. In normalised coordinates, where the shorter side of the image is from −1 to 1; with in_ndc=False in
+            pixels. Of FoVPerspectiveCameras it is 1 / tan(fov / 2).
+        principal_point : (2,) or (N, 2), default zeros
+            Likewise; in normalised coordinates x runs to the left and y up.
+        in_ndc : bool, default True
         """
-        rotation = as_tensor("R", R, floating=True)
-        check_float("R", rotation)
-        check_shape("R", rotation, (3, 3), ("N", 3, 3))
+        rotation = as_real("R", R, (3, 3), ("N", 3, 3))
         check_rotation("R", rotation)
         shift = as_tensor("T", T, like=rotation)
         check_shape("T", shift, rotation.shape[:-1])
@@ -143,22 +161,24 @@ class Conventions(CameraFields):
     def from_colmap(
         cls: type[CameraT], rotation: Vector, translation: Vector, model: str, params: Vector, size: tuple[int, int]
     ) -> CameraT:
-        """From COLMAP: an image's pose and its camera.
+        """Return a camera from an image's pose and its camera in COLMAP; load_cameras() reads whole reconstructions.
 
-        rotation     (4,) quaternion w, x, y, z, as in images.txt, or (3, 3): world to camera, +X right, +Y down, +Z forward
-        translation  (3,)
-        model        SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, SIMPLE_FISHEYE, FISHEYE,
-                     SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE or OPENCV_FISHEYE
-        params       its parameters, in COLMAP's order; pixel centres at +0.5, as here
-        size         (H, W)
+        Raises TypeError or ValueError.
 
-        load_cameras() reads whole reconstructions. Raises TypeError or ValueError.
+        Parameters
+        ----------
+        rotation : (4,) quaternion w, x, y, z, as in images.txt, or (3, 3)
+            World to camera, +X right, +Y down, +Z forward.
+        translation : (3,)
+        model : str
+            SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, SIMPLE_FISHEYE, FISHEYE, SIMPLE_RADIAL_FISHEYE,
+            RADIAL_FISHEYE or OPENCV_FISHEYE.
+        params : (n,)
+            Its parameters, in COLMAP's order; pixel centres at +0.5, as here.
+        size : (H, W)
         """
-        pose = as_tensor("rotation", rotation, floating=True)
-        check_float("rotation", pose)
-        check_shape("rotation", pose, (4,), (3, 3))
+        pose = as_real("rotation", rotation, (4,), (3, 3))
         if pose.dim() == 1:
-            check_finite("rotation", pose)
             if values_visible(pose) and not bool(pose.detach().any()):
                 raise ValueError(
                     "rotation: expected a quaternion w, x, y, z, got zeros; take (1, 0, 0, 0) for no rotation"
@@ -186,18 +206,21 @@ class Conventions(CameraFields):
     def from_projection(
         cls: type[CameraT], projection: Vector, size: tuple[int, int], view: Vector | None = None
     ) -> CameraT:
-        """From OpenGL's matrices: `clip = projection · view · p`, with x/w to the right and y/w up, from −1 to 1 over the image.
+        """Return a camera from OpenGL's matrices: `clip = projection · view · p`, with x/w to the right and y/w up, from −1 to
+        1 over the image.
 
-        projection  (4, 4)   to clip space, as glFrustum, glm or nvdiffrast's examples make it; or already times the view
-        size        (H, W)   of the image, whose first row here is the upper one: that of nvdiffrast is `image.flip(0)`
-        view        (4, 4)   world to view, +X right, +Y up, looking along −Z; the identity when None
+        It is perspective or orthographic; how depth is mapped does not matter. Differentiable. Raises TypeError or ValueError.
 
-        Perspective or orthographic; how depth is mapped does not matter. Differentiable. Raises TypeError or ValueError.
+        Parameters
+        ----------
+        projection : (4, 4)
+            To clip space, as glFrustum, glm or nvdiffrast's examples make it; or already times the view.
+        size : (H, W)
+            Of the image, whose first row here is the upper one: that of nvdiffrast is `image.flip(0)`.
+        view : (4, 4), default the identity
+            World to view, +X right, +Y up, looking along −Z.
         """
-        matrix = as_tensor("projection", projection, floating=True)
-        check_float("projection", matrix)
-        check_shape("projection", matrix, (4, 4))
-        check_finite("projection", matrix)
+        matrix = as_real("projection", projection, (4, 4))
         eye, ahead = matrix.new_zeros(3), matrix[2, :3]
         if view is not None:
             to_view = as_tensor("view", view, like=matrix).to(matrix)
@@ -260,8 +283,8 @@ def _from_opencv(
 
 
 def _triangular(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """K (3, 3), R (3, 3) and b (3,) with rows (3, 4) = [K R | b], the last of K (0, 0, 1): Gram and Schmidt's orthogonalisation
-    from the last row up. Raises ValueError."""
+    """Return K (3, 3), R (3, 3) and b (3,) with rows (3, 4) = [K R | b], the last of K (0, 0, 1). Gram and Schmidt's
+    orthogonalisation goes from the last row up. Raises ValueError."""
     A, b = rows[:, :3], rows[:, 3]
     forward = A[2]
     center = (A[:2] * forward).sum(-1)
@@ -280,7 +303,7 @@ def _triangular(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _rotation_of(quaternion: Tensor) -> Tensor:
-    """(3, 3) of a quaternion (4,) w, x, y, z of any length but zero."""
+    """Return the matrix (3, 3) of a quaternion (4,) w, x, y, z of any length but zero."""
     w, x, y, z = torch.nn.functional.normalize(quaternion, dim=0).unbind()
     rows = (
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

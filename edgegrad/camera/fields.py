@@ -1,4 +1,4 @@
-"""The fields of a camera, and what they must be."""
+"""The fields of a camera, and their checks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..check import LARGEST, as_tensor, check_finite, check_float, check_shape, values_visible
-from .lens import COUNTS, TURNS
+from .lens import COEFFICIENT_COUNTS, MOST_TURNS
 from .poses import check_last_row, check_rotation, image_size
 
 CameraT = TypeVar("CameraT", bound="CameraFields")
@@ -18,7 +18,7 @@ CameraT = TypeVar("CameraT", bound="CameraFields")
 
 @dataclass(frozen=True, eq=False)
 class CameraFields:
-    """What Camera has, and its constructors make; see there."""
+    """Fields that Camera has and its constructors make; see there."""
 
     world_to_camera: Tensor
     K: Tensor
@@ -40,8 +40,10 @@ class CameraFields:
                 "give one K (3, 3) for all or as many as cameras"
             )
         object.__setattr__(self, "size", image_size(self.size))
-        if self.projection not in COUNTS:
-            raise ValueError(f"projection: expected one of {', '.join(map(repr, COUNTS))}, got {self.projection!r}")
+        if self.projection not in COEFFICIENT_COUNTS:
+            raise ValueError(
+                f"projection: expected one of {', '.join(map(repr, COEFFICIENT_COUNTS))}, got {self.projection!r}"
+            )
         if self.distortion is not None:
             distortion = as_tensor("distortion", self.distortion, like=self.K)
             if self.projection == "perspective" and distortion.dim() > 0:
@@ -51,7 +53,7 @@ class CameraFields:
         self._check_values()
 
     def _check_distortion(self, distortion: Tensor) -> None:
-        counts = COUNTS[self.projection]
+        counts = COEFFICIENT_COUNTS[self.projection]
         if not counts:
             article = "an" if self.projection == "orthographic" else "a"
             raise ValueError(
@@ -87,23 +89,24 @@ class CameraFields:
             self._check_turns()
 
     def _check_turns(self) -> None:
-        """What the kernel draws of a panorama, it draws once for each turn."""
+        """Check how often a panorama reaches around, because the kernel draws it once for each turn."""
         H, W = self.size
         K = self.K.detach().double().reshape(-1, 3, 3)
         around = [[x, y] for x in (-1.0, W + 1.0) for y in (-1.0, H + 1.0)]
         corners = torch.tensor(around, dtype=K.dtype, device=K.device)
         angles = torch.linalg.solve(K[:, None, :2, :2], (corners - K[:, None, :2, 2])[..., None])
         turns = float(angles.abs().max()) / math.tau
-        if not turns <= TURNS:
+        if not turns <= MOST_TURNS:
             raise ValueError(
-                f"K: expected a panorama that reaches no more than {TURNS} turns from its axis, got {turns:.4g}; "
+                f"K: expected a panorama that reaches no more than {MOST_TURNS} turns from its axis, got {turns:.4g}; "
                 "K is in pixels a radian: width / 2π for all around, height / π from pole to pole"
             )
 
 
 def _without_zeros(distortion: Tensor) -> Tensor:
-    """The first eight of OpenCV's 12 or 14 coefficients, where the others are zero. Raises ValueError where they are not."""
-    count, most = distortion.shape[-1], max(COUNTS["perspective"])
+    """Return the first eight of OpenCV's 12 or 14 coefficients, where the others are zero. Raises ValueError where they are
+    not."""
+    count, most = distortion.shape[-1], max(COEFFICIENT_COUNTS["perspective"])
     if count not in (12, 14):
         return distortion
     if not values_visible(distortion):

@@ -1,5 +1,5 @@
-"""What lenses do to the image of a pinhole: they bend normalised image coordinates n = (X/Z, Y/Z) to m, and K takes m to pixels;
-and where a panorama sees a point.
+"""Distortion by lenses of normalised image coordinates n = (X/Z, Y/Z) to m, which K takes to pixels; and where a panorama sees
+a point.
 
 The kernel has the same maps (csrc/camera/brown_conrady.h, fisheye.h, wide_fisheye.h, equirectangular.h).
 """
@@ -9,31 +9,34 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-COUNTS = {
+COEFFICIENT_COUNTS = {
     "perspective": (4, 5, 8),
     "fisheye": (4,),
     "panorama": (),
     "orthographic": (),
 }  # of coefficients, by projection
-MOST = 8  # what the kernel takes
-TURNS = 4  # how often a panorama may reach around, either way
+MOST_COEFFICIENTS = 8  # what the kernel takes
+MOST_TURNS = 4  # how often a panorama may reach around, either way
 
 
-def bend(projection: str, q: Tensor, distortion: Tensor) -> Tensor:
-    """m (…, 2) of q (…, 3), in camera coordinates, with the coefficients (4,), (5,) or (8,) in OpenCV's order."""
+def distort(projection: str, q: Tensor, distortion: Tensor) -> Tensor:
+    """Return m (…, 2) of q (…, 3), in camera coordinates, with the coefficients (4,), (5,) or (8,) in OpenCV's order."""
     return _fisheye(q, distortion) if projection == "fisheye" else _brown_conrady(q[..., :2] / q[..., 2:], distortion)
 
 
 def longitude_latitude(q: Tensor) -> Tensor:
-    """(…, 2) radians of q (…, 3), in camera coordinates: to the right in (−π, π], and downwards. Neither has a derivative on
-    the vertical axis."""
+    """Return radians (…, 2) of q (…, 3) in camera coordinates: to the right in (−π, π], and downwards. Neither has a derivative
+    on the vertical axis."""
     x, y, z = q.unbind(-1)
     return torch.stack([torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))], -1)
 
 
 def _brown_conrady(n: Tensor, distortion: Tensor) -> Tensor:
-    """Brown 1966 and Conrady 1919, with OpenCV's rational radial part: coefficients k1, k2, p1, p2, k3, k4, k5, k6."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = torch.nn.functional.pad(distortion, (0, MOST - len(distortion))).unbind()
+    """Distort by Brown 1966 and Conrady 1919, with OpenCV's rational radial part: coefficients k1, k2, p1, p2, k3, k4, k5,
+    k6."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = torch.nn.functional.pad(
+        distortion, (0, MOST_COEFFICIENTS - len(distortion))
+    ).unbind()
     x, y = n.unbind(-1)
     s = x * x + y * y
     g = (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
@@ -43,8 +46,8 @@ def _brown_conrady(n: Tensor, distortion: Tensor) -> Tensor:
 
 
 def _fisheye(q: Tensor, distortion: Tensor) -> Tensor:
-    """OpenCV's fisheye (Kannala and Brandt 2006): coefficients k1, k2, k3, k4 of the angle to the axis. Also behind the camera,
-    where OpenCV gives what is mirrored in the eye; not a number on the axis there."""
+    """Distort by OpenCV's fisheye (Kannala and Brandt 2006): coefficients k1, k2, k3, k4 of the angle to the axis. It also
+    serves behind the camera, where OpenCV mirrors points in the eye; on the axis there it is not a number."""
     across, z = q[..., :2], q[..., 2:]
     s = (across * across).sum(-1, keepdim=True)
     on_axis = s == 0

@@ -1,4 +1,4 @@
-"""Matrices of cameras: checked, and built from what users say."""
+"""Matrices of cameras: checked, and built from what users give."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def image_size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def constant(values: Sequence[Any], like: Tensor) -> Tensor:
-    """Numbers as a tensor of this kind and in this place. like.new_tensor() fails under torch.func in torch 2.4."""
+    """Return numbers as a tensor of this kind and in this place. like.new_tensor() fails under torch.func in torch 2.4."""
     return torch.tensor(values, dtype=like.dtype, device=like.device)
 
 
 def check_last_row(name: str, matrix: Tensor, expected: list[float], fix: str = "is it transposed?") -> None:
-    """`matrix` (…, n, n) is finite and ends with the row `expected`. Raises ValueError."""
+    """Check that `matrix` (…, n, n) is finite and ends with the row `expected`. Raises ValueError."""
     check_finite(name, matrix)
     if not values_visible(matrix):
         return
@@ -40,14 +40,15 @@ def check_last_row(name: str, matrix: Tensor, expected: list[float], fix: str = 
 
 
 def rotation(vector: Tensor) -> Tensor:
-    """(3, 3) by a rotation vector (3,), radians, differentiable: the exponential of its cross-product matrix."""
+    """Return the rotation (3, 3) by a rotation vector (3,), radians, differentiable: the exponential of its cross-product
+    matrix."""
     x, y, z = vector.unbind()
     o = torch.zeros_like(x)
     return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o]).reshape(3, 3))
 
 
 def check_rotation(name: str, matrix: Tensor) -> None:
-    """`matrix` (…, 3, 3) is a rotation. Raises ValueError."""
+    """Check that `matrix` (…, 3, 3) is a rotation. Raises ValueError."""
     check_finite(name, matrix)
     if not values_visible(matrix):
         return
@@ -77,13 +78,13 @@ def _vector(name: str, value: Vector, like: Tensor | None = None) -> Tensor:
 
 
 def _direction(vector: Tensor) -> Tensor:
-    """A vector (3,) that is not zero, at length one. Scaled first, so that squares neither overflow nor vanish."""
+    """Return a vector (3,) that is not zero, at length one. It is scaled first, so that squares neither overflow nor vanish."""
     vector = vector / vector.detach().abs().max()
     return vector / vector.norm()
 
 
 def rigid(R: Tensor, t: Tensor) -> Tensor:
-    """(…, 4, 4) from R (…, 3, 3) and t (…, 3)."""
+    """Return (…, 4, 4) of R (…, 3, 3) and t (…, 3)."""
     last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=R.dtype, device=R.device).expand(*R.shape[:-2], 1, 4)
     return torch.cat([torch.cat([R, t.to(R)[..., None]], -1), last], -2)
 
@@ -97,7 +98,7 @@ def looking_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
     like = _widest(given) if given else None
     vectors = _vector("eye", eye, like), _vector("target", target, like), _vector("up", up, like)
     like = _widest(vectors) if like is None else like
-    # In double: in float32, distances of 1e±30 have no square, and a distant eye would round the directions.
+    # In float32, distances of 1e±30 have no square, and a distant eye would round the directions.
     e, g, u = (v.to(like).double() for v in vectors)
     if values_visible(e, g, u):
         if torch.equal(e, g):
@@ -114,7 +115,7 @@ def looking_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
 
 
 def intrinsics(fx: Tensor, fy: Tensor, cx: Tensor | float, cy: Tensor | float) -> Tensor:
-    """K (…, 3, 3) from tensors (…)."""
+    """Return K (…, 3, 3) of tensors (…)."""
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     rows = [fx, zero, cx * one], [zero, fy, cy * one], [zero, zero, one]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
@@ -123,7 +124,7 @@ def intrinsics(fx: Tensor, fy: Tensor, cx: Tensor | float, cy: Tensor | float) -
 def intrinsics_of_view(
     fov_y: float | Tensor | None, fov_x: float | Tensor | None, size: tuple[int, int], like: Tensor
 ) -> Tensor:
-    """K (3, 3) of square pixels, centred, from the one full field of view in degrees that is given; differentiable."""
+    """Return K (3, 3) of square pixels, centred, from the one full field of view in degrees that is given; differentiable."""
     H, W = size
     name, fov, pixels = ("fov_y", fov_y, H) if fov_x is None else ("fov_x", fov_x, W)
     degrees = as_scalar(name, fov, like=like)

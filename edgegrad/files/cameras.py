@@ -1,4 +1,4 @@
-"""Cameras in files: this library's, and those of others."""
+"""Cameras in files: this library's JSON, glTF, COLMAP, NeRF's transforms.json, and calibrations."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 from ..camera.camera import Camera
-from ..check import check_positive_int
+from ..check import check_dtype, check_positive_int
 from .formats import calibration, colmap, transforms
-from .formats.part import Fault, naming
-from .formats.source import Unsupported
+from .formats.context import UnreadLog
+from .formats.part import FormatError, errors_with_path
 from .formats.views import View, matched
 from .parts import GLTFS, read_cameras
 from .paths import PathLike, check_readable, check_suffix, replacing
@@ -24,11 +24,9 @@ ALONE = 1e-4  # units by which float32 may move the eyes of cameras that have no
 
 
 def save_camera(path: PathLike, camera: Camera) -> None:
-    """Writes a camera, or a batch, as JSON: world_to_camera, K (rows, in pixels), size [H, W], projection, and
-    distortion if it has any.
-
-    Missing folders are made. Raises ValueError (a name that does not end in .json), TypeError or OSError.
-    """
+    """Write a camera, or a batch, as JSON. The keys are world_to_camera, K (rows, in pixels), size [H, W], projection and, of a
+    lens that distorts, distortion. Missing folders are made. Raises ValueError for a name that does not end in .json, TypeError
+    or OSError."""
     file = check_suffix(path, (".json",))
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
@@ -47,39 +45,45 @@ def save_camera(path: PathLike, camera: Camera) -> None:
 def load_camera(
     path: PathLike, dtype: torch.dtype | None = None, size: tuple[int, int] | None = None, index: int = 0
 ) -> Camera:
-    """A camera as save_camera writes it; "projection" may be left out (perspective), and "distortion" (none). Or one of a glTF or
-    GLB file, where it stands in the scene.
+    """Return a camera that save_camera() wrote, or one of a glTF or GLB file in its place in the scene.
 
-    dtype  as in load_cameras
-    size   (H, W) of a glTF's camera, which has none; pixels are square, and its height of view counts, not its aspectRatio
-    index  which of a glTF's, in the order of their nodes
+    The JSON may lack "projection" (perspective) and "distortion" (none). Raises FileNotFoundError, TypeError, or ValueError
+    that names the file and the key.
 
-    Raises FileNotFoundError, TypeError, or ValueError that names the file and the key.
+    Parameters
+    ----------
+    path : str or Path
+    dtype : torch.float32, torch.float64 or None
+        As in load_cameras().
+    size : (H, W), only of a glTF
+        Size in pixels, which a glTF does not state. Pixels are square: the height of view counts, aspectRatio does not.
+    index : int, default 0
+        Number of the camera in a glTF, in the order of their nodes.
     """
     file = check_readable(path, (".json", *GLTFS))
-    if file.suffix.lower() in GLTFS:
-        return _typed(path, [_gltf_camera(path, size, index)], dtype, Unsupported())[0]
-    if size is not None or index != 0:
+    is_gltf = file.suffix.lower() in GLTFS
+    if not is_gltf and (size is not None or index != 0):
         raise ValueError(
             f"{path}: expected neither size nor index for a JSON file, which says its size; leave them out"
         )
-    with naming(path):
-        camera = _our_camera(_json(file))
-    return _typed(path, [camera], dtype, Unsupported())[0]
+    with errors_with_path(path):
+        camera = _gltf_camera(path, size, index) if is_gltf else _our_camera(_json(file))
+    return _typed(path, [camera], dtype, UnreadLog())[0]
 
 
 def _json(file: Path) -> Any:
-    """Raises Fault."""
     try:
         return json.loads(file.read_bytes())  # in UTF-8, UTF-16 or UTF-32, with a byte order mark or without
     except UnicodeDecodeError as error:
-        raise Fault(f"expected JSON in UTF-8, got text in another encoding ({error}); save it as UTF-8") from error
+        raise FormatError(
+            f"expected JSON in UTF-8, got text in another encoding ({error}); save it as UTF-8"
+        ) from error
     except (ValueError, RecursionError) as error:
-        raise Fault(f"expected JSON, got something else ({error}); export it again") from error
+        raise FormatError(f"expected JSON, got something else ({error}); export it again") from error
 
 
 def _our_camera(fields: Any) -> Camera:
-    """In float64. Raises Fault."""
+    """Return the camera of save_camera()'s keys in float64. Raises FormatError."""
     known = {"world_to_camera", "K", "size", "projection", "distortion"}
     try:
         if isinstance(fields, dict) and "frames" in fields:
@@ -103,19 +107,22 @@ def _our_camera(fields: Any) -> Camera:
             raise ValueError(f"size: expected [height, width], got {fields['size']!r}")
         return Camera(**fields)
     except (TypeError, ValueError) as error:
-        raise Fault(str(error)) from error
+        raise FormatError(str(error)) from error
 
 
 def _gltf_camera(path: PathLike, size: tuple[int, int] | None, index: int) -> Camera:
+    found = list(_gltf_cameras(path, size).values())
+    if not isinstance(index, int) or not 0 <= index < len(found):
+        raise ValueError(f"index: expected that of one of {len(found)} cameras in the file, from 0, got {index!r}")
+    if isinstance(camera := found[index], FormatError):
+        raise camera
+    return camera
+
+
+def _gltf_cameras(path: PathLike, size: tuple[int, int] | None) -> dict[str, Camera | FormatError]:
     if size is None:
-        raise ValueError(
-            f"{path}: size: expected (height, width) in pixels for the camera of a glTF, got None; pass size="
-        )
-    with naming(path):
-        found = list(read_cameras(path, _whole(size)).values())
-        if not isinstance(index, int) or not 0 <= index < len(found):
-            raise ValueError(f"index: expected that of one of {len(found)} cameras in the file, from 0, got {index!r}")
-        return _sound(found[index])
+        raise ValueError("size: expected (height, width) in pixels for the cameras of a glTF, got None; pass size=")
+    return read_cameras(path, _whole(size))
 
 
 def load_cameras(
@@ -124,44 +131,49 @@ def load_cameras(
     images: PathLike | None = None,
     dtype: torch.dtype | None = None,
 ) -> dict[str, View]:
-    """The cameras of a file or folder by name, each with its image: `View(camera, image)`.
+    """Return the cameras of a file or folder by name, each with its image: `View(camera, image)`.
 
-    A camera speaks of the pixels that its image stores: read_image(view.image) does not apply an EXIF orientation, unless the
-    camera's size tells that it speaks of the upright image. Where an image has another size than the file of cameras says, a
-    warning tells which: the camera is scaled to it, or, where they are not in proportion, View.image is None.
+    A camera describes the pixels that its image stores: read_image(view.image) applies no EXIF orientation, unless the camera's
+    size shows that it describes the upright image. Where an image has another size than the file of cameras says, a warning
+    tells which. The camera is then scaled to the image, or View.image is None where the sizes are not in proportion.
 
-    - a folder with COLMAP's cameras and images, text or binary, or with sparse/0 in it; names are the images'
-    - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path. What a frame says goes before what the
-      file says of all, whatever the key: its camera_angle_x before the file's fl_x. Keys that are null count as absent
-    - .yml, .yaml or .xml of OpenCV's calibration: camera_matrix, distortion_coefficients, image_width, image_height,
-      fisheye_model and extrinsic_parameters, as its calibration program has them. A stereo pair by the names of its matrices,
-      "M1" and "M2": the first at the origin, the second by R and T, which may stand in extrinsics.yml beside intrinsics.yml
-    - .yaml of ROS (camera_info), by camera_name; and of Kalibr (camchain), pinhole with radtan or equidistant: "cam0", "cam1" …,
-      the first at the origin
-    - .gltf and .glb; names are the nodes'
-    - .json of save_camera; names are numbers
+    - A folder with COLMAP's cameras and images, text or binary, or with sparse/0 in it; names are the images'.
+    - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path. A frame's own keys take precedence
+      over the file's, whatever the key: its camera_angle_x over the file's fl_x. Keys that are null count as absent.
+    - .yml, .yaml or .xml of OpenCV's calibration program: camera_matrix, distortion_coefficients, image_width, image_height,
+      fisheye_model and extrinsic_parameters. A stereo pair is named by its matrices, "M1" and "M2": the first is at the origin,
+      the second at R and T, which may stand in extrinsics.yml next to intrinsics.yml.
+    - .yaml of ROS (camera_info), by camera_name; and of Kalibr (camchain), pinhole with radtan or equidistant: "cam0", "cam1"
+      …, the first at the origin.
+    - .gltf and .glb; names are the nodes'.
+    - .json of save_camera(); names are numbers.
 
-    size    (H, W) pixels, where the file does not say it
-    images  the folder of COLMAP's images; else `images` beside the reconstruction or up to two folders above. Or that of a
-            transforms.json's images, by as much of the end of file_path as leads to one; else they are beside the file or below
-    dtype   torch.float32 or torch.float64, of the cameras. None: float64 where float32 would move an eye by more than a millionth
-            of the extent of all eyes, as in coordinates of a map, or where all are at one place by more than 1e-4 units; else
-            float32. A warning tells where cameras are rounded to less than that, as dtype says
+    Cameras of one size can be joined by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the
+    error names it. One warning names all keys that nothing reads, unless cameras do not depend on them. Raises
+    FileNotFoundError, TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML (edgegrad[cameras]).
 
-    Stack those of one size by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the error names
-    it. One warning names what a file says and nobody reads, unless cameras do not depend on it. Raises FileNotFoundError,
-    TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML (edgegrad[cameras]).
+    Parameters
+    ----------
+    path : str or Path
+    size : (H, W) in pixels
+        Needed where the file does not state it.
+    images : str or Path
+        Folder of COLMAP's images, by default `images` next to the reconstruction or up to two folders above it. Or the folder
+        of a transforms.json's images, found by as much of the end of file_path as leads to a file; by default they are next to
+        the file or below it.
+    dtype : torch.float32, torch.float64 or None
+        Type of the cameras. None: float64 where float32 would move an eye by more than a millionth of the extent of all eyes,
+        as in map coordinates, or by more than 1e-4 units where all eyes are at one place; else float32. A warning tells where
+        the requested type rounds more than that.
     """
-    unread = Unsupported()
+    unread = UnreadLog()
     views = matched(_views(path, size, images, unread), unread)
     cameras = _typed(path, [view.camera for view in views.values()], dtype, unread)
     return {name: View(c, view.image) for (name, view), c in zip(views.items(), cameras, strict=True)}
 
 
-def _views(
-    path: PathLike, size: tuple[int, int] | None, images: PathLike | None, unread: Unsupported
-) -> dict[str, View]:
-    """In float64."""
+def _views(path: PathLike, size: tuple[int, int] | None, images: PathLike | None, unread: UnreadLog) -> dict[str, View]:
+    """Return the views in float64."""
     folder = Path(path) if isinstance(path, (str, os.PathLike)) else None
     if folder is not None and folder.is_dir():
         place = colmap.find(folder)
@@ -172,21 +184,17 @@ def _views(
                 f"{path}: expected cameras and images of COLMAP (.bin or .txt) or transforms.json, got a folder without; "
                 "name the one that has them"
             )
-        with naming(path):
+        with errors_with_path(path):
             views = _some(colmap.read(place, None if images is None else Path(images), unread))
         colmap.note_others(folder, place, unread)
         return views
     file = check_readable(path, (".json", *CALIBRATIONS, *GLTFS))
     whole = None if size is None else _whole(size)
-    with naming(path):
+    with errors_with_path(path):
         if file.suffix.lower() != ".json":
             _check_no_images(images)
         if file.suffix.lower() in GLTFS:
-            if whole is None:
-                raise ValueError(
-                    "size: expected (height, width) in pixels for the cameras of a glTF, got None; pass size="
-                )
-            return _of_gltf(read_cameras(path, whole), unread)
+            return _views_of_gltf(_gltf_cameras(path, size), unread)
         if file.suffix.lower() in CALIBRATIONS:
             return calibration.read(file, whole, unread)
         fields = _json(file)
@@ -197,30 +205,22 @@ def _views(
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
 
 
-def _of_gltf(found: dict[str, Camera | Fault], unread: Unsupported) -> dict[str, View]:
-    """Return views of the cameras that can be read, and note the others. Raises Fault where none can."""
+def _views_of_gltf(found: dict[str, Camera | FormatError], unread: UnreadLog) -> dict[str, View]:
+    """Return views of the cameras that can be read, and note the others. Raises FormatError where none can."""
     views = {name: View(camera, None) for name, camera in found.items() if isinstance(camera, Camera)}
-    for name, fault in found.items():
-        if isinstance(fault, Fault):
+    for name, error in found.items():
+        if isinstance(error, FormatError):
             if not views:
-                raise fault
-            unread.note(f"camera {name[:60]!r}", f"left out: {fault}")
+                raise error
+            unread.note(f"camera {name[:60]!r}", f"left out: {error}")
     return _some(views)
 
 
-def _sound(camera: Camera | Fault) -> Camera:
-    """Raises Fault in place of one."""
-    if isinstance(camera, Fault):
-        raise camera
-    return camera
-
-
-def _typed(path: PathLike, cameras: list[Camera], dtype: torch.dtype | None, unread: Unsupported) -> list[Camera]:
-    """In the type that is wanted, else in float64 where float32 would move eyes too far. Says what there is to say."""
-    if dtype not in (None, torch.float32, torch.float64):
-        raise TypeError(f"dtype: expected torch.float32, torch.float64 or None, got {dtype!r}")
-    if dtype is not torch.float64:
-        with naming(path):  # numbers beyond the range of float32
+def _typed(path: PathLike, cameras: list[Camera], dtype: torch.dtype | None, unread: UnreadLog) -> list[Camera]:
+    """Return the cameras in the requested type, by default float64 where float32 would move eyes too far, and warn of what was
+    not read."""
+    if check_dtype(dtype) is not torch.float64:
+        with errors_with_path(path):  # numbers beyond the range of float32
             rounded = [camera.to(torch.float32) for camera in cameras]
         eyes = torch.cat([camera.eye.reshape(-1, 3) for camera in cameras])
         moved = float((torch.cat([c.to(torch.float64).eye.reshape(-1, 3) for c in rounded]) - eyes).abs().max())
@@ -229,18 +229,18 @@ def _typed(path: PathLike, cameras: list[Camera], dtype: torch.dtype | None, unr
         if precise and dtype is torch.float32:
             unread.note("eyes in float64", f"moved by up to {moved:.2g}, for they are rounded to float32 as dtype says")
         cameras = cameras if precise and dtype is None else rounded
-    unread.say(path, UNREAD)
+    unread.warn(path, UNREAD)
     return cameras
 
 
 def _check_no_images(images: PathLike | None) -> None:
     if images is not None:
-        raise Fault("images: expected none for a file that names no images, got a folder; leave it out")
+        raise FormatError("images: expected none for a file that names no images, got a folder; leave it out")
 
 
 def _some(views: dict[str, View]) -> dict[str, View]:
     if not views:
-        raise Fault("expected cameras, got none; export it with them")
+        raise FormatError("expected cameras, got none; export it with them")
     return views
 
 

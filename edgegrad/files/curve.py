@@ -1,4 +1,4 @@
-"""Curves of cameras: from the numbers of an image file, 0 … 1, to linear radiance."""
+"""Response curves of cameras: from the numbers of an image file, 0 … 1, to linear radiance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STEEPEST = 10.0  # exponent
 
 
 def decoder(curve: Curve, srgb: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-    """What makes linear radiance (N, C) of values (N, C), both float64. Raises TypeError or ValueError."""
+    """Return the function from file values (N, C) to linear radiance (N, C), both float64. Raises TypeError or ValueError."""
     if isinstance(curve, str):
         if curve != "srgb":
             raise ValueError(f'curve: expected "srgb", an exponent, a table or a function, got {curve!r}')
@@ -55,7 +55,7 @@ def decoder(curve: Curve, srgb: Callable[[Tensor], Tensor]) -> Callable[[Tensor]
 
 
 def _looked_up(table: Tensor, values: Tensor) -> Tensor:
-    """Linear between entries, which stand for values evenly spaced from 0 to 1."""
+    """Interpolate linearly between entries, which stand for values evenly spaced from 0 to 1."""
     if table.shape[1] not in (1, values.shape[1]):
         raise ValueError(
             f"curve: expected a table (N,) for an image of {values.shape[1]} channel(s), got {table.shape[1]} columns"

@@ -1,4 +1,4 @@
-"""Depth from image files: how far what a pixel shows is away along the camera's axis."""
+"""Depth from image files: the distance along the camera's axis of what each pixel shows."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ LEAST_BITS = 16  # of whole numbers: 256 steps are a picture of depth
 
 
 def read_depth(path: PathLike, scale: float | None = None) -> Tensor:
-    """(H, W) float32 from an image file of one channel: distances along +Z of the camera in world units, 0 or NaN where there is
-    none, as `depth=` of fits takes them. Row 0 on top, upright as its EXIF orientation says.
+    """Return depth (H, W) float32 from an image file of one channel.
 
-    scale  the length of one unit of the file, in world units: 0.001 where it has millimetres and the mesh is in metres. Data sets
-           name it `depth_scale`; that of BOP says millimetres. Whole numbers (PNG, TIFF of 16 or 32 bits) need it; numbers of
-           floating point (EXR, float TIFF) are taken as they are without it
+    Values are distances along +Z of the camera in world units, 0 or NaN where there is none, as `depth=` of fits takes them.
+    Row 0 is on top, upright as the EXIF orientation says. Raises TypeError or ValueError for more than one channel, for whole
+    numbers of 8 bits, for whole numbers without a scale, or for a scale that is not above 0; and what read_image() raises.
 
-    Raises TypeError or ValueError where the file has more than one channel or whole numbers of 8 bits, or they have no scale, or
-    it is not above 0; and what read_image() raises.
+    Parameters
+    ----------
+    path : str or Path
+    scale : float
+        Length of one unit of the file in world units: 0.001 where it has millimetres and the mesh is in metres. Data sets call
+        it `depth_scale`; that of BOP is in millimetres. Whole numbers (PNG, TIFF of 16 or 32 bits) need it; floating-point
+        numbers (EXR, float TIFF) count as they are without it.
     """
     if scale is not None:
         if not isinstance(scale, (int, float)) or isinstance(scale, bool):

@@ -14,7 +14,7 @@ UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, of EXIF's FocalPlaneResolutionUnit
 
 
 class FocalLength(NamedTuple):
-    """A focal length as EXIF data states it."""
+    """The focal length that EXIF data states."""
 
     pixels: float  # of the image as it is stored
     words: str  # where it comes from

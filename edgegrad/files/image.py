@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..camera.mistakes import warn_of_bytes
+from ..camera.convention_warnings import warn_of_bytes
 from ..check import as_tensor, check_finite, check_not_meta, check_shape
 from ..optional import require
 from ..warnings import warn
@@ -25,27 +25,27 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRG
 
 
 def srgb_to_linear(values: Tensor) -> Tensor:
-    """Linear radiance from sRGB values, any shape, 0 … 1; differentiable. The piecewise curve of IEC 61966-2-1."""
+    """Return linear radiance of sRGB values of any shape, 0 … 1; differentiable. The curve is IEC 61966-2-1's."""
     # The clamp keeps the power's unused branch, and its gradient, finite.
     curve = ((values.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(values <= 0.04045, values / 12.92, curve)
 
 
 def linear_to_srgb(values: Tensor) -> Tensor:
-    """sRGB values from linear radiance, any shape, 0 … 1; differentiable. The inverse of srgb_to_linear."""
+    """Return sRGB values of linear radiance of any shape, 0 … 1; differentiable. It inverts srgb_to_linear()."""
     curve = 1.055 * values.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(values <= 0.0031308, values * 12.92, curve)
 
 
 def srgb_slope(values: Tensor) -> Tensor:
-    """The derivative of linear_to_srgb(), any shape, where it gives the sRGB `values`."""
+    """Return the derivative of linear_to_srgb(), of any shape, where it gives the sRGB `values`."""
     # The inverse of the other curve's slope.
     curve = (2.4 / 1.055 * ((values.clamp(min=0.04045) + 0.055) / 1.055) ** 1.4).reciprocal()
     return torch.where(values <= 0.04045, torch.full_like(values, 12.92), curve)
 
 
 class Stored(NamedTuple):
-    """An image with the numbers that are in its file: upright, or of a StoredPath as it is stored."""
+    """The numbers of an image file: upright, or for a StoredPath as they are stored."""
 
     # (H, W, C) float32 or, where asked for, float64; not multiplied by alpha unless the file is an EXR; integers are from 0 to 1
     color: Tensor
@@ -54,7 +54,8 @@ class Stored(NamedTuple):
 
 
 def read_stored(path: PathLike, exact: bool = False) -> Stored:
-    """`exact`: integers of 32 bits in float64, which holds them all. Raises what read_image does."""
+    """Return the numbers of an image file. With `exact`, integers of 32 bits become float64, which holds them all. Raises what
+    read_image() raises."""
     file = check_readable(path, READABLE)
     oiio = require("OpenImageIO", "OpenImageIO", "reading images")
     hint = oiio.ImageSpec()
@@ -101,24 +102,28 @@ def read_stored(path: PathLike, exact: bool = False) -> Stored:
 
 
 def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb") -> Tensor:
-    """(H, W, C) float32 from an image file: linear radiance, row 0 on top, upright as its EXIF orientation says. A path that
-    load_cameras() found is read as it is stored, for its camera speaks of these pixels.
+    """Return an image file as linear radiance (H, W, C) float32, row 0 on top, upright as its EXIF orientation says.
 
-    Integer pixels (PNG, JPEG, BMP, WebP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
-    floating-point pixels (EXR, HDR, float TIFF) are linear as they are. Alpha is the last channel, not gamma-corrected and
-    not multiplied into the colours: those of a TIFF with associated alpha are divided by it, where it is above 0. EXR files
-    hold colours times alpha, and these stay so. At most 2³⁰ pixels times channels. read_mask() reads masks.
+    A path that load_cameras() found is read as it is stored, because its camera describes these pixels. Integer pixels (PNG,
+    JPEG, BMP, WebP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1; floating-point pixels (EXR, HDR,
+    float TIFF) are linear already. Alpha is the last channel, not gamma-corrected and not multiplied into the colours: a TIFF's
+    associated alpha is divided out where it is above 0. EXR files hold colours times alpha, and these stay so. At most 2³⁰
+    pixels times channels are read. read_mask() reads masks.
 
-    channels  None keeps what the file has. 1 gives the luminance and 3 the colours, both without alpha;
-              4 adds an alpha of 1 where the file has none
-    curve     how integer pixels, as values v from 0 to 1, become radiance: "srgb"; an exponent γ, vᵞ, 1 for pixels that are
-              linear already; a table (N,), or (N, 3) with a column for each colour, of the radiances of N values evenly spaced
-              from 0 to 1, as calibrations of a camera's response give it, which must rise; or a function of a tensor (n, C),
-              float64, such as those of colour-science. Floating-point pixels have none
+    Raises FileNotFoundError, PermissionError, TypeError, ValueError (another kind of file, damaged, too large, colours that do
+    not convert) or ImportError without OpenImageIO.
 
-    Raises FileNotFoundError, PermissionError, TypeError, ValueError (another kind of file, damaged, too large, colours that
-    do not convert)
-    or ImportError without OpenImageIO.
+    Parameters
+    ----------
+    path : str or Path
+    channels : None, 1, 3 or 4
+        None keeps the channels of the file. 1 gives the luminance and 3 the colours, both without alpha; 4 adds an alpha of 1
+        where the file has none.
+    curve : "srgb", float, table or function, default "srgb"
+        How integer pixels, as values v from 0 to 1, become radiance. A number γ means vᵞ, 1 for pixels that are linear already.
+        A table (N,), or (N, 3) with a column for each colour, has the radiances of N values evenly spaced from 0 to 1, as
+        calibrations of a camera's response give it, and must rise. A function maps a tensor (n, C), float64, as those of
+        colour-science do. Floating-point pixels take no curve.
     """
     if channels not in (None, 1, 3, 4):
         raise ValueError(f"channels: expected None, 1, 3 or 4, got {channels!r}")
@@ -128,7 +133,7 @@ def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb
         raise ValueError(
             f"curve: expected none for {path}, whose floating-point pixels are linear, got one; leave it out"
         )
-    # Not OpenImageIO's own conversion: what it does depends on the OCIO configuration that it finds.
+    # OpenImageIO's own conversion depends on the OCIO configuration that it finds.
     if largest is not None:
         for rows in color.split(
             max(1, (1 << 20) // color[0].numel())
@@ -146,19 +151,19 @@ def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb
 
 
 def read_size(path: PathLike) -> tuple[int, int]:
-    """(H, W) of an image file as read_image reads it, by its header alone. Raises what read_image does."""
+    """Return the size (H, W) that read_image() would give, from the header alone. Raises what read_image() raises."""
     spec = _header(path).spec()
     turned = spec.getattribute("Orientation") in (5, 6, 7, 8) and not isinstance(path, StoredPath)
     return (spec.full_width, spec.full_height) if turned else (spec.full_height, spec.full_width)
 
 
 def read_orientation(path: PathLike) -> int:
-    """The EXIF orientation of an image file, 1 to 8; 1 where it says none. Raises what read_image does."""
+    """Return the EXIF orientation of an image file, 1 to 8, or 1 without one. Raises what read_image() raises."""
     return _header(path).spec().getattribute("Orientation") or 1
 
 
 def _header(path: PathLike) -> Any:
-    """An ImageBuf of which the header alone is read."""
+    """Return an ImageBuf of which only the header is read."""
     file = check_readable(path, READABLE)
     stored = require("OpenImageIO", "OpenImageIO", "reading images").ImageBuf(str(file))
     spec = stored.spec()
@@ -168,14 +173,20 @@ def _header(path: PathLike) -> Any:
 
 
 def write_image(path: PathLike, img: Tensor) -> None:
-    """Writes linear radiance `img`, (H, W) or (H, W, C) of any floating dtype, from any device, row 0 on top.
+    """Write linear radiance to an image file.
 
-    PNG, JPEG, BMP and TIFF: clipped to 0 … 1, sRGB, 8 bit, rounded to nearest; C up to 4 (2 and 4: the last is alpha,
-    not gamma-corrected; JPEG holds 1 or 3). HDR: linear, C = 3. EXR: linear float32, any C. The file appears whole or
-    not at all; an existing one is replaced, and missing folders are made.
+    PNG, JPEG, BMP and TIFF are clipped to 0 … 1, sRGB, 8 bit, rounded to nearest, with up to 4 channels (of 2 and 4 the last is
+    alpha, not gamma-corrected; JPEG holds 1 or 3). HDR is linear with 3 channels. EXR is linear float32 with any number. The
+    file appears whole or not at all; an existing one is replaced, and missing folders are made.
 
-    Raises ValueError (unknown ending, wrong shape, NaN or infinity), TypeError (not floating-point),
-    OSError (cannot write) or ImportError without OpenImageIO.
+    Raises ValueError (unknown ending, wrong shape, NaN or infinity), TypeError (not floating-point), OSError (cannot write) or
+    ImportError without OpenImageIO.
+
+    Parameters
+    ----------
+    path : str or Path
+    img : (H, W) or (H, W, C) tensor of any floating dtype, on any device
+        Radiance, row 0 on top.
     """
     file = check_suffix(path, IMAGES)
     image = as_tensor("img", img).detach()
@@ -224,14 +235,14 @@ def write_image(path: PathLike, img: Tensor) -> None:
 
 
 def to_bytes(values: Tensor, linear: bool = False) -> np.ndarray:
-    """(…, 3) uint8 from (…, 1) or (…, 3), clipped to 0 … 1; sRGB unless told otherwise."""
+    """Return uint8 (…, 3) of values (…, 1) or (…, 3), clipped to 0 … 1; as sRGB unless `linear`."""
     values = values.detach().cpu().double().clamp(0.0, 1.0)
     values = values.expand(*values.shape[:-1], 3)
     return ((values if linear else linear_to_srgb(values)) * 255.0).round().to(torch.uint8).contiguous().numpy()
 
 
 def _reason(source: object) -> str:
-    """The errors of an OpenImageIO object, each once, on one line."""
+    """Return the errors of an OpenImageIO object, each once, on one line."""
     try:
         lines = dict.fromkeys(" ".join(line.split()) for line in source.geterror().splitlines())  # type: ignore[attr-defined]
         return " ".join(lines) or "it ends early"
@@ -240,7 +251,7 @@ def _reason(source: object) -> str:
 
 
 def _jpeg_ends(data: bytes) -> bool:
-    """Whether a JPEG has its end marker; without it, the decoder fills the rest with grey and says nothing."""
+    """Return whether a JPEG has its end marker; without it, the decoder silently fills the rest with grey."""
     at = 2
     # Past the header first: a thumbnail in it has an end marker of its own.
     while data[at : at + 1] == b"\xff" and data[at : at + 2] != b"\xff\xda":

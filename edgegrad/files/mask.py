@@ -25,24 +25,28 @@ LISTED = 8  # labels in an error
 
 
 def read_mask(path: PathLike, label: int | None = None) -> Tensor:
-    """(H, W) float32 from an image file: the share of each pixel that the object covers, from 0 to 1. Row 0 on top, upright as
-    its EXIF orientation says.
+    """Return a mask (H, W) float32 from an image file: the share of each pixel that the object covers, from 0 to 1.
 
-    Numbers are taken as they are, without the sRGB curve: 128 of 255 is 0.5. (write_image() encodes by that curve: a mask is
-    written by write_image(path, srgb_to_linear(mask)).) What counts is, in this order:
+    Row 0 is on top, upright as the EXIF orientation says. Numbers are taken as they are, without the sRGB curve: 128 of 255 is
+    0.5. (write_image() applies that curve: write a mask by write_image(path, srgb_to_linear(mask)).) The first of these that
+    applies counts:
 
-    - the alpha channel, unless it is 1 everywhere
-    - grey: 1, 8 and 16 bit from black to white, floating point (EXR, float TIFF) from 0 to 1. Whole numbers of which the
-      largest is 1 are labels: 0 beside the object, 1 on it. Several are labels where few of them, none of which is 0 or the
-      largest, fill areas, as the greys of a smooth border do not
-    - black and one other colour, or of a palette number 0 and another: 1 where it is the other
+    - The alpha channel, unless it is 1 everywhere.
+    - Grey: 1, 8 and 16 bit from black to white, floating point (EXR, float TIFF) from 0 to 1. Whole numbers up to 1 are labels:
+      0 off the object, 1 on it. There are several labels where few numbers, none of which is 0 or the largest, fill areas, as
+      the greys of a smooth border do not.
+    - Black and one other colour, or number 0 of a palette and another: 1 at the other.
 
-    label  the number of the object in an image of labels: grey of whole numbers, or a palette's numbers. 1 where the image has
-           it, 0 elsewhere. The mask of several is the sum of theirs
-
-    Raises ValueError where it is none of these: several labels without label=, or none that is this one, which are named, or a
-    picture in colours; and what read_image() raises. Warns of what looks like an inverted mask. Palettes need Pillow
+    Raises ValueError for several labels without label=, for one that does not occur (the message names those that do) and for a
+    picture in colours; and what read_image() raises. Warns of what appears to be an inverted mask. Palettes need Pillow
     (edgegrad[files]).
+
+    Parameters
+    ----------
+    path : str or Path
+    label : int
+        Number of the object in an image of labels: grey of whole numbers, or a palette's numbers. The mask is 1 at this label
+        and 0 elsewhere; add masks for several objects.
     """
     if label is not None:
         check_int("label", label, 0, 2**32 - 1)
@@ -61,8 +65,8 @@ def read_mask(path: PathLike, label: int | None = None) -> Tensor:
 
 
 def read_weight(path: PathLike) -> Tensor:
-    """(H, W) float32 from an image file, from 0 to 1 without the sRGB curve: alpha unless it is 1 everywhere, else grey. Whole
-    numbers are no labels here. Raises what read_mask() raises."""
+    """Return weights (H, W) float32 from an image file, from 0 to 1 without the sRGB curve. They are its alpha unless that is 1
+    everywhere, else its grey. Whole numbers are no labels here. Raises what read_mask() raises."""
     color, alpha, _ = read_stored(path)
     if alpha is not None and bool((alpha != 1.0).any()):
         return _coverage(path, alpha[..., 0])
@@ -103,10 +107,9 @@ def _covered(path: PathLike, color: Tensor, alpha: Tensor | None, largest: int |
 
 
 def _areas(grey: Tensor, largest: int) -> list[int] | None:
-    """The numbers of an image (H, W) where they look like labels, else None.
-
-    A smooth border is one to a few pixels wide, and its greys are different from one pixel to the next: nearly none has the
-    same grey all around, as nearly all inside of a label have."""
+    """Return the numbers of an image (H, W) that appear to be labels, else None. A smooth border is one to a few pixels wide,
+    and its greys differ from one pixel to the next. Nearly none has the same grey all around, as nearly all pixels inside a
+    label have."""
     between = (grey > 0.0) & (grey < grey.max())
     count = int(between.sum())
     if count == 0 or min(grey.shape) < 3:
@@ -140,7 +143,7 @@ def _is_grey(color: Tensor) -> bool:
 
 
 def _coverage(path: PathLike, values: Tensor) -> Tensor:
-    """Raises ValueError unless they are from 0 to 1."""
+    """Return the values as a mask. Raises ValueError unless they are from 0 to 1."""
     if not bool(((values >= -ROUNDING) & (values <= 1.0 + ROUNDING)).all()):  # nor NaN
         raise ValueError(
             f"{path}: expected coverage from 0 to 1, got {float(values.min()):g} to {float(values.max()):g}; of an image of "
@@ -150,7 +153,7 @@ def _coverage(path: PathLike, values: Tensor) -> Tensor:
 
 
 def _numbers(path: PathLike, color: Tensor, largest: int | None) -> Tensor:
-    """(H, W) labels: a palette's numbers, or grey as it is stored. Raises ValueError or ImportError."""
+    """Return labels (H, W): a palette's numbers, or grey as it is stored. Raises ValueError or ImportError."""
     indexed = _indexed(path)
     if indexed is not None:
         return indexed[0]
@@ -160,12 +163,12 @@ def _numbers(path: PathLike, color: Tensor, largest: int | None) -> Tensor:
 
 
 def _whole(grey: Tensor, largest: int) -> Tensor:
-    """int64, as they are stored."""
+    """Return the integers that are stored, int64."""
     return (grey.double() * largest).round().long()
 
 
 def _two_colors(path: PathLike, color: Tensor) -> Tensor:
-    """1 where the image is not its background. Raises ValueError or ImportError."""
+    """Return 1 where the image is not its background. Raises ValueError or ImportError."""
     indexed = _indexed(path)
     if indexed is None:
         red, green, blue = (color.clamp(0.0, 1.0) * 255.0).round().long().unbind(-1)
@@ -203,8 +206,8 @@ def _used(numbers: Tensor) -> list[int]:
 
 
 def _indexed(path: PathLike) -> tuple[Tensor, list[int]] | None:
-    """(H, W) int64 numbers of an image with a palette or of one bit, which OpenImageIO replaces by colours, and which of them are
-    black; None of another. Raises ImportError without Pillow."""
+    """Return the numbers (H, W) int64 of an image with a palette or of one bit, and which of them are black; else None.
+    OpenImageIO replaces these numbers by colours. Raises ImportError without Pillow."""
     if Path(path).suffix.lower() not in DISPLAY:
         return None
     pillow = require("PIL.Image", "edgegrad[files]", "reading labels")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 if sys.platform == "win32":
     from pathlib import WindowsPath as NativePath
@@ -18,18 +20,17 @@ PathLike = str | os.PathLike[str]
 
 
 class StoredPath(NativePath):
-    """The path of an image whose pixels are read as they are stored: its EXIF orientation is not applied.
+    """The path of an image that is read as it is stored: its EXIF orientation is not applied.
 
-    Cameras and texture coordinates in files speak of these pixels. COLMAP, instant-ngp, nerfstudio and Blender do not apply
-    the orientation either."""
+    Cameras and texture coordinates in files describe these pixels. COLMAP, instant-ngp, nerfstudio and Blender do not apply the
+    orientation either.
+    """
 
 
 def check_readable(path: PathLike, suffixes: Collection[str]) -> Path:
-    """An existing, non-empty file whose name ends in one of `suffixes`.
-
-    Raises FileNotFoundError when nothing is there, PermissionError when it may not be read, ValueError when it is a directory
-    or a device, of another kind or empty.
-    """
+    """Return the path of an existing, non-empty file whose name ends in one of `suffixes`. Raises FileNotFoundError when
+    nothing is there, PermissionError when it may not be read, ValueError when it is a directory or a device, of another kind or
+    empty."""
     file = check_suffix(path, suffixes)
     if file.is_dir():
         raise ValueError(f"{path}: expected a file, got a directory; name a file in it")
@@ -45,7 +46,7 @@ def check_readable(path: PathLike, suffixes: Collection[str]) -> Path:
 
 
 def check_suffix(path: PathLike, suffixes: Collection[str]) -> Path:
-    """`path` when its name ends in one of `suffixes`, in any case. Raises TypeError or ValueError."""
+    """Return `path` when its name ends in one of `suffixes`, in any case. Raises TypeError or ValueError."""
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"path: expected a str or pathlib.Path, got {type(path).__name__}")
     file = Path(path)
@@ -59,11 +60,8 @@ def check_suffix(path: PathLike, suffixes: Collection[str]) -> Path:
 
 @contextmanager
 def replacing(path: PathLike) -> Iterator[Path]:
-    """A temporary file beside `path` that takes its place when the block succeeds and vanishes when it fails. Missing folders
-    are made.
-
-    Raises OSError when that fails, ValueError when `path` is a directory.
-    """
+    """Yield a temporary file in the same folder that replaces `path` when the block succeeds and vanishes when it fails.
+    Missing folders are made. Raises OSError when that fails, ValueError when `path` is a directory."""
     file = Path(path)
     if file.is_dir():
         raise ValueError(f"{path}: expected a file name, got a directory; add a name to it")
@@ -71,10 +69,29 @@ def replacing(path: PathLike) -> Iterator[Path]:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(f"{path}: expected a folder to write to, got {file.parent} ({error.strerror})") from error
-    # The same ending, since libraries choose the format by it; not tempfile, whose files only their owner may read.
+    # Libraries choose the format by the ending. Files of tempfile may only be read by their owner.
     temporary = file.with_name(f".{file.stem[:64]}-{secrets.token_hex(6)}{file.suffix}")
     try:
         yield temporary
         os.replace(temporary, file)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: PathLike, text: str) -> None:
+    """Write a text file in UTF-8, whole or not at all. Raises OSError."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: PathLike, content: Any, indent: int = 2) -> None:
+    """Write a JSON file, whole or not at all. Raises OSError."""
+    write_text(path, json.dumps(content, indent=indent) + "\n")
+
+
+def write_figures(folder: Path, draw: Mapping[str, Callable[[], Any]]) -> list[str]:
+    """Write matplotlib figures, each whole or not at all, and return their names. Raises OSError or what drawing raises."""
+    for name, figure in draw.items():
+        with replacing(folder / name) as temporary:
+            figure().savefig(temporary)
+    return list(draw)

@@ -1,6 +1,7 @@
-"""Meshes to and from trimesh, meshes and scenes into files by it.
+"""Conversion to and from trimesh, and meshes and scenes into files by it.
 
-trimesh keeps colours as 8-bit sRGB, here they are linear; its texture coordinates are the vertices', which are split at seams.
+trimesh keeps colours as 8-bit sRGB, while here they are linear; its texture coordinates belong to vertices, which are split at
+seams.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..scene.scene import Scene
 from ..warnings import warn
 from .formats.geometry import in_double, rounding
 from .formats.gltf_pack import scene_to_gltf, to_glb
-from .formats.part import Fault
+from .formats.part import FormatError
 from .formats.text_write import to_obj, to_off
 from .formats.trimesh_parts import of_trimesh
 from .image import to_bytes
@@ -32,8 +33,13 @@ SCENES = (".glb", ".gltf")
 
 
 def from_trimesh(given: Any) -> Mesh:
-    """See Mesh.from_trimesh."""
-    trimesh = require("trimesh", "trimesh", "Mesh.from_trimesh")
+    """Return the mesh of a trimesh.Trimesh with equal vertices welded.
+
+    It has the vertex or face colours or the texture, which are sRGB there, or the colour of its material, which is linear.
+    It is float64 where float32 would move vertices by more than a millionth of the extent, else float32. Raises TypeError,
+    ValueError or ImportError.
+    """
+    trimesh = require("trimesh", "trimesh", "from_trimesh")
     if isinstance(given, trimesh.Scene):
         raise TypeError("mesh: expected a trimesh.Trimesh, got a Scene; take scene.to_mesh(), or one of scene.geometry")
     if not isinstance(given, trimesh.Trimesh):
@@ -47,13 +53,17 @@ def from_trimesh(given: Any) -> Mesh:
         if rounding(part.verts)[1]:
             return to_mesh(in_double([part])[0], torch.float64)
         return to_mesh(part._replace(verts=part.verts.astype(np.float32)))
-    except Fault as fault:
-        raise ValueError(f"mesh: {fault}") from fault.__cause__
+    except FormatError as error:
+        raise ValueError(f"mesh: {error}") from error.__cause__
 
 
 def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
-    """See Mesh.to_trimesh. faces_colored: False where faces have none of their own, which those of their vertices then hold."""
-    trimesh = require("trimesh", "trimesh", "Mesh.to_trimesh")
+    """Return a trimesh.Trimesh of a mesh, with colours or texture as 8-bit sRGB.
+
+    Vertices are split where texture coordinates or the colours of corners differ. Without `faces_colored`, colours of faces
+    become colours of vertices, which are split for them. Raises ValueError for other than 1 or 3 channels, ImportError.
+    """
+    trimesh = require("trimesh", "trimesh", "to_trimesh")
     _check_channels(mesh)
     faces = _array(mesh.faces)
     verts, colors = _array(mesh.verts), mesh.colors
@@ -77,23 +87,23 @@ def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
         assert given is not None
         verts, faces = verts[faces.reshape(-1)], np.arange(faces.size).reshape(-1, 3)
         colors = given.reshape(-1, given.shape[-1])
-    look = {}
+    appearance = {}
     if colors is not None:
-        look["vertex_colors"] = to_bytes(colors)
+        appearance["vertex_colors"] = to_bytes(colors)
     elif mesh.face_colors is not None:
-        look["face_colors"] = to_bytes(mesh.face_colors)
-    return trimesh.Trimesh(verts, faces, process=False, **look)
+        appearance["face_colors"] = to_bytes(mesh.face_colors)
+    return trimesh.Trimesh(verts, faces, process=False, **appearance)
 
 
 def save_mesh(path: PathLike, mesh: Mesh) -> None:
-    """Writes a mesh: PLY, OBJ, GLB, STL or OFF by the name's ending. Missing folders are made.
+    """Write a mesh as PLY, OBJ, GLB, STL or OFF by the name's ending.
 
-    A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as
-    `load_scene(path, lit=True)` reads them: factors and colours of vertices in full, textures in 8 bit (sRGB those of
-    colour), clipped to 0 … 1. Metallic, roughness and emission of vertices become their mean, for glTF has none. A
-    Lambertian material is one without a highlight (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an
-    OBJ also a texture, which lies beside it with its .mtl; STL and OFF the shape alone. Positions in PLY, STL and GLB are
-    float32; those in OBJ and OFF have all digits of the mesh's type. A warning names what is left out, rounded or clipped.
+    A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as `load_scene(path, lit=True)`
+    reads them: factors and vertex colours in full, textures in 8 bit (colour as sRGB), clipped to 0 … 1. Metallic, roughness
+    and emission of vertices become their mean, because glTF has none. A Lambertian material is one without a highlight
+    (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an OBJ also a texture, which is written next to it with
+    its .mtl; STL and OFF hold the shape alone. Positions in PLY, STL and GLB are float32; those in OBJ and OFF have all digits
+    of the mesh's type. A warning names what is left out, rounded or clipped. Missing folders are made.
 
     Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
     """
@@ -117,7 +127,8 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     if lost:
         warn(
             f"left out of {kind}",
-            f"save_mesh: {file.name} holds no {', no '.join(lost)}; torch.save(mesh, path) keeps all of a Mesh",
+            f"save_mesh: {file.name} holds no {', no '.join(lost)}; "
+            "torch.save(Scene(mesh).state_dict(), path) keeps all of a Mesh",
         )
     for name, data in {**beside, file.name: content}.items():
         with replacing(file.parent / Path(name).name) as temporary:
@@ -127,18 +138,21 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
 def save_scene(
     path: PathLike, scene: Scene | Mesh, cameras: Camera | Sequence[Camera] | Mapping[str, Camera] | None = None
 ) -> None:
-    """Writes a scene as GLB or glTF by the name's ending; a .gltf holds its arrays and images itself. Missing folders are made.
-
-    scene    a mesh each becomes a node, with its material as save_mesh() writes it; one without a material is said to be unlit
-             (KHR_materials_unlit). Directional, point and spot lights are KHR_lights_punctual. What meshes share stands in the
-             file once
-    cameras  one, a batch, a sequence, or by name
+    """Write a scene as GLB or glTF by the name's ending; a .gltf embeds its arrays and images.
 
     `load_scene(path, lit=True)` reads the meshes in their order and the lights, load_cameras(path, size) the cameras. A glTF
-    has no environments, spherical harmonics, backgrounds, lenses, and no cameras whose principal point is off the middle or whose
-    pixels are not square: a warning names what is left out, rounded or clipped.
+    has no environments, spherical harmonics, backgrounds or lenses, and no cameras whose principal point is off the middle or
+    whose pixels are not square: a warning names what is left out, rounded or clipped. Missing folders are made.
 
     Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+
+    Parameters
+    ----------
+    path : str or Path
+    scene : Scene or Mesh
+        Each mesh becomes a node, with its material as save_mesh() writes it; one without a material is marked as unlit
+        (KHR_materials_unlit). Directional, point and spot lights are KHR_lights_punctual. What meshes share is written once.
+    cameras : Camera, a batch, a sequence, or a mapping by name
     """
     file = check_suffix(path, SCENES)
     if not isinstance(scene, Scene | Mesh):
@@ -152,15 +166,15 @@ def save_scene(
     if lost:
         warn(
             f"left out of {file.suffix}",
-            f"save_scene: {file.name} holds no {', no '.join(lost)}; torch.save(scene, path) keeps all of a Scene, and "
-            "save_camera() all of a camera",
+            f"save_scene: {file.name} holds no {', no '.join(lost)}; "
+            "torch.save(scene.state_dict(), path) keeps all of a Scene, and save_camera() all of a camera",
         )
     with replacing(file) as temporary:
         temporary.write_bytes(content)
 
 
 def _named(cameras: object) -> dict[str, Camera]:
-    """One by one; without names of their own by number. Raises TypeError."""
+    """Return single cameras by name, numbered where they have no names. Raises TypeError."""
     if cameras is None:
         return {}
     given = dict(cameras) if isinstance(cameras, Mapping) else None
@@ -182,19 +196,18 @@ def _named(cameras: object) -> dict[str, Camera]:
 
 
 def _check_channels(mesh: Mesh) -> None:
-    """Raises ValueError."""
     if mesh.channels not in (None, 1, 3):
         raise ValueError(f"mesh: expected 1 or 3 channels, got {mesh.channels}; pick some")
 
 
 def _left_out(mesh: Mesh, kind: str) -> list[str]:
-    """What of a mesh a file of this kind, other than GLB, does not hold."""
-    look = {"colors": mesh.colors, "face_colors": mesh.face_colors, "corner_colors": mesh.corner_colors}
-    look["texture"] = mesh.texture
+    """Return the names of what a file of this kind, other than GLB, does not hold of a mesh."""
+    appearance = {"colors": mesh.colors, "face_colors": mesh.face_colors, "corner_colors": mesh.corner_colors}
+    appearance["texture"] = mesh.texture
     never = {"material": mesh.material, "normals": mesh.normals, "alpha": mesh.alpha}
     never["uvs"] = mesh.uvs if mesh.texture is None or kind != "obj" else None
     found = [name for name, value in never.items() if value is not None]
-    for name, value in look.items():
+    for name, value in appearance.items():
         if value is None:
             continue
         if kind in ("stl", "off") or (name == "texture" and kind != "obj"):

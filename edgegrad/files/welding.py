@@ -1,4 +1,4 @@
-"""Parts of mesh files as meshes: joined where they look alike, and welded."""
+"""Parts of mesh files as meshes: joined where their appearance is the same, and welded."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from torch import Tensor
 
 from ..scene.mesh import LARGEST_UV, Mesh
 from .formats.geometry import compact
-from .formats.part import Fault, Part
+from .formats.part import FormatError, Part
 
 
-def _look_of(part: Part) -> tuple[object, ...]:
-    """What parts that become one mesh have in common."""
+def _appearance_of(part: Part) -> tuple[object, ...]:
+    """Return a key that is equal for parts that may become one mesh."""
     missing = part.colors is None, part.face_colors is None, part.normals is None
     images = id(part.texture), id(part.alpha), id(part.material), tuple(sorted(part.material_uvs))
     return *missing, *images, part.cutoff if part.alpha is not None else None, part.wrap, part.filter
 
 
 def merge(parts: list[Part]) -> Part:
-    """One part from parts that look alike. Raises Fault when they do not."""
+    """Return one part from parts of the same appearance. Raises FormatError where it differs."""
     if len(parts) == 1:
         return parts[0]
-    if len({_look_of(part) for part in parts}) > 1:
+    if len({_appearance_of(part) for part in parts}) > 1:
         names = ", ".join(repr(part.name) for part in parts[:5]) + (", …" if len(parts) > 5 else "")
         what = "textures or kinds of colour" if all(part.material is None for part in parts) else "materials or normals"
-        raise Fault(
+        raise FormatError(
             f"expected one mesh, got {len(parts)} parts ({names}) with different {what}; "
             "use load_scene, which keeps them apart, or materials=False"
         )
@@ -38,7 +38,7 @@ def merge(parts: list[Part]) -> Part:
         return None if any(value is None for value in found) else join(found)
 
     def indices(rows: str, name: str) -> np.ndarray | None:
-        """Those into joined rows; None where these are the vertices', or missing."""
+        """Return indices into joined rows, or None where they are the vertices' or missing."""
         given = [getattr(part, rows) for part in parts]
         if any(value is None for value in given) or (name != "faces" and all(getattr(p, name) is None for p in parts)):
             return None
@@ -63,23 +63,25 @@ def merge(parts: list[Part]) -> Part:
 
 
 class Welded(NamedTuple):
-    """Equal rows once."""
+    """Rows of which equal ones are kept once."""
 
     kept: np.ndarray  # (n,) which rows, in the order of the file
     faces: np.ndarray  # (F, 3), indices into these
 
 
 def to_mesh(part: Part, dtype: torch.dtype = torch.float32, by: Welded | None = None) -> Mesh:
-    """Vertices are welded in the type of the part, and then get theirs; `by` says which are one, where it is not the positions
-    alone that tell. Raises Fault."""
+    """Return the mesh of a part in a type; vertices are welded in the type of the part before. Raises FormatError. `by` says
+    which vertices are one where their positions alone do not decide."""
     by = welded(part.verts, part.faces) if by is None else by
     verts, faces = torch.from_numpy(part.verts[by.kept]).to(dtype), torch.from_numpy(by.faces)
     images: dict[str, Any] = {**_material(part), "name": part.name or None}
     shared = part.material is not None and set(part.material.textures) - set(part.material_uvs)
     textured = part.texture is not None or part.alpha is not None or bool(shared)
     if textured and part.uvs is None:
-        raise Fault(f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh")
-    # Those that nothing of the file needs are for textures to come, and for shaders.
+        raise FormatError(
+            f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh"
+        )
+    # Coordinates that no texture of the file needs serve later textures, and shaders.
     if part.uvs is not None and (textured or bool((np.abs(part.uvs) <= LARGEST_UV).all())):
         images["uvs"], images["uv_faces"] = _weld(part.uvs, part.faces if part.uv_faces is None else part.uv_faces)
     if textured:
@@ -102,7 +104,7 @@ def to_mesh(part: Part, dtype: torch.dtype = torch.float32, by: Welded | None = 
 
 
 def _material(part: Part) -> dict[str, Any]:
-    """The material, with texture coordinates for those of its textures that do not lie on the mesh's."""
+    """Return the material, with texture coordinates for textures that do not use the mesh's."""
     if part.material is None:
         return {}
     own = {}
@@ -113,20 +115,20 @@ def _material(part: Part) -> dict[str, Any]:
 
 
 def _of_vertices(corners: Tensor, faces: Tensor, count: int) -> Tensor | None:
-    """(V, K) from values at corners (F, 3, K); None where those at one vertex differ."""
+    """Return values (V, K) of vertices from values at corners (F, 3, K), or None where those at one vertex differ."""
     values = corners.new_zeros(count, corners.shape[-1])
     values[faces] = corners
     return values if torch.equal(values[faces], corners) else None
 
 
 def _weld(rows: np.ndarray, index: np.ndarray) -> tuple[Tensor, Tensor]:
-    """The rows that `index` (F, 3) uses, equal ones once, in the order of the file; and the index into them."""
+    """Return the rows that `index` (F, 3) uses, equal ones once, in the order of the file; and the index into them."""
     found = welded(rows, index)
     return torch.from_numpy(rows[found.kept]), torch.from_numpy(found.faces)
 
 
 def welded(rows: np.ndarray, index: np.ndarray) -> Welded:
-    """Of rows (N, K), those that `index` (F, 3) uses."""
+    """Weld the rows (N, K) that `index` (F, 3) uses."""
     used, flat = compact(index)
     rows = rows[used]
     order = np.lexsort(rows.T)

@@ -1,4 +1,4 @@
-"""Checkpoints of fits: whole files or none, and refused by another fit than the one that wrote them."""
+"""Checkpoints of fits: files that are written whole or not at all, and refused by any other fit than the one that wrote them."""
 
 from __future__ import annotations
 
@@ -17,33 +17,25 @@ from ..files.paths import PathLike, replacing
 from ..warnings import warn
 from .options import Options, Parameter
 from .placement import Placement
-from .views import View
+from .views import Observation
 
-FORMAT = 7
-SAME = (
-    "loss",
-    "mask_loss",
-    "method",
-    "views_per_step",
-    "spp",
-    "seed",
-    "patience",
-    "tolerance",
-    "render",
-)  # options that steps depend on
+FORMAT = 8
+STEP_OPTIONS = (  # options that steps depend on
+    "loss", "mask_loss", "method", "views_per_step", "spp", "seed", "patience", "tolerance", "render",
+)  # fmt: skip
 
 
 class Checkpoint:
-    """The file of one fit, which goes on from it if it `resumes`, and what it was given, by the names of arguments: tensors,
-    dataclasses of them, numbers; functions are taken as the same."""
+    """The file of one fit, which the fit resumes from if `resumes` is True. `given` are the fit's arguments by name: tensors,
+    numbers, or dataclasses of them. Another fit is one with other arguments; functions are not compared."""
 
     def __init__(self, path: PathLike | None, resumes: bool, given: Mapping[str, Any]) -> None:
         self.path, self._resumes = path, resumes
         self._given = {} if path is None else {name: _digest(value) for name, value in given.items()}
 
     @staticmethod
-    def of(options: Options, views: Sequence[View], given: Mapping[str, Any]) -> Checkpoint:
-        """That of a descent; `given` are the arguments of which views and options do not tell."""
+    def from_fit(options: Options, views: Sequence[Observation], given: Mapping[str, Any]) -> Checkpoint:
+        """Return the checkpoint of a descent; `given` are the arguments that options and views do not hold."""
         of_views = {
             "cameras": [traits(view.camera) for view in views],
             "images": [view.image for view in views],
@@ -52,16 +44,17 @@ class Checkpoint:
         }
         if any(view.measured for view in views):
             of_views["measured"] = [dict(view.measured) for view in views]
-        of_options = {name: getattr(options, name) for name in SAME}
+        of_options = {name: getattr(options, name) for name in STEP_OPTIONS}
         return Checkpoint(options.checkpoint, options.resume, {**given, **of_views, **of_options})
 
     def read(self) -> dict[str, Any] | None:
-        """The state to go on from, or None to begin. Raises ValueError for a file that is no checkpoint, or another fit's."""
+        """Return the state to go on from, or None to begin. Raises ValueError for a file that is no checkpoint, or another
+        fit's."""
         if not self._resumes or self.path is None or not Path(self.path).exists():
             return None
         try:
             state = torch.load(self.path, weights_only=True)
-        except Exception as error:  # whatever torch says of a damaged file
+        except Exception as error:  # torch raises errors of many kinds for a damaged file
             raise ValueError(
                 f"{self.path}: expected a checkpoint of a fit, got something else ({type(error).__name__}); "
                 "remove it, or leave out resume"
@@ -85,10 +78,10 @@ class Checkpoint:
         return state["state"]
 
     def write(self, state: dict[str, Any]) -> None:
-        """Where that fails, as on a full disk, the fit goes on, and a warning says so."""
+        """Write the state. If that fails, as on a full disk, the fit goes on with a warning."""
         if self.path is None:
             return
-        content = io.BytesIO()  # torch's own errors of writing do not say why
+        content = io.BytesIO()  # torch's own errors of writing do not give the reason
         torch.save({"format": FORMAT, "given": self._given, "state": state}, content)
         try:
             with replacing(self.path) as temporary:
@@ -101,12 +94,12 @@ class Checkpoint:
 
 
 def traits(camera: Camera) -> tuple[Any, ...]:
-    """All that a camera is, for Checkpoint."""
+    """Return all that a camera consists of, for Checkpoint."""
     return camera, camera.size, camera.projection, camera.lens
 
 
 def _digest(value: Any) -> str:
-    """Of the tensors and plain values in it."""
+    """Hash the tensors and plain values in it."""
     digest = hashlib.sha256()
     for part in _parts(value):
         digest.update(f"{len(part)}:".encode())  # so that 1, 23 and 12, 3 differ
@@ -139,6 +132,6 @@ def _parts(value: Any) -> Any:
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield type(value).__name__.encode()
         for field in dataclasses.fields(value):
-            if field.name != "name":  # what a mesh is called changes nothing
+            if field.name != "name":  # a mesh's name changes nothing
                 yield field.name.encode()
                 yield from _parts(getattr(value, field.name))

@@ -1,10 +1,10 @@
-"""How a fit ended, and what that means for its result, in words."""
+"""How a fit ended, and what this means for its result, in words."""
 
 from __future__ import annotations
 
 from enum import Enum
 
-from .verdict import ENOUGH
+from .edge_support import MIN_EDGE_SUPPORT
 
 
 class Ending(Enum):
@@ -17,9 +17,9 @@ class Ending(Enum):
 
 
 def reason_of(
-    ending: Ending, explained: float, suspects: str = "scene, cameras or pictures", enough: float = ENOUGH
+    ending: Ending, explained: float, suspects: str = "scene, cameras or pictures", enough: float = MIN_EDGE_SUPPORT
 ) -> str:
-    """In words: "converged", or what kept the fit from that, and after a colon how to mend it."""
+    """Return "converged", or what kept the fit from it and, after a colon, how to mend it."""
     if ending is Ending.INTERRUPTED:
         return "interrupted"
     if ending is Ending.FALLING:

@@ -1,4 +1,4 @@
-"""The visual hull of silhouettes: where a fit of a shape may start."""
+"""The visual hull of silhouettes, an initial shape for a fit."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ..check import as_tensor, check_finite, check_int, check_positive_int, chec
 from ..scene.mesh import Mesh
 from .regularizers import edges
 from .remeshing import gpytoolbox, remeshed
-from .views import Images, View, views_of
+from .views import Images, Observation, views_of
 
-COARSE = 32  # cells on a side of the cubes in which the object is looked for
-SMALL = 0.01  # pieces with a smaller share of the largest one's faces are left out
+HULL_CELLS = 32  # on a side of the boxes in which the object is looked for
+MIN_PIECE = 0.01  # of the largest piece's faces; smaller pieces are dropped
 
 
 def visual_hull(
@@ -27,18 +27,19 @@ def visual_hull(
     faces: int | None = None,
     bounds: Tensor | None = None,
 ) -> Mesh:
-    """The largest body that has these silhouettes (Laurentini 1994), as a closed mesh: a start for fit_shape() that has the
-    object's holes, and its parts where they are seen apart.
+    """Return the largest body that has these silhouettes (Laurentini 1994), as a closed mesh.
+
+    As the start of fit_shape() it has the object's holes, and its parts where some view shows them apart.
 
     cameras     at least two that look at the object from different sides
-    masks       (H, W) each, 1 on the object, 0 elsewhere; beyond a side of an image that a mask touches, the
-                object may go on, and nothing is cut away
-    resolution  cells on the longest side of the box around the object: details smaller than a cell are not there
-    faces       about so many, even triangles, as a fit wants them: few for its first level; None: those of the cells
-    bounds      (2, 3) opposite corners of a box that holds the object; None: found from where the cameras look
+    masks       (H, W) each, 1 on the object, 0 elsewhere; where a mask touches a side of its image, the object may go on beyond
+    resolution  cells on the longest side of the box around the object; smaller details are lost
+    faces       about so many even triangles; few are best for the first level of fit_shape(). None: those of the cells
+    bounds      (2, 3) opposite corners of a box that holds the object; None: found from the cameras
 
-    Marching cubes at a mask of one half (Lorensen and Cline 1987). Pieces with less than 1 % of the faces of the largest are left
-    out. Needs gpytoolbox (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError that names the argument, ImportError.
+    The surface is found by marching cubes at a mask of one half (Lorensen and Cline 1987). Pieces with less than 1 % of the
+    faces of the largest piece are dropped. Needs gpytoolbox (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError
+    that names the argument, ImportError.
     """
     check_int("resolution", resolution, 4, 512)
     if faces is not None:
@@ -56,7 +57,7 @@ def visual_hull(
     low, high = box
     cell = float((high - low).max()) / resolution
     count = ((high - low) / cell).ceil().long() + 3
-    # One cell around, so that the surface is closed.
+    # One more cell on each side closes the surface.
     axes = [float(low[k]) + cell * (torch.arange(int(count[k])) - 1).double() for k in range(3)]
     inside = _closed(_inside(views, axes))
     found = _surface(inside, axes)
@@ -73,8 +74,8 @@ def _checked(bounds: object) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def _where_cameras_look(views: Sequence[View]) -> tuple[Tensor, Tensor]:
-    """A cube around the point nearest to all optical axes, as large as what the cameras see there."""
+def _where_cameras_look(views: Sequence[Observation]) -> tuple[Tensor, Tensor]:
+    """Return a cube around the point nearest to all optical axes, as large as what the cameras see there."""
     eyes, axes = [], []
     for view in views:
         pose = view.camera.world_to_camera.double()
@@ -82,7 +83,7 @@ def _where_cameras_look(views: Sequence[View]) -> tuple[Tensor, Tensor]:
         eyes.append(-R.T @ t)
         axes.append(R[2])
     eye, axis = torch.stack(eyes), F.normalize(torch.stack(axes), dim=1)
-    # Of lines through e along a: Σ (I − a aᵀ)(x − e) = 0.
+    # The point x nearest to lines through e along a solves Σ (I − a aᵀ)(x − e) = 0.
     across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
     total = across.sum(0)
     if float(torch.linalg.eigvalsh(total)[0]) < 1e-4 * len(views):
@@ -100,12 +101,12 @@ def _where_cameras_look(views: Sequence[View]) -> tuple[Tensor, Tensor]:
     return middle - half, middle + half
 
 
-def _occupied(views: Sequence[View], box: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """The part of the box that is not empty, and a cell more. Raises ValueError."""
+def _occupied(views: Sequence[Observation], box: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Return the part of the box that is not empty, and one more cell. Raises ValueError."""
     low, high = box
-    step = (high - low) / COARSE
-    axes = [low[k] + step[k] * (torch.arange(COARSE).double() + 0.5) for k in range(3)]
-    # Any pixel of the mask that a cell may cover: the masks are dilated by a cell.
+    step = (high - low) / HULL_CELLS
+    axes = [low[k] + step[k] * (torch.arange(HULL_CELLS).double() + 0.5) for k in range(3)]
+    # Masks are dilated by a cell, so that any pixel that a cell may cover counts.
     places = (_inside(views, axes, float(step.max())) > 0.0).nonzero()
     if not len(places):
         raise ValueError(
@@ -113,12 +114,12 @@ def _occupied(views: Sequence[View], box: tuple[Tensor, Tensor]) -> tuple[Tensor
             "conventions, or turned images, or give bounds"
         )
     first, last = places.amin(0), places.amax(0) + 1
-    return low + step * (first - 0.5).clamp(min=0), low + step * (last + 0.5).clamp(max=COARSE)
+    return low + step * (first - 0.5).clamp(min=0), low + step * (last + 0.5).clamp(max=HULL_CELLS)
 
 
-def _inside(views: Sequence[View], axes: Sequence[Tensor], reach: float = 0.0) -> Tensor:
-    """(nx, ny, nz): the least mask at the points of a grid; zero where no camera sees. With a `reach`, the largest within so many
-    world units counts for each."""
+def _inside(views: Sequence[Observation], axes: Sequence[Tensor], reach: float = 0.0) -> Tensor:
+    """Return the least mask (nx, ny, nz) at the points of a grid, zero where no camera sees. A `reach` in world units takes the
+    largest mask within it for each camera."""
     points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     least, seen = torch.ones(len(points)), torch.zeros(len(points), dtype=torch.bool)
     for view in views:
@@ -145,8 +146,8 @@ def _inside(views: Sequence[View], axes: Sequence[Tensor], reach: float = 0.0) -
 
 
 def _beyond(mask: Tensor, unit: Tensor) -> Tensor:
-    """(N,) what counts as the mask at places outside of an image, whose corners are ±1: 1 beyond sides that it touches, for there
-    the object may go on; 0 beyond the others."""
+    """Return the mask (N,) at places outside of an image with corners at ±1: 1 beyond sides that the mask touches, where the
+    object may go on, and 0 beyond the others."""
     sides = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
     ends = {name: bool((side > 0.5).any()) for name, side in sides.items()}
     x, y = unit.unbind(-1)
@@ -156,7 +157,7 @@ def _beyond(mask: Tensor, unit: Tensor) -> Tensor:
 
 
 def _closed(inside: Tensor) -> Tensor:
-    """Nothing on the rim of the grid."""
+    """Set the border of the grid to zero."""
     inside = inside.clone()
     for dim in range(3):
         for end in (0, -1):
@@ -167,7 +168,7 @@ def _closed(inside: Tensor) -> Tensor:
 def _surface(inside: Tensor, axes: Sequence[Tensor]) -> Mesh:
     nx, ny, nz = inside.shape
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
-    order = grid.permute(1, 2, 0, 3).reshape(-1, 3)  # x runs fastest, then z: how gpytoolbox counts them
+    order = grid.permute(1, 2, 0, 3).reshape(-1, 3)  # gpytoolbox's order: x runs fastest, then z
     field = inside.permute(1, 2, 0).reshape(-1).double()
     found, faces = gpytoolbox("a visual hull").marching_cubes(field.numpy(), order.numpy(), nx, ny, nz, 0.5)
     if not len(faces):
@@ -180,10 +181,10 @@ def _surface(inside: Tensor, axes: Sequence[Tensor]) -> Mesh:
 
 
 def _without_crumbs(verts: Tensor, faces: Tensor) -> Mesh:
-    """Without small pieces."""
+    """Drop small pieces."""
     label = torch.arange(len(verts))
     pairs = edges(faces)
-    while True:  # the least number of all vertices that hang together, by steps that double
+    while True:  # label connected vertices by the least index among them, in steps that double
         new = label.scatter_reduce(0, pairs[:, 0], label[pairs[:, 1]], "amin")
         new = new.scatter_reduce(0, pairs[:, 1], new[pairs[:, 0]], "amin")
         new = new[new]
@@ -192,6 +193,6 @@ def _without_crumbs(verts: Tensor, faces: Tensor) -> Mesh:
         label = new
     piece = label[faces[:, 0]]
     count = torch.bincount(piece, minlength=len(verts))
-    faces = faces[count[piece] >= SMALL * count.max()]
+    faces = faces[count[piece] >= MIN_PIECE * count.max()]
     used, index = faces.unique(return_inverse=True)
     return Mesh(verts[used].float(), index.reshape(-1, 3))

@@ -1,12 +1,11 @@
 """Losses between a render and a picture.
 
-Each takes image and target (..., H, W, C) and, if wanted, a weight (..., H, W, 1), and gives a number: the mean over pixels and
-channels, weighted. A fit takes any function of this form.
+Each takes an image and a target (..., H, W, C) and optionally a weight (..., H, W, 1), and returns the weighted mean over
+pixels and channels. A fit takes any function of this form.
 
-A render has noise of its samples, which is independent of that of its gradient. The gradient of `l2` is therefore unbiased
-with any number of samples; losses that are not quadratic are so in the limit of many. Losses that count outliers less (`l1`,
-`huber`, `robust`) are for what is wrong in the picture; of a noisy render they drop the rare bright samples that carry a part of
-its light.
+A render has noise that is independent of the noise of its gradient. The gradient of `l2` is therefore unbiased with any number
+of samples; gradients of other losses are unbiased in the limit of many. Losses that discount outliers (`l1`, `huber`, `robust`)
+are for faults of the picture. With a noisy render they also drop rare bright samples, which carry a part of its light.
 """
 
 from __future__ import annotations
@@ -30,29 +29,29 @@ def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
 
 
 def l1(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """|r|, r = image − target: outliers count less than with l2."""
+    """Return the mean of |r|, r = image − target: outliers count less than with l2."""
     return _mean((image - target).abs(), weight)
 
 
 def l2(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """r²: the best where what is left is noise alone."""
+    """Return the mean of r², r = image − target: the best loss where the differences are noise alone."""
     return _mean((image - target).square(), weight)
 
 
 def huber(image: Tensor, target: Tensor, weight: Tensor | None = None, scale: float = 0.1) -> Tensor:
-    """½ r² up to |r| = scale, scale (|r| − ½ scale) beyond (Huber 1964)."""
+    """Return the mean of ½ r² up to |r| = scale, and scale (|r| − ½ scale) beyond (Huber 1964)."""
     return _mean(F.huber_loss(image, target, reduction="none", delta=scale), weight)
 
 
 def robust(
     image: Tensor, target: Tensor, weight: Tensor | None = None, scale: float = 0.1, alpha: float = -2.0
 ) -> Tensor:
-    """ρ(r) = |α−2|/α (((r/scale)² / |α−2| + 1)^(α/2) − 1), a general and adaptive robust loss (Barron 2019).
+    """Return the mean of ρ(r) = |α−2|/α (((r/scale)² / |α−2| + 1)^(α/2) − 1), a general robust loss (Barron 2019).
 
-    alpha 2 is l2, 1 a smooth l1, 0 Cauchy's log(½ x² + 1), −2 Geman and McClure's 2x² / (x² + 4), −∞ Welsch's 1 − exp(−½ x²),
-    x = r/scale: at 0 and below, residuals far beyond `scale` hardly matter, whatever hides the object there. For renders whose
-    own noise is well below `scale`: rare bright samples, as of glossy surfaces under small lamps, would be left out too, and the
-    fit be biased. Raise spp and light_samples first.
+    With x = r/scale, alpha 2 is l2, 1 a smooth l1, 0 Cauchy's log(½ x² + 1), −2 Geman and McClure's 2x² / (x² + 4), and −∞
+    Welsch's 1 − exp(−½ x²). At 0 and below, residuals far beyond `scale` hardly count, whatever hides the object there. The
+    noise of the render must be well below `scale`: rare bright samples, as of glossy surfaces under small lights, would be
+    dropped too and bias the fit. Raise spp and light_samples first.
     """
     square = ((image - target) / scale).square()
     if alpha == 2.0:
@@ -68,14 +67,15 @@ def robust(
 
 
 def iou(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """1 − Σ min(a, b) / Σ max(a, b) of soft masks a and b: one minus intersection over union, over each whole image."""
+    """Return 1 − Σ min(a, b) / Σ max(a, b) of soft masks: one minus intersection over union, over each whole image."""
     w = torch.ones_like(image[..., :1]) if weight is None else weight
     both, either = ((w * f(image, target)).sum((-3, -2, -1)) for f in (torch.minimum, torch.maximum))
     return (1.0 - both / either.clamp(min=1e-30)).mean()
 
 
 def ssim(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """1 − the structural similarity (Wang et al. 2004) of images in 0 … 1, by torchmetrics (`pip install 'edgegrad[fit]'`)."""
+    """Return 1 − the structural similarity (Wang et al. 2004) of images in 0 … 1, by torchmetrics (`pip install
+    'edgegrad[fit]'`)."""
     metrics = require("torchmetrics.functional.image", "edgegrad[fit]", "ssim")
 
     def batch(x: Tensor) -> Tensor:
@@ -88,7 +88,7 @@ def ssim(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
 
 
 def multiscale(loss: Loss = l2, levels: int = 4) -> Loss:
-    """The mean of `loss` over an image pyramid, each level half the size: sees further than a pixel."""
+    """Return a loss that is the mean of `loss` over an image pyramid of halved levels; it sees farther than a pixel."""
 
     def over_levels(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
         total = torch.zeros((), dtype=image.dtype)
@@ -96,7 +96,7 @@ def multiscale(loss: Loss = l2, levels: int = 4) -> Loss:
         image, target = image * w, target * w
         used = 0
         for _ in range(levels):
-            # Divided where pixels count at all, so that what a weight hides does not darken its neighbours.
+            # Dividing by the weight keeps hidden pixels from darkening their neighbours.
             share = w.clamp(min=1e-6)
             total, used = total + loss(image / share, target / share, w), used + 1
             if min(image.shape[-3:-1]) < 2:
@@ -112,12 +112,12 @@ def _halved(x: Tensor) -> Tensor:
     return F.avg_pool2d(flat, 2).movedim(1, -1).reshape(*x.shape[:-3], x.shape[-3] // 2, x.shape[-2] // 2, x.shape[-1])
 
 
-REGION = "region"  # of pictures, not of renders: descent/regions.py has it
+REGION = "region"  # compares pictures with silhouettes: see descent/region_loss.py
 LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "huber": huber, "robust": robust, "iou": iou, "ssim": ssim}
 
 
 def loss_of(name: str, loss: str | Loss) -> Loss:
-    """By name, or itself, which then raises TypeError or ValueError if it gives no number. Raises TypeError or ValueError."""
+    """Return the loss of that name, or a function that checks what the given one returns. Raises TypeError or ValueError."""
     if callable(loss):
         return _checked(name, loss)
     if not isinstance(loss, str):
@@ -133,7 +133,7 @@ def _checked(name: str, loss: Loss) -> Loss:
         inspect.signature(loss).bind(None, None, None)
     except TypeError as error:
         raise TypeError(f"{name}: expected a function of image, target and weight, got one with {error}") from None
-    except ValueError:  # it does not tell
+    except ValueError:  # some builtins have no signature
         pass
 
     def checked(image: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:

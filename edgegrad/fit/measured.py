@@ -1,9 +1,8 @@
-"""Pictures of depth, normals and positions, from sensors or other renderers, and how a render is compared with them.
+"""Measured depths, normals and positions, from sensors or other renderers, and the loss that compares a render with them.
 
-A render's channels are multiplied by its alpha a, and so is the picture before it is compared: r = c − a m, of the channel c and
-what was measured, m. At a silhouette r then jumps by the difference of two depths, not by the depth itself, so it does not
-matter from where depths are counted. Where the render shows nothing, r is zero; that what was measured is covered, says the
-mask, or where there is none a term of its own.
+A render's channel c is multiplied by its alpha a, and so is the measurement m: r = c − a m. At a silhouette r then jumps by the
+difference of two depths, not by the depth itself, so the origin of depths does not matter. Where the render shows nothing, r is
+zero; the mask says that measured pixels are covered, or, without a mask, a term of its own.
 """
 
 from __future__ import annotations
@@ -19,22 +18,26 @@ from torch import Tensor
 from ..camera.camera import Camera
 from ..check import as_tensor, check_float, check_positive, check_shape
 
-CHANNELS = {"depths": "depth", "normals": "shading_normal", "positions": "position"}  # of render_aovs(), by argument
+CHANNELS = {
+    "depths": "depth",
+    "normals": "shading_normal",
+    "positions": "position",
+}  # channels of render_aovs() by argument
 WIDTHS = {"depth": 1, "shading_normal": 3, "position": 3}
-NORMAL_SCALE = 0.1  # some 6°
-MAD = 1.4826  # standard deviations of Gaussian noise in the median of its sizes
+NORMAL_SCALE = 0.1  # about 6°
+MAD = 1.4826  # standard deviation of Gaussian noise over the median of its sizes
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Pictures of depth, normals or positions, and how far to trust them.
+    """Measured depths, normals or positions, and how far to trust them.
 
-    values   for each camera (H, W), (H, W, 1) or (H, W, 3), or None where it has none. What is not finite, or 0 (of normals and
-             positions all three), is not measured
-    weights  for each camera (H, W) or (H, W, 1), from 0, or None: how much a pixel counts, as a sensor's confidence says. None: 1
-    factor   how much all of them count beside masks and colours
-    scale    residuals up to about this are noise, in the units of `values`; once most are so small, much larger ones are
-             taken for outliers. None: the width of a pixel at the object, and for normals 0.1
+    values   for each camera (H, W), (H, W, 1) or (H, W, 3), or None where it has none; a pixel that is not finite, or 0 (for
+             normals and positions in all three), is not measured
+    weights  for each camera (H, W) or (H, W, 1), ≥ 0: how much a pixel counts, as a sensor's confidence says; None: 1
+    factor   weight of all of them relative to masks and colours
+    scale    residuals up to about this are noise, in the units of `values`; much larger ones count as outliers once most are
+             below. None: the width of a pixel at the object, and 0.1 for normals
 
     Raises TypeError or ValueError that names the argument.
     """
@@ -52,16 +55,16 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """One such picture. `factor` and `scale` are the same in all views."""
+    """A measured channel of one view. `factor` and `scale` are the same in all views."""
 
     value: Tensor  # (H, W, c), zero where nothing was measured
     weight: Tensor  # (H, W, 1), zero there too
     factor: float
     scale: float
-    metric: bool  # whether the scale is that of a pixel's width, which grows as pixels do
+    metric: bool  # whether the scale is a pixel's width, which grows with pixels
 
     def resized(self, size: tuple[int, int]) -> Measurement:
-        """Means over larger pixels; what was measured in less than half of one, is not."""
+        """Average over larger pixels; a pixel is measured if at least half of it is."""
         H, W = self.value.shape[:2]
         weight = area_mean(self.weight, size)
         value = area_mean(self.value * self.weight, size) / weight.clamp(min=1e-30)
@@ -70,15 +73,15 @@ class Measurement:
         return replace(self, value=value * known, weight=weight * known, scale=scale)
 
     def displayed(self, value: Tensor) -> Tensor:
-        """(H, W, c) from 0 to 1, the range of what was measured, but for what is not there."""
+        """Map (H, W, c) to 0 … 1, the range of the measured values."""
         seen = self.value[self.weight[..., 0] > 0]
         low, high = (seen.amin(0), seen.amax(0)) if len(seen) else (value.amin(), value.amax())
         return ((value - low) / (high - low).clamp(min=1e-30)).clamp(0.0, 1.0)
 
 
 def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[dict[str, Measurement]]:
-    """For each camera what was measured there, by the channel of render_aovs(); `given` by the argument's name, each a Measured,
-    or its values. Raises TypeError or ValueError that names the argument."""
+    """Return for each camera its measurements by the channel of render_aovs(). `given` has a Measured, or its values, by the
+    argument's name. Raises TypeError or ValueError that names the argument."""
     found: list[dict[str, Measurement]] = [{} for _ in cameras]
     for name, value in given.items():
         if value is None:
@@ -92,7 +95,7 @@ def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[di
             if picture is not None:
                 checked[i] = _checked(where, picture, weight, WIDTHS[CHANNELS[name]], camera.size)
             elif weight is not None:
-                raise ValueError(f"{where}: expected a picture beside its weights, got None")
+                raise ValueError(f"{where}: expected a picture with its weights, got None")
         if not any(bool((weight > 0).any()) for _, weight in checked.values()):
             raise ValueError(
                 f"{name}: expected a pixel that was measured, got none: all are 0, not finite, or have the weight 0"
@@ -109,7 +112,7 @@ def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[di
 
 
 def _each(name: str, value: Any, cameras: Sequence[Camera]) -> list[Any]:
-    """One for each camera. Raises ValueError."""
+    """Return one for each camera. Raises ValueError."""
     if value is None:
         return [None] * len(cameras)
     single = len(cameras) == 1 and not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) < 4
@@ -122,7 +125,7 @@ def _each(name: str, value: Any, cameras: Sequence[Camera]) -> list[Any]:
 
 
 def _checked(name: str, picture: Any, weight: Any, width: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Picture (H, W, width) and weight (H, W, 1), both zero where nothing was measured. Raises TypeError or ValueError."""
+    """Return values (H, W, width) and weights (H, W, 1), both zero where nothing was measured. Raises TypeError or ValueError."""
     fix = "the camera must have the picture's size: camera.resized((H, W))"
     value = as_tensor(name, picture).detach().cpu()
     if not value.is_floating_point():
@@ -161,7 +164,7 @@ def _check_lengths(pictures: Mapping[int, tuple[Tensor, Tensor]]) -> None:
 
 
 def _pixel_width(name: str, pictures: Mapping[int, tuple[Tensor, Tensor]], cameras: Sequence[Camera]) -> float:
-    """What a pixel covers at what was measured, the median of the views."""
+    """Return the median over views of what a pixel covers at the measured surface."""
     widths = []
     for i, (value, weight) in pictures.items():
         camera, seen = cameras[i], value[weight[..., 0] > 0]
@@ -179,17 +182,19 @@ def _pixel_width(name: str, pictures: Mapping[int, tuple[Tensor, Tensor]], camer
 
 
 def comparable(render: Tensor, alpha: Tensor, given: Measurement) -> tuple[Tensor, Tensor]:
-    """What a render (H, W, c) with alpha (H, W, 1) is compared with, and the weights: where nothing was measured, with itself."""
+    """Return a target for a render (H, W, c) with alpha (H, W, 1), which is the render itself where nothing was measured, and
+    weights."""
     known = given.weight > 0
     return torch.where(known, alpha * given.value, render), given.weight
 
 
 def measured_loss(render: Tensor, alpha: Tensor, given: Sequence[Measurement], covers: bool) -> Tensor:
-    """Of renders (B, H, W, c) with alpha (B, H, W, 1), a mean over all pixels: with x = |r| / s Geman and McClure's
-    2x² / (x² + 4), which levels off for outliers, times s / scale. s is the residuals' median size, and the scale at least, so
-    that a shape that is far away is not taken for an outlier.
+    """Return the loss of renders (B, H, W, c) with alpha (B, H, W, 1), a mean over all pixels.
 
-    covers  whether the render must be opaque where a pixel and those beside it were measured, for there is no mask that says it
+    With x = |r| / s it is Geman and McClure's 2x² / (x² + 4), which levels off for outliers, times s / scale. s is the
+    residuals' median size, and the scale at least, so that a shape that is far away does not count as an outlier.
+
+    covers  whether the render must be opaque at pixels that are measured with all their neighbours, for there is no mask
     """
     value, weight = torch.stack([m.value for m in given]), torch.stack([m.weight for m in given])
     square = (render - alpha * value).square().sum(-1, keepdim=True)
@@ -208,5 +213,5 @@ def measured_loss(render: Tensor, alpha: Tensor, given: Sequence[Measurement], c
 
 
 def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Means over the new pixels' areas, which is what a render of that size with the box filter estimates."""
+    """Resize by means over the new pixels' areas, which a render of that size with the box filter estimates."""
     return F.interpolate(image.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)

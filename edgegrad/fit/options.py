@@ -1,4 +1,4 @@
-"""What a fit by gradient descent is told: its parameters and its options."""
+"""The parameters and options of fits by descent."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ RENDER = tuple(inspect.signature(render_aovs).parameters)[3:]
 
 @dataclass(frozen=True)
 class Parameter:
-    """What is sought: a tensor and its steps.
+    """A tensor to find, and how it moves.
 
-    lr       the learning rate: about how far each number moves in a step, in its own units
-    value    where the fit starts; None: what the scene holds under this name
-    low      bounds, numbers or tensors that broadcast
-    high
-    uniform  one step size for all numbers instead of each its own, as the coordinates of one surface need
+    lr       learning rate: about how far each number moves in a step, in its own units
+    value    where the fit starts; None: the scene's tensor of this name
+    low      lower bound, a number or a tensor that broadcasts; None: none
+    high     upper bound, likewise
+    uniform  one step size for all numbers of the tensor, as coordinates of one surface need; False: one for each number
     """
 
     lr: float
@@ -39,7 +39,7 @@ class Parameter:
     uniform: bool = False
 
     def checked(self, name: str) -> Parameter:
-        """With a value of its own, on the CPU. Raises TypeError or ValueError."""
+        """Return a copy with a value of its own on the CPU. Raises TypeError or ValueError."""
         check_positive(f"{name}: lr", self.lr, least=0.0, most=1e30)
         if self.value is None:
             raise ValueError(f"{name}: expected a value to start from, got None; give Parameter(lr, value)")
@@ -67,33 +67,34 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Options:
-    """What all fits by descent can be told.
+    """Options of all fits by descent.
 
     loss              between render and picture: "l1", "l2", "huber", "robust", "ssim", or a function of image, target and
-                      weight; edgegrad.fit.losses has more, with their parameters. "robust" for what the render lacks, not
-                      against noise of glossy light. Or "region", for photographs without masks, whose light nobody knows: the
-                      object is where the colours are that lie within its silhouette, counted near the contour in the picture.
-                      It moves shapes, poses and cameras; colours of the render have no part in it, and all meshes of the scene
-                      are the object. Colours are counted by the present silhouette every three steps, and stay between
-    mask_loss         the same between the render's alpha and the mask, also "iou"
+                      weight; edgegrad.fit.losses has more, with their parameters. "robust" is for what the render lacks, not
+                      for noise of glossy light. "region" is for photographs without masks in unknown light: the object is where
+                      the colours are that lie within its silhouette, counted near the contour. It moves shapes, poses and
+                      cameras, and takes all meshes of the scene for the object; the scene's own colours do not count. Colours
+                      are counted every three steps
+    mask_loss         between alpha and mask: one of the same, or "iou"
     method            "adam", for any count of numbers; or "gauss-newton", for up to 400: far fewer steps, each with the
-                      derivative by every one of them in forward mode. It wants all views in each step, and a loss of each
-                      pixel by itself (not "ssim", "iou" or a pyramid). A step then moves no number by more than ten learning
-                      rates
-    steps             at most so many
-    views_per_step    so many views, drawn anew, in each step; None: all of them
-    spp               samples a pixel
-    seed              the same seed gives the same fit
-    patience          the fit ends where so many more steps promise, by the gradients at the end of the last ones, that the loss
-    tolerance         falls by less than this share of it, or of what it has fallen by so far, or by less than its noise; "adam"
-                      first takes shorter steps, three times. With a tolerance of 0 it takes all its steps
+                      derivative by every number in forward mode. It needs all views in each step, and a loss that compares each
+                      pixel by itself (not "ssim", "iou" or a pyramid); a step moves no number by more than ten learning rates
+    steps             largest number of steps
+    views_per_step    number of views in each step, drawn anew; None: all
+    spp               samples per pixel
+    seed              of the samples; the same seed gives the same fit
+    patience          number of steps over which the fit predicts the decrease of its loss, from gradients at the end of the
+                      last steps
+    tolerance         the fit ends if that decrease is less than this share of the loss, or of its decrease so far, or less than
+                      its noise; "adam" first shortens its steps, three times. 0: the fit takes all its steps
     progress          show a bar with the loss on standard error
-    callback          called after each step with its Record, which is a Progress: it has scene and cameras too; KeyboardInterrupt
-                      from it ends the fit
-    checkpoint        a file that holds the fit's state, written every `checkpoint_every` steps and at the end, and never in part
+    callback          called after each step with its Record, a Progress with scene and cameras; KeyboardInterrupt from it ends
+                      the fit
+    checkpoint        file for the fit's state, written every `checkpoint_every` steps and at the end, never in part; None: no
+                      file
     checkpoint_every  steps
-    resume            go on from the checkpoint, if there is one: the fit ends as if it had never stopped. One of a fit that was
-                      given something else is refused
+    resume            go on from the checkpoint if there is one: the fit ends as if it had never stopped. A checkpoint of a fit
+                      with other arguments is refused
     render            further arguments of render(), such as light_samples
     """
 
@@ -136,7 +137,7 @@ class Options:
 
 
 def check_checkpoint(checkpoint: PathLike | None, every: int, resume: bool) -> None:
-    """Raises TypeError, ValueError or FileNotFoundError."""
+    """Check arguments for checkpoints. Raises TypeError, ValueError or FileNotFoundError."""
     check_positive_int("checkpoint_every", every)
     if resume and checkpoint is None:
         raise ValueError("resume: expected a checkpoint to go on from, got none; give checkpoint=path")

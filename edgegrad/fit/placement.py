@@ -1,4 +1,4 @@
-"""Where an object stands: a pose, and a parameter of a fit that is one."""
+"""Poses of objects, and parameters of a fit that are poses."""
 
 from __future__ import annotations
 
@@ -19,48 +19,50 @@ from .options import Parameter
 
 
 class Pose(NamedTuple):
-    """Mesh to world, `world = scale · R v + t`, and the focal length relative to the given camera's. float64 where a fit gives
-    it; in a function that makes the scene of fit_scene(), in the type of the object's vertices."""
+    """A pose, mesh to world: `world = scale · R v + t`, and the change of the camera's lens.
+
+    It is float64 in results. A function that makes the scene of fit_scene() gets it in the type of the object's vertices.
+    """
 
     R: Tensor  # (3, 3)
     t: Tensor  # (3,) world units
     scale: Tensor = torch.ones((), dtype=torch.float64)  # ()
-    focal: Tensor = torch.ones((), dtype=torch.float64)  # ()
-    principal: Tensor = torch.zeros(2, dtype=torch.float64)  # how far the point moved, in widths of the image
-    distortion: Tensor = torch.zeros(8, dtype=torch.float64)  # what is added to the camera's
+    focal: Tensor = torch.ones((), dtype=torch.float64)  # () relative to the given camera's focal length
+    principal: Tensor = torch.zeros(2, dtype=torch.float64)  # shift of the principal point, in widths of the image
+    distortion: Tensor = torch.zeros(8, dtype=torch.float64)  # added to the camera's coefficients
 
     @property
     def matrix(self) -> Tensor:
-        """(4, 4), for column vectors."""
+        """The (4, 4) matrix for column vectors."""
         return rigid(self.scale * self.R, self.t)
 
     @property
     def numbers(self) -> list[float]:
-        """All of them, one after the other."""
+        """All fields as one list."""
         return [number for field in self for number in field.flatten().tolist()]
 
     def closest(self, symmetries: Symmetries, reference: Pose) -> Pose:
-        """Of the poses in which the mesh looks the same, the one whose rotation is nearest to the reference's."""
+        """Return, among the poses that `symmetries` make equal, the one whose rotation is nearest to the reference's."""
         matrix = symmetries.closest(self.matrix, reference.matrix)
         return self._replace(R=matrix[:3, :3] / self.scale, t=matrix[:3, 3])
 
     @staticmethod
-    def of(numbers: list[float]) -> Pose:
-        """From `numbers`."""
+    def from_numbers(numbers: list[float]) -> Pose:
+        """Return the pose of a list as `numbers` gives it."""
         R, t, scale, focal, principal, distortion = torch.tensor(numbers, dtype=torch.float64).split([9, 3, 1, 1, 2, 8])
         return Pose(R.reshape(3, 3), t, scale[0], focal[0], principal, distortion)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseParameter:
-    """A pose that is sought, in steps by a rotation vector about the object's centre, and a shift in sizes of the object.
+    """A pose to find, in steps of a rotation vector about the object's centre and a shift in sizes of the object.
 
-    start     where it stands at first, a Pose(R, t) or Pose(R, t, scale); None: where its vertices are
-    of        the object, a Mesh or a Scene: its centre and size are those of its bounding box. None: of what the scene holds
-              under the parameter's name
-    rotation  learning rates: about so many radians in a step,
-    shift     so many sizes of the object, the diagonals of its bounding box,
-    scale     and so much of the logarithm of the scale; None: that stays as it is
+    start     initial pose, Pose(R, t) or Pose(R, t, scale); None: the vertices stay where they are
+    of        the object, a Mesh or a Scene: centre and size are those of its bounding box. None: the part of the scene that the
+              parameter's name names
+    rotation  learning rate, about radians per step
+    shift     learning rate, about sizes of the object (diagonals of its bounding box) per step
+    scale     learning rate of the logarithm of the scale; None: the scale is fixed
     """
 
     start: Pose | None = None
@@ -70,7 +72,7 @@ class PoseParameter:
     scale: float | None = None
 
     def placed(self, name: str, of: Mesh | Scene | None = None) -> Placement:
-        """Checked; `of` where it names no object itself. Raises TypeError or ValueError."""
+        """Return the checked parameter of an object, by default `of`. Raises TypeError or ValueError."""
         for rate in ("rotation", "shift", "scale"):
             if rate != "scale" or self.scale is not None:
                 check_positive(f"{name}: {rate}", getattr(self, rate), least=0.0, most=1e30)
@@ -90,7 +92,7 @@ class PoseParameter:
 
 
 def _checked(name: str, start: object) -> Pose:
-    """float64 on the CPU. Raises TypeError or ValueError."""
+    """Return the pose in float64 on the CPU. Raises TypeError or ValueError."""
     f64 = torch.float64
     if start is None:
         return Pose(torch.eye(3, dtype=f64), torch.zeros(3, dtype=f64))
@@ -108,8 +110,8 @@ def _checked(name: str, start: object) -> Pose:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A PoseParameter of a known object. Its coordinates are zero at the start: a rotation vector ω about the centre c, a shift d
-    in sizes, and the logarithm of a scale; R = exp([ω]×) R₀, and the centre is at s₀ R₀ c + t₀ + d · size."""
+    """A PoseParameter of a known object. Its coordinates are zero at the start: a rotation vector ω about the centre c, a shift
+    d in sizes, and the logarithm of a scale. R = exp([ω]×) R₀, and the centre is at s₀ R₀ c + t₀ + d · size."""
 
     parameter: PoseParameter
     start: Pose
@@ -119,7 +121,7 @@ class Placement:
 
     @property
     def coordinates(self) -> dict[str, Parameter]:
-        """As parameters of their own, by the names that gradients have in histories."""
+        """The coordinates as parameters, by the names that gradients have in histories."""
         rates = {"rotation": self.parameter.rotation, "shift": self.parameter.shift}
         found = {name: Parameter(rate, torch.zeros(3, dtype=torch.float64)) for name, rate in rates.items()}
         if self.parameter.scale is not None:
@@ -127,7 +129,7 @@ class Placement:
         return found
 
     def pose(self, values: Mapping[str, Tensor]) -> Pose:
-        """At these coordinates, differentiable."""
+        """Return the pose at these coordinates, differentiable."""
         R0, t0, s0 = self.start[:3]
         R = rotation(values["rotation"]) @ R0
         scale = s0 * values["scale"].exp() if "scale" in values else s0
@@ -136,7 +138,7 @@ class Placement:
 
 
 class Coordinates:
-    """The tensors in which a fit takes its steps, and the values of which a scene is made: some of these are poses."""
+    """The tensors in which a fit takes its steps, and the values, some of them poses, of which a scene is made."""
 
     def __init__(self, parameters: Mapping[str, Parameter | Placement]) -> None:
         self.parameters: dict[str, Parameter] = {}
@@ -148,7 +150,7 @@ class Coordinates:
                 self.parameters[name] = parameter
 
     def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Tensors, and a Pose for each PoseParameter, by the parameters' names; differentiable."""
+        """Return a tensor, or a Pose for each PoseParameter, by the parameters' names; differentiable."""
         if not self.placements:
             return dict(tensors)
         found: dict[str, Any] = dict(tensors)
@@ -158,7 +160,7 @@ class Coordinates:
         return found
 
     def plain(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The same without gradients, and with poses as matrices (4, 4) float64, as results and histories have them."""
+        """Return the values without gradients, poses as matrices (4, 4) float64, as results and histories hold them."""
         with torch.no_grad():
             found = {name: tensor.detach() for name, tensor in tensors.items()}
             for name, pose in self.poses(tensors).items():
@@ -168,11 +170,11 @@ class Coordinates:
             return found
 
     def recorded(self, record: Record) -> Record:
-        """As histories have it."""
+        """Return the record as histories hold it."""
         return record._replace(values=self.plain(record.values)) if self.placements else record
 
     def poses(self, tensors: Mapping[str, Tensor]) -> dict[str, Pose]:
-        """Those by name, float64."""
+        """Return the poses by name, in float64."""
         with torch.no_grad():
             return {
                 name: placement.pose({part: tensors[f"{name}.{part}"].detach() for part in placement.coordinates})

@@ -1,4 +1,4 @@
-"""Pictures of fits by descent."""
+"""Figures of fits by descent."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ..files.image import linear_to_srgb
 from .history import Record
+from .views import displayed
 
 INK = "#303030"
 
 
 def comparison(rows: Sequence[tuple[Tensor, Tensor, Tensor]], differences: bool = True) -> Figure:
-    """target | start | fit | difference; a row of linear images (H, W, C) for each view."""
+    """Draw target, start, fit and difference, with a row of linear images (H, W, C) for each view."""
     columns = 3 + differences
-    shown = [tuple(map(displayed, row)) for row in rows]
+    shown = [tuple(displayed(image).numpy() for image in row) for row in rows]
     apart = [np.abs(end - target) for target, _, end in shown]
-    # Errors of a good fit are too faint to see as they are; by a power of two, so that the caption is easy to read.
+    # Errors of a good fit are too faint to see. A power of two keeps the caption easy to read.
     largest = max(float(np.quantile(a, 0.999)) for a in apart)
     factor = 2 ** int(np.clip(np.floor(-np.log2(largest + 1e-9)), 0, 4))
     h, w = np.array(shown[0][0].shape[:2]) / max(shown[0][0].shape[:2])
@@ -39,7 +39,7 @@ def comparison(rows: Sequence[tuple[Tensor, Tensor, Tensor]], differences: bool 
 
 
 def curves(history: Sequence[Record]) -> Figure:
-    """The loss, and the norm of the gradient by each parameter."""
+    """Draw the loss, and the norm of the gradient by each parameter."""
     figure = Figure(figsize=(6.4, 4.4), dpi=200, layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     steps = [record.step + 1 for record in history]
@@ -52,19 +52,13 @@ def curves(history: Sequence[Record]) -> Figure:
 
 
 def draw_gradients(axes: Axes, gradients: Sequence[Mapping[str, float]]) -> None:
-    """The norm of each, from step 1 on; with gaps where a step has none of that name."""
+    """Draw each norm from step 1 on, with gaps where a step has none of that name."""
     for name in dict.fromkeys(name for gradient in gradients for name in gradient):
         norms = [gradient.get(name, math.nan) for gradient in gradients]
-        # With points, for a step between gaps has no line.
+        # A step between gaps has no line, so it is drawn as a point.
         axes.plot(range(1, len(norms) + 1), norms, ".-", markersize=3, linewidth=1, label=name)
     axes.set_yscale("log")
     axes.set_ylabel("|gradient|")
     axes.set_xlabel("step")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
-
-
-def displayed(image: Tensor) -> np.ndarray:
-    """(H, W, 3) sRGB in 0 … 1 from linear radiance."""
-    colors = image[..., :3] if image.shape[-1] >= 3 else image[..., :1].expand(-1, -1, 3)
-    return linear_to_srgb(colors.detach().clamp(0.0, 1.0)).numpy()

@@ -1,7 +1,7 @@
-"""What poses are likely where the pictures do not say: terms that fit_rig() adds to its loss.
+"""Priors for fit_rig(): terms of its loss for what the pictures leave open.
 
-Each makes a function of a rig's values, by name, rotations as rotation vectors. Weights are relative to the loss at full size, a
-mean square difference of pictures from 0 to 1; fit_rig() makes them larger on coarse levels.
+Each is a function of a rig's values by name, rotations as rotation vectors. Weights are relative to the loss at full size, a
+mean square difference of pictures in 0 … 1; fit_rig() raises them on coarse levels.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ PLACE = ("translation", "orientation", "scale")
 
 
 def checked_priors(priors: Sequence[Prior], values: Mapping[str, Tensor]) -> list[Prior]:
-    """That each makes one number of such values. Raises TypeError or ValueError."""
+    """Check that each returns one number for such values. Raises TypeError or ValueError."""
     if not isinstance(priors, Sequence) or isinstance(priors, str):
         raise TypeError(f"priors: expected a list of functions of values, got {type(priors).__name__}")
     for k, term in enumerate(priors):
@@ -32,7 +32,7 @@ def checked_priors(priors: Sequence[Prior], values: Mapping[str, Tensor]) -> lis
 
 
 def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
-    """Σ (x − rest)² over all values but those of the whole's place; rotations are in radians."""
+    """Return the prior weight · Σ (x − rest)² over all values but PLACE; rotations are in radians."""
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:
         total = torch.zeros((), dtype=torch.float64)
@@ -47,8 +47,8 @@ def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
 def mirrored(
     name: str, pairs: Sequence[tuple[int, int]], signs: Sequence[float] = (1.0, -1.0, -1.0), weight: float = 1e-6
 ) -> Prior:
-    """Σ |x_left − s x_right|² over pairs of rows of a control: with these signs of rotation vectors, mirrored at x = 0 where the
-    joints' own axes are the world's."""
+    """Return the prior weight · Σ |x_left − s x_right|² over pairs of rows of a control. The signs s mirror rotation vectors at
+    x = 0 if the joints' own axes are the world's."""
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:
         value = values[name]
@@ -59,7 +59,8 @@ def mirrored(
 
 
 def near(before: Mapping[str, Tensor], weight: float = 1e-5) -> Prior:
-    """Σ (x − before)² over all values: smooth over time, where `before` is the pose of the last frame, or what it leads to."""
+    """Return the prior weight · Σ (x − before)² over all values. It makes a sequence smooth if `before` is the pose of the last
+    frame, or its extrapolation."""
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:
         parts = [(value - before[name].to(value)).square().sum() for name, value in values.items() if name in before]

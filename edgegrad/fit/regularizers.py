@@ -1,6 +1,6 @@
-"""What a good shape or texture looks like where the pictures do not say: terms to add to a loss.
+"""Regularizers of shapes and textures: terms to add to a loss for what the pictures leave open.
 
-All are numbers without units, so that one weight serves meshes of any scale. verts are (V, 3), faces (F, 3).
+All are numbers without units, so one weight serves meshes of any scale. verts are (V, 3), faces (F, 3).
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from ..scene.rows import areas, unit
 
 
 def edges(faces: Tensor) -> Tensor:
-    """(E, 2) int64: every edge once, its smaller vertex first."""
+    """Return every edge (E, 2) int64 once, its smaller vertex first."""
     f = faces.long()
     pairs = torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).sort(dim=1).values
     return torch.unique(pairs, dim=0)
 
 
 def edge_pairs(faces: Tensor) -> Tensor:
-    """(P, 2) int64: the two faces of every edge that has two."""
+    """Return the two faces (P, 2) int64 of every edge that has two."""
     f = faces.long()
     sides = torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).sort(dim=1).values
     owner = torch.arange(len(f)).repeat(3)
@@ -30,7 +30,7 @@ def edge_pairs(faces: Tensor) -> Tensor:
 
 
 def laplacian(verts: Tensor, faces: Tensor) -> Tensor:
-    """Mean |v − mean of its neighbours|², in squared mean edge lengths: zero where the surface is flat and evenly meshed."""
+    """Return the mean |v − mean of its neighbours|², in squared mean edge lengths: zero where the surface is flat and even."""
     pairs = edges(faces)
     both = torch.cat([pairs, pairs.flip(1)])
     count = torch.zeros(len(verts), dtype=verts.dtype).index_add(0, both[:, 0], verts.new_ones(len(both)))
@@ -41,29 +41,32 @@ def laplacian(verts: Tensor, faces: Tensor) -> Tensor:
 
 
 def edge_length(verts: Tensor, faces: Tensor) -> Tensor:
-    """The variance of the edges' lengths over their mean square: zero when all are alike."""
+    """Return the variance of the edges' lengths over their mean square: zero when all are equal."""
     pairs = edges(faces)
     length = (verts[pairs[:, 0]] - verts[pairs[:, 1]]).norm(dim=1)
     return length.var(correction=0) / length.square().mean().detach()
 
 
 def normal_consistency(verts: Tensor, faces: Tensor) -> Tensor:
-    """Mean 1 − n₁·n₂ of faces that share an edge: zero where the surface is flat."""
+    """Return the mean 1 − n₁·n₂ of faces that share an edge: zero where the surface is flat."""
     normals = unit(areas(verts[faces.long()])).to(verts.dtype)
     first, second = normals[edge_pairs(faces)].unbind(1)
     return (1.0 - (first * second).sum(1)).mean()
 
 
 def area(verts: Tensor, faces: Tensor) -> Tensor:
-    """The area of the surface, in squared diagonals of its bounding box: the smallest surface among those that pictures allow. In
-    a fit to silhouettes it takes away what no view shows to be empty or full, for nothing else does."""
+    """Return the area of the surface, in squared diagonals of its bounding box.
+
+    It prefers the smallest surface that the pictures allow. In a fit to silhouettes nothing else removes what no view shows to
+    be empty or full.
+    """
     a, b, c = verts[faces.long()].unbind(1)
     low, high = verts.detach().aminmax(dim=0)
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / (high - low).square().sum().clamp(min=1e-30)
 
 
 def total_variation(texture: Tensor) -> Tensor:
-    """Mean |difference of neighbouring texels| of (h, w, C): keeps edges and takes away speckles."""
+    """Return the mean |difference of neighbouring texels| of (h, w, C): it keeps edges and removes speckles."""
     return (texture[1:] - texture[:-1]).abs().mean() + (texture[:, 1:] - texture[:, :-1]).abs().mean()
 
 

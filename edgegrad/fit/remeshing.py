@@ -1,4 +1,4 @@
-"""Meshes of even triangles."""
+"""Remeshing to even triangles."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ import torch
 from ..optional import require
 from ..scene.mesh import Mesh
 
-ROUNDS = 5
+REMESHING_ROUNDS = 5
 
 
 def remeshed(mesh: Mesh, faces: int) -> Mesh:
-    """About so many even triangles on the same surface (Botsch and Kobbelt 2004), by gpytoolbox. Raises ImportError."""
+    """Return a mesh of about so many even triangles on the same surface (Botsch and Kobbelt 2004), by gpytoolbox. Raises
+    ImportError."""
     a, b, c = mesh.verts.double()[mesh.faces.long()].unbind(1)
     area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
-    edge = math.sqrt(4.0 * area / (math.sqrt(3.0) * faces))  # of equilateral triangles
+    edge = math.sqrt(4.0 * area / (math.sqrt(3.0) * faces))  # of equilateral triangles with that area
     verts, triangles = gpytoolbox("remeshing").remesh_botsch(
-        mesh.verts.double().numpy(), mesh.faces.numpy().astype(np.int32), ROUNDS, edge, True
+        mesh.verts.double().numpy(), mesh.faces.numpy().astype(np.int32), REMESHING_ROUNDS, edge, True
     )
     return Mesh(torch.from_numpy(verts).to(mesh.verts.dtype), torch.from_numpy(triangles.astype(np.int64)))
 
 
-def crowded_edges(mesh: Mesh) -> int:
-    """How many edges have more than two triangles, with which remeshed() does not work. Raises ImportError."""
+def count_nonmanifold_edges(mesh: Mesh) -> int:
+    """Count edges with more than two triangles, with which remeshed() does not work. Raises ImportError."""
     return len(gpytoolbox("remeshing").non_manifold_edges(mesh.faces.cpu().numpy().astype(np.int32)))
 
 

@@ -1,4 +1,4 @@
-"""What a fit compares with: pictures, masks and weights, each with its camera."""
+"""The views that a fit compares with: pictures, masks and weights, each with its camera."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ from ..warnings import warn
 from .measured import Measurement, area_mean, measurements
 
 Images = Tensor | Sequence[Tensor]
-FULL = 0.98  # a mask of more covers the whole pixel
-REACH = 8  # pixels
-WITH_ALPHA = 2, 4  # channels of pictures
-BYTE_ROUNDING = 1e-2  # of 255, by what resizes a picture
+FULL = 0.98  # a pixel with a higher mask is covered
+FILL_REACH = 8  # pixels by which colours grow into partly covered ones
+WITH_ALPHA = 2, 4  # channels of pictures with alpha
+BYTE_ROUNDING = 1e-2  # above 255, by resizing a picture
 DARKEST_BYTE = 5.0  # median of a picture of 8-bit numbers that are not whole
-HIGHLIGHTS = 0.01  # share of the pixels
-ROUNDING = 0.02  # of a step of 8 bits: how far float32 takes a level from a whole number
-FAINT = 0.5  # a mask that covers no pixel by more was read by another curve, or holds labels
+HIGHLIGHTS = 0.01  # share of the pixels that are brighter than white
+ROUNDING = 0.02  # distance of a level from a whole number in float32, in steps of 8 bits
+FAINT_MASK = 0.5  # a mask whose pixels are all below was read with another curve, or holds labels
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """One camera, and what it saw. With a mask, the picture is black outside of it."""
+class Observation:
+    """The pictures of one camera. If there is a mask, the image is black outside of it."""
 
     camera: Camera
     image: Tensor | None  # (H, W, C) linear radiance
-    mask: Tensor | None  # (H, W, 1), the share of each pixel that the object covers
+    mask: Tensor | None  # (H, W, 1), covered share of each pixel
     weight: Tensor | None  # (H, W, 1), zero where the picture says nothing
-    sure: Tensor | None = None  # (H, W, 1), zero where its colour is not sure, for the mask is neither full nor empty
+    sure: Tensor | None = None  # (H, W, 1), zero where the mask is between and leaves the colour open
     measured: Mapping[str, Measurement] = field(default_factory=dict)  # by the channel of render_aovs()
-    outlined: bool = False  # the picture tells where the object is, not its colours: alpha is rendered
+    by_region: bool = False  # the picture's colours say where the object is, and alpha is rendered
 
     @property
     def aovs(self) -> list[str]:
         """The channels to render, as render_aovs() names them; the first is the one to show."""
-        own = ["image"] * (self.image is not None and not self.outlined)
-        own += ["alpha"] * (self.mask is not None or self.outlined)
+        own = ["image"] * (self.image is not None and not self.by_region)
+        own += ["alpha"] * (self.mask is not None or self.by_region)
         return [*own, *self.measured, *(["alpha"] if self.measured and self.mask is None else [])]
 
     @property
     def shown(self) -> Tensor:
-        """(H, W, c) the picture, or the channel to show, from 0 to 1 where it is neither a colour nor a mask."""
-        if self.outlined and self.image is not None:
+        """The picture (H, W, c), or the channel to show, in 0 … 1 if it is neither a colour nor a mask."""
+        if self.by_region and self.image is not None:
             return self.image
         first = self.aovs[0]
         return (
@@ -61,18 +61,18 @@ class View:
 
     @property
     def wanted(self) -> dict[str, Tensor]:
-        """Image and alpha of the picture, (H, W, c) each."""
-        both = {"image": None if self.outlined else self.image, "alpha": self.mask}
+        """Image and alpha (H, W, c) of the picture."""
+        both = {"image": None if self.by_region else self.image, "alpha": self.mask}
         return {name: value for name, value in both.items() if value is not None}
 
     @property
     def weights(self) -> dict[str, Tensor | None]:
-        """How much the pixels of each channel count."""
+        """The weights of the pixels of each channel."""
         of_image = self.weight if self.sure is None else self.sure if self.weight is None else self.sure * self.weight
         return {"image": of_image, "alpha": self.weight}
 
-    def resized(self, factor: float) -> View:
-        """With the sides multiplied by `factor`; pixels are means over the area of the old ones."""
+    def resized(self, factor: float) -> Observation:
+        """Multiply the sides by `factor`; pixels are means over the area of the old ones."""
         H, W = self.camera.size
         size = max(1, round(H * factor)), max(1, round(W * factor))
         if size == (H, W):
@@ -82,7 +82,7 @@ class View:
             for value in (self.image, self.mask, self.weight, self.sure)
         )
         measured = {name: one.resized(size) for name, one in self.measured.items()}
-        return View(self.camera.resized(size), image, mask, weight, sure, measured, self.outlined)
+        return Observation(self.camera.resized(size), image, mask, weight, sure, measured, self.by_region)
 
 
 def views_of(
@@ -91,13 +91,13 @@ def views_of(
     masks: Images | None = None,
     weights: Images | None = None,
     measured: Mapping[str, Any] | None = None,
-) -> list[View]:
-    """One View for each camera. Raises TypeError or ValueError that names the argument.
+) -> list[Observation]:
+    """Return one observation for each camera. Raises TypeError or ValueError that names the argument.
 
     cameras   one, a batch, or a sequence of cameras, of any sizes
     images    (H, W, C) for one camera, else (B, H, W, C) or a sequence; linear radiance
     masks     (H, W) or (H, W, 1) each, 1 on the object and 0 elsewhere
-    weights   (H, W) or (H, W, 1) each, from 0: how much a pixel counts
+    weights   (H, W) or (H, W, 1) each, ≥ 0: how much a pixel counts
     measured  "depths", "normals" and "positions", each as measurements() takes it
 
     In a sequence of any of them None stands where a camera has none.
@@ -106,7 +106,7 @@ def views_of(
     pictures, shapes, counts = (
         _images(name, value, split) for name, value in (("images", images), ("masks", masks), ("weights", weights))
     )
-    beside = measurements(measured or {}, split)
+    by_camera = measurements(measured or {}, split)
     views = []
     for i, (camera, image, mask, weight) in enumerate(zip(split, pictures, shapes, counts, strict=True)):
         for name, value in (("masks", mask), ("weights", weight)):
@@ -114,13 +114,13 @@ def views_of(
                 check_shape(name, value, (*camera.size, 1))
         if weight is not None and not bool((weight >= 0).all()):
             raise ValueError(f"weights: expected numbers from 0 up, got {float(weight.min()):g}")
-        if image is None and mask is None and not beside[i]:
-            which = f" for cameras[{i}]" if any(x is not None for x in (*pictures, *shapes)) or any(beside) else ""
+        if image is None and mask is None and not by_camera[i]:
+            which = f" for cameras[{i}]" if any(x is not None for x in (*pictures, *shapes)) or any(by_camera) else ""
             raise ValueError(f"images: expected pictures or masks to compare with, got neither{which}")
         sure = None
         if image is not None and mask is not None:
-            image, sure = before_black(image, mask)
-        views.append(View(camera, image, mask, weight, sure, _counted(beside[i], mask, weight)))
+            image, sure = over_black(image, mask)
+        views.append(Observation(camera, image, mask, weight, sure, _counted(by_camera[i], mask, weight)))
     for name, values in (("masks", shapes), ("weights", counts)):
         given = [value for value in values if value is not None]
         if given and not any(bool((value > 0).any()) for value in given):
@@ -131,8 +131,8 @@ def views_of(
     return views
 
 
-def outlined_views(views: Sequence[View]) -> list[View]:
-    """The same for a loss of regions. Raises ValueError where there is something else to compare than pictures."""
+def region_views(views: Sequence[Observation]) -> list[Observation]:
+    """Return the views for the loss "region". Raises ValueError if there is something else to compare than pictures."""
     for view in views:
         if view.mask is not None:
             raise ValueError(
@@ -146,19 +146,19 @@ def outlined_views(views: Sequence[View]) -> list[View]:
         if view.image is None:
             raise ValueError('images: expected a picture for each camera with loss="region", got None')
         check_without_alpha("images", view.image)
-    return [replace(view, outlined=True) for view in views]
+    return [replace(view, by_region=True) for view in views]
 
 
 def _counted(measured: dict[str, Measurement], mask: Tensor | None, weight: Tensor | None) -> dict[str, Measurement]:
-    """With the weights of the view's pixels. Where a mask is neither full nor empty, a depth may be that of the object, of what
-    lies behind, or between; where it is empty, it is not the object's."""
+    """Multiply measurements by the weights of the view's pixels, and drop those where the mask is not full: a depth there may
+    be the object's, that of what lies behind, or between."""
     count = torch.ones(()) if weight is None else weight
     count = count if mask is None else count * (mask > FULL)
     return {name: replace(one, weight=one.weight * count) for name, one in measured.items()}
 
 
 def cameras_of(cameras: object) -> list[Camera]:
-    """One by one, as copies on the CPU. Raises TypeError."""
+    """Return cameras one by one, as copies on the CPU. Raises TypeError."""
     given = [cameras] if isinstance(cameras, Camera) else cameras
     if not isinstance(given, Sequence):
         raise TypeError(f"cameras: expected a Camera or a sequence of them, got {type(cameras).__name__}")
@@ -168,14 +168,14 @@ def cameras_of(cameras: object) -> list[Camera]:
     for i, camera in enumerate(given):
         if not isinstance(camera, Camera):
             raise TypeError(f"cameras[{i}]: expected a Camera, got {type(camera).__name__}")
-        # Copies, for autograd does not keep tensors that were made in torch.inference_mode().
+        # Autograd keeps no tensors that were made in torch.inference_mode(), so they are copied.
         camera = map_tensors(camera, lambda tensor: tensor.detach().cpu().clone())
         split += [camera] if camera.batch is None else [part_of(camera, k) for k in range(camera.batch)]
     return split
 
 
 def part_of(camera: Camera, k: int) -> Camera:
-    """One camera of a batch."""
+    """Return camera k of a batch."""
     fields: dict[str, Any] = {"world_to_camera": 3, "K": 3, "distortion": 2}
     values = {name: getattr(camera, name) for name in fields}
     return camera.replace(
@@ -184,7 +184,7 @@ def part_of(camera: Camera, k: int) -> Camera:
 
 
 def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | None]:
-    """(H, W, c) float32 on the CPU, one for each camera. Raises TypeError or ValueError."""
+    """Return (H, W, c) float32 on the CPU, one for each camera. Raises TypeError or ValueError."""
     if value is None:
         return [None] * len(cameras)
     if len(cameras) == 1 and isinstance(value, (list, tuple)) and len(value) > 1 and hasattr(value[0], "ndim"):
@@ -200,7 +200,7 @@ def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | No
 
 
 def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
-    """(H, W, C) float32 on the CPU. Raises TypeError or ValueError."""
+    """Return (H, W, C) float32 on the CPU. Raises TypeError or ValueError."""
     if value is None or isinstance(value, (str, OsPath)):
         got = "None" if value is None else f"the path {str(value)!r}"
         read = "read_mask" if name.startswith("mask") else "read_image"
@@ -237,7 +237,7 @@ def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
 
 
 def check_without_alpha(name: str, image: Tensor) -> None:
-    """Of a picture (H, W, C) whose colours are all compared, and tell the object from what surrounds it. Raises ValueError."""
+    """Check that a picture (H, W, C) whose colours are all compared has no alpha. Raises ValueError."""
     if (C := image.shape[-1]) in WITH_ALPHA:
         raise ValueError(
             f"{name}: expected grey or colours, got {C} channels, of which the last one would be alpha; read it with "
@@ -246,9 +246,9 @@ def check_without_alpha(name: str, image: Tensor) -> None:
 
 
 def warn_of_faint(name: str, masks: Sequence[Tensor]) -> None:
-    """Where no pixel of any mask is nearly covered."""
+    """Warn if no pixel of any mask is nearly covered."""
     most = max((float(mask.max()) for mask in masks), default=0.0)
-    if 0.0 < most < FAINT:
+    if 0.0 < most < FAINT_MASK:
         warn(
             f"faint {name}",
             f"{name}: expected 1 where the object covers the pixel, got at most {most:.3g}; divide by that number, or choose the "
@@ -257,27 +257,25 @@ def warn_of_faint(name: str, masks: Sequence[Tensor]) -> None:
 
 
 def _is_of_bytes(image: Tensor) -> bool:
-    """Whether it looks like 8-bit numbers that were made floats, or resized after that. Radiance that reaches so far, as of a
-    picture with a sun in it, is hardly whole, and low in most pixels."""
+    """Whether these are 8-bit numbers converted to floats, or resized after that. Radiance of this range, as of a picture with
+    a sun, is hardly whole, and low in most pixels."""
     if not image.numel() or not 100.0 < float(image.max()) <= 255.0 + BYTE_ROUNDING:
         return False
     return bool((image == image.round()).all()) or float(image.median()) > DARKEST_BYTE
 
 
-def before_black(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor | None]:
-    """(H, W, C): the object alone, as a render before black shows it, from a picture of it before anything; and (H, W, 1)
-    where this is sure, or None where it is so everywhere.
-
-    Where the mask is full, the picture shows the object. A pixel that it covers in part may hold its colour as it is
-    (straight alpha), times the mask (before black), or mixed with what lies behind (a photograph), and does not tell
-    which. So it gets the mask times the colour beside it, grown from where the mask is full by up to REACH pixels, and
-    what is farther from there the mask times its own. That is not sure."""
+def over_black(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Return a picture of the object alone (H, W, C), as rendered over black, and where it is sure (H, W, 1); None: everywhere.
+    The picture shows the object where the mask is full. In a pixel covered in part it may hold the object's colour (straight
+    alpha), the colour times the mask (premultiplied), or a mixture with the background (a photograph), and does not say
+    which. Such a pixel gets the mask times the colour grown from where the mask is full, by up to FILL_REACH pixels; beyond,
+    the mask times its own colour. It is not sure."""
     colors, known = image, mask > FULL
     partial = (mask > 0.0) & ~known
     if not bool(known.any()) or not bool(partial.any()):
         return image * mask, None
     left = partial
-    for _ in range(REACH):
+    for _ in range(FILL_REACH):
         share = _around(known.to(image))
         fresh = left & (share > 0.01)  # a ninth, or rounding
         if not bool(fresh.any()):
@@ -288,27 +286,32 @@ def before_black(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor | None]:
 
 
 def _around(image: Tensor) -> Tensor:
-    """Means over 3 × 3 pixels, of zeros beyond the rim."""
+    """Return means over 3 × 3 pixels, with zeros beyond the border."""
     return F.avg_pool2d(image.movedim(-1, 0)[None], 3, stride=1, padding=1)[0].movedim(0, -1)
 
 
-def grouped(views: Sequence[View]) -> list[list[int]]:
-    """Places of views whose cameras can be rendered as one batch, with the same channels to compare."""
+def displayed(image: Tensor) -> Tensor:
+    """Return (H, W, 3) sRGB in 0 … 1 of linear radiance; the first channel as grey if there are fewer than three."""
+    colors = image[..., :3] if image.shape[-1] >= 3 else image[..., :1].expand(-1, -1, 3)
+    return linear_to_srgb(colors.detach().clamp(0.0, 1.0))
+
+
+def batch_groups(views: Sequence[Observation]) -> list[list[int]]:
+    """Return indices of views whose cameras can be rendered as one batch, with the same channels to compare."""
     groups: dict[Any, list[int]] = {}
     for i, view in enumerate(views):
         camera = view.camera
         lens = None if camera.distortion is None else camera.distortion.shape
         shape = None if view.image is None else view.image.shape[-1]
         key = camera.size, camera.projection, lens, camera.K.dtype, shape, view.mask is None
-        key = *key, view.weight is None, view.sure is None, tuple(view.measured), view.outlined
+        key = *key, view.weight is None, view.sure is None, tuple(view.measured), view.by_region
         groups.setdefault(key, []).append(i)
     return list(groups.values())
 
 
-def white_of(pixels: Tensor) -> float:
-    """Return what one pixel in a hundred of (N, C) is brighter than: it counts as white. Linear radiance may be in any unit.
-
-    Where that is black, the brightest pixel is white; where all are black, 1 is."""
+def white_level(pixels: Tensor) -> float:
+    """Return the brightness that one pixel in a hundred of (N, C) exceeds; it counts as white, for radiance may have any unit.
+    If that is black, the brightest pixel is white; if all are black, 1 is."""
     if not len(pixels):
         return 1.0
     brightest = pixels.amax(1)
@@ -318,7 +321,6 @@ def white_of(pixels: Tensor) -> float:
 
 
 def has_levels(picture: Tensor) -> bool:
-    """Whether linear radiance, of any shape, has the 256 levels of a file of 8 bits. Such a picture says what is white, 1, also
-    where it is dark."""
+    """Whether linear radiance of any shape has the 256 levels of an 8-bit file. White is then 1, also in a dark picture."""
     levels = 255.0 * linear_to_srgb(picture)
     return float(picture.max()) <= 1.0 and bool(((levels - levels.round()).abs() < ROUNDING).all())

@@ -31,7 +31,7 @@ def render_image(request: Request, batched: bool) -> Tensor:
 
 
 def _known_signature(function: Callable[..., Any]) -> Callable[..., Any]:
-    """torch looks for the signature of forward() at every call, for a tenth of a millisecond unless it is written down."""
+    """torch inspects the signature of forward() at every call, for a tenth of a millisecond unless it is written down."""
     setattr(function, "__signature__", inspect.signature(function))  # noqa: B010  no attribute that type checkers know
     return function
 

@@ -1,4 +1,4 @@
-"""Images of several scenes, rendered and differentiated beside each other."""
+"""Images of several scenes, rendered and differentiated in parallel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from .autograd import FIRST_ORDER
 from .operators import Hits, backward_kernel, forward_kernel
 from .request import IS_TENSOR, POSITIONS, SLOTS, Request, join, others_of, tensors_of
-from .threads import beside
+from .threads import parallel_map
 
 WIDTH = len(IS_TENSOR)  # arguments of a packed request
 
@@ -26,7 +26,7 @@ def render_images(requests: Iterable[Request], count: int) -> list[Tensor]:
             made.append(request)
             yield request
 
-    found = beside(forward_kernel, remembered(), count)
+    found = parallel_map(forward_kernel, remembered(), count)
     # Backward passes of single images run from the last to the first, and so are sums over them of what scenes share.
     packed = [value for request in reversed(made) for value in request.pack()]
     return list(reversed(_RenderBatch.apply(found[::-1], *packed)))  # pyright: ignore[reportArgumentType, reportCallIssue]
@@ -63,7 +63,7 @@ class _RenderBatch(torch.autograd.Function):
             return {i: found[name].to(request.slot(name).dtype) for i, name in names.items()}
 
         out: list[Tensor | None] = [None] * (WIDTH * len(groups))
-        for k, found in enumerate(beside(gradients, range(len(groups)), len(groups))):
+        for k, found in enumerate(parallel_map(gradients, range(len(groups)), len(groups))):
             for i, grad in found.items():
                 out[k * WIDTH + i] = grad
         return None, *out

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 # What the kernel counts.
-CURVES = ("silhouettes", "creases", "intersections", "rim")
+CURVES = ("silhouettes", "creases", "intersections", "lens_boundary")
 COUNTS = (
     "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "step_lines", *CURVES,
 )  # fmt: skip

@@ -28,10 +28,10 @@ class Flat(NamedTuple):
     face_texture: Tensor  # (F,) int32: texture of the face, −1 for none; (0,) when the scene has no texture
     uv_corners: Tensor  # (F, 3) int32, rows of uvs, −1 for none; (0, 3) when corners say as much
     alphas: Tensor  # (Y, 1), alpha textures end to end, row by row
-    cut_outs: Tensor  # (M, 6) int64: first of its alphas, height, width, wrap of u and v, filter
-    face_cut_out: Tensor  # (F,) int32: cut-out of the face, −1 for none; (0,) when the scene has none
+    alpha_masks: Tensor  # (M, 6) int64: first of its alphas, height, width, wrap of u and v, filter
+    face_alpha_mask: Tensor  # (F,) int32: alpha-tested face of the face, −1 for none; (0,) when the scene has none
     background: Tensor  # (C,) or (H, W, C)
-    cutoffs: list[float]  # of the cut-outs
+    cutoffs: list[float]  # of the alpha-tested faces
     spacing: list[
         float
     ]  # of the numbers in which the vertices were given: pairs of a vertex and the spacing from there on
@@ -39,8 +39,8 @@ class Flat(NamedTuple):
     @property
     def has_steps(self) -> bool:
         """Whether something jumps within a face: it is cut out, or its texels are."""
-        if len(self.cut_outs) > 0 or len(self.textures) == 0:
-            return len(self.cut_outs) > 0
+        if len(self.alpha_masks) > 0 or len(self.textures) == 0:
+            return len(self.alpha_masks) > 0
         return bool((self.textures[:, 5] == FILTERS.index("nearest")).any())
 
 
@@ -90,7 +90,7 @@ def _sampler(mesh: Mesh) -> list[int]:
 def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
     """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back.
 
-    all_uvs   also texture coordinates that neither a texture nor a cut-out needs
+    all_uvs   also texture coordinates that neither a texture nor a alpha-tested face needs
     blended   whether meshes that blend are there as a whole; else they are cut out where their alpha is below ½
     """
     C = scene.channels
@@ -104,14 +104,14 @@ def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
     def is_cut(mesh: Mesh) -> bool:
         return mesh.alpha is not None and not (blended and mesh.blends)
 
-    any_cut_out = any(map(is_cut, scene.meshes))
+    any_alpha_mask = any(map(is_cut, scene.meshes))
 
     def has_uvs(mesh: Mesh) -> bool:
         return mesh.texture is not None or is_cut(mesh) or (all_uvs and mesh.uvs is not None)
 
-    own_uvs = any_cut_out or any(has_uvs(mesh) and mesh.texture is None for mesh in scene.meshes)
+    own_uvs = any_alpha_mask or any(has_uvs(mesh) and mesh.texture is None for mesh in scene.meshes)
     verts, faces, corners, colors, uvs, texels, textures, face_texture = ([] for _ in range(8))
-    uv_corners, alphas, cut_outs, face_cut_out, cutoffs = ([] for _ in range(5))
+    uv_corners, alphas, alpha_masks, face_alpha_mask, cutoffs = ([] for _ in range(5))
     n_verts = n_colors = n_uvs = n_texels = n_alphas = 0
     alone = len(scene.meshes) == 1
     # Colours of vertices are indexed by the faces. That it is one tensor tells the kernel that neighbours agree at their edge.
@@ -129,12 +129,14 @@ def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
             n_uvs += mesh.uvs.shape[0]
         if own_uvs:
             uv_corners.append(uv_rows)
-        if any_cut_out:
-            face_cut_out.append(torch.full((F,), len(cut_outs) if is_cut(mesh) else -1, dtype=torch.int32, device=cpu))
+        if any_alpha_mask:
+            face_alpha_mask.append(
+                torch.full((F,), len(alpha_masks) if is_cut(mesh) else -1, dtype=torch.int32, device=cpu)
+            )
         if is_cut(mesh):
             assert mesh.alpha is not None
             h, w = mesh.alpha.shape
-            cut_outs.append([n_alphas, h, w, *_sampler(mesh)])
+            alpha_masks.append([n_alphas, h, w, *_sampler(mesh)])
             cutoffs.append(0.5 if mesh.blends else mesh.alpha_cutoff)
             alphas.append(mesh.alpha.cpu().to(dtype).reshape(h * w, 1))
             n_alphas += h * w
@@ -185,8 +187,8 @@ def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
         join(face_texture, torch.empty(0, dtype=torch.int32, device=cpu)),
         join(uv_corners, empty(3, torch.int32)),
         join(alphas, empty(1, dtype)),
-        torch.tensor(cut_outs, dtype=torch.int64, device=cpu).reshape(-1, 6),
-        join(face_cut_out, torch.empty(0, dtype=torch.int32, device=cpu)),
+        torch.tensor(alpha_masks, dtype=torch.int64, device=cpu).reshape(-1, 6),
+        join(face_alpha_mask, torch.empty(0, dtype=torch.int32, device=cpu)),
         background,
         cutoffs,
         _vertex_spacing(scene),

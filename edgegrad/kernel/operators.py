@@ -61,7 +61,7 @@ def kernel_camera(camera: PackedCamera, index: int = 0, by_distortion: bool = Tr
 
 
 def kernel_channels(request: Request, index: int = 0) -> Any:
-    arrays = request.beside._replace(vertex_attributes=request.beside.vertex_attributes[index])._asdict()
+    arrays = request.auxiliary._replace(vertex_attributes=request.auxiliary.vertex_attributes[index])._asdict()
     return core.Channels(
         **{name: _array(value) if isinstance(value, Tensor) else value for name, value in arrays.items()}
     )
@@ -92,7 +92,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
     """image (B, H, W, C), what the backward pass takes from it, and what the kernel did for each camera. Raises MemoryError."""
-    with image_room(request):
+    with image_memory(request):
         scene, options = kernel_scene(request.scene), request.image._asdict()
         B, height, width = request.cameras, request.camera.height, request.camera.width
         image = request.scene.colors.new_empty((B, height, width, request.channels))
@@ -129,7 +129,7 @@ def backward_kernel(
 
     `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
-    with gradient_room(adjoint, request, wanted):
+    with gradient_memory(adjoint, request, wanted):
         scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
         # Sums are taken in double whatever the arrays hold. NumPy has its zeros from the system, torch would wake all threads.
         grads = {name: np.zeros(request.slot(name).shape) for name in SLOTS if name in wanted}
@@ -161,7 +161,7 @@ def backward_kernel(
 def jvp_kernel(hits: Hits, request: Request, tangents: Mapping[str, Tensor], directions: int) -> Tensor:
     """Derivatives (D, B, H, W, C) of the image in D directions, in the type of the image: `tangents` (D, …) by slot, zero
     where there is none. Raises MemoryError."""
-    with derivatives_room(request, tangents, directions):
+    with derivatives_memory(request, tangents, directions):
         scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
         given = {name: np.ascontiguousarray(t.detach().double().numpy()) for name, t in tangents.items()}
         adjoint = _channel_weights(request).expand(request.camera.height, request.camera.width, -1).contiguous()
@@ -188,8 +188,8 @@ def _channel_weights(request: Request) -> Tensor:
     """(C,) how much each channel matters for where samples of a derivative of all of them go: as much as any other,
     whatever its unit."""
     weights = request.scene.colors.new_ones(request.channels)
-    values = request.beside.vertex_attributes.detach()
-    first = request.scene.colors.shape[1] + request.beside.alpha
+    values = request.auxiliary.vertex_attributes.detach()
+    first = request.scene.colors.shape[1] + request.auxiliary.alpha
     size = values.abs().mean((0, 1)).to(weights)
     weights[first : first + len(size)] = torch.where(size > 0, 1.0 / size, 1.0)
     return weights
@@ -197,7 +197,7 @@ def _channel_weights(request: Request) -> Tensor:
 
 def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Tensor:
     """How the loss changes as what is seen in a pixel moves right and down: (B, H, W, 2). Raises MemoryError."""
-    with derivatives_room(request, ["verts"], 1):
+    with derivatives_memory(request, ["verts"], 1):
         scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
         out = np.zeros((*adjoint.shape[:3], 2))
         for b in range(request.cameras):
@@ -254,9 +254,9 @@ def _sides(camera: PackedCamera) -> int:
 
 def pass_size(request: Request) -> Any:
     """What the kernel's needs depend on, of tensors with values."""
-    flat, camera, beside = request.scene, request.camera, request.beside
+    flat, camera, auxiliary = request.scene, request.camera, request.auxiliary
     by_vertex = flat.corners is flat.faces or flat.corners.data_ptr() == flat.faces.data_ptr()
-    jumps = not by_vertex or beside.barycentrics or beside.face_attributes.shape[-1] > 0
+    jumps = not by_vertex or auxiliary.barycentrics or auxiliary.face_attributes.shape[-1] > 0
     return core.PassSize(
         verts=len(flat.verts),
         faces=len(flat.faces),
@@ -266,8 +266,8 @@ def pass_size(request: Request) -> Any:
         alphas=len(flat.alphas),
         pixels=camera.height * camera.width,
         radiance=flat.colors.shape[1],
-        vertex_attributes=beside.vertex_attributes.shape[-1],
-        face_attributes=beside.face_attributes.shape[-1],
+        vertex_attributes=auxiliary.vertex_attributes.shape[-1],
+        face_attributes=auxiliary.face_attributes.shape[-1],
         channels=request.channels,
         number=flat.colors.element_size(),
         textured=len(flat.textures) > 0,
@@ -280,13 +280,13 @@ def pass_size(request: Request) -> Any:
 KEPT = ("ray structure", "topology")  # what may be there already, from an earlier call
 
 
-def image_room(request: Request) -> AbstractContextManager[None]:
+def image_memory(request: Request) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the image does not fit."""
     needs = core.image_bytes(pass_size(request), request.cameras)
     return memory.room("render", needs, lambda: lower(request))
 
 
-def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) -> AbstractContextManager[None]:
+def gradient_memory(adjoint: Tensor, request: Request, wanted: Collection[str]) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the gradients do not fit."""
     work, options = Work.of(request, wanted), request.gradient
     needs = {}
@@ -307,7 +307,7 @@ def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) ->
     return memory.room("backward pass", needs, lambda: lower(request) + ", or let fewer tensors require a gradient")
 
 
-def derivatives_room(request: Request, wanted: Collection[str], directions: int) -> AbstractContextManager[None]:
+def derivatives_memory(request: Request, wanted: Collection[str], directions: int) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if derivatives in so many directions do not fit."""
     work, options, size = Work.of(request, wanted), request.gradient, pass_size(request)
     width = directions * request.channels
@@ -364,7 +364,7 @@ def _render_fake(*args: Any) -> tuple[Tensor, ...]:
 @torch.library.impl("edgegrad::faces_at_centers", "CPU")
 def _faces_at_centers_cpu(*args: Any) -> Tensor:
     request = Request.unpack(args)
-    with image_room(request):
+    with image_memory(request):
         scene = kernel_scene(request.scene)
         faces = _faces_at_centers_fake(*args)
         for b in range(request.cameras):

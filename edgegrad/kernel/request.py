@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..camera.lens import MOST
-from ..camera.mistakes import warn_if_behind
+from ..camera.convention_warnings import warn_if_behind
+from ..camera.lens import MOST_COEFFICIENTS
 from ..check import as_int, check_not_meta, check_positive, check_positive_int, check_shape
 from ..library import core
 from ..scene.mesh import Mesh
@@ -36,7 +36,7 @@ class PackedCamera(NamedTuple):
 
 
 class Channels(NamedTuple):
-    """What the image has beside the radiance, in this order (csrc/shading/attributes.h)."""
+    """Channels of the image after its radiance, in this order (csrc/shading/attributes.h)."""
 
     alpha: bool  # 1 wherever a face is seen
     vertex_attributes: Tensor  # (B, V, n) float64, interpolated over the faces
@@ -66,12 +66,12 @@ class Request(NamedTuple):
 
     scene: Flat
     camera: PackedCamera
-    beside: Channels
+    auxiliary: Channels
     image: ImageOptions
     gradient: GradientOptions
 
     def pack(self) -> tuple[Any, ...]:
-        return (*self.scene, *self.camera, *self.beside, *self.image, *self.gradient)
+        return (*self.scene, *self.camera, *self.auxiliary, *self.image, *self.gradient)
 
     @classmethod
     def unpack(cls, values: Sequence[Any]) -> Request:
@@ -104,7 +104,8 @@ _NAMES = {Tensor: "Tensor", bool: "bool", int: "SymInt", float: "float", str: "s
 # The arguments of the operators. A SymInt may stay symbolic under torch.compile, an int would compile once for each value.
 SCHEMA = ", ".join(f"{_NAMES[kind]} {field}" for field, kind in zip(FIELDS, _TYPES, strict=True))
 
-# What a gradient can be asked for, from the kernel's table (csrc/accumulate/gradients.h), and where it is among the packed values.
+# The parameters that may have a gradient, from the kernel's table (csrc/accumulate/gradients.h), and their places among the
+# packed values.
 SLOTS: tuple[str, ...] = core.GRADIENT_SLOTS
 POSITIONS = tuple(FIELDS.index(name) for name in SLOTS)
 _LABELS = {"texels": "texture", "alphas": "alpha"}
@@ -220,12 +221,14 @@ def pack_camera(camera: Camera) -> PackedCamera:
     world_to_camera = camera.world_to_camera.cpu().double().reshape(-1, 4, 4)
     K = camera.K.cpu().double().reshape(-1, 3, 3)
     distortion = camera.coefficients.cpu().double()
-    distortion = torch.nn.functional.pad(distortion, (0, MOST - distortion.shape[-1])).reshape(-1, MOST)
+    distortion = torch.nn.functional.pad(distortion, (0, MOST_COEFFICIENTS - distortion.shape[-1])).reshape(
+        -1, MOST_COEFFICIENTS
+    )
     B = max(world_to_camera.shape[0], K.shape[0], distortion.shape[0])
     return PackedCamera(
         world_to_camera.expand(B, 4, 4).contiguous(),
         K.expand(B, 3, 3).contiguous(),
-        distortion.expand(B, MOST).contiguous(),
+        distortion.expand(B, MOST_COEFFICIENTS).contiguous(),
         camera.projection != "orthographic",
         camera.lens,
         *camera.size,

@@ -1,4 +1,4 @@
-"""How many threads a pass of the kernel takes, and passes beside each other."""
+"""How many threads a pass of the kernel takes, and passes that run in parallel."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ Result = TypeVar("Result")
 
 
 def threads() -> int:
-    """As many as torch takes; one where passes run beside each other."""
-    return 1 if getattr(_own, "beside", False) else torch.get_num_threads()
+    """As many as torch takes; one where passes run in parallel."""
+    return 1 if getattr(_own, "parallel", False) else torch.get_num_threads()
 
 
-def beside(work: Callable[[Item], Result], items: Iterable[Item], count: int) -> list[Result]:
+def parallel_map(work: Callable[[Item], Result], items: Iterable[Item], count: int) -> list[Result]:
     """work(item) of all `count` items, on as many threads as torch takes, each pass on one of them. Work on an item begins once
     it is there, while the calling thread makes the next. Nothing of the work is recorded by autograd."""
     threads = min(torch.get_num_threads(), count)
 
     def run(item: Item) -> Result:
-        _own.beside = threads > 1
+        _own.parallel = threads > 1
         with torch.no_grad():
             return work(item)
 

@@ -23,7 +23,7 @@ class Points(NamedTuple):
     seed: Tensor  # (N,) int64
     index: Tensor | None  # pyright: ignore[reportIncompatibleMethodOverride]: points of a light whose shadow is known
     uv: Tensor | None
-    density: Tensor | None
+    pdf: Tensor | None
     lit: Tensor | None  # (N,) uint8
 
 
@@ -33,11 +33,11 @@ class Options(NamedTuple):
     shadows: bool
     samples: int  # points of each light with an extent, for each point that is shaded
     only: int = -1  # the light whose radiance alone is wanted, −1: all
-    in_fours: bool = False  # on glossy surfaces points of environments come in fours, for derivatives (companions.h)
+    antithetic: bool = False  # on glossy surfaces points of environments come in sets, for derivatives (antithetic.h)
     dark: float = DARK
     bounces: int = 1  # how often light is scattered on its way, at most
-    near: float = 0.0  # world units: derivatives by barycentrics leave out light from nearer (near_part.h)
-    only_near: bool = False  # whether values are those of that light alone
+    near: float = 0.0  # world units: derivatives by barycentrics leave out light from nearer (near_field.h)
+    only_near_field: bool = False  # whether values are those of that light alone
 
     @property
     def kernel(self) -> Any:
@@ -80,7 +80,7 @@ class AtPoints(NamedTuple):
         tables: list[Any] = list(tensors[self._first : self._first + self.tables])
         return {
             "lit": self.layout.kernel(tables, self._flat(tensors).faces),
-            "points": core.LitPoints(b=array(b), forced_lamp=self.forced, **arrays),
+            "points": core.LitPoints(b=array(b), forced_light=self.forced, **arrays),
             "options": options.kernel,
             "threads": torch.get_num_threads(),
         }

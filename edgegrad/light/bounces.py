@@ -1,9 +1,9 @@
 """What render() can differentiate where light is scattered more than once.
 
-Inside surfaces every tensor of a scene has its derivative (csrc/shading/lit/path_radiance.h), the borders of lights' shadows have
-theirs (unseen_shadows.py), and so have edges on the way of light from one surface to another, and the lines along which surfaces
-pass through each other (bounce_edges.py). Of some borders there are no samples. Without them a gradient would be wrong without
-notice, so it is refused.
+Every tensor of a scene has its derivative inside surfaces (csrc/shading/lit/path_radiance.h). The borders of lights' shadows
+have theirs (indirect_shadows.py). So have edges on the way of light from one surface to another, and the lines along which
+surfaces pass through each other (secondary_edges.py). Some borders have no samples. Without them a gradient would be wrong
+without notice, so it is refused.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def note_jumps(hits: Hits, indirect: bool = False) -> None:
     if len(scene.meshes) > 1:
         hits._note_jump("mesh", lambda: surfaces.mesh_of_face[:, None, None].expand(-1, 3, 1))
     for index, mesh in enumerate(scene.meshes):
-        hits._note_jump(("appearance", index), _of_scene(surfaces, index, lambda i=index: _looks(surfaces, i)))
+        hits._note_jump(("appearance", index), _of_scene(surfaces, index, lambda i=index: _appearance(surfaces, i)))
         if mesh.material is None or not (scene.lights or scene.casting):
             continue
         if mesh.normals is None:
@@ -61,7 +61,7 @@ def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> 
     return corners
 
 
-def _looks(surfaces: Surfaces, index: int) -> Tensor:
+def _appearance(surfaces: Surfaces, index: int) -> Tensor:
     return jumps(surfaces.scene.meshes[index], surfaces.tangents(index))
 
 

@@ -24,8 +24,8 @@ from ..scene.lights import Light, LightPoints
 from ..scene.material import Texture
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
+from .antithetic import MOST_SETS, SET_SIZE
 from .at_points import AtPoints, Indirect, Options, Points, Shading
-from .companions import COMPANIONS, MOST_FOURS
 from .layout import layout_of
 from .resampled import DARK
 
@@ -47,7 +47,7 @@ def _filters(scene: Scene) -> set[str]:
 
 
 def nearest_textures(mesh: Mesh) -> list[Texture]:
-    """Those of a mesh that give the nearest texel, in the order in which shading looks them up."""
+    """Those of a mesh that give the nearest texel, in the order in which shading reads them."""
     found = [] if mesh.texture is None else [Texture(mesh.texture, wrap=mesh.wrap, filter=mesh.filter)]
     if mesh.material is not None:
         m = mesh.material
@@ -66,7 +66,7 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     # Without values nothing is computed now; but once it must be, to note the lights whose shadows are asked for.
     known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
     values = hits._needs_values or not known
-    options = Options(shadows=shadows, samples=samples, only=only, in_fours=not hits._needs_values)
+    options = Options(shadows=shadows, samples=samples, only=only, antithetic=not hits._needs_values)
     found, *kept = apply(Shading(at, options, values), tensors)
     if not values:
         return found.to(surfaces.verts)
@@ -80,16 +80,18 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
             surfaces.shadowing.add(light)
             if casting.punctual:
                 hits._note_visibility(light, own)
-        fours = options.in_fours and isinstance(casting, Environment) and surfaces.scene.is_glossy
-        column += 1 if casting.punctual else samples * (MOST_FOURS * COMPANIONS if fours else 1)
+        sets = options.antithetic and isinstance(casting, Environment) and surfaces.scene.is_glossy
+        column += 1 if casting.punctual else samples * (MOST_SETS * SET_SIZE if sets else 1)
     return found.to(surfaces.verts)
 
 
-def indirect(hits: Hits, shadows: bool, bounces: int, only_near: float = 0.0) -> Tensor:
+def indirect(hits: Hits, shadows: bool, bounces: int, only_near_field: float = 0.0) -> Tensor:
     """(N, C) what is to be added of light that is scattered more than once, `bounces` times at most; or, of light that comes from
     so near, world units. Zeros with the same derivatives, if the hits need no values."""
     at, tensors = _at(hits)
-    options = Options(shadows, 1, bounces=bounces, near=only_near or hits._near, only_near=only_near > 0)
+    options = Options(
+        shadows, 1, bounces=bounces, near=only_near_field or hits._near, only_near_field=only_near_field > 0
+    )
     return apply(Indirect(at, options, hits._needs_values), tensors)[0].to(hits._surfaces.verts)
 
 
@@ -130,22 +132,24 @@ def image(frame: Frame, options: Options, points: int) -> Tensor:
     return frame.here(found)
 
 
-def bounce_samples(frame: Frame, options: Options, further: int) -> tuple[CurveRecords, Tensor, Tensor]:
+def secondary_edge_samples(frame: Frame, options: Options, further: int) -> tuple[CurveRecords, Tensor, Tensor]:
     """Samples on the borders of what surfaces of paths see of one another, and (S, C) float64 by how much the image jumps there,
     times what a sample stands for. Where light goes `further` steps after that: what has come to the first point of each, and
     (S, 3) from which unit directions (csrc/secondary/secondary_edges.h)."""
     own = {"further": further, "seen": further == 0}
-    return _samples_of_lines(frame, options, "bounce_samples", derived_seed(frame.sampler.grad_seed, -further), own)
+    return _samples_of_lines(
+        frame, options, "secondary_edge_samples", derived_seed(frame.sampler.grad_seed, -further), own
+    )
 
 
-def surface_border_samples(
-    frame: Frame, options: Options, further: int, crossings: bool, rims: bool
+def surface_edge_samples(
+    frame: Frame, options: Options, further: int, crossings: bool, alpha_edges: bool
 ) -> tuple[CurveRecords, Tensor, Tensor]:
-    """Samples on the curves at which surfaces begin to send light: where faces pass through each other, and on rims of cut-outs.
-    The first point of each gets light from there, that may go `further` steps after that; see bounce_samples()."""
-    own = {"further": further, "crossings": crossings, "rims": rims}
+    """Samples on the curves at which surfaces begin to send light: where faces pass through each other, and on alpha edges.
+    The first point of each gets light from there, that may go `further` steps after that; see secondary_edge_samples()."""
+    own = {"further": further, "crossings": crossings, "alpha_edges": alpha_edges}
     seed = derived_seed(frame.sampler.grad_seed, -core.MOST_BOUNCES - further)
-    return _samples_of_lines(frame, options, "surface_border_samples", seed, own)
+    return _samples_of_lines(frame, options, "surface_edge_samples", seed, own)
 
 
 def _samples_of_lines(
@@ -160,7 +164,7 @@ def _samples_of_lines(
 
     count = frame.request.gradient.edge_samples
     casters = frame.fixed.casters if frame.surfaces.scene.blends else None
-    return frame.sampler.bounce_samples(compute, tables, seed, count, moves(frame.intrinsics), casters)
+    return frame.sampler.secondary_edge_samples(compute, tables, seed, count, moves(frame.intrinsics), casters)
 
 
 def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, int]) -> list[Tensor]:
@@ -198,7 +202,7 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
     def compute(b: Tensor, face: Tensor, seed: Tensor, faces: Tensor, *others: Tensor) -> Sequence[Tensor]:
         spread, tables = (array(others[0]), others[1:]) if filtered else (None, others)
         points = core.LitPoints(face=array(face), b=array(b), seed=array(seed), spread=spread)
-        options = core.LitOptions(shadows=False, samples=samples, only=-1, in_fours=False, dark=DARK)
+        options = core.LitOptions(shadows=False, samples=samples, only=-1, antithetic=False, dark=DARK)
         lit = layout.kernel(tables, faces)
         found = core.light_points(lit, points, options, hits._index(light), torch.get_num_threads())
         return [torch.from_numpy(x) for x in found]

@@ -22,7 +22,7 @@ from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
-from .lamp_trees import hides, least_brightness, tree_of
+from .mesh_light_sampling import hides, least_brightness, tree_of
 
 
 class _Tables:
@@ -50,7 +50,7 @@ class Layout(NamedTuple):
     """How a scene is made of tables: which table holds what."""
 
     meshes: list[Any]
-    lamps: list[Any]
+    lights: list[Any]
     verts: int
     eye: int
     perspective: bool
@@ -65,10 +65,10 @@ class Layout(NamedTuple):
         meshes = [_mesh(surfaces, index, int(vertex), tables) for index, vertex in enumerate(firsts[:-1])]
         eps = torch.finfo(surfaces.verts.dtype).eps
         still = (light for light in scene.lights if isinstance(light, SphericalHarmonics))
-        lamps = [_lamp(scene, light, k, eps, tables) for k, light in enumerate((*scene.casting, *still))]
+        lights = [_kernel_light(scene, light, k, eps, tables) for k, light in enumerate((*scene.casting, *still))]
         center, radius = surfaces.ball
         ball = [*map(float, values_of(center)[0]), radius]
-        return cls(meshes, lamps, verts, seen_from, view.perspective, scene.channels, ball)
+        return cls(meshes, lights, verts, seen_from, view.perspective, scene.channels, ball)
 
     def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
         parts = self._asdict()
@@ -154,22 +154,22 @@ def _texture(surfaces: Surfaces, mesh: Mesh, texture: Texture, tables: _Tables) 
     )
 
 
-def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) -> Any:
+def _kernel_light(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) -> Any:
     stream = [mixed_bits(number * 0x10001 + k) for k in range(3)]
 
-    def lamp(kind: str, **fields: Any) -> Any:
-        return core.Lamp(kind, stream=stream, **{"eps": eps, **fields})
+    def described(kind: str, **fields: Any) -> Any:
+        return core.Light(kind, stream=stream, **{"eps": eps, **fields})
 
     if isinstance(light, MeshLight):
         mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
         running, density = values_of(*light._table)
         glossy = any(m.material is not None and m.material.is_glossy for m in scene.meshes)
-        # Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a lamp must not hide itself.
-        return lamp(
+        # Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a light must not hide itself.
+        return described(
             "mesh",
             mesh=mesh,
             running=running,
-            density=density,
+            pdf=density,
             brightness=np.array([least_brightness(light)]),
             tree=tree_of(light) if glossy else None,
             hides=hides(light),
@@ -178,7 +178,7 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
     if isinstance(light, Environment):
         running, density, brightness, cosines = values_of(*light._table, light._brightness, light._cosines)
         height, width = light._size
-        return lamp(
+        return described(
             "environment",
             radiance=tables.add(light.radiance, light.radiance.shape[-1]),
             rotation=tables.add_numbers(light.rotation),
@@ -186,20 +186,20 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
             width=width,
             is_image=light.radiance.dim() == 3,
             running=running,
-            density=density,
+            pdf=density,
             brightness=brightness,
             cosines=cosines,
         )
     if isinstance(light, SphericalHarmonics):
         coefficients = tables.add(light.coefficients, light.coefficients.shape[1])
-        return lamp("spherical harmonics", radiance=coefficients, rotation=tables.add_numbers(light.rotation))
+        return described("spherical harmonics", radiance=coefficients, rotation=tables.add_numbers(light.rotation))
     assert isinstance(light, (DirectionalLight, PointLight, SpotLight))
     power = {"intensity": tables.add(light.intensity, 1), "color": tables.add_numbers(light.color)}
     if isinstance(light, DirectionalLight):
-        return lamp("directional", direction=tables.add(light.direction, 3), **power)
+        return described("directional", direction=tables.add(light.direction, 3), **power)
     if isinstance(light, PointLight):
-        return lamp("point", position=tables.add(light.position, 3), **power)
-    return lamp(
+        return described("point", position=tables.add(light.position, 3), **power)
+    return described(
         "spot",
         position=tables.add(light.position, 3),
         direction=tables.add(light.direction, 3),

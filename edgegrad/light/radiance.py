@@ -37,26 +37,26 @@ from ..scene.tree import tensors_in
 from ..shader import Effort, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
+from .antithetic import SET_SIZE, SETS
 from .at_points import Options
-from .bounce_edges import bounce_edges
 from .bounces import check_bounces
 from .bsdf import Scattering, dot, terminator
-from .companions import COMPANIONS, FOURS
 from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
-from .lamp_trees import MeshTowards, tree_of
+from .indirect_shadows import indirect_shadows
+from .mesh_light_sampling import MeshTowards, tree_of
+from .near_field import NearField, radius
 from .resampled import Glossy, resampled
-from .sliding import Nearby, radius
-from .unseen_shadows import unseen_shadows
+from .secondary_edges import secondary_edges
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 # Where glossy surfaces end or meet, points of a light for each sample of it: these are few points, and what is wanted of them is
 # the difference of both sides.
 AT_CURVES = 4
-# By which lines that look for rims of cut-outs and borders of nearest texels lie closer where surfaces light each other: these
+# By which lines that look for alpha edges and borders of nearest texels lie closer where surfaces light each other: these
 # have some samples a pixel, and each side of a sample has one path.
 CLOSER_STEPS = 8.0
-BESIDE_TEXELS = (
+NEXT_TO_TEXELS = (
     1e-4  # of a texel, from the border of nearest ones, where light that is scattered more than once is asked for
 )
 
@@ -126,10 +126,10 @@ class Lighting(NamedTuple):
             additive=additive,
             closer=CLOSER_STEPS if self.bounces > 1 else 1.0,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
-            # The kernel, which finds light that is scattered more than once, looks up its texels by itself.
-            beside_steps=BESIDE_TEXELS if self.bounces > 1 else 0.0,
+            # The kernel, which finds light that is scattered more than once, reads its texels by itself.
+            step_margin=NEXT_TO_TEXELS if self.bounces > 1 else 0.0,
             # Comparisons see borders, which visibility=False leaves out; and layers behind others have none.
-            sliding=self._sliding if self.bounces > 1 and additive and request.gradient.visibility else None,
+            near_field=self._sliding if self.bounces > 1 and additive and request.gradient.visibility else None,
             indirect=self._indirect if self.bounces > 1 else None,
             watch=watch,
         )
@@ -146,17 +146,19 @@ class Lighting(NamedTuple):
         terms: list[Term] = []
         if self.shadows:
             with watch.part("unseen shadows"):
-                terms += unseen_shadows(frame, self.bounces, watch)
+                terms += indirect_shadows(frame, self.bounces, watch)
         with watch.part("bounce edges"):
             options = Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces, near=radius(frame))
-            terms += bounce_edges(frame, options)
+            terms += secondary_edges(frame, options)
         return terms
 
     def _sliding(self, frame: Frame, hits: Hits) -> tuple[float, Tensor]:
         """How light from nearby changes as hits slide on their faces, and how near that is."""
         near, scene = radius(frame), frame.surfaces.scene
         declare = declare_steps if any(nearest_textures(mesh) for mesh in scene.meshes) else None
-        nearby = Nearby(frame, hits, lambda there: in_kernel.indirect(there, self.shadows, self.bounces, near), declare)
+        nearby = NearField(
+            frame, hits, lambda there: in_kernel.indirect(there, self.shadows, self.bounces, near), declare
+        )
         return near, nearby.slid() if near > 0 else hits._exact.new_zeros((len(hits), 1)).to(frame.dtype)
 
     @staticmethod
@@ -168,8 +170,8 @@ class Lighting(NamedTuple):
         """Points of a light for each sample of the gradient inside a glossy face."""
         if light.punctual:
             return 1
-        fours = scene.is_glossy and isinstance(light, Environment)
-        return self.samples * (FOURS * COMPANIONS if fours else 1)
+        sets = scene.is_glossy and isinstance(light, Environment)
+        return self.samples * (SETS * SET_SIZE if sets else 1)
 
     def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
         """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces
@@ -230,17 +232,17 @@ def _in_front(g: Tensor, v: Tensor) -> Tensor:
 def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1, bounces: int = 1) -> Tensor:
     """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours."""
     note_jumps(hits, bounces > 1)
-    # Where steps are forced to a side PyTorch shades, for the kernel looks up the texel in which a point lies.
+    # Where steps are forced to a side PyTorch shades, for the kernel reads the texel in which a point lies.
     fused = isinstance(hits._view, View) and is_fused(hits._surfaces.scene) and not hits._steps.forced
     L = in_kernel.radiance(hits, shadows, light_samples) if fused else reference(hits, shadows, light_samples)
     if bounces > 1 and not hits._only_light:
         L = L + in_kernel.indirect(hits, shadows, bounces)
-    lamps = _moving_lamps(hits)
-    return L + _of_moving_borders(hits, lamps, Lighting(shadows, light_samples)) if lamps else L
+    lights = _moving_emitters(hits)
+    return L + _of_moving_borders(hits, lights, Lighting(shadows, light_samples)) if lights else L
 
 
 def reference(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
-    """The same in PyTorch, but for what borders between texels of lamps do elsewhere."""
+    """The same in PyTorch, but for what borders between texels of lights do elsewhere."""
     lighting = Lighting(shadows, light_samples)
     return _of_each_mesh(hits, lambda own, index: _of_mesh(own, index, lighting))
 
@@ -324,7 +326,7 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
 
 
 def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> list[LightPoints]:
-    """`count` points of a light for each point of a surface; where only derivatives are wanted, fours of an environment for a
+    """`count` points of a light for each point of a surface; where only derivatives are wanted, sets of an environment for a
     glossy one."""
     lambertian = surface.scattering.roughness is None
     by_light = lambertian or (isinstance(light, MeshLight) and tree_of(light) is None)
@@ -343,7 +345,7 @@ def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> list[
         )
     if hits._needs_values:
         return resampled(light, index, glossy, count)
-    return resampled(light, index, glossy, count, in_fours=True)
+    return resampled(light, index, glossy, count, antithetic=True)
 
 
 def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:
@@ -380,9 +382,9 @@ def _scattered(
     return total.index_copy(0, rows, scattered.expand(len(rows), C))
 
 
-def _moving_lamps(hits: Hits) -> list[_Lamp]:
-    """The lamps whose borders of texels may move. Light samples have no derivative for these."""
-    found: list[_Lamp] = []
+def _moving_emitters(hits: Hits) -> list[_MovingEmitter]:
+    """The lights whose borders of texels may move. Light samples have no derivative for these."""
+    found: list[_MovingEmitter] = []
     scene = hits._surfaces.scene
     if not differentiates() or hits._forced is not None or len(hits) == 0:
         return found
@@ -393,18 +395,18 @@ def _moving_lamps(hits: Hits) -> list[_Lamp]:
         first, second = hits.random(2, stream)[0].tolist()
         borders = light.borders((first, second))
         if borders is not None:
-            found.append(_Lamp(light, borders, stream))
+            found.append(_MovingEmitter(light, borders, stream))
     return found
 
 
-class _Lamp(NamedTuple):
+class _MovingEmitter(NamedTuple):
     light: MeshLight
     borders: TexelBorders
     stream: int  # of random numbers
 
 
-def _of_moving_borders(hits: Hits, lamps: list[_Lamp], lighting: Lighting) -> Tensor:
-    """(N, C) zeros, with the derivative of what lamps give by where their texels end, as many points of borders as of light:
+def _of_moving_borders(hits: Hits, lights: list[_MovingEmitter], lighting: Lighting) -> Tensor:
+    """(N, C) zeros, with the derivative of what lights give by where their texels end, as many points of borders as of light:
 
     f max(0, n·l) V cos θ / r² · [E_i − E_{i−1}] δp / |∇p|        (scene/texel_borders.py)
     """
@@ -417,7 +419,7 @@ def _of_moving_borders(hits: Hits, lamps: list[_Lamp], lighting: Lighting) -> Te
             return total
         with torch.no_grad():
             surface = _Surface.of(own, at, material)
-        for light, borders, stream in lamps:
+        for light, borders, stream in lights:
             for sample in range(lighting.samples):
                 drawn = borders.draw(own.random(2, stream, sample, lighting.samples))
                 with torch.no_grad():

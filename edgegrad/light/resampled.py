@@ -17,10 +17,10 @@ from ..scene.environment import Environment
 from ..scene.lights import Light, LightPoints
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
+from .antithetic import MOST_SETS, SET_SIZE, SETS, antithetic_set, seen_aside
 from .bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
-from .companions import COMPANIONS, FOURS, MOST_FOURS, companions, seen_aside
-from .lamp_trees import MeshTowards, tree_of
 from .lobes import WIDEST_LOBE, Lobes
+from .mesh_light_sampling import MeshTowards, tree_of
 
 EACH = 8  # candidates for one point that is kept, half of them by the lobe if it is narrow
 # Where radiance has derivatives, points are drawn as if no surface were darker, for what is black has derivatives too.
@@ -31,19 +31,19 @@ AT_ONCE = 1 << 19  # candidates
 def how_drawn(scene: Scene) -> str:
     """What plan() says of points of lights: by what they are drawn, and why."""
     skies = sum(isinstance(light, Environment) for light in scene.casting)
-    lamps = [light for light in scene.casting if isinstance(light, MeshLight)]
-    if not (skies or lamps):
+    lights = [light for light in scene.casting if isinstance(light, MeshLight)]
+    if not (skies or lights):
         return ""
     materials = [mesh.material for mesh in scene.meshes if mesh.material is not None]
     if not any(material.is_glossy for material in materials):
         return ", drawn by the light, for no surface is glossy"
-    of = ["skies"] * (skies > 0) + ["meshes that emit"] * (len(lamps) > 0)
+    of = ["skies"] * (skies > 0) + ["meshes that emit"] * (len(lights) > 0)
     said = f"; on glossy surfaces of {EACH} candidates for each, by light and, up to roughness {WIDEST_LOBE}, by lobe"
     said += f", one is kept by what it gives ({', '.join(of)})"
-    if lamps:
-        said += "; a lamp well within the lobe by the light alone, of a round one directions to a ball around it"
-    if any(tree_of(lamp) is None for lamp in lamps):
-        said += "; lamps of too many faces by the light alone"
+    if lights:
+        said += "; a light well within the lobe by the light alone, of a round one directions to a ball around it"
+    if any(tree_of(light) is None for light in lights):
+        said += "; lights of too many faces by the light alone"
     return said
 
 
@@ -88,30 +88,30 @@ class Glossy(NamedTuple):
 
 
 def resampled(
-    light: Light, stream: int, surfaces: Glossy, count: int, meets: MeshTowards | None = None, in_fours: bool = False
+    light: Light, stream: int, surfaces: Glossy, count: int, meets: MeshTowards | None = None, antithetic: bool = False
 ) -> list[LightPoints]:
     """`count` points for each surface, from random numbers of a stream. Where nothing arrives their density is infinite.
     Surfaces `meets` a mesh that emits; an environment is everywhere the same.
 
-    in_fours   directions to an environment with their companions instead (companions.py; csrc/shading/lit/derivative_points.h):
-               what is drawn, weighted and kept are all four of them; FOURS for each point that is asked for, MOST_FOURS where
+    antithetic   directions to an environment in antithetic sets instead (antithetic.py; csrc/shading/lit/derivative_points.h):
+               what is drawn, weighted and kept are all four of them; SETS for each point that is asked for, MOST_SETS where
                seen_aside()
     """
     with torch.no_grad():
         lobes = Lobes.of(surfaces.v, surfaces.n, surfaces.roughness)
         N, every = len(surfaces.n), torch.arange(len(surfaces.n), device=surfaces.n.device)
         together, keeps = 1, torch.full_like(every, count)
-        if in_fours:
+        if antithetic:
             aside = seen_aside(surfaces.v, surfaces.n, surfaces.g)
-            together, keeps, count = COMPANIONS, count * torch.where(aside, MOST_FOURS, FOURS), count * MOST_FOURS
+            together, keeps, count = SET_SIZE, count * torch.where(aside, MOST_SETS, SETS), count * MOST_SETS
         index = torch.zeros((N, count, together), dtype=torch.int64, device=surfaces.n.device)
         uv, density = surfaces.n.new_zeros((N, count, together, 2)), surfaces.n.new_full((N, count, together), math.inf)
         asked = lobes.narrow if meets is None else meets.is_drawn_by(lobes)
-        alike = torch.zeros_like(asked) if meets is None else meets.are_alike(lobes)
+        interchangeable = torch.zeros_like(asked) if meets is None else meets.interchangeable(lobes)
         by_ball = torch.zeros_like(asked) if meets is None else meets.is_drawn_by_ball(lobes)
         for kept, few, ask_lobe, ball in itertools.product(keeps.unique().tolist(), *[(False, True)] * 3):
             all = kept if few else EACH * kept
-            rows_ = every[(keeps == kept) & (alike == few) & (asked == ask_lobe) & (by_ball == ball)]
+            rows_ = every[(keeps == kept) & (interchangeable == few) & (asked == ask_lobe) & (by_ball == ball)]
             for rows in rows_.split(max(1, AT_ONCE // (all * together))) if len(rows_) else ():
                 some = None if meets is None else meets.select(rows)
                 drawn = _Drawn(light, stream, surfaces.select(rows), lobes.select(rows), some, ball, together)
@@ -184,7 +184,7 @@ class _Drawn(NamedTuple):
             L, measure = l[:, None], torch.ones_like(l[:, :1])
             if K > 1:
                 alpha = (surfaces.roughness * surfaces.roughness).clamp(min=LEAST_ALPHA)
-                L, measure = companions(surfaces.v, surfaces.n, alpha, l)
+                L, measure = antithetic_set(surfaces.v, surfaces.n, alpha, l)
                 all += [self.light.points_at(other) for other in L.unbind(1)[1:]]
             brightness = torch.stack([self.light.brightness_at(each) for each in all], 1)
         index, uv, density = (torch.stack(part, 1) for part in zip(*all, strict=True))

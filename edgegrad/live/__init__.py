@@ -1,4 +1,4 @@
-"""The live view of a fit: a page in a browser, or a figure in a notebook. Other parts of the library do without it."""
+"""The live view of a fit: a page in a browser, or a figure in a notebook. No other part of the library depends on it."""
 
 from .view import Viewer, viewer
 

@@ -1,4 +1,4 @@
-"""The live view as a figure in a notebook that changes in its place."""
+"""The live view as a figure that is updated in place in a notebook."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..optional import require
-from .frame import CONTRAST, Frame
+from .snapshot import CONTRAST, Snapshot
 
 INK = "#303030"
 
 
-class Notebook:
-    """The figure."""
+class NotebookFigure:
+    """A matplotlib figure in a notebook."""
 
     url = None
 
@@ -25,9 +25,9 @@ class Notebook:
         self._handle: Any = None
         self.figure = Figure(figsize=(9.0, 2.6), dpi=90, layout="constrained")
 
-    def draw(self, frame: Frame, index: int, losses: Sequence[float], state: str) -> None:
+    def draw(self, snapshot: Snapshot, index: int, losses: Sequence[float], state: str) -> None:
         self.figure.clear()
-        panel = frame.panel(index) if frame.cameras else []
+        panel = snapshot.panel(index) if snapshot.cameras else []
         curve = [np.isfinite(loss) for loss in losses].count(True) > 1
         axes = list(self.figure.subplots(1, max(1, len(panel) + curve), squeeze=False)[0])
         titles = ("target", "render", f"difference × {CONTRAST}") if len(panel) == 3 else ("render",)
@@ -41,9 +41,9 @@ class Notebook:
             axes[-1].set_yscale("log" if np.nanmin(losses) > 0.0 else "linear")
             axes[-1].set_title("loss", fontsize=9, color=INK)
             axes[-1].spines[["top", "right"]].set_visible(False)
-        self.say(state)
+        self.set_status(state)
 
-    def say(self, state: str) -> None:
+    def set_status(self, state: str) -> None:
         self.figure.suptitle(state.replace("**", ""), fontsize=9, color=INK)
         file = io.BytesIO()
         self.figure.savefig(file, format="png")
@@ -53,8 +53,8 @@ class Notebook:
         else:
             self._handle.update(image)
 
-    def label(self, pause: str, stop: str) -> None:
-        """It has no buttons: the notebook's own ends a fit."""
+    def set_labels(self, pause: str, stop: str) -> None:
+        """Do nothing: the figure has no buttons, and the notebook's own one ends a fit."""
 
     def close(self) -> None:
-        """The figure stays."""
+        """Leave the figure as it is."""

@@ -1,7 +1,8 @@
-"""eg.viewer(): watching a fit, pausing and stopping it.
+"""eg.viewer(): watch a fit, pause it and stop it.
 
-Fits do not know of it: it is a callback. It draws in the fit's own thread, so that nothing changes while it draws, and takes no
-more than a small share of the time. The page's buttons come in threads of the server: they set flags that the next step reads.
+Fits do not know of it, for it is a callback. It draws in the fit's own thread, so that nothing changes while it draws, and
+takes only a small share of the time. The page's buttons are handled in threads of the server: they set flags that the next step
+reads.
 """
 
 from __future__ import annotations
@@ -23,25 +24,26 @@ from ..scene.scene import Scene
 if TYPE_CHECKING:
     from ..fit import Calibration, CameraFit, Fit, PoseFit, RigFit
     from .browser import Browser
-    from .figure import Notebook
-    from .frame import Frame, Shown
+    from .figure import NotebookFigure
+    from .snapshot import Shown, Snapshot
 
-SHORTEST = 0.1  # seconds between two drawings
-BEAT = 0.1  # seconds in which a pause notices Ctrl-C
+MIN_INTERVAL = 0.1  # seconds between two drawings
+POLL = 0.1  # seconds until a pause notices Ctrl-C
 
 
 def viewer(port: int = 8080, host: str = "127.0.0.1", *, server: bool | None = None, share: float = 0.03) -> Viewer:
-    """A live view: the meshes as they move, cameras with their pictures, target | render | difference, the loss, and buttons
-    that pause and stop. Of fit_rig() also the skeleton.
+    """Open a live view: moving meshes, cameras with their pictures, target | render | difference, the loss, and buttons that
+    pause and stop. It shows the skeleton, too, in fit_rig().
 
         with eg.viewer() as view:
             print(view.url)
             fit = eg.fit.fit_pose(mesh, image, camera, callback=view)
 
-    port     of the page; where it is taken, the next free one. 0: any
-    host     whose address the page has. Only this computer sees 127.0.0.1; "0.0.0.0" is for all who reach it, without a password
-    server   False: a figure that changes in its place in a notebook, with neither meshes nor buttons. None: that figure in a
-             notebook without viser, a page everywhere else
+    port     of the page, or the next free one; 0: any
+    host     address of the page. "127.0.0.1" is visible on this computer alone; "0.0.0.0" to all who reach it, without a
+             password
+    server   False: a figure that is updated in place in a notebook, without meshes and buttons. None: that figure in a notebook
+             without viser, a page everywhere else
     share    of the time that drawing may take, 0.001 … 1
 
     Raises TypeError or ValueError that names the argument, ImportError without viser (`pip install 'edgegrad[view]'`).
@@ -56,43 +58,43 @@ def viewer(port: int = 8080, host: str = "127.0.0.1", *, server: bool | None = N
 
 
 class Viewer:
-    """What viewer() makes: a callback of every fit, and for loops of one's own update()."""
+    """A live view, as viewer() opens it. It is the callback of any fit; a loop of one's own calls update()."""
 
     def __init__(self, port: int, host: str, server: bool | None, share: float) -> None:
         self._share = share
-        self._display: Browser | Notebook = self._opened(port, host, server)
+        self._display: Browser | NotebookFigure = self._opened(port, host, server)
         self._steps = 0
         self._losses: list[float] = []
-        self._frame: Frame | None = None
+        self._snapshot: Snapshot | None = None
         self._index = 0
-        self._next = 0.0  # when to draw again
+        self._next = 0.0  # time of the next drawing
         self._drawing = threading.Lock()
         self._go, self._stop = threading.Event(), threading.Event()
         self._go.set()
         self._closed = self._ended = False
 
-    def _opened(self, port: int, host: str, server: bool | None) -> Browser | Notebook:
+    def _opened(self, port: int, host: str, server: bool | None) -> Browser | NotebookFigure:
         if server is False and not in_notebook():
             raise ValueError("server: expected True outside of a notebook, got False; nothing there shows a figure")
         if server is False or (server is None and importlib.util.find_spec("viser") is None and in_notebook()):
             require("matplotlib", "edgegrad[figures]", "a figure in a notebook")
-            from .figure import Notebook
+            from .figure import NotebookFigure
 
-            return Notebook()
+            return NotebookFigure()
         from .browser import Browser, Controls
 
-        return Browser(host, port, Controls(self._toggle, self.stop, self._look))
+        return Browser(host, port, Controls(self._toggle, self.stop, self._select_camera))
 
-    # -- what one does with it ------------------------------------------------------------------------------------------------
+    # -- for users ------------------------------------------------------------------------------------------------------------
 
     @property
     def url(self) -> str | None:
-        """The page's address; None of a figure."""
+        """The page's address; None for a figure."""
         return self._display.url
 
     @property
     def stopped(self) -> bool:
-        """Whether Stop was pressed, in a loop of one's own; a fit that it ends takes it back for the next."""
+        """Whether Stop was pressed in a loop of one's own. A fit that it ends resets it."""
         return self._stop.is_set()
 
     @property
@@ -100,11 +102,11 @@ class Viewer:
         return not self._go.is_set()
 
     def __call__(self, fit: Shown) -> None:
-        """As the callback of a fit: draws when it is time to, waits while paused, and ends the fit, which keeps its best, by
-        KeyboardInterrupt when Stop was pressed."""
-        from .frame import frame_of
+        """Serve as a fit's callback: draw when it is due, wait while paused, and raise KeyboardInterrupt after Stop, by which
+        the fit ends with its best result."""
+        from .snapshot import snapshot_from_fit
 
-        if not self._step(_loss(fit), lambda: frame_of(fit)):
+        if not self._step(_loss(fit), lambda: snapshot_from_fit(fit)):
             self._stop.clear()
             raise KeyboardInterrupt
 
@@ -117,32 +119,32 @@ class Viewer:
         masks: Tensor | Sequence[Tensor] | None = None,
         loss: Tensor | float | None = None,
     ) -> bool:
-        """A step of a loop of one's own: draws when it is time to, waits while paused, and gives False when Stop was pressed.
+        """Report a step of one's own loop: draw when it is due, and wait while paused. Return False after Stop.
 
             if not view.update(scene, camera, image, loss=loss):
                 break
 
         cameras, images and masks are as for fit_scene(). Raises TypeError or ValueError that names the argument.
         """
-        from .frame import frame_of_scene
+        from .snapshot import snapshot_from_scene
 
         number = None if loss is None else float(loss)
-        return self._step(number, lambda: frame_of_scene(scene, cameras, images, masks))
+        return self._step(number, lambda: snapshot_from_scene(scene, cameras, images, masks))
 
     def show(self, fit: Fit | PoseFit | CameraFit | Calibration | RigFit) -> None:
-        """Draws at once: what a fit returns, for its last step may not be drawn."""
-        from .frame import frame_of
+        """Draw a fit's result at once, for its last step may not have been drawn."""
+        from .snapshot import snapshot_from_fit
 
-        self._draw(frame_of(fit))
+        self._draw(snapshot_from_fit(fit))
 
     def wait(self) -> None:
-        """Keeps the page open until Stop, which then says Close, or Ctrl-C."""
+        """Keep the page open until Ctrl-C or Stop, which now says Close."""
         if self.url is None:
             return
         self._ended = True
         self._label()
         try:
-            while not self._stop.wait(BEAT):
+            while not self._stop.wait(POLL):
                 pass
         except KeyboardInterrupt:
             pass
@@ -160,7 +162,7 @@ class Viewer:
         self.resume()
 
     def close(self) -> None:
-        """Ends the page. A fit that goes on is no longer shown."""
+        """Close the page. A fit that goes on is no longer shown."""
         if not self._closed:
             self._closed = True
             self._go.set()
@@ -173,7 +175,7 @@ class Viewer:
         self.close()
 
     def _repr_html_(self) -> str | None:
-        """In a notebook: the page."""
+        """Show the page in a notebook."""
         if self.url is None:
             return None
         link = f'<a href="{self.url}" target="_blank">{self.url}</a>'
@@ -184,63 +186,63 @@ class Viewer:
 
     # -- steps ----------------------------------------------------------------------------------------------------------------
 
-    def _step(self, loss: float | None, frame: Callable[[], Frame]) -> bool:
-        """Whether to go on."""
+    def _step(self, loss: float | None, snapshot: Callable[[], Snapshot]) -> bool:
+        """Return whether to go on."""
         if self._closed:
             return not self.stopped
         self._steps += 1
         if loss is not None:
             self._losses.append(loss)
-        began, first = time.perf_counter(), self._frame is None
+        began, first = time.perf_counter(), self._snapshot is None
         if began >= self._next:
-            self._draw(frame())
+            self._draw(snapshot())
             now = time.perf_counter()
-            # The first one sends textures and pictures, later ones what changed.
-            self._next = now + max(SHORTEST, 0.0 if first else (now - began) * (1.0 / self._share - 1.0))
+            # The first drawing sends textures and pictures, later ones send changes.
+            self._next = now + max(MIN_INTERVAL, 0.0 if first else (now - began) * (1.0 / self._share - 1.0))
         if self.paused:
-            self._draw(frame())
-            while not self._go.wait(BEAT):
+            self._draw(snapshot())
+            while not self._go.wait(POLL):
                 pass
             self._draw_state()
         return not self.stopped
 
-    def _draw(self, frame: Frame) -> None:
+    def _draw(self, snapshot: Snapshot) -> None:
         with self._drawing:
-            self._frame = frame
-            self._index = min(self._index, max(0, len(frame.cameras) - 1))
-            self._display.draw(frame, self._index, self._losses, self._state())
+            self._snapshot = snapshot
+            self._index = min(self._index, max(0, len(snapshot.cameras) - 1))
+            self._display.draw(snapshot, self._index, self._losses, self._state())
 
     def _draw_state(self) -> None:
         with self._drawing:
-            self._display.say(self._state())
+            self._display.set_status(self._state())
 
     def _state(self) -> str:
         what = f"step {self._steps}" + (f", loss {self._losses[-1]:.3e}" if self._losses else "")
         return f"**paused** at {what}" if self.paused else f"**ended** at {what}" if self._ended else what
 
     def _label(self) -> None:
-        self._display.label("Resume" if self.paused else "Pause", "Close" if self._ended else "Stop")
+        self._display.set_labels("Resume" if self.paused else "Pause", "Close" if self._ended else "Stop")
 
     def _toggle(self) -> None:
         self.resume() if self.paused else self.pause()
 
-    def _look(self, index: int) -> None:
-        """Through another camera, also while paused and after the end."""
+    def _select_camera(self, index: int) -> None:
+        """Show another camera, also while paused and after the end."""
         with self._drawing:
             self._index = index
-            if self._frame is not None and self._display.url is not None:
-                self._display.draw_panel(self._frame, index)  # pyright: ignore[reportAttributeAccessIssue]
+            if self._snapshot is not None and self._display.url is not None:
+                self._display.draw_panel(self._snapshot, index)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _loss(fit: object) -> float | None:
-    """Of the last step."""
+    """Return the last step's loss."""
     search = getattr(fit, "search", fit)
     history = getattr(search, "history", None)
     return getattr(history[-1] if history else fit, "loss", None)
 
 
 def in_notebook() -> bool:
-    """Whether this process is a notebook's kernel."""
+    """Return whether this process is a notebook's kernel."""
     try:
         from IPython import get_ipython  # pyright: ignore[reportMissingImports]
     except ImportError:

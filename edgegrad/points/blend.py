@@ -66,7 +66,7 @@ class Blended:
         return background[frame.here(row), frame.here(column)]
 
 
-def panes(surfaces: Surfaces) -> Tensor:
+def transparent(surfaces: Surfaces) -> Tensor:
     """(F,) bool: the faces of meshes that blend."""
     blends = torch.tensor([mesh.blends for mesh in surfaces.scene.meshes], device=surfaces.mesh_of_face.device)
     return blends[surfaces.mesh_of_face]
@@ -74,8 +74,8 @@ def panes(surfaces: Surfaces) -> Tensor:
 
 def let_through(frame: Frame, records: CurveRecords) -> Tensor:
     """(S,) float64: what the surfaces before samples on curves let through, Π (1 − α), without derivatives."""
-    sample = frame.here(records.pane_row_of)
-    passed = frame.fixed_hits(records.pane, records.pane_b, records.x[records.pane_row_of])
+    sample = frame.here(records.transparent_row_of)
+    passed = frame.fixed_hits(records.transparent, records.transparent_b, records.x[records.transparent_row_of])
     total = torch.ones(len(records.x), dtype=torch.float64, device=frame.device)
     return total.scatter_reduce(0, sample, 1 - opacity(passed)[:, 0].double(), "prod")
 

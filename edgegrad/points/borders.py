@@ -33,7 +33,7 @@ class Borders:
         """Points of the pixels (N,), after they were shaded."""
         steps = list(zip(hits._steps.kinds, hits._steps.values, strict=True))
         self._known = self._known and values_visible(*(values for _, values in steps if values is not None))
-        # Each point sees another part of a light with an extent, so its neighbours tell nothing of the shadow's border.
+        # Each point sees another part of a light with an extent, so its neighbours say nothing about the shadow's border.
         lights = [k for k, light in enumerate(hits.lights) if light.punctual]
         if not self._known or not (steps or lights):
             return
@@ -72,6 +72,6 @@ def _sides(kind: str, values: Tensor) -> Tensor:
 def _around(values: Tensor, outside: int) -> Tensor:
     """(H, W): the greatest of the eight neighbours of each pixel, with this value beyond the border."""
     padded = torch.nn.functional.pad(values, (1, 1, 1, 1), value=outside)
-    beside = torch.maximum(padded[:, :-2], padded[:, 2:])
-    three = torch.maximum(beside, padded[:, 1:-1])
-    return torch.maximum(beside[1:-1], torch.maximum(three[:-2], three[2:]))
+    horizontal = torch.maximum(padded[:, :-2], padded[:, 2:])
+    three = torch.maximum(horizontal, padded[:, 1:-1])
+    return torch.maximum(horizontal[1:-1], torch.maximum(three[:-2], three[2:]))

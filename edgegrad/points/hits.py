@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ..check import as_tensor, check_finite, check_float, check_shape, values_visible
-from ..scene import provided
 from ..scene.lights import Light, LightPoints
 from ..scene.material import WRAPS
 from ..scene.mesh import FILTERS
@@ -24,6 +23,8 @@ from .shadow_rays import Forced, seen_from
 from .sobol import key_of, sobol
 from .steps import Steps, StepsOfSubset
 from .surfaces import Rays, Surfaces, View, every_face
+
+LightSampler = Callable[["Hits", Light, int], list[LightPoints]]  # so many points of a light for each of the hits
 
 
 class Hits:
@@ -53,14 +54,16 @@ class Hits:
         self._surfaces, self._view, self._rays_at = surfaces, view, rays_at
         self._needs_values = True  # False: radiance may be zeros that have its derivatives (light/in_kernel.py)
         self._on_curve = False  # whether it is asked how radiance jumps there
-        self._near = 0.0  # world units: light from nearer has no derivatives by where these lie (light/sliding.py)
+        self._near = 0.0  # world units: light from nearer has no derivatives by where these lie (light/near_field.py)
         self._seed = torch.arange(len(face), device=face.device) if seed is None else seed
         self._forced = forced
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
         self._pixel, self._steps = pixel, steps or Steps()
         self._all: tuple[Hits, Tensor] | None = None  # the hits that these are a subset of, and their rows there
-        self._drawn: dict[tuple[int, int], list[LightPoints]] = {}  # by materials, of a light and so many samples
+        self._drawn: dict[
+            tuple[LightSampler, int, int], list[LightPoints]
+        ] = {}  # by a sampler, of a light and so many samples
         # What visible_from() found, by the light's place in scene.casting: (N,) int8, −1 where it was not asked.
         self._lit: dict[int, Tensor] = {}
 
@@ -232,7 +235,7 @@ class Hits:
         """(N, K): a texture (h, w, K), row 0 on top, at texture coordinates uv (N, 2), v running up; those of the surface when
         None.
 
-        wrap     beyond the rim: "repeat", "clamp" or "mirror", or two of these, for u and for v
+        wrap     beyond the border: "repeat", "clamp" or "mirror", or two of these, for u and for v
         filter   "linear" between the centres of texels; "nearest", the texel itself, whose borders are steps: see where()
         mipmap   True: texels are averaged over squares of 2, 4, 8 … so that neighbouring pixels are about a texel apart, linear
                  between two such levels (Williams 1983). Only for hits of a camera
@@ -354,32 +357,31 @@ class Hits:
         sequence with the powers of the generalised golden ratio of three dimensions). Each `stream` gives other numbers."""
         return uniform(self._seed * parts + part, n, stream)
 
-    def light_points(self, light: Light, sample: int = 0, samples: int = 1, by: str = "light") -> LightPoints:
+    def light_points(
+        self, light: Light, sample: int = 0, samples: int = 1, by: LightSampler | None = None
+    ) -> LightPoints:
         """A point of a light of `lights` for each of the N points. With several `samples` of a light, `sample` is the number of
         this one. light.place() and light.arriving() take the result.
 
-        by   "light": drawn in proportion to what the light emits. "material": as render() draws them, by what the material of
-             the point's mesh makes of them where nothing lies between; on glossy ones the density is then that of the choice
-             among some candidates, infinite where none gives anything
+        by   None: drawn in proportion to what the light emits. eg.lights.points_by_material: as render() draws them, by what the
+             material of the point's mesh makes of them where nothing lies between; on glossy ones the density is then that of
+             the choice among some candidates, infinite where none gives anything
 
-        A mean of any function of the point over the density is right with either, but "material" draws nothing of what the
-        material scatters not at all. There are no derivatives by where points are drawn. Raises ValueError.
+        A mean of any function of the point over the density is right with either, but points_by_material draws nothing of what
+        the material scatters not at all. There are no derivatives by where points are drawn. Raises TypeError or ValueError.
         """
         index = self._index(light)
-        if by not in ("light", "material"):
-            raise ValueError(f'by: expected "light" or "material", got {by!r}')
+        if by is not None and not callable(by):
+            raise TypeError(f"by: expected a function such as eg.lights.points_by_material, or None, got {by!r}")
         if not 0 <= sample < samples:
             raise ValueError(f"sample: expected a number from 0 to {samples - 1}, below samples, got {sample}")
-        if by == "material":
-            return self._by_material(light, index, samples)[sample]
+        if by is not None:
+            if (by, index, samples) not in self._drawn:
+                self._drawn[by, index, samples] = by(self, light, samples)
+            return self._drawn[by, index, samples][sample]
         points = light.draw(sobol(self._seed, key_of(index, 0), sample, samples))
         forced = self._forced
         return points if forced is None or forced.light != index else forced.among(points)
-
-    def _by_material(self, light: Light, index: int, samples: int) -> list[LightPoints]:
-        if (index, samples) not in self._drawn:
-            self._drawn[index, samples] = provided.points_by_material(self, light, samples)
-        return self._drawn[index, samples]
 
     def visible_from(self, light: Light, points: LightPoints) -> Tensor:
         """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). It has no derivative, but

@@ -66,15 +66,15 @@ class CurveRecords(NamedTuple):
     row_of: Tensor  # (R,) int64, the sample of a row
     vertex: Tensor  # (R,) int64
     by_q: Tensor  # (R, 3) float64, the curve's velocity by a vertex in camera coordinates
-    uv_row_of: Tensor  # (P,) int64, the sample of a row by texture coordinates, of cut-outs
+    uv_row_of: Tensor  # (P,) int64, the sample of a row by texture coordinates, of alpha-tested faces
     uv: Tensor  # (P,) int64
     by_uv: Tensor  # (P, 2) float64
     alpha_row_of: Tensor  # (Q,) int64, the sample of a row by texels of alpha
     alpha: Tensor  # (Q,) int64
     by_alpha: Tensor  # (Q,) float64
-    pane_row_of: Tensor  # (P,) int64, the sample of a row by faces through which it is seen
-    pane: Tensor  # (P,) int64
-    pane_b: Tensor  # (P, 2) float64, the last two barycentrics there
+    transparent_row_of: Tensor  # (P,) int64, the sample of a row by faces through which it is seen
+    transparent: Tensor  # (P,) int64
+    transparent_b: Tensor  # (P, 2) float64, the last two barycentrics there
     # For borders of shadows alone: the first point is the one in the light, the second the one in the shadow.
     light: Tensor  # (S,) int64, the part of the light
     light_uv: Tensor  # (S, 2) float64, where on it
@@ -121,7 +121,9 @@ class TraceRecords(NamedTuple):
 SURFACE_BYTES, CURVE_BYTES = 8 * (1 + 2 + 3 + 3 * 14 + 1), 8 * (2 + 3 + 6 + 3 + 14 + 4 * (1 + 1 + 3))
 
 
-def shaded_room(request: Request, gradient: bool | None = None, textured: bool = False) -> AbstractContextManager[None]:
+def shaded_memory(
+    request: Request, gradient: bool | None = None, textured: bool = False
+) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails. What the
     shader itself takes is not known. The samples of the `gradient` count too, by default where gradients are enabled."""
     size, options = size_of_values(request), request.gradient
@@ -215,7 +217,7 @@ def without_colors(flat: Flat, attributes: Tensor | None = None) -> Flat:
     return flat._replace(
         corners=corners,
         colors=colors,
-        uvs=flat.uvs if len(flat.cut_outs) else flat.uvs.new_zeros((0, 2)),
+        uvs=flat.uvs if len(flat.alpha_masks) else flat.uvs.new_zeros((0, 2)),
         texels=colors.new_zeros((0, colors.shape[1])),
         textures=flat.textures.new_zeros((0, 6)),
         face_texture=flat.face_texture.new_zeros(0),
@@ -279,7 +281,7 @@ class Sampler:
     def __init__(self, request: Request, camera: int, least: float) -> None:
         """`least`: the smallest barycentric of points on curves."""
         self._request, self._camera, self._least = request, camera, least
-        self.panes: Tensor | None = None  # (F,) bool: faces that hide no curve, for one sees through them
+        self.transparent: Tensor | None = None  # (F,) bool: faces that hide no curve, for one sees through them
         self._kept: tuple[list[Any], Flat, Any] | None = None
         height, width, faces = request.camera.height, request.camera.width, len(request.scene.faces)
         dtype = request.scene.colors.dtype
@@ -300,8 +302,8 @@ class Sampler:
         return camera_seed(self._request.gradient.grad_seed, self._camera)
 
     @property
-    def _panes(self) -> np.ndarray | None:
-        return None if self.panes is None else self.panes.cpu().to(torch.uint8).numpy()
+    def _transparent(self) -> np.ndarray | None:
+        return None if self.transparent is None else self.transparent.cpu().to(torch.uint8).numpy()
 
     def _scene(self, flat: Flat) -> Any:
         """The kernel's scene, checked once: most calls have the same arrays."""
@@ -378,16 +380,16 @@ class Sampler:
         intrinsics: bool = False,
         steps: bool = False,
         lit: Scene | None = None,
-        looks: Tensor | None = None,
+        importance: Tensor | None = None,
     ) -> tuple[SurfaceRecords, CurveRecords]:
         """Of the gradient, to be called after pixel_hits(). The scene of `request` has colours that differ at creases.
 
         lit     the scene whose lights shade them
-        looks   (H, W), above zero: how much they are to look at each pixel; None: the same everywhere
+        importance  (H, W), above zero: how much they are to look at each pixel; None: the same everywhere
         """
-        of_pixels = () if looks is None else (looks.to(self._hits.coverage.dtype),)
+        of_pixels = () if importance is None else (importance.to(self._hits.coverage.dtype),)
 
-        def compute(request: Request, camera: Any, *looks: Tensor) -> Sequence[Tensor]:
+        def compute(request: Request, camera: Any, *importance: Tensor) -> Sequence[Tensor]:
             flat, options = request.scene, request.gradient
             surface, curves = self._scene(flat).samples(
                 camera=camera,
@@ -407,8 +409,8 @@ class Sampler:
                 threads=torch.get_num_threads(),
                 hits=kernel_hits(self._hits),
                 detailed=faces_with_textures(lit),
-                panes=self._panes,
-                looks=looks[0].cpu().contiguous().numpy() if looks else None,
+                transparent=self._transparent,
+                importance=importance[0].cpu().contiguous().numpy() if importance else None,
             )
             return (*_record(SurfaceRecords, surface), *_record(CurveRecords, curves))
 
@@ -445,7 +447,7 @@ class Sampler:
 
         return CurveRecords(*self._compute(self._request, compute, *light[:3], *parts))
 
-    def bounce_samples(
+    def secondary_edge_samples(
         self,
         compute: Callable[..., tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]],
         tables: Sequence[Tensor],
@@ -479,7 +481,7 @@ class Sampler:
             "least": self._least,
             "threads": torch.get_num_threads(),
             "hits": kernel_hits(self._hits),
-            "panes": self._panes,
+            "transparent": self._transparent,
         }
 
     def hits_at(self, x: Tensor) -> PlaceRecords:

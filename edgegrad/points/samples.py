@@ -29,7 +29,7 @@ from ..scene.scene import Scene, as_scene
 from .frame import Frame
 from .hits import Hits
 from .moving import Form, velocity
-from .records import CurveRecords, SurfaceRecords, shaded_room, without_colors
+from .records import CurveRecords, SurfaceRecords, shaded_memory, without_colors
 from .shadow_rays import Forced
 from .shadows import ShadowLight
 from .splat import Term, boundary, splat
@@ -113,7 +113,7 @@ class SurfaceSamples:
 
 class EdgeSamples:
     """Samples on the curves where the image jumps: silhouettes, borders, intersections and creases, and
-    the rim where a lens folds or ends.
+    the boundary where a lens folds or ends.
 
     hits      Hits, the N points on their surfaces, at most three a sample; without derivatives
     sample    (N,) int64, the sample of each point
@@ -209,7 +209,7 @@ def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSa
     Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
     """
     request = _request_of(primary, "surface_samples", count)
-    with shaded_room(request._replace(gradient=request.gradient._replace(edge_samples=0)), gradient=True):
+    with shaded_memory(request._replace(gradient=request.gradient._replace(edge_samples=0)), gradient=True):
         moving = moves(primary.frame.intrinsics)
         surface, _ = primary.frame.sampler.samples(request, interior=True, boundary=False, intrinsics=moving)
     return SurfaceSamples(primary.frame, surface)
@@ -239,7 +239,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
         raise TypeError(f"creases: expected True, False or a tensor (F, 3, K), got {type(creases).__name__}")
     request = request._replace(scene=without_colors(request.scene, attributes))
     frame = primary.frame
-    with shaded_room(request._replace(gradient=request.gradient._replace(surface_samples=0)), gradient=True):
+    with shaded_memory(request._replace(gradient=request.gradient._replace(surface_samples=0)), gradient=True):
         _, curves = frame.sampler.samples(
             request, interior=False, boundary=True, intrinsics=moves(frame.intrinsics), steps=request.scene.has_steps
         )

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..scene.lights import Light, LightPoints
 from .surfaces import Surfaces
 
-# Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a lamp must not hide itself.
+# Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a light must not hide itself.
 THIN = 2.0**-40
 
 

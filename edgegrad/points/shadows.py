@@ -16,7 +16,7 @@ from .seeds import STEPS, mixed_bits, signed
 from .surfaces import Surfaces
 
 MOST_FACES = 4096  # of an emissive mesh: if it has more, so many are drawn with each seed
-DIRECTIONS = 1 << 14  # drawn from an environment, to tell where it is bright
+DIRECTIONS = 1 << 14  # drawn from an environment, to find where it is bright
 SHARES = 12  # no part of an environment holds more than one in so many of these
 
 

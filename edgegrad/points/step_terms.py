@@ -38,7 +38,7 @@ class StepTerms(NamedTuple):
     spacing: float  # px between the lines along which steps are looked for
     # How far from a step its sides are shaded, in units of its function: more than 0 for shaders that may look for themselves
     # on which side they are.
-    beside: float = 0.0
+    margin: float = 0.0
 
     def found(self, watch: Watch) -> list[Term]:
         crossings = self._crossings()
@@ -80,7 +80,7 @@ class StepTerms(NamedTuple):
             jumps = []
             for part in self._parts(found):
                 face, b, x = found.face[part], found.b[part], found.x[part]
-                aside = self._aside(found, rays, part, gradient[part]) if self.beside else torch.zeros_like(b)
+                aside = self._aside(found, rays, part, gradient[part]) if self.margin else torch.zeros_like(b)
                 before, after = (
                     self.shade(frame.fixed_hits(face, b + shift, x, seed[part], Steps(states[part])))
                     for states, shift in ((found.before, -aside), (found.after, aside))
@@ -99,7 +99,7 @@ class StepTerms(NamedTuple):
         face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
         _, b_by_x = frame.fixed_view.barycentrics_by(frame.fixed, face, along, by_x)
         squared = (gradient * gradient).sum(1, keepdim=True)
-        rises = torch.where(frame.here(found.rises), self.beside, -self.beside)[:, None]
+        rises = torch.where(frame.here(found.rises), self.margin, -self.margin)[:, None]
         x = torch.where(squared > 0, rises[part] * gradient / squared, 0.0)
         return (b_by_x * x[:, None]).sum(-1)[:, 1:].to(found.b)
 

@@ -118,7 +118,7 @@ class Surfaces:
             normal_faces = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
             given = (mesh.verts, mesh.faces), (mesh.normals, normal_faces), (uvs, uv_faces)
             values = values_of(*(tensor for pair in given for tensor in pair))
-            fans = Fans.of(*zip(values[::2], values[1::2], strict=True))
+            fans = Fans.from_corners(*zip(values[::2], values[1::2], strict=True))
             self._tangents[index] = fans.tangents(*(rows_of(x.to(mesh.verts.device), at.long()) for x, at in given))
         return self._tangents[index]
 
@@ -133,10 +133,10 @@ class Surfaces:
         """(F, 3, K): all properties that may jump and were asked for, each divided by its largest value."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
         attributes = columns([scaled(p) for p in parts if p.shape[-1]], len(self.faces), self.verts)
-        return _Beside.apply(attributes) if transformed() else attributes
+        return _NextToSteps.apply(attributes) if transformed() else attributes
 
 
-class _Beside(torch.autograd.Function):
+class _NextToSteps(torch.autograd.Function):
     """Attributes (F, 3, K). Under torch.vmap, those of all elements side by side: these share the samples of one image."""
 
     @staticmethod
@@ -158,7 +158,7 @@ class _Beside(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int, ...], *args: Any) -> tuple[Tensor, None]:
         (attributes,), (batch,) = args, in_dims
-        return _Beside.apply(attributes.movedim(batch, -1).flatten(2)), None
+        return _NextToSteps.apply(attributes.movedim(batch, -1).flatten(2)), None
 
 
 def every_face(count: int) -> Tensor:

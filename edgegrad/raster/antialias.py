@@ -16,7 +16,7 @@ from .tensors import check_image, check_positions, contiguous, ranges_of, to_ker
 
 
 class TopologyHash:
-    """Which triangles share edges, from `antialias_construct_topology_hash`."""
+    """The edges that triangles share, from `antialias_construct_topology_hash`."""
 
     def __init__(self, tri: Tensor) -> None:
         self.tri = tri
@@ -37,11 +37,13 @@ class TopologyHash:
 
 
 def antialias_construct_topology_hash(tri: Tensor) -> TopologyHash:
-    """Which triangles share edges, for `antialias`, which otherwise finds it at each call.
-
-    tri  (F, 3) int
+    """Return which triangles share edges, for `antialias`, which otherwise finds it at each call.
 
     Raises TypeError or ValueError that names the argument.
+
+    Parameters
+    ----------
+    tri : (F, 3) int
     """
     return TopologyHash(triangles(tri, 2**31 - 1, "pos").clone())
 
@@ -59,33 +61,41 @@ def antialias(
     spp: int = 16,
     seed: int = 0,
 ) -> Tensor:
-    """An image whose pixels are blended across silhouettes, so that it changes continuously with the vertices.
-
-    color               (B, H, W, C) float
-    rast                (B, H, W, 4) float, the first result of `rasterize`
-    pos                 (B, V, 4) or (V, 4) float, the positions that were rasterized
-    tri                 (F, 3) int, the triangles that were rasterized
-    topology_hash       of `antialias_construct_topology_hash`; None: made here
-    pos_gradient_boost  a factor of the gradient of `pos`
-    exact               means of pixels instead, see below
-    ranges              (B, 2) int, with `exact` and pos (V, 4): those that were rasterized
-    spp, seed           with `exact`: samples a pixel, and which
+    """Return an image whose pixels are blended across silhouettes, so that it changes continuously with the vertices, (B, H, W,
+    C).
 
     Where two pixels side by side, or above each other, show different triangles and the nearer of these ends between their
-    centres with a silhouette (an edge of one triangle, or of several on the same side in the image), the pixel that the edge cuts
-    is blended with the other, by half a pixel less the distance of the edge from the centre. Edges that run more up than along
-    count between pixels side by side, others between those above each other (Laine et al. 2020, section 3.5).
-
-    Returns (B, H, W, C). Gradients go to `color` and to x, y and w of `pos`: the exact derivatives of what is returned. They know
-    silhouettes whose triangle is seen at a pixel's centre.
+    centres with a silhouette (an edge of one triangle, or of several on the same side in the image), the pixel that the edge
+    cuts is blended with the other, by half a pixel less the distance of the edge from the centre. Edges that run more up than
+    along count between pixels side by side, others between those above each other (Laine et al. 2020, section 3.5). Gradients
+    go to `color` and to x, y and w of `pos`: the exact derivatives of what is returned. They cover silhouettes whose triangle
+    is seen at a pixel's centre.
 
     With `exact` a pixel becomes the mean over its area, by `spp` samples, of the colours of what they hit, and the gradient is
-    that of this mean: unbiased, also where triangles are small or seen from their edge and no centre shows them. A sample's
-    colour is that of the pixel, among the nine around it, that shows its triangle; if none does, of another one that does; if
-    none in the image does, of the one of the nine that shows the surface nearest in depth. Background has the colour of the
-    nearest pixel without a triangle. Edges between triangles of one surface count too.
+    that of this mean. It is unbiased, also where triangles are small or seen from their edge and no centre shows them. A
+    sample's colour is that of the pixel, among the nine around it, that shows its triangle; if none does, of another one that
+    does; if none in the image does, of the one of the nine that shows the surface nearest in depth. Background has the colour
+    of the nearest pixel without a triangle. Edges between triangles of one surface count, too.
 
     Raises TypeError or ValueError that names the argument.
+
+    Parameters
+    ----------
+    color : (B, H, W, C) float
+    rast : (B, H, W, 4) float
+        The first result of `rasterize`.
+    pos, tri : (B, V, 4) or (V, 4) float, and (F, 3) int
+        The positions and triangles that were rasterized.
+    topology_hash : TopologyHash
+        Result of `antialias_construct_topology_hash`; None: made here.
+    pos_gradient_boost : float, default 1
+        Factor of the gradient of `pos`.
+    exact : bool, default False
+        Whether pixels become means.
+    ranges : (B, 2) int
+        With `exact` and pos (V, 4): those that were rasterized.
+    spp, seed : int, default 16 and 0
+        With `exact`: samples a pixel, and which.
     """
     (color, rast, pos), device = to_kernel(color=color, rast=rast, pos=pos)
     check_image("rast", rast, 4)
@@ -127,7 +137,7 @@ def antialias(
 
 
 def _spans(ranges: Tensor | None, pos: Tensor, tri: Tensor, images: int) -> list[list[int]]:
-    """First triangle of each image and how many."""
+    """Return the first triangle of each image and how many."""
     if ranges is None:
         if len(pos) != images:
             raise ValueError(
@@ -141,7 +151,7 @@ def _spans(ranges: Tensor | None, pos: Tensor, tri: Tensor, images: int) -> list
 
 
 def _check_shown(image: int, number: Tensor, first: int, count: int) -> None:
-    """Of each pixel (H, W) 0, or a triangle of the image + 1. Raises ValueError."""
+    """Check that each pixel (H, W) has 0, or a triangle of the image + 1. Raises ValueError."""
     fine = (number == 0) | ((number >= first + 1) & (number <= first + count) & (number == number.round()))
     if not bool(fine.all()):
         y, x = (~fine).nonzero()[0].tolist()
@@ -152,7 +162,7 @@ def _check_shown(image: int, number: Tensor, first: int, count: int) -> None:
 
 
 class _Antialias(torch.autograd.Function):
-    """csrc/raster/antialias.h"""
+    """The operator of csrc/raster/antialias.h."""
 
     @staticmethod
     def forward(ctx: Any, color: Tensor, pos: Tensor, rast: Tensor, tri: Tensor, groups: Any, boost: float) -> Tensor:

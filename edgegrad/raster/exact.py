@@ -23,9 +23,10 @@ class Sampling(NamedTuple):
 
 
 def exact_means(color: Tensor, rast: Tensor, pos: Tensor, tri: Tensor, sampling: Sampling) -> Tensor:
-    """(H, W, C) of one image: color (H, W, C), rast (H, W, 4), pos (V, 4), tri (F, 3); triangles are counted as in rast."""
+    """Return the means (H, W, C) of one image: color (H, W, C), rast (H, W, 4), pos (V, 4), tri (F, 3). Triangles are counted
+    as in rast."""
     height, width = color.shape[:2]
-    shown = Shown(color.reshape(height * width, -1), rast.detach().reshape(-1, 4), (height, width))
+    shown = PixelColors(color.reshape(height * width, -1), rast.detach().reshape(-1, 4), (height, width))
     mesh, owner = _in_device_coordinates(pos.double(), tri)
     background = shown.background()
     if mesh is None:
@@ -43,16 +44,17 @@ def exact_means(color: Tensor, rast: Tensor, pos: Tensor, tri: Tensor, sampling:
     return image.to(color.dtype)
 
 
-class Shown(NamedTuple):
-    """What the centres of an image's pixels show, from which samples have their colours."""
+class PixelColors(NamedTuple):
+    """Colours at the centres of an image's pixels, from which samples take theirs."""
 
     color: Tensor  # (H W, C)
     rast: Tensor  # (H W, 4)
     size: tuple[int, int]
 
     def of_hits(self, hits: Hits, owner: Tensor) -> Tensor:
-        """(N, C): of the pixel, among the nine around a sample, that shows its triangle, or else of one anywhere; if none does,
-        of the one of the nine that shows the surface nearest in depth; if none shows any, of the sample's own pixel."""
+        """Return colours (N, C) of samples: of the pixel, among the nine around a sample, that shows its triangle, or else of
+        one anywhere. If none does, it is that of the one of the nine that shows the surface nearest in depth; if none shows
+        any, of the sample's own pixel."""
         height, width = self.size
         column, row = hits.pixel.detach().floor().long().unbind(1)
         row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)  # of a sample on the image's border
@@ -64,7 +66,7 @@ class Shown(NamedTuple):
         return self.color[own]
 
     def _around(self, row: Tensor, column: Tensor, face: Tensor, depth: Tensor, triangles: int) -> Tensor:
-        """(N,) the pixels that samples take their colours of, if it need not be their own."""
+        """Return the pixels (N,) that samples take their colours of, if it need not be their own."""
         height, width = self.size
         own = row * width + column
         anywhere = self._pixel_of(triangles)[face]
@@ -83,13 +85,13 @@ class Shown(NamedTuple):
         return source
 
     def _pixel_of(self, triangles: int) -> Tensor:
-        """(F,) a pixel that shows a triangle, or −1."""
+        """Return a pixel (F,) that shows each triangle, or −1."""
         pixels = torch.arange(len(self.rast))
         found = torch.full((triangles + 1,), -1).scatter_reduce(0, self.rast[:, 3].long(), pixels, "amax")
         return found[1:]
 
     def background(self) -> Tensor:
-        """(H W, C): of each pixel what the nearest one shows that has no triangle, by steps to neighbours; black if none has."""
+        """Return (H W, C) what the nearest pixel without a triangle shows, by steps to neighbours; black if there is none."""
         height, width = self.size
         empty = self.rast[:, 3] == 0
         if not bool(empty.any()):
@@ -104,7 +106,7 @@ class Shown(NamedTuple):
 
 
 def _in_device_coordinates(pos: Tensor, tri: Tensor) -> tuple[Mesh | None, Tensor]:
-    """What of the triangles lies between the near and the far plane, and of each of its faces the triangle. None: nothing."""
+    """Return the parts of triangles between the near and the far plane, None without any, and the triangle of each face."""
     owner = torch.arange(len(tri))
     tri = tri.long()
     for plane in ((0.0, 0.0, 1.0, 1.0), (0.0, 0.0, -1.0, 1.0)):
@@ -118,7 +120,7 @@ def _in_device_coordinates(pos: Tensor, tri: Tensor) -> tuple[Mesh | None, Tenso
 
 
 def _cut(pos: Tensor, tri: Tensor, owner: Tensor, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The part of triangles where the height (V,), linear on them, is not below zero."""
+    """Return the part of triangles where the height (V,), linear on them, is not below zero."""
     inside = height.detach() >= 0
     count = inside[tri].sum(1)
     crossing = (count == 1) | (count == 2)

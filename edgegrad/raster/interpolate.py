@@ -21,18 +21,21 @@ def interpolate(
     rast_db: Tensor | None = None,
     diff_attrs: Sequence[int] | Literal["all"] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Attributes of vertices, interpolated in each pixel's triangle.
+    """Return attributes of vertices, interpolated in each pixel's triangle, and their derivatives in the image.
 
-    attr        (B, V, A) float, of each image; (1, V, A) or (V, A) of all
-    rast        (B, H, W, 4) float, the first result of `rasterize`
-    tri         (F, 3) int, vertices of the triangles
-    rast_db     (B, H, W, 4) float, the second result of `rasterize`
-    diff_attrs  numbers of the attributes whose derivatives in the image are wanted, or "all"; with `rast_db`
-
-    Returns (B, H, W, A), zero where there is no triangle, and (B, H, W, 2 len(diff_attrs)): ∂a/∂X and ∂a/∂Y of each, for a pixel
-    to the right and up, or (B, H, W, 0). Gradients go to `attr`, to u and v of `rast`, and to `rast_db`.
-
+    The first are (B, H, W, A), zero where there is no triangle. The second are (B, H, W, 2 len(diff_attrs)), ∂a/∂X and ∂a/∂Y of
+    each, for a pixel to the right and up, or (B, H, W, 0). Gradients go to `attr`, to u and v of `rast`, and to `rast_db`.
     Raises TypeError or ValueError that names the argument.
+
+    Parameters
+    ----------
+    attr : (B, V, A) float, or (1, V, A) or (V, A) for all images
+    rast, rast_db : (B, H, W, 4) float
+        The results of `rasterize`.
+    tri : (F, 3) int
+        Vertices of the triangles.
+    diff_attrs : sequence of int, or "all"
+        Numbers of the attributes whose derivatives in the image are wanted; with `rast_db`.
     """
     if rast_db is not None and diff_attrs is None and tuple(rast_db.shape[3:]) == (0,):
         rast_db = None  # of a context without derivatives
@@ -78,7 +81,7 @@ def _chosen(diff_attrs: Sequence[int] | str | None, width: int) -> list[int]:
 
 
 class _Interpolate(torch.autograd.Function):
-    """csrc/raster/interpolate.h"""
+    """The operator of csrc/raster/interpolate.h."""
 
     @staticmethod
     def forward(

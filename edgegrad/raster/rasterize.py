@@ -1,4 +1,4 @@
-"""Which triangle covers each pixel's centre, and where in it."""
+"""The triangle that covers each pixel's centre, and where in it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ from .tensors import check_positions, contiguous, ranges_of, to_kernel, triangle
 
 
 class RasterizeContext:
-    """What `rasterize` asks for, which here holds one choice and no resources.
+    """The context that `rasterize` takes, which here holds one choice and no resources. Raises ValueError for another mode.
 
-    output_db  whether derivatives of barycentrics in the image are returned
-    mode       "automatic" or "manual", which do the same here
-    device     ignored: results are on the device of `pos`
-
-    Raises ValueError for another mode.
+    Parameters
+    ----------
+    output_db : bool, default True
+        Whether derivatives of barycentrics in the image are returned.
+    mode : "automatic" or "manual"
+        Both do the same here.
+    device
+        Ignored: results are on the device of `pos`.
     """
 
     def __init__(self, output_db: bool = True, mode: str = "automatic", device: Any = None) -> None:
@@ -31,18 +34,18 @@ class RasterizeContext:
         self.output_db = bool(output_db)
 
     def set_context(self) -> None:
-        """Does nothing: there is no context of a graphics library."""
+        """Do nothing: there is no context of a graphics library."""
 
     def release_context(self) -> None:
-        """Does nothing: there is no context of a graphics library."""
+        """Do nothing: there is no context of a graphics library."""
 
 
 class RasterizeGLContext(RasterizeContext):
-    """`RasterizeContext` by the name that scripts use."""
+    """`RasterizeContext` under the name that scripts use."""
 
 
 class RasterizeCudaContext(RasterizeContext):
-    """`RasterizeContext` by the name, and with the arguments, that scripts use."""
+    """`RasterizeContext` under the name, and with the arguments, that scripts use."""
 
     def __init__(self, device: Any = None) -> None:
         super().__init__(device=device)
@@ -52,13 +55,13 @@ _log_level = 1
 
 
 def set_log_level(level: int) -> None:
-    """Remembers a level, 0 to 3, for scripts that set one: nothing is logged here, what is wrong raises an error."""
+    """Remember a level, 0 to 3, for scripts that set one. Nothing is logged here: errors are raised."""
     global _log_level
     _log_level = check_int("level", level, 0, 3)
 
 
 def get_log_level() -> int:
-    """That of `set_log_level`, 1 at first."""
+    """Return the level of `set_log_level`, 1 at first."""
     return _log_level
 
 
@@ -70,25 +73,30 @@ def rasterize(
     ranges: Tensor | None = None,
     grad_db: bool = True,
 ) -> tuple[Tensor, Tensor]:
-    """The nearest surface at the centre of each pixel.
+    """Return the nearest surface at the centre of each pixel, in two tensors of the dtype and on the device of `pos`.
 
-    ctx         a context of any name
-    pos         (B, V, 4) float, vertices of each image in clip space: what lies in −w ≤ x, y, z ≤ w is seen, the smaller z/w
-                the nearer. Or (V, 4) of all images, with `ranges`
-    tri         (F, 3) int, vertices of the triangles
-    resolution  (height, width) in pixels; row 0 is at the bottom, y = −w
-    ranges      (B, 2) int, for each image the first of its triangles and how many; with pos (V, 4), else ignored
-    grad_db     whether gradients of the second result go to `pos`
-
-    Returns two tensors of the dtype and on the device of `pos`. (B, H, W, 4): u, v, z/w and the triangle + 1; all 0 where there
-    is none. u and v are the barycentrics of the first two vertices, in space, not in the image. (B, H, W, 4): ∂u/∂X, ∂u/∂Y,
-    ∂v/∂X, ∂v/∂Y for a pixel to the right and up; (B, H, W, 0) if the context says so.
+    The first is (B, H, W, 4): u, v, z/w and the triangle + 1; all 0 where there is none. u and v are the barycentrics of the
+    first two vertices, in space, not in the image. The second is (B, H, W, 4): ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y for a pixel to the
+    right and up; (B, H, W, 0) if the context says so.
 
     A centre on an edge that two triangles share belongs to exactly one of them, by exact arithmetic. Of surfaces at the same
-    depth the first in `tri` is seen. Gradients of u, v and their derivatives go to x, y and w of `pos`; z/w has none, and what
+    depth the first in `tri` is seen. Gradients of u, v and their derivatives go to x, y and w of `pos`. z/w has none, and what
     moves at silhouettes gets its gradient in `antialias`. A float32 can name 2²⁴ triangles; give float64 positions for more.
-
     Raises TypeError or ValueError that names the argument.
+
+    Parameters
+    ----------
+    ctx : RasterizeContext
+    pos : (B, V, 4) float, or (V, 4) for all images with `ranges`
+        Vertices of each image in clip space: −w ≤ x, y, z ≤ w is seen, the smaller z/w the nearer.
+    tri : (F, 3) int
+        Vertices of the triangles.
+    resolution : (height, width) in pixels
+        Row 0 is at the bottom, y = −w.
+    ranges : (B, 2) int
+        For each image the first of its triangles and how many; with pos (V, 4), else ignored.
+    grad_db : bool, default True
+        Whether gradients of the second result go to `pos`.
     """
     return _Arguments.checked(ctx, pos, tri, resolution, ranges, grad_db).layer(None)
 
@@ -123,7 +131,7 @@ class DepthPeeler:
         self._open, self._behind = False, None
 
     def rasterize_next_layer(self) -> tuple[Tensor, Tensor]:
-        """As `rasterize` returns. Raises RuntimeError outside of `with`."""
+        """Return what `rasterize` returns. Raises RuntimeError outside of `with`."""
         if not self._open:
             raise RuntimeError("rasterize_next_layer: expected a call within `with DepthPeeler(…) as peeler:`")
         rast, rast_db = self._arguments.layer(self._behind)
@@ -177,7 +185,7 @@ class _Arguments(NamedTuple):
 
 
 class _Rasterize(torch.autograd.Function):
-    """csrc/raster/rasterize.h"""
+    """The operator of csrc/raster/rasterize.h."""
 
     @staticmethod
     def forward(ctx: Any, arguments: _Arguments, pos: Tensor, behind: Tensor | None) -> tuple[Tensor, Tensor]:

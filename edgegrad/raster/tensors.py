@@ -11,10 +11,7 @@ from ..check import as_tensor, check_countable, check_finite, check_indices, che
 
 
 def to_kernel(**given: Any) -> tuple[list[Tensor], torch.device]:
-    """Floating-point tensors in float32, or float64 if one of them is, and the device of the first. Raises TypeError.
-
-    None stays out: ask for what is there.
-    """
+    """Return floating-point tensors in float32, or float64 if one of them is, and the device of the first. Raises TypeError."""
     tensors = {name: as_tensor(name, value, floating=True) for name, value in given.items()}
     for name, tensor in tensors.items():
         check_not_meta(name, tensor)
@@ -27,7 +24,7 @@ def to_kernel(**given: Any) -> tuple[list[Tensor], torch.device]:
 
 
 def triangles(tri: Any, vertices: int, of: str) -> Tensor:
-    """(F, 3) int32 on the CPU, indices into `vertices` rows of `of`. Raises TypeError or ValueError."""
+    """Return tri (F, 3) int32 on the CPU, indices into `vertices` rows of `of`. Raises TypeError or ValueError."""
     tri = as_tensor("tri", tri)
     check_integer("tri", tri)
     if tri.dim() != 2 or tri.shape[1] != 3:
@@ -38,12 +35,13 @@ def triangles(tri: Any, vertices: int, of: str) -> Tensor:
 
 
 def check_positions(pos: Tensor) -> None:
-    """Of clip space, finite and not so small that areas of triangles vanish. Raises ValueError."""
+    """Check that clip-space positions are finite and not so small that areas of triangles vanish. Raises ValueError."""
     check_finite("pos", pos, smallest=1e-90)  # areas are products of three
 
 
 def ranges_of(ranges: Any, triangles: int) -> Tensor:
-    """(B, 2) int32 on the CPU: the first triangle and how many, of `triangles`. Raises TypeError or ValueError."""
+    """Return ranges (B, 2) int32 on the CPU: the first triangle and how many, of `triangles`. Raises TypeError or
+    ValueError."""
     ranges = as_tensor("ranges", ranges)
     check_integer("ranges", ranges)
     if ranges.dim() != 2 or ranges.shape[1] != 2:
@@ -60,7 +58,7 @@ def ranges_of(ranges: Any, triangles: int) -> Tensor:
 
 
 def check_image(name: str, tensor: Tensor, channels: int | str, like: Tensor | None = None) -> None:
-    """(B, H, W, channels), a string for any number of them, with the B, H, W of `like`. Raises ValueError."""
+    """Check for shape (B, H, W, channels), a string for any number of them, with the B, H, W of `like`. Raises ValueError."""
     fits = tensor.dim() == 4 and (isinstance(channels, str) or tensor.shape[3] == channels)
     fits = fits and (like is None or tensor.shape[:3] == like.shape[:3])
     if not fits:
@@ -69,5 +67,5 @@ def check_image(name: str, tensor: Tensor, channels: int | str, like: Tensor | N
 
 
 def contiguous(tensor: Tensor | None) -> Any:
-    """As an array of the kernel's; None as it is."""
+    """Return the tensor as an array for the kernel; None as it is."""
     return None if tensor is None else tensor.detach().contiguous().numpy()

@@ -25,15 +25,18 @@ class Mipmaps(NamedTuple):
 
 
 def texture_construct_mip(tex: Tensor, max_mip_level: int | None = None, cube_mode: bool = False) -> Mipmaps:
-    """Means of a texture over squares of 2, 4, 8 … texels, made once for many calls of `texture`.
+    """Return means of a texture over squares of 2, 4, 8 … texels, made once for many calls of `texture`.
 
-    tex            (B, h, w, C) float; of cubes (B, 6, h, h, C)
-    max_mip_level  the last level that is made; None: down to one texel
-    cube_mode      whether it is a cube
+    Give the result to `texture` as `mip`, with the same `tex`, to which the gradients then go. Raises ValueError where a side
+    is odd, unless it is 1 or `max_mip_level` ends before.
 
-    Give what is returned to `texture` as `mip`, with the same `tex`, to which the gradients then go.
-
-    Raises ValueError where a side is odd, unless it is 1 or `max_mip_level` ends before.
+    Parameters
+    ----------
+    tex : (B, h, w, C) float, or (B, 6, h, h, C) for cubes
+    max_mip_level : int, default down to one texel
+        The last level that is made.
+    cube_mode : bool, default False
+        Whether it is a cube.
     """
     (tex,), _ = to_kernel(tex=tex)
     _check_texture(tex, cube_mode)
@@ -51,27 +54,31 @@ def texture(
     boundary_mode: str = "wrap",
     max_mip_level: int | None = None,
 ) -> Tensor:
-    """A texture at the coordinates of each pixel.
-
-    tex             (B, h, w, C) float; of cubes (B, 6, h, h, C), sides +x, −x, +y, −y, +z, −z with OpenGL's axes. B may be 1.
-                    Texel [0, 0] is at (u, v) = (0, 0), v runs with the rows
-    uv              (B, H, W, 2) float; of cubes directions (B, H, W, 3) of any length
-    uv_da           (B, H, W, 4) float, or 6: ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y a pixel, as `interpolate` returns
-    mip_level_bias  (B, H, W) float, added to the level; the level itself without `uv_da`
-    mip             of `texture_construct_mip`, or a list of levels of your own, which then get gradients of their own; None: made
-                    here
-    filter_mode     "nearest", "linear", "linear-mipmap-nearest", "linear-mipmap-linear"; "auto": the last with `uv_da` or
-                    `mip_level_bias`, else "linear"
-    boundary_mode   "wrap", "clamp" to the outermost texels' centres, "zero" beyond the texture, or "cube"
-    max_mip_level   the last level that is used
+    """Return a texture at the coordinates of each pixel, (B, H, W, C).
 
     The level is log2 of the longer axis of the ellipse of texels that a pixel sees (Williams 1983). Across the edges of a cube
-    texels are taken from both sides; where three meet, the fourth is their mean. Directions of zero length, or not finite,
-    give zeros and no gradient.
+    texels are taken from both sides; where three meet, the fourth is their mean. Directions of zero length, or not finite, give
+    zeros and no gradient. Gradients go to `tex`, `uv`, `uv_da`, `mip_level_bias` and the levels of a list. Raises TypeError or
+    ValueError that names the argument.
 
-    Returns (B, H, W, C). Gradients go to `tex`, `uv`, `uv_da`, `mip_level_bias` and the levels of a list.
-
-    Raises TypeError or ValueError that names the argument.
+    Parameters
+    ----------
+    tex : (B, h, w, C) float, or (B, 6, h, h, C) for cubes
+        Sides of cubes are +x, −x, +y, −y, +z, −z with OpenGL's axes. B may be 1. Texel [0, 0] is at (u, v) = (0, 0), v runs
+        with the rows.
+    uv : (B, H, W, 2) float, or directions (B, H, W, 3) of any length for cubes
+    uv_da : (B, H, W, 4) float, or 6
+        ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y a pixel, as `interpolate` returns.
+    mip_level_bias : (B, H, W) float
+        Added to the level; the level itself without `uv_da`.
+    mip : Mipmaps, or a list of levels of your own, default made here
+        The levels of a list get gradients of their own.
+    filter_mode : "nearest", "linear", "linear-mipmap-nearest", "linear-mipmap-linear" or "auto"
+        "auto" is the last with `uv_da` or `mip_level_bias`, else "linear".
+    boundary_mode : "wrap", "clamp", "zero" or "cube"
+        "clamp" continues the outermost texels' centres, "zero" is black beyond the texture.
+    max_mip_level : int
+        The last level that is used.
     """
     if filter_mode not in FILTERS:
         raise ValueError(f"filter_mode: expected one of {', '.join(FILTERS)}, got {filter_mode!r}")
@@ -154,7 +161,7 @@ def _check_levels(tex: Tensor, levels: list[Tensor]) -> None:
 
 
 def _levels_of(tex: Tensor, most: int | None) -> list[Tensor]:
-    """The means over two by two texels, of these again, and so on."""
+    """Return the means over two by two texels, of these again, and so on."""
     levels: list[Tensor] = []
     last = tex
     while max(last.shape[-3:-1]) > 1 and (most is None or len(levels) < most):
@@ -180,7 +187,7 @@ def _made(mip: Mipmaps, tex: Tensor) -> list[Tensor]:
 
 
 class _Pyramid(torch.autograd.Function):
-    """A texture and the levels that were made of it, one after the other: what these get goes to the texture."""
+    """A texture and the levels that were made of it, one after the other: gradients of levels go to the texture."""
 
     @staticmethod
     def forward(ctx: Any, tex: Tensor, *levels: Tensor) -> Tensor:
@@ -203,7 +210,7 @@ class _Pyramid(torch.autograd.Function):
 
 
 class _Sample(torch.autograd.Function):
-    """csrc/raster/sample_texture.h"""
+    """The operator of csrc/raster/sample_texture.h."""
 
     @staticmethod
     def forward(ctx: Any, options: Any, *tensors: Tensor | None) -> Tensor:

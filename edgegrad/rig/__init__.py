@@ -1,1 +1,1 @@
-"""What bends: functions from few numbers to meshes."""
+"""Rigs: functions from few numbers to meshes that bend."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_finite, check_shape
+from ..check import as_double, as_tensor, check_finite, check_shape
 from .joints import Joints
 from .rotations import roma
 
@@ -18,15 +18,22 @@ INTERPOLATIONS = ("LINEAR", "STEP", "CUBICSPLINE")
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """What an animation does to one joint, or to some morphs.
+    """The motion that an animation gives one joint, or some morphs.
 
-    path           "translation", "rotation", "scale", within the parent and in place of what is at rest; or "weights" of morphs
-    target         the joint's place, or that of the first morph
-    times          (K,) seconds, ascending
-    values         (K, n): 3 numbers, 4 of a unit quaternion x, y, z, w, or as many as there are morphs; of a CUBICSPLINE
-                   (K, 3, n): the tangent that it comes in by, the value, the tangent that it goes out by. Quaternions of
-                   length 1 to 0.01, as normalised bytes have it, are divided by it, with their tangents; others are refused
-    interpolation  "LINEAR", which of rotations is along the shorter arc, "STEP" or "CUBICSPLINE"
+    Parameters
+    ----------
+    path : "translation", "rotation", "scale" or "weights"
+        The first three are within the parent and in place of what is at rest; the last is of morphs.
+    target : int
+        Place of the joint, or of the first morph.
+    times : (K,)
+        Seconds, ascending.
+    values : (K, n), or (K, 3, n) for a CUBICSPLINE
+        3 numbers, 4 of a unit quaternion x, y, z, w, or as many as there are morphs. A CUBICSPLINE has the tangent that it
+        comes in by, the value, and the tangent that it goes out by. Quaternions of length 1 to 0.01, as normalised bytes have
+        it, are divided by it, with their tangents; others are refused.
+    interpolation : "LINEAR", "STEP" or "CUBICSPLINE", default "LINEAR"
+        "LINEAR" takes the shorter arc of rotations.
     """
 
     path: str
@@ -40,13 +47,10 @@ class Channel:
             raise ValueError(f"path: expected one of {', '.join(PATHS)}, got {self.path!r}")
         if self.interpolation not in INTERPOLATIONS:
             raise ValueError(f"interpolation: expected one of {', '.join(INTERPOLATIONS)}, got {self.interpolation!r}")
-        times = as_tensor("times", self.times, floating=True).detach().double()
-        values = as_tensor("values", self.values, floating=True).detach().double()
-        check_shape("times", times, ("K",))
+        times = as_double("times", self.times, ("K",))
         n: int | str = {"rotation": 4, "weights": "n"}.get(self.path, 3)
-        check_shape("values", values, (len(times), 3, n) if self.interpolation == "CUBICSPLINE" else (len(times), n))
-        check_finite("times", times)
-        check_finite("values", values)
+        shape = (len(times), 3, n) if self.interpolation == "CUBICSPLINE" else (len(times), n)
+        values = as_double("values", self.values, shape)
         if not bool((times.diff() > 0).all()):
             raise ValueError(f"times: expected ascending numbers, got {times.tolist()[:5]}")
         if self.path == "rotation":
@@ -55,7 +59,7 @@ class Channel:
         object.__setattr__(self, "values", values)
 
     def at(self, t: Tensor) -> Tensor:
-        """(…, n) at times (…), differentiable by them; before the first key and after the last, theirs."""
+        """Return values (…, n) at times (…), differentiable by them; before the first key and after the last, theirs."""
         K = len(self.times)
         t = t.clamp(float(self.times[0]), float(self.times[-1]))
         k = (torch.searchsorted(self.times, t.detach().contiguous(), right=True) - 1).clamp(0, max(K - 2, 0))
@@ -81,7 +85,7 @@ class Channel:
 
 
 def _of_unit_length(values: Tensor, quaternions: Tensor) -> Tensor:
-    """Rows of values divided by the lengths of their quaternions (K, 4). Raises ValueError."""
+    """Return rows of values divided by the lengths of their quaternions (K, 4). Raises ValueError."""
     length = quaternions.norm(dim=-1)
     bad = (length - 1.0).abs() > ROUNDED
     if bool(bad.any()):
@@ -94,7 +98,7 @@ def _of_unit_length(values: Tensor, quaternions: Tensor) -> Tensor:
 
 
 def _slerp(first: Tensor, last: Tensor, s: Tensor) -> Tensor:
-    """(…, 4) from one unit quaternion to another by the shorter arc."""
+    """Interpolate (…, 4) from one unit quaternion to another by the shorter arc."""
     lib = roma()
     turn = lib.unitquat_to_rotvec(lib.quat_product(lib.quat_conjugation(first), last))
     return lib.quat_product(first, lib.rotvec_to_unitquat(s * turn))
@@ -102,7 +106,7 @@ def _slerp(first: Tensor, last: Tensor, s: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """How joints and morphs move over time. Load one by rig.animation(name)."""
+    """The motion of joints and morphs over time. Load one by rig.animation(name)."""
 
     name: str
     channels: tuple[Channel, ...]
@@ -111,12 +115,15 @@ class Animation:
 
     @property
     def duration(self) -> float:
-        """Seconds, to the last key."""
+        """Return the seconds to the last key."""
         return max((float(channel.times[-1]) for channel in self.channels), default=0.0)
 
     def at(self, t: float | Tensor) -> dict[str, Tensor]:
-        """What moves at a time, seconds, as rig.posed(**…) takes it; at times (B,) a batch. Differentiable by the time.
-        Before the first key and after the last one, it rests at theirs; take t % duration for a loop."""
+        """Return what moves at a time in seconds, as rig.posed(**…) takes it; at times (B,) a batch. Differentiable by the
+        time.
+
+        Before the first key and after the last one, it rests at theirs; take t % duration for a loop.
+        """
         time = as_tensor("t", t, floating=True).double()
         check_shape("t", time, (), ("B",))
         check_finite("t", time)

@@ -19,11 +19,16 @@ Values = Mapping[str, Any]
 class Control:
     """Some numbers that move a rig, under one name.
 
-    rest     their values at rest, of any shape; of rotations (J, 3) rotation vectors, radians
-    low      limits, of the same shape; None: none
-    high
-    names    of the rows: joints, morph targets
-    rotates  whether they are rotations, which posed() also takes as quaternions or matrices
+    Parameters
+    ----------
+    rest : tensor of any shape, for rotations (J, 3) rotation vectors in radians
+        Their values at rest.
+    low, high : of the same shape, default none
+        Limits.
+    names : tuple of str
+        Names of the rows: joints, morph targets.
+    rotates : bool, default False
+        Whether they are rotations, which posed() also takes as quaternions or matrices.
     """
 
     rest: Tensor
@@ -33,7 +38,7 @@ class Control:
     rotates: bool = False
 
     def checked(self, name: str) -> Control:
-        """As float64. Raises TypeError or ValueError."""
+        """Return the control in float64. Raises TypeError or ValueError."""
         rest = as_tensor(name, self.rest, floating=True).detach().double()
         check_finite(name, rest)
         if self.names and (rest.dim() == 0 or len(self.names) != len(rest)):
@@ -41,7 +46,7 @@ class Control:
         return replace(self, rest=rest).limited(name, self.low, self.high)
 
     def limited(self, name: str, low: object, high: object) -> Control:
-        """With these limits, which broadcast. Raises ValueError."""
+        """Return the control with these limits, which broadcast. Raises ValueError."""
         bounds = []
         for side, bound in (("low", low), ("high", high)):
             tensor = None if bound is None else as_tensor(f"{name}: {side}", bound, like=self.rest).detach().double()
@@ -58,13 +63,14 @@ class Control:
         return replace(self, low=bounds[0], high=bounds[1])
 
     def row(self, name: str, which: object) -> int:
-        """Raises ValueError."""
+        """Return the place of a row by its name. Raises ValueError."""
         if which not in self.names:
             raise ValueError(f"{name}: expected names among {', '.join(self.names)}, got {which!r}")
         return self.names.index(str(which))
 
     def value(self, name: str, given: object) -> Tensor:
-        """As float64, with or without a batch in front; of rotations matrices (…, J, 3, 3). Raises TypeError or ValueError."""
+        """Return a value in float64, with or without a batch in front; of rotations matrices (…, J, 3, 3). Raises TypeError or
+        ValueError."""
         if given is None:
             value = self.rest
         elif isinstance(given, Mapping):
@@ -78,7 +84,7 @@ class Control:
         return value
 
     def _of_rows(self, name: str, given: Mapping[str, Any]) -> Tensor:
-        """Of some rows by their names, each with or without a batch in front."""
+        """Return the value where some rows are given by their names, each with or without a batch in front."""
         rows, several = list(as_matrices(name, self.rest, len(self.rest)) if self.rotates else self.rest), []
         dims = rows[0].dim()
         for key, row in given.items():
@@ -97,15 +103,15 @@ class Control:
         return torch.stack(rows, -1 - dims)
 
     def within(self, value: Tensor) -> Tensor:
-        """Clamped to the limits."""
+        """Clamp to the limits."""
         if self.low is not None:
             value = torch.maximum(value, self.low.to(value))
         return value if self.high is None else torch.minimum(value, self.high.to(value))
 
 
 def batch_of(values: Sequence[tuple[str, Tensor, int]]) -> int | None:
-    """The number of poses that values are given for, by their names and dimensions without a batch; None: one. Raises
-    ValueError where they differ."""
+    """Return the number of poses that values are given for, by their names and dimensions without a batch; None for a single
+    one. Raises ValueError where they differ."""
     counts = {name: len(value) for name, value, dims in values if value.dim() > dims}
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{count} of {name}" for name, count in counts.items())

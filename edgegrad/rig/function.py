@@ -20,7 +20,7 @@ PLACING = "translation", "scale", "orientation", "skinning"
 
 
 @dataclass(frozen=True, eq=False)
-class OfFunction:
+class FunctionDeformer:
     """A function from controls to vertices."""
 
     function: Callable[..., Any]
@@ -30,13 +30,13 @@ class OfFunction:
     parents: tuple[int, ...]
 
     @staticmethod
-    def of(
+    def from_arguments(
         function: Callable[..., Any],
         controls: Mapping[str, Tensor | Control],
         batched: bool,
         joints: Sequence[tuple[str, int]],
-    ) -> OfFunction:
-        """Raises TypeError or ValueError."""
+    ) -> FunctionDeformer:
+        """Return the deformer of checked arguments. Raises TypeError or ValueError."""
         for name in controls:
             if name in PLACING:
                 raise ValueError(
@@ -48,13 +48,13 @@ class OfFunction:
             for name, given in controls.items()
         }
         names, parents = tuple(name for name, _ in joints), tuple(parent for _, parent in joints)
-        return OfFunction(function, made, batched, names, parents)
+        return FunctionDeformer(function, made, batched, names, parents)
 
-    def with_controls(self, controls: Mapping[str, Control]) -> OfFunction:
+    def with_controls(self, controls: Mapping[str, Control]) -> FunctionDeformer:
         return replace(self, controls=controls)
 
     def at_rest(self) -> list[Tensor]:
-        """(V, 3) of each mesh."""
+        """Return the vertices (V, 3) of each mesh."""
         return self._parts({})[0]
 
     def __call__(
@@ -74,7 +74,7 @@ class OfFunction:
         return found, [self._normals(own, mesh) for own, mesh in zip(found, meshes, strict=True)], joints
 
     def _normals(self, verts: Tensor, mesh: Mesh) -> Tensor | None:
-        """Those of the bent surface, where the mesh at rest has one for each vertex."""
+        """Return normals of the bent surface, where the mesh at rest has one for each vertex."""
         if mesh.normals is None or mesh.normal_faces is not None:
             return None
         if verts.dim() == 2:
@@ -82,7 +82,7 @@ class OfFunction:
         return torch.stack([vertex_normals(v, mesh.faces) for v in verts])
 
     def _parts(self, values: Mapping[str, Tensor]) -> tuple[list[Tensor], Tensor | None]:
-        """Vertices of each mesh and joints, with a batch where a value has one."""
+        """Return vertices of each mesh and joints, with a batch where a value has one."""
         full, counts = {}, []
         for name, control in self.controls.items():
             value = values.get(name, control.rest)
@@ -110,7 +110,6 @@ class OfFunction:
 
 
 def _split(returned: Any) -> tuple[list[Tensor], Tensor | None]:
-    """Raises TypeError."""
     verts, joints = (
         (returned.get("verts"), returned.get("joints")) if isinstance(returned, Mapping) else (returned, None)
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_finite, check_shape
+from ..check import as_double, as_tensor, check_finite
 from .rotations import as_matrices
 
 
@@ -16,13 +16,19 @@ from .rotations import as_matrices
 class Joints:
     """A hierarchy of joints at rest.
 
-    names         each once
-    parents       the place of each one's parent among them, −1 of none
-    translations  (J, 3) within the parent, world units
-    rotations     (J, 3), (J, 4) or (J, 3, 3) within the parent, as posed() takes them
-    stretches     (J, 3, 3) applied before the rotation, or (J, 3) scales along the axes; None: the identity
-
     A joint takes points of its own to its parent's by x → R S x + t. Kept in float64. Raises TypeError or ValueError.
+
+    Parameters
+    ----------
+    names : sequence of str, each once
+    parents : sequence of int
+        Place of each one's parent among them, −1 of none.
+    translations : (J, 3)
+        Within the parent, world units.
+    rotations : (J, 3), (J, 4) or (J, 3, 3)
+        Within the parent, as posed() takes them.
+    stretches : (J, 3, 3), or (J, 3) scales along the axes, default the identity
+        Applied before the rotation.
     """
 
     names: Sequence[str]
@@ -41,15 +47,12 @@ class Joints:
             raise ValueError(f"names: expected each joint once, got {list(names)}; give them different names")
         if len(parents) != J or any(not -1 <= parent < J for parent in parents):
             raise ValueError(f"parents: expected {J} numbers from −1 to {J - 1}, got {list(parents)}")
-        translations = as_tensor("translations", self.translations, floating=True).detach().double()
-        check_shape("translations", translations, (J, 3))
+        translations = as_double("translations", self.translations, (J, 3))
         rotations = as_matrices("rotations", as_tensor("rotations", self.rotations, floating=True).detach().double(), J)
         given = torch.ones(J, 3) if self.stretches is None else self.stretches
-        stretches = as_tensor("stretches", given, floating=True).detach().double()
-        check_shape("stretches", stretches, (J, 3), (J, 3, 3))
+        stretches = as_double("stretches", given, (J, 3), (J, 3, 3))
         stretches = torch.diag_embed(stretches) if stretches.dim() == 2 else stretches
-        for name, tensor in (("translations", translations), ("rotations", rotations), ("stretches", stretches)):
-            check_finite(name, tensor)
+        check_finite("rotations", rotations)
         order = _by_depth(names, parents)
         values = {
             "names": names, "parents": parents, "translations": translations, "rotations": rotations, "stretches": stretches,
@@ -64,11 +67,14 @@ class Joints:
     def world(
         self, rotations: Tensor | None = None, translations: Tensor | None = None, scales: Tensor | None = None
     ) -> Tensor:
-        """(…, J, 4, 4) from each joint's own coordinates to the world, differentiable.
+        """Return the matrices (…, J, 4, 4) from each joint's own coordinates to the world, differentiable.
 
-        rotations     (…, J, 3, 3) of each about its own axes, from rest
-        translations  (…, J, 3) within the parents, in place of those at rest
-        scales        (…, J, 3) along the axes, likewise
+        Parameters
+        ----------
+        rotations : (…, J, 3, 3)
+            Of each about its own axes, from rest.
+        translations, scales : (…, J, 3)
+            Within the parents, and along the axes, in place of those at rest.
         """
         assert isinstance(self.stretches, Tensor)
         stretches = self.stretches
@@ -92,7 +98,7 @@ class Joints:
 
 
 def _by_depth(names: tuple[str, ...], parents: tuple[int, ...]) -> list[Tensor]:
-    """Raises ValueError where they go in a circle."""
+    """Return the joints of each depth. Raises ValueError where they form a cycle."""
     depth = [-1] * len(parents)
     for k in range(len(parents)):
         way, at = [], k

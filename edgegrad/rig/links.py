@@ -14,7 +14,7 @@ from .control import Control
 
 
 @dataclass(frozen=True, eq=False)
-class Links:
+class RobotLinks:
     """A chain of pytorch-kinematics, and the link that carries each mesh, whose vertices are in the link's coordinates."""
 
     chain: Any  # pytorch_kinematics.Chain, float64
@@ -25,7 +25,7 @@ class Links:
     offset: Tensor  # (n,)
     controls: Mapping[str, Control]
 
-    def with_controls(self, controls: Mapping[str, Control]) -> Links:
+    def with_controls(self, controls: Mapping[str, Control]) -> RobotLinks:
         return replace(self, controls=controls)
 
     def __call__(
@@ -33,7 +33,7 @@ class Links:
     ) -> tuple[list[Tensor], list[Tensor | None], Tensor]:
         angles = values.get("angles", self.controls["angles"].rest)
         every = torch.atleast_2d(angles @ self.couple.T + self.offset)
-        # Not its own backward pass, which has no forward mode.
+        # Its own backward pass has no forward mode.
         frames = self.chain.forward_kinematics_tensor(every, analytical_grad=False)
         places = self.chain.get_frame_indices(*self.names)
         world = frames[places].movedim(0, 1)  # (B, L, 4, 4)

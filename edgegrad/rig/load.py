@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ..files.formats.gltf_rig import Bound, RigFile
-from ..files.formats.part import Part, Wanted, naming
+from ..files.formats.gltf_rig import RigFile, SkinBinding
+from ..files.formats.part import LoadOptions, Part, errors_with_path
 from ..files.parts import read_rig
 from ..files.paths import PathLike
 from ..files.welding import to_mesh, welded
@@ -20,24 +20,24 @@ from .skin import Skin
 
 
 def load_rig(path: PathLike, materials: bool = True, lit: bool = False, dtype: torch.dtype | None = None) -> Rig:
-    """A Rig from a glTF or GLB file: what its skins, morph targets and nodes move, and its animations.
+    """Return a Rig from a glTF or GLB file: what its skins, morph targets and nodes move, and its animations.
 
-    Each node of the scene is a joint, by its name, and each primitive of a visible node a mesh, in their order; a node without a
-    skin carries its mesh along. Weights of a skin are normalised, with a warning where they are more than a hundredth from it;
-    JOINTS_n and WEIGHTS_n are read for all n. Morphs have the names of mesh.extras.targetNames. Vertices are welded where they
-    are equal in all poses. Lights stand where they are at rest.
+    Each node of the scene is a joint, by its name, and each primitive of a visible node a mesh, in their order; a node without
+    a skin carries its mesh along. Weights of a skin are normalised, with a warning where they are more than a hundredth from
+    it; JOINTS_n and WEIGHTS_n are read for all n. Morphs have the names of mesh.extras.targetNames. Vertices are welded where
+    they are equal in all poses. Lights stand where they are at rest.
 
     One warning names what does not fit, and the rest is loaded: vertices whose weights are all 0 are bound to the skin's first
     joint, primitives without JOINTS_0 are rigid with their node, rotations of another length than 1 are divided by it, and
     channels of animations, morph targets and lights that cannot be read are left out.
 
-    The other arguments are those of load_scene, and so are the errors; beside them ValueError for a skin whose joints are not in
-    the scene, other faults of a skin, and nodes in a circle.
+    The arguments are those of load_scene(), and so are the errors. ValueError is also raised for a skin whose joints are not in
+    the scene, other errors of a skin, and nodes in a cycle.
     """
     roma()
-    wanted = Wanted(materials, lit, rigged=True, dtype=dtype)
-    with naming(path):
-        found, model = read_rig(path, wanted)
+    options = LoadOptions(materials, lit, rigged=True, dtype=dtype)
+    with errors_with_path(path):
+        found, model = read_rig(path, options)
         joints = Joints(
             [node.name for node in found.nodes],
             [node.parent for node in found.nodes],
@@ -58,11 +58,11 @@ def load_rig(path: PathLike, materials: bool = True, lit: bool = False, dtype: t
         )
 
 
-def _bound(part: Part, bound: Bound, world: np.ndarray, dtype: torch.dtype) -> tuple[Mesh, Skin]:
-    """The mesh, and how it hangs on the joints."""
+def _bound(part: Part, bound: SkinBinding, world: np.ndarray, dtype: torch.dtype) -> tuple[Mesh, Skin]:
+    """Return the mesh, and how it is bound to the joints."""
     moves = [*bound.targets, bound.weights]
     by = welded(np.concatenate([part.verts, *moves], 1), part.faces)
-    # In a mirror the front of a face stays its front.
+    # The front of a face stays its front in a mirror.
     blended = np.einsum("vn,nij->vij", bound.weights[by.kept], (world[bound.joints] @ bound.inverse_binds)[:, :3, :3])
     mirrored = np.median(np.linalg.det(blended)) < 0.0
     by = by._replace(faces=by.faces[:, ::-1].copy()) if mirrored else by
@@ -70,7 +70,7 @@ def _bound(part: Part, bound: Bound, world: np.ndarray, dtype: torch.dtype) -> t
     normals, index, owners, of_normals = None, None, None, None
     if part.normals is not None:
         each = part.normal_faces if part.normal_faces is not None else part.faces
-        # One row for each vertex and normal that meet at a corner.
+        # There is one row for each vertex and normal that meet at a corner.
         at = np.zeros(len(part.normals), np.int64)
         at[each] = by.faces
         rows = np.concatenate([at[:, None], part.normals, *bound.normal_targets], 1)

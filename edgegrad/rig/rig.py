@@ -14,35 +14,36 @@ from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from .animation import Animation
 from .control import Control, batch_of
-from .function import OfFunction
+from .function import FunctionDeformer
 from .joints import Joints
 from .rotations import one_as_matrix
 from .skin import Skin
-from .skinned import Skinned
+from .skinned import SkinDeformer
 
-Bent = tuple[list[Tensor], list[Tensor | None], Tensor | None]  # verts and normals of each mesh, joints; see Shape
+Deformed = tuple[list[Tensor], list[Tensor | None], Tensor | None]  # verts and normals of each mesh, joints; see Shape
 
 
 class Deformer(Protocol):
-    """What bends the meshes of a rig."""
+    """An object that bends the meshes of a rig."""
 
     @property
     def controls(self) -> Mapping[str, Control]: ...
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its joints."""
+        """Return the names of its joints."""
         ...
 
     @property
     def parents(self) -> tuple[int, ...]:
-        """Of its joints, −1 of none."""
+        """Return the parents of its joints, −1 of none."""
         ...
 
     def with_controls(self, controls: Mapping[str, Control]) -> Deformer: ...
 
-    def __call__(self, values: Mapping[str, Tensor], meshes: Sequence[Mesh]) -> Bent:
-        """Values are float64, of rotations matrices; some may have a batch in front, and so does then what depends on them."""
+    def __call__(self, values: Mapping[str, Tensor], meshes: Sequence[Mesh]) -> Deformed:
+        """Return vertices, normals and joints. Values are float64, of rotations matrices; some, and what depends on them, may
+        have a batch in front."""
         ...
 
 
@@ -58,13 +59,18 @@ class Shape(NamedTuple):
 class Rig:
     """Meshes that bend: a differentiable function from few numbers to vertices.
 
-    Made by load_rig(path), Rig.from_arrays(…), Rig.from_function(…) or load_robot(path).
+    It is made by load_rig(path), Rig.from_arrays(…), Rig.from_function(…) or load_robot(path).
 
-    scene       what is bent, a Mesh or a Scene, with its look
-    controls    by name, the numbers that move it: their values at rest, limits and names of rows. Of a skinned rig "rotations",
-                "joint_translations", "joint_scales" and "morphs"; of a robot "angles"; of a function its own
-    animations  by name
-    joints      of a skinned rig, at rest
+    Attributes
+    ----------
+    scene : Mesh or Scene
+        The meshes at rest, with their appearance.
+    controls : mapping of names to Control
+        The numbers that move it: their values at rest, limits and names of rows. A skinned rig has "rotations",
+        "joint_translations", "joint_scales" and "morphs"; a robot has "angles"; a function has its own.
+    animations : mapping of names to Animation
+    joints : Joints
+        Of a skinned rig, at rest.
     """
 
     scene: Scene | Mesh
@@ -109,21 +115,27 @@ class Rig:
         skinning: str | None = None,
         **values: Any,
     ) -> Any:
-        """The meshes in a pose: a Mesh or a Scene, as the rig's; of a batch a list of these. What is not given is at rest.
+        """Return the meshes in a pose: a Mesh or a Scene, as the rig's; of a batch a list of these. Arguments that are not
+        given are at rest.
 
-        rotations           of each joint about its own axes, from rest, where all are the identity: rotation vectors (J, 3) in
-                            radians, unit quaternions x, y, z, w (J, 4) or matrices (J, 3, 3); or some by the joint's name
-        morphs              (M,) weights of morph targets, or some by name
-        joint_translations  (J, 3) of joints within their parents, in place of those at rest
-        joint_scales        (J, 3), likewise, along the joint's own axes
-        translation         (3,) then the whole is turned and scaled about the middle of its box at rest, `center`, and moved
-        orientation         (3,), (4,) or (3, 3), which is a matrix
-        scale               a number
-        skinning            "linear" (the default), or "dual quaternion", which keeps volume where joints twist
-        values              of other rigs: those of their controls, as `angles` of a robot
+        It is differentiable by all of them. Each may have one more dimension in front, the poses of a batch. Limits are not
+        applied: see clamped(). Raises TypeError or ValueError that names the argument, ImportError without roma.
 
-        Differentiable by all of them. Each may have one more dimension in front, the poses of a batch. Limits are not applied:
-        see clamped(). Raises TypeError or ValueError that names the argument, ImportError without roma.
+        Parameters
+        ----------
+        rotations : (J, 3) rotation vectors in radians, (J, 4) unit quaternions x, y, z, w or (J, 3, 3) matrices, or a mapping
+        of some by the joint's name
+            Rotations of each joint about its own axes, from rest, where all are the identity.
+        morphs : (M,), or a mapping by name
+            Weights of morph targets.
+        joint_translations, joint_scales : (J, 3)
+            Of joints within their parents, in place of those at rest; scales are along the joint's own axes.
+        translation, orientation, scale : (3,); (3,), (4,) or a matrix (3, 3); float
+            Then the whole is turned and scaled about the middle of its box at rest, `center`, and moved.
+        skinning : "linear" or "dual quaternion", default "linear"
+            The latter keeps volume where joints twist.
+        **values
+            Of other rigs: those of their controls, as `angles` of a robot.
         """
         given = {**values, **({} if rotations is None else {"rotations": rotations})}
         for name in given:
@@ -146,7 +158,7 @@ class Rig:
         orientation: object = None,
         **settings: Any,
     ) -> Shape:
-        """Vertices, normals and joints of what posed() makes, as tensors, of values by the names of controls."""
+        """Return vertices, normals and joints of what posed() makes, as tensors, of values by the names of controls."""
         known = {
             name: self._control("shape", name).value(name, value) for name, value in values.items() if value is not None
         }
@@ -181,7 +193,7 @@ class Rig:
             None if joints is None else placed(joints, f64),
         )
 
-    def _bent(self, values: Mapping[str, Tensor], settings: Mapping[str, Any]) -> Bent:
+    def _bent(self, values: Mapping[str, Tensor], settings: Mapping[str, Any]) -> Deformed:
         return self.deformer(values, self.meshes, **settings)
 
     def _scene(self, verts: list[Tensor], normals: list[Tensor | None]) -> Scene | Mesh:
@@ -198,8 +210,11 @@ class Rig:
         return self.controls[name]
 
     def bones(self, values: Mapping[str, Any]) -> Tensor | None:
-        """(K, 2, 3) float64: from the parent of each joint that has one to the joint, of all values that posed() takes. None
-        where nothing says."""
+        """Return the bones (K, 2, 3) float64, from the parent of each joint that has one to the joint, of all values that
+        posed() takes.
+
+        None is returned where the rig has no such joints.
+        """
         own = {name: value for name, value in values.items() if name in self.controls}
         joints = self.shape(own, **{name: value for name, value in values.items() if name not in own}).joints
         pairs = [(parent, k) for k, parent in enumerate(self.deformer.parents) if parent >= 0]
@@ -208,7 +223,7 @@ class Rig:
     # -- limits -------------------------------------------------------------------------------------------------------------
 
     def with_limits(self, **limits: Any) -> Rig:
-        """With limits for controls, a pair of low and high that broadcast; or such pairs by the names of rows:
+        """Return the rig with limits for controls: a pair of low and high that broadcast, or such pairs by the names of rows.
 
             rig.with_limits(rotations={"elbow": ([0, 0, 0], [0, 0, 2.4])}, morphs=(0.0, 1.0))
 
@@ -231,7 +246,7 @@ class Rig:
         return replace(self, deformer=self.deformer.with_controls(controls))
 
     def clamped(self, **values: Any) -> dict[str, Tensor]:
-        """Values of controls within their limits; rotations become rotation vectors. Raises TypeError or ValueError."""
+        """Return values of controls within their limits; rotations become rotation vectors. Raises TypeError or ValueError."""
         from .rotations import roma
 
         found = {}
@@ -242,7 +257,7 @@ class Rig:
         return found
 
     def animation(self, name: str | int = 0) -> Animation:
-        """By name or place: rig.posed(**rig.animation("Walk").at(0.5)). Raises ValueError."""
+        """Return an animation by name or place: rig.posed(**rig.animation("Walk").at(0.5)). Raises ValueError."""
         names = list(self.animations)
         if isinstance(name, int) and not isinstance(name, bool) and -len(names) <= name < len(names):
             name = names[name]
@@ -261,15 +276,20 @@ class Rig:
         morphs: Mapping[str, float] | Sequence[str] = (),
         animations: Sequence[Animation] = (),
     ) -> Rig:
-        """A skinned rig.
+        """Return a skinned rig. Raises TypeError or ValueError that names the argument.
 
-        mesh        at rest
-        joints      their hierarchy at rest
-        skins       how each mesh hangs on them; or weights (V, J) of one mesh that is bound as it stands at rest
-        morphs      names of the morph targets that the skins hold, with their weights at rest, 0 where none is said
-        animations  of these joints
-
-        Raises TypeError or ValueError that names the argument.
+        Parameters
+        ----------
+        mesh : Mesh or Scene
+            At rest.
+        joints : Joints
+            Their hierarchy at rest.
+        skins : Skin, a sequence of Skin, or (V, J)
+            How each mesh is bound to the joints; or weights of one mesh that is bound as it stands at rest.
+        morphs : sequence of names, or mapping of names to weights
+            The morph targets that the skins hold, with their weights at rest, 0 by default.
+        animations : sequence of Animation
+            Of these joints.
         """
         meshes = [mesh] if isinstance(mesh, Mesh) else list(mesh.meshes)
         if isinstance(skins, Tensor):
@@ -286,7 +306,7 @@ class Rig:
             if last > len(named):
                 raise ValueError(f"morphs: expected names for {last} morph targets of skins[{k}], got {len(named)}")
         weights = torch.tensor(list(named.values()), dtype=torch.float64)
-        made = Skinned.of(joints, tuple(checked), tuple(named), weights)
+        made = SkinDeformer.from_skins(joints, tuple(checked), tuple(named), weights)
         return Rig(mesh, made, {animation.name: animation for animation in animations})
 
     @staticmethod
@@ -298,19 +318,24 @@ class Rig:
         batched: bool = False,
         joints: Sequence[tuple[str, int]] = (),
     ) -> Rig:
-        """A rig of anything that maps numbers to vertices, such as a body model.
-
-        function  is given the controls by name and returns vertices (V, 3), or those of each mesh of a Scene; or a dict of these
-                  as "verts", with "joints" (J, 3) where keypoints are to be fitted. It must be differentiable by PyTorch
-        faces     (F, 3), or a Mesh or Scene with the look of what is bent
-        controls  values at rest, by the names of the function's arguments; or Controls, with limits and names
-        batched   whether the function takes and returns a batch: then it is always given one, (B, …)
-        joints    the name of each joint and the place of its parent, −1 of none
+        """Return a rig of any function from numbers to vertices, such as a body model. Raises TypeError or ValueError that
+        names the argument.
 
             model = anny.Anny(skinning_method="lbs")
             rig = eg.Rig.from_function(body, model.get_triangular_faces(), {"age": torch.tensor(0.5), …})
 
-        Raises TypeError or ValueError that names the argument.
+        Parameters
+        ----------
+        function : callable
+            It is given the controls by name and returns vertices (V, 3), or those of each mesh of a Scene; or a dict of these
+            as "verts", with "joints" (J, 3) where keypoints are to be fitted. It must be differentiable by PyTorch.
+        faces : (F, 3), Mesh or Scene
+            A Mesh or Scene also has the appearance of what is bent.
+        controls : mapping of the function's arguments
+            Values at rest; or Controls, with limits and names.
+        batched : bool, default False
+            Whether the function takes and returns a batch: then it is always given one, (B, …).
+        joints : sequence of (name, place of its parent, −1 of none)
         """
         if not callable(function):
             raise TypeError(f"function: expected a function, got {type(function).__name__}")
@@ -318,7 +343,7 @@ class Rig:
             raise TypeError(
                 "controls: expected a mapping of names to values at rest, got none; give what moves the vertices"
             )
-        made = OfFunction.of(function, controls, batched, joints)
+        made = FunctionDeformer.from_arguments(function, controls, batched, joints)
         if not isinstance(faces, Mesh | Scene):
             with torch.no_grad():
                 verts = made.at_rest()
@@ -330,7 +355,7 @@ class Rig:
 
 
 def _turn(given: object) -> Tensor:
-    """(…, 3, 3) from what posed() takes as orientation."""
+    """Return matrices (…, 3, 3) of what posed() takes as orientation."""
     eye = torch.eye(3, dtype=torch.float64)
     return eye if given is None else one_as_matrix("orientation", as_tensor("orientation", given, like=eye).double())
 

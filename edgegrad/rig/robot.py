@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..files.formats.source import Unsupported
+from ..files.formats.context import UnreadLog
 from ..files.paths import PathLike, check_readable
 from ..optional import require
 from ..scene.scene import Scene
 from .control import Control
-from .links import Links
+from .links import RobotLinks
 from .rig import Rig
 from .robot_visuals import Visuals
 
@@ -26,31 +26,36 @@ MOVING = ("revolute", "continuous", "prismatic")
 
 
 def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ()) -> Rig:
-    """A Rig from a URDF file, whose control `angles` (m,) has the positions of its joints in the file's order: radians, or metres
-    of prismatic ones. Joints that mimic others follow them and have none of their own.
+    """Return a Rig from a URDF file. Its control `angles` (m,) has the positions of its joints in the file's order: radians, or
+    metres of prismatic ones.
 
         robot = eg.load_robot("arm.urdf")
         scene = robot.posed(angles=[0.0, 0.4, -1.2, 0.0, 0.7, 0.0, 0.0])
 
-    package_dirs  a folder or several, in which package://NAME/… is looked for as FOLDER/NAME/…, or as FOLDER/… where the folder
-                  itself is called NAME; by default, and then, in the folder of the file and those above it
+    Joints that mimic others follow them and have no angle. There is one Mesh for each visual, or for each part of it where
+    parts differ in appearance: OBJ, glTF, GLB, PLY, STL, OFF, 3MF or DAE files (in the unit that a DAE says, along its own
+    axes), boxes, cylinders and spheres. A mesh file's own appearance goes before the visual's material, whose colour or texture
+    is shown else. One warning names what is not shown. At rest all angles are 0, or at the limit nearest to 0. Limits are those
+    of the file, 0 where a <limit> lacks lower or upper; fits keep them, robot.clamped(angles=…) applies them. Links are the
+    rig's joints, by their names.
 
-    One Mesh for each visual, or for each part of it where parts look different: OBJ, glTF, GLB, PLY, STL, OFF, 3MF or DAE files
-    (in the unit that a DAE says, along its own axes), boxes, cylinders and spheres. A mesh file's own look goes before the
-    visual's material, whose colour or texture is shown else. One warning names what is not shown. At rest all are 0, or at the
-    limit nearest to 0. Limits are those of the file, 0 where a <limit> lacks lower or upper; fits keep them,
-    robot.clamped(angles=…) applies them. Links are its joints, by their names.
+    Files are read by yourdfpy, kinematics are by pytorch-kinematics (`pip install 'edgegrad[robots]'`). Raises
+    FileNotFoundError (the file, or a mesh that it names), ValueError that names the file (no URDF, no visuals, no tree of
+    links, a joint of another type or without an axis), ImportError.
 
-    Files by yourdfpy, kinematics by pytorch-kinematics (`pip install 'edgegrad[robots]'`). Raises FileNotFoundError (the file, or
-    a mesh that it names), ValueError that names the file (no URDF, no visuals, no tree of links, a joint of another type or
-    without an axis), ImportError.
+    Parameters
+    ----------
+    path : str or Path
+    package_dirs : str, Path or a sequence of these
+        Folders in which package://NAME/… is looked for as FOLDER/NAME/…, or as FOLDER/… where the folder itself is called NAME.
+        By default, and then, the folder of the file and those above it are searched.
     """
     file = check_readable(path, (".urdf", ".xml"))
     packages = _folders(package_dirs)
     yourdfpy, pk = require("yourdfpy", *EXTRA), require("pytorch_kinematics", *EXTRA)
-    with _naming(file):
+    with _errors_with_path(file):
         given = yourdfpy.URDF.load(str(file), load_meshes=False, build_scene_graph=False)
-    robot, unread = given.robot, Unsupported()
+    robot, unread = given.robot, UnreadLog()
     joints = list(robot.joints)
     links = [link.name for link in robot.links]
     parents = _parents(file, links, joints)
@@ -65,8 +70,8 @@ def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ())
             carries += [place] * len(found)
     if not meshes:
         raise ValueError(f"{file}: expected links with visuals, got none; nothing of it is seen")
-    with _naming(file):
-        # As it was understood, for the other's parser refuses what is not of the format.
+    with _errors_with_path(file):
+        # The other parser refuses content that is not of the format, so it gets what yourdfpy understood.
         chain = (pk.build_chain_from_urdf(given.write_xml_string()) if joints else _chain(pk, links[0])).to(
             dtype=torch.float64
         )
@@ -82,13 +87,12 @@ def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ())
         raise ValueError(f"{file}: joint {bad!r}: expected limits with lower ≤ upper; repair them")
     rest = torch.zeros(len(free), dtype=torch.float64).clamp(low, high)
     control = Control(rest, low, high, tuple(joint.name for joint in free))
-    deformer = Links(chain, tuple(carries), tuple(links), parents, couple, offset, {"angles": control})
-    unread.say(path)
+    deformer = RobotLinks(chain, tuple(carries), tuple(links), parents, couple, offset, {"angles": control})
+    unread.warn(path)
     return Rig(meshes[0] if len(meshes) == 1 else Scene(meshes), deformer)
 
 
 def _folders(given: PathLike | Sequence[PathLike]) -> list[Path]:
-    """Raises TypeError or FileNotFoundError."""
     several = [given] if isinstance(given, (str, os.PathLike)) else list(given)
     for folder in several:
         if not isinstance(folder, (str, os.PathLike)):
@@ -101,7 +105,6 @@ def _folders(given: PathLike | Sequence[PathLike]) -> list[Path]:
 
 
 def _check_joint(file: Path, joint: Any) -> None:
-    """Raises ValueError."""
     if joint.type not in (*MOVING, "fixed"):
         raise ValueError(
             f"{file}: joint {joint.name!r}: expected a type among {', '.join(MOVING)} and fixed, got {joint.type!r}; "
@@ -115,14 +118,14 @@ def _check_joint(file: Path, joint: Any) -> None:
 
 
 def _chain(pk: Any, link: str) -> Any:
-    """A chain of one link, which its builder does not make."""
+    """Return a chain of one link, which its builder does not make."""
     root = pk.frame.Frame(link)
     root.joint, root.link = pk.frame.Joint(), pk.frame.Link(link, pk.Transform3d(), [pk.frame.Visual()])
     return pk.Chain(root)
 
 
 def _parents(file: Path, links: list[str], joints: list[Any]) -> tuple[int, ...]:
-    """By link, the place of the one that it hangs on; −1 of none. Raises ValueError."""
+    """Return by link the place of its parent, −1 of none. Raises ValueError."""
     for what, names in (("link", links), ("joint", [joint.name for joint in joints])):
         twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
         if twice is not None:
@@ -152,7 +155,8 @@ def _parents(file: Path, links: list[str], joints: list[Any]) -> tuple[int, ...]
 
 
 def _coupling(file: Path, moving: list[Any], free: list[Any], order: dict[str, int]) -> tuple[Tensor, Tensor]:
-    """Of the chain's joints by the angles that are given: q = C a + c, where what mimics follows. Raises ValueError."""
+    """Return C and c of the chain's joints q = C a + c by the angles a that are given, where mimicking joints follow. Raises
+    ValueError."""
     column = {joint.name: k for k, joint in enumerate(free)}
     couple, offset = (
         torch.zeros(len(order), len(free), dtype=torch.float64),
@@ -176,8 +180,8 @@ def _coupling(file: Path, moving: list[Any], free: list[Any], order: dict[str, i
     return couple, offset
 
 
-def _limit(joint: Any, side: str, unread: Unsupported) -> float:
-    """0 where the joint's limit does not say it, as the format defines it; infinite without a limit."""
+def _limit(joint: Any, side: str, unread: UnreadLog) -> float:
+    """Return the joint's limit: 0 where it does not say it, as the format defines it; infinite without a limit."""
     if joint.limit is None or joint.type == "continuous":
         return -np.inf if side == "lower" else np.inf
     value = getattr(joint.limit, side)
@@ -190,8 +194,8 @@ def _limit(joint: Any, side: str, unread: Unsupported) -> float:
 
 
 @contextmanager
-def _naming(file: Path) -> Iterator[None]:
-    """Whatever the libraries say of a file names it."""
+def _errors_with_path(file: Path) -> Iterator[None]:
+    """Name the file in whatever the libraries say of it."""
     try:
         yield
     except Exception as error:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..files.formats.source import Unsupported
+from ..files.formats.context import UnreadLog
 from ..files.image import read_image, srgb_to_linear
 from ..files.load import load_parts
 from ..files.paths import StoredPath
@@ -19,10 +19,10 @@ from ..optional import require
 from ..scene.mesh import Mesh
 from ..scene.winding import flipped
 
-GREY = 0.7  # of what has no colour
+DEFAULT_COLOR = 0.7  # of what has no colour
 
 
-class Look(NamedTuple):
+class Appearance(NamedTuple):
     """A material of a URDF."""
 
     color: Tensor | None  # (3,) linear
@@ -30,13 +30,13 @@ class Look(NamedTuple):
 
 
 class Visuals:
-    """The visuals of a file. Notes what of them is not shown."""
+    """The visuals of a file, and a record of those that are not shown."""
 
-    def __init__(self, file: Path, robot: Any, packages: Sequence[Path], unread: Unsupported) -> None:
+    def __init__(self, file: Path, robot: Any, packages: Sequence[Path], unread: UnreadLog) -> None:
         self.file, self.robot, self.packages, self.unread = file, robot, packages, unread
 
     def meshes(self, link: str, visual: Any) -> list[Mesh]:
-        """In the link's coordinates. Raises FileNotFoundError or ValueError."""
+        """Return the meshes in the link's coordinates. Raises FileNotFoundError or ValueError."""
         geometry = visual.geometry
         matrix = np.eye(4) if visual.origin is None else np.asarray(visual.origin, np.float64)
         if geometry.mesh is not None:
@@ -53,7 +53,7 @@ class Visuals:
             matrix = matrix @ np.diag([*scale, 1.0])
         else:
             parts = [_shape(geometry)]
-        look = self._look(link, visual.material)
+        appearance = self._appearance(link, visual.material)
         name = f"{link}: {visual.name}" if visual.name else link
         found = []
         for k, part in enumerate(parts):
@@ -61,25 +61,25 @@ class Visuals:
             mesh = part.transformed(placed[:3, :3], placed[:3, 3])
             mesh = flipped(mesh) if np.linalg.det(matrix[:3, :3]) < 0.0 else mesh
             own = f"{name} {k}" if len(parts) > 1 else name
-            found.append(self._painted(mesh, look, own).replace(name=own))
+            found.append(self._painted(mesh, appearance, own).replace(name=own))
         return found
 
-    def _painted(self, mesh: Mesh, look: Look, name: str) -> Mesh:
-        """Return the mesh with the look of its file, or else with that of the URDF."""
+    def _painted(self, mesh: Mesh, appearance: Appearance, name: str) -> Mesh:
+        """Return the mesh with the appearance of its file, or else with that of the URDF."""
         if mesh.channels is not None:
             return mesh
-        if look.texture is not None and mesh.uvs is not None:
-            return mesh.replace(texture=look.texture, uvs=mesh.uvs, uv_faces=mesh.uv_faces)
-        if look.texture is not None:
+        if appearance.texture is not None and mesh.uvs is not None:
+            return mesh.replace(texture=appearance.texture, uvs=mesh.uvs, uv_faces=mesh.uv_faces)
+        if appearance.texture is not None:
             self.unread.note(f"the texture of {name!r}", "left out, for the shape has no texture coordinates")
-        color = torch.full((3,), GREY) if look.color is None else look.color
+        color = torch.full((3,), DEFAULT_COLOR) if appearance.color is None else appearance.color
         faces = color.to(mesh.verts).repeat(len(mesh.faces), 1)
         return mesh.replace(face_colors=faces, uvs=mesh.uvs, uv_faces=mesh.uv_faces)
 
-    def _look(self, link: str, material: Any) -> Look:
-        """Return what a material says; its numbers are sRGB, as displays show them."""
+    def _appearance(self, link: str, material: Any) -> Appearance:
+        """Return the appearance of a material; its numbers are sRGB, as displays show them."""
         if material is None:
-            return Look(None, None)
+            return Appearance(None, None)
         shared = [one for one in self.robot.materials if one.name == material.name]  # defined once for the whole robot
         color, texture = (
             next((value for one in (material, *shared) if (value := getattr(one, name)) is not None), None)
@@ -94,7 +94,7 @@ class Visuals:
         if len(rgba) == 4 and rgba[3] < 1.0:
             self.unread.note(f"alpha {rgba[3]:g} of material {material.name!r}", "opaque")
         linear = srgb_to_linear(torch.tensor(rgba[:3], dtype=torch.float32)) if rgba else None
-        return Look(linear, None if texture is None else self._texture(link, texture.filename))
+        return Appearance(linear, None if texture is None else self._texture(link, texture.filename))
 
     def _texture(self, link: str, name: str | None) -> Tensor | None:
         found = None if name is None else self._find(name)
@@ -124,8 +124,8 @@ class Visuals:
             raise ValueError(f"{self.file}: link {link!r}: {error}") from error
 
     def _find(self, name: str) -> Path | None:
-        """A file by its path, or by a URL such as package://NAME/PATH: in the folders of packages, else in that of the robot's
-        file and those above it."""
+        """Return a file by its path, or by a URL such as package://NAME/PATH: in the folders of packages, else in that of the
+        robot's file and those above it."""
         scheme, _, rest = name.rpartition("://")
         package, _, within = rest.partition("/")
         here = self.file.absolute().parent

@@ -1,4 +1,4 @@
-"""Rotations as people write them, by roma."""
+"""Rotations as vectors, quaternions or matrices, by roma."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ STRAY = 1e-3  # of a matrix from a rotation, of a quaternion from length 1
 
 
 def roma() -> ModuleType:
-    """Raises ImportError."""
+    """Return the module roma. Raises ImportError."""
     return require("roma", "edgegrad[rigs]", "rotations of joints")
 
 
 def one_as_matrix(name: str, value: Tensor) -> Tensor:
-    """(…, 3, 3) from one rotation vector (3,), quaternion (4,) or matrix (3, 3), with or without a batch in front; (3, 3) is a
-    matrix. Raises ValueError."""
+    """Return (…, 3, 3) of one rotation vector (3,), quaternion (4,) or matrix (3, 3), with or without a batch in front; (3, 3)
+    is a matrix. Raises ValueError."""
     check_shape(name, value, *(s for one in ((3,), (4,), (3, 3)) for s in (one, ("B", *one))))
     check_finite(name, value)
     matrices = value.dim() > 1 and value.shape[-2:] == (3, 3)
@@ -28,8 +28,8 @@ def one_as_matrix(name: str, value: Tensor) -> Tensor:
 
 
 def as_matrices(name: str, value: Tensor, count: int) -> Tensor:
-    """(…, J, 3, 3) from rotation vectors (…, J, 3) in radians, quaternions (…, J, 4) as x, y, z, w, or matrices, with or without
-    a batch in front. Three dimensions that end in 3 × 3 are J matrices where the first is J. Raises ValueError."""
+    """Return (…, J, 3, 3) of rotation vectors (…, J, 3) in radians, quaternions (…, J, 4) as x, y, z, w, or matrices, with or
+    without a batch in front. Three dimensions that end in 3 × 3 are J matrices where the first is J. Raises ValueError."""
     vectors, quaternions, matrices = (count, 3), (count, 4), (count, 3, 3)
     check_shape(name, value, *(s for one in (vectors, quaternions, matrices) for s in (one, ("B", *one))))
     if value.shape[-2:] == (3, 3) and (value.dim() == 4 or (value.dim() == 3 and len(value) == count)):

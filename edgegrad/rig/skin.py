@@ -1,4 +1,4 @@
-"""Vertices that hang on joints: morph targets, then blended transformations."""
+"""Vertices that joints move: morph targets, then blended transformations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..check import as_tensor, check_finite, check_shape
+from ..check import as_double, as_tensor, check_finite
 from .rotations import roma
 
 RIGID = 1e-3  # of a joint's transformation from a rotation with one scale
@@ -17,15 +17,24 @@ SKINNINGS = ("linear", "dual quaternion")
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """How a mesh hangs on joints.
+    """The binding of a mesh to joints.
 
-    joints          (n,) their places among all joints of the rig
-    inverse_binds   (n, 4, 4) from the mesh's coordinates to each joint's own
-    weights         (V, n) from 0; rows are divided by their sums, which must not be zero
-    morphs          the place of its first morph among the rig's
-    targets         (M, V, 3) by how much a morph of weight 1 moves each vertex; None: no morphs
-    normal_targets  (M, N, 3) and each normal
-    normal_verts    (N,) the vertex of each normal; None: they are the vertices'
+    Parameters
+    ----------
+    joints : (n,)
+        Their places among all joints of the rig.
+    inverse_binds : (n, 4, 4)
+        From the mesh's coordinates to each joint's own.
+    weights : (V, n)
+        From 0; rows are divided by their sums, which must not be zero.
+    morphs : int, default 0
+        Place of its first morph among the rig's.
+    targets : (M, V, 3), default no morphs
+        How far a morph of weight 1 moves each vertex.
+    normal_targets : (M, N, 3)
+        How far it moves each normal.
+    normal_verts : (N,), default the vertices
+        The vertex of each normal.
     """
 
     joints: Tensor
@@ -37,15 +46,11 @@ class Skin:
     normal_verts: Tensor | None = None
 
     def checked(self, name: str, joints: int, verts: Tensor, normals: Tensor | None) -> Skin:
-        """Of a mesh, in its type. Raises TypeError or ValueError."""
+        """Return the checked skin of a mesh, in its type. Raises TypeError or ValueError."""
         index = as_tensor(f"{name}: joints", self.joints).long()
         n, V = len(index), len(verts)
-        weights = as_tensor(f"{name}: weights", self.weights, floating=True).detach().double()
-        check_shape(f"{name}: weights", weights, (V, n))
-        check_finite(f"{name}: weights", weights)
-        inverse_binds = as_tensor(f"{name}: inverse_binds", self.inverse_binds, floating=True).detach().double()
-        check_shape(f"{name}: inverse_binds", inverse_binds, (n, 4, 4))
-        check_finite(f"{name}: inverse_binds", inverse_binds)
+        weights = as_double(f"{name}: weights", self.weights, (V, n))
+        inverse_binds = as_double(f"{name}: inverse_binds", self.inverse_binds, (n, 4, 4))
         if n and not bool(((index >= 0) & (index < joints)).all()):
             raise ValueError(f"{name}: joints: expected places from 0 to {joints - 1}, got {index.tolist()}")
         total = weights.sum(1, keepdim=True)
@@ -63,8 +68,9 @@ class Skin:
     def bent(
         self, world: Tensor, morphs: Tensor, verts: Tensor, normals: Tensor | None, skinning: str
     ) -> tuple[Tensor, Tensor | None]:
-        """Vertices (…, V, 3) and normals (…, N, 3) by the joints' world transformations (…, J, 4, 4) and morph weights (…, M)."""
-        # In double: a joint may be far from the origin, and its inverse bind takes it back.
+        """Return vertices (…, V, 3) and normals (…, N, 3) by the joints' world transformations (…, J, 4, 4) and morph weights
+        (…, M)."""
+        # Double is needed: a joint may be far from the origin, and its inverse bind takes it back.
         A = (world.index_select(-3, self.joints) @ self.inverse_binds)[..., :3, :]
         bases, turns = (_linear if skinning == "linear" else _dual_quaternion)(A, self.weights, normals is not None)
         points = _morphed(verts, self.targets, morphs, self.morphs)
@@ -90,7 +96,7 @@ def _targets(name: str, given: Tensor | None, rows: int, like: Tensor) -> Tensor
 
 
 def _morphed(rows: Tensor, targets: Tensor | None, morphs: Tensor, first: int) -> Tensor:
-    """(…, V, 3): p + Σ wₖ dₖ."""
+    """Return p + Σ wₖ dₖ, (…, V, 3)."""
     if targets is None:
         return rows
     own = morphs[..., first : first + len(targets)].to(rows)
@@ -98,8 +104,8 @@ def _morphed(rows: Tensor, targets: Tensor | None, morphs: Tensor, first: int) -
 
 
 def _linear(A: Tensor, weights: Tensor, normals: bool) -> tuple[Tensor, Tensor | None]:
-    """Linear blend skinning: (…, V, 3, 4) of points, Σ w A, and (…, V, 3, 3) of normals, the cofactors of its linear part, where
-    they are asked for."""
+    """Return linear blend skinning: Σ w A (…, V, 3, 4) of points, and the cofactors (…, V, 3, 3) of its linear part of normals,
+    where they are asked for."""
     bases = (weights @ A.flatten(-2).to(weights)).unflatten(-1, (3, 4))
     if not normals:
         return bases, None
@@ -112,8 +118,8 @@ def _linear(A: Tensor, weights: Tensor, normals: bool) -> tuple[Tensor, Tensor |
 
 
 def _dual_quaternion(A: Tensor, weights: Tensor, normals: bool) -> tuple[Tensor, Tensor]:
-    """Dual-quaternion blending (Kavan, Collins, Žára and O'Sullivan, Skinning with Dual Quaternions, 2007): the same of rigid
-    transformations with one scale each, which is blended apart. Raises ValueError for others."""
+    """Return the same by dual-quaternion blending (Kavan, Collins, Žára and O'Sullivan, Skinning with Dual Quaternions, 2007)
+    of rigid transformations with one scale each, which is blended apart. Raises ValueError for others."""
     L, t = A[..., :3], A[..., 3]
     scale = torch.linalg.det(L).clamp(min=1e-30) ** (1.0 / 3.0)
     R = L / scale[..., None, None]

@@ -1,4 +1,4 @@
-"""Meshes that hang on joints."""
+"""Meshes that joints move by skins."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .skin import SKINNINGS, Skin
 
 
 @dataclass(frozen=True, eq=False)
-class Skinned:
+class SkinDeformer:
     """Joints, and a skin for each mesh."""
 
     joints: Joints
@@ -23,8 +23,8 @@ class Skinned:
     controls: Mapping[str, Control]
 
     @staticmethod
-    def of(joints: Joints, skins: tuple[Skin, ...], morphs: tuple[str, ...], weights: Tensor) -> Skinned:
-        """At rest. Skins are checked."""
+    def from_skins(joints: Joints, skins: tuple[Skin, ...], morphs: tuple[str, ...], weights: Tensor) -> SkinDeformer:
+        """Return the deformer at rest, of checked skins."""
         assert isinstance(joints.stretches, Tensor)
         names, J = tuple(joints.names), len(joints)
         controls = {
@@ -34,7 +34,7 @@ class Skinned:
         }
         if morphs:
             controls["morphs"] = Control(weights, names=morphs)
-        return Skinned(joints, skins, controls)
+        return SkinDeformer(joints, skins, controls)
 
     @property
     def parents(self) -> tuple[int, ...]:
@@ -44,7 +44,7 @@ class Skinned:
     def names(self) -> tuple[str, ...]:
         return tuple(self.joints.names)
 
-    def with_controls(self, controls: Mapping[str, Control]) -> Skinned:
+    def with_controls(self, controls: Mapping[str, Control]) -> SkinDeformer:
         return replace(self, controls=controls)
 
     def __call__(

@@ -1,1 +1,2 @@
-"""What is rendered: meshes and their materials, lights, backgrounds; it knows neither cameras, nor files, nor the kernel."""
+"""Rendered scenes: meshes and their materials, lights, backgrounds. This package knows neither cameras, nor files, nor the
+kernel."""

@@ -7,40 +7,32 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_finite, check_float, check_shape, values_visible
+from ..check import as_real, as_tensor, check_finite, check_float, values_visible
 
 ROUNDING = 1e-3  # by which the rows of a rotation may miss being orthonormal
 
 
 class Affine(NamedTuple):
-    """x ↦ scale · R x + t."""
+    """The map x ↦ scale · R x + t."""
 
     R: Tensor | None  # (3, 3)
     t: Tensor | None  # (3,)
     scale: Tensor  # ()
 
     @classmethod
-    def of(cls, R: Tensor | None, t: Tensor | None, scale: Tensor | float, like: Tensor) -> Affine:
-        """Checked. Raises TypeError or ValueError."""
+    def from_arguments(cls, R: Tensor | None, t: Tensor | None, scale: Tensor | float, like: Tensor) -> Affine:
+        """Return the map of checked arguments. Raises TypeError or ValueError."""
         scale = as_tensor("scale", scale, like=like)
         check_float("scale", scale)
         if scale.numel() != 1:
             raise ValueError(f"scale: expected one number, got shape {tuple(scale.shape)}; scale the verts yourself")
         check_finite("scale", scale)
-        if R is not None:
-            R = as_tensor("R", R, like=like)
-            check_float("R", R)
-            check_shape("R", R, (3, 3))
-            check_finite("R", R)
-        if t is not None:
-            t = as_tensor("t", t, like=like)
-            check_float("t", t)
-            check_shape("t", t, (3,))
-            check_finite("t", t)
+        R = None if R is None else as_real("R", R, (3, 3), like=like)
+        t = None if t is None else as_real("t", t, (3,), like=like)
         return cls(R, t, scale.reshape(()))
 
     def vectors(self, v: Tensor) -> Tensor:
-        """R v of vectors (..., 3)."""
+        """Return R v of vectors (..., 3)."""
         # Column by column rather than by a matrix product: each row is then rounded alike, so that copies of
         # one vertex stay equal and its edges stay welded.
         R = self.R
@@ -52,12 +44,12 @@ class Affine(NamedTuple):
 
     @property
     def area(self) -> Tensor:
-        """() how many times larger areas become; where R is no similarity, those of spheres on the mean of their axes."""
+        """Return () by how much areas grow; where R is no similarity, those of spheres on the mean of their axes."""
         squared = self.scale**2
         return squared if self.R is None else squared * torch.linalg.det(self.R).abs() ** (2 / 3)
 
     def normals(self, n: Tensor) -> Tensor:
-        """What stays at right angles to surfaces: by the cofactors of R, so that R may be any matrix."""
+        """Return vectors that stay at right angles to surfaces: by the cofactors of R, so that R may be any matrix."""
         if self.R is None:
             return n
         a, b, c = self.R.unbind(0)
@@ -65,7 +57,7 @@ class Affine(NamedTuple):
         return self._replace(R=cofactors).vectors(n)
 
     def rotated(self, name: str, rotation: Tensor | None) -> Tensor | None:
-        """R · rotation, for what lies infinitely far away. Raises ValueError where R is no rotation."""
+        """Return R · rotation, for what lies infinitely far away. Raises ValueError where R is no rotation."""
         if self.R is None:
             return rotation
         check_rotation("R", self.R, f"{name} can only be turned")
@@ -73,7 +65,6 @@ class Affine(NamedTuple):
 
 
 def check_rotation(name: str, R: Tensor, why: str) -> None:
-    """Raises ValueError."""
     if not values_visible(R):
         return
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""What surfaces look like at points: colours, parameters of materials, texture coordinates, normals."""
+"""Appearance of surfaces at points: colours, parameters of materials, texture coordinates, normals."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class OnMesh(NamedTuple):
     tangents: Callable[[], Tensor] | None = None  # (F, 3, 4) at corners, of a normal map where normals are interpolated
 
     def interpolated(self, rows: Tensor, index: Tensor) -> Tensor:
-        """(N, K) from rows (R, K) by the corners of faces, index (F, 3)."""
+        """Interpolate rows (R, K) by the corners of faces, index (F, 3), to (N, K)."""
         corners = rows.to(self.b)[index[self.face].long()]
         return (self.b[:, :, None] * corners).sum(1)
 
     def value(self, parameter: Parameter | float) -> Tensor:
-        """(N, K), or (1, K) of what is the same everywhere."""
+        """Return a parameter (N, K), or (1, K) where it is the same everywhere."""
         if isinstance(parameter, Texture):
             return self._looked_up(parameter)
         value = torch.as_tensor(parameter).to(self.b)
@@ -62,7 +62,7 @@ class OnMesh(NamedTuple):
         return found if texture.factor is None else found * torch.as_tensor(texture.factor).to(self.b)
 
     def color(self) -> Tensor | None:
-        """(N, C) of the mesh itself, whatever kind it has."""
+        """Return the colour (N, C) of the mesh itself, whatever kind it has."""
         mesh = self.mesh
         if mesh.texture is not None:
             return self._looked_up(Texture(mesh.texture, wrap=mesh.wrap, filter=mesh.filter))
@@ -75,7 +75,7 @@ class OnMesh(NamedTuple):
         return None
 
     def base_color(self) -> Tensor:
-        """(N, C), (N, 1) or (1, K): colours times the material's factor; radiance where there is no material."""
+        """Return colours times the material's factor, (N, C), (N, 1) or (1, K); radiance where there is no material."""
         own = self.color()
         of_material = None if self.mesh.material is None else self.mesh.material.base_color
         if of_material is None:
@@ -84,7 +84,7 @@ class OnMesh(NamedTuple):
         return factor if own is None else own * factor
 
     def shows(self) -> Tensor:
-        """(N,) bool: whether the mesh is there, for what light meets: not where it is cut out, nor where it blends below ½."""
+        """Return (N,) bool whether light meets the mesh: not where alpha masks it, nor where it blends below ½."""
         mesh = self.mesh
         if mesh.alpha is None:
             return torch.ones(len(self.face), dtype=torch.bool, device=self.face.device)
@@ -98,12 +98,12 @@ class OnMesh(NamedTuple):
         return alpha[:, 0] >= (0.5 if mesh.blends else mesh.alpha_cutoff)
 
     def corners(self) -> Tensor:
-        """(N, 3, 3) positions of the corners of the faces."""
+        """Return the positions (N, 3, 3) of the corners of the faces."""
         return self.mesh.verts.to(self.b)[self.mesh.faces[self.face].long()]
 
     def shading_normal(self, g: Tensor) -> Tensor:
-        """(N, 3) unit normals on the side of the faces' own normals g (N, 3): interpolated if there are any, and bent by the
-        material's normal map where that tells a direction."""
+        """Return unit normals (N, 3) on the side of the faces' own normals g (N, 3). They are interpolated if there are any,
+        and bent by the material's normal map where that has a direction."""
         n = self.smooth_normal(g)
         material = self.mesh.material
         if material is None or material.normal_map is None:
@@ -117,7 +117,7 @@ class OnMesh(NamedTuple):
         return normalize(m, dim=-1)
 
     def smooth_normal(self, g: Tensor) -> Tensor:
-        """(N, 3) unit normals on the side of the faces' own normals g (N, 3): interpolated if there are any."""
+        """Return unit normals (N, 3) on the side of the faces' own normals g (N, 3): interpolated if there are any."""
         mesh = self.mesh
         if mesh.normals is None:
             return g
@@ -128,7 +128,7 @@ class OnMesh(NamedTuple):
         return torch.where((n.detach() * g.detach()).sum(1, keepdim=True) < 0, -n, n)
 
     def tangent_frame(self, n: Tensor, texture: Texture | None) -> TangentFrame:
-        """Of the texture's coordinates, or the mesh's, at right angles to unit normals n (N, 3)."""
+        """Return the frame of the texture's coordinates, or the mesh's, at right angles to unit normals n (N, 3)."""
         tangent, hand = self._tangent(texture)
         t = tangent - n * (n * tangent).sum(1, keepdim=True)
         there = (t.detach() * t.detach()).sum(1, keepdim=True) > 0
@@ -136,8 +136,8 @@ class OnMesh(NamedTuple):
         return TangentFrame(t, hand * torch.linalg.cross(n, t), there)
 
     def _tangent(self, texture: Texture | None) -> tuple[Tensor, Tensor]:
-        """(N, 3) along which u grows, of any length, and (N, 1) 1, or −1 where the image is mirrored: of the face, or
-        interpolated as normals are."""
+        """Return the direction (N, 3) in which u grows, of any length, and (N, 1) 1, or −1 where the image is mirrored. They
+        are the face's, or interpolated as normals are."""
         if self.mesh.normals is not None:
             assert self.tangents is not None
             corners = rows_of(self.tangents(), self.face).to(self.b)
@@ -148,7 +148,7 @@ class OnMesh(NamedTuple):
 
 
 def coordinates(mesh: Mesh, texture: Texture | None) -> tuple[Tensor, Tensor]:
-    """Texture coordinates and their indices: those of the texture, or else of the mesh."""
+    """Return texture coordinates and their indices: those of the texture, or else of the mesh."""
     if texture is not None and texture.uvs is not None and texture.uv_faces is not None:
         return texture.uvs, texture.uv_faces
     assert mesh.uvs is not None and mesh.uv_faces is not None
@@ -156,8 +156,8 @@ def coordinates(mesh: Mesh, texture: Texture | None) -> tuple[Tensor, Tensor]:
 
 
 def jumps(mesh: Mesh, of_corners: Tensor | None) -> Tensor:
-    """(F, 3, K) at the corners of faces: what of the mesh's looks may jump at edges, but for normals; each of a size near 1.
-    `of_corners`: the tangents (F, 3, 4), if there are some."""
+    """Return values (F, 3, K) at the corners of faces that may jump at edges, apart from normals; each of a size near 1.
+    `of_corners` are the tangents (F, 3, 4), if there are some."""
     found: list[Tensor] = []
     if mesh.corner_colors is not None:
         found.append(mesh.corner_colors)
@@ -171,7 +171,7 @@ def jumps(mesh: Mesh, of_corners: Tensor | None) -> Tensor:
     if of_corners is not None:
         found.append(torch.cat([of_corners[..., 3:] * of_corners[..., :3], of_corners[..., 3:]], -1))
     elif material is not None and material.normal_map is not None:
-        # Of each face, they jump at every edge of a curved mesh.
+        # Tangents of faces jump at every edge of a curved mesh.
         uvs, uv_faces = coordinates(mesh, material.normal_map)
         tangent, hand = tangents(mesh.verts[mesh.faces.long()], uvs.to(mesh.verts)[uv_faces.long()])
         found.append((hand * unit(tangent.double()))[:, None].expand(-1, 3, -1))

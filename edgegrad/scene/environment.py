@@ -22,17 +22,20 @@ EVEN = 0.1  # the share of points of a light that is drawn evenly, so that what 
 class Environment(Light):
     """Light from infinitely far away, from all around.
 
-    radiance  a number or (C,), the same from all around, or (h, w, C), an image of directions, linear, in the equirectangular
-              projection: row 0 is around +Y, the last one around −Y, the middle looks along −Z, and +X is to the right of it.
-              Between the centres of texels it is bilinear, around the whole turn
-    rotation  (3, 3)  from that frame to the world; the identity when None
-    visible   shown behind all surfaces where the scene has no background of its own
+    Directions are drawn by what texels emit times their solid angle, a tenth of them evenly; for glossy surfaces also by how
+    they scatter. Radiance below zero is not refused, because an optimisation may pass there: like a negative intensity of other
+    lights, it takes light away. Raises TypeError or ValueError that names the argument.
 
-    Directions are drawn by what texels emit times their solid angle, a tenth of them evenly; for glossy surfaces also by how they
-    scatter. Radiance below zero is not refused,
-    for an optimisation may pass there: like a negative intensity of other lights, it takes light away.
-
-    Raises TypeError or ValueError that names the argument.
+    Parameters
+    ----------
+    radiance : float, (C,) or (h, w, C)
+        Constant, or a linear image of directions in the equirectangular projection: row 0 is around +Y, the last one around −Y,
+        the middle is the direction −Z, and +X is to the right of it. Between the centres of texels it is bilinear, around the
+        whole turn.
+    rotation : (3, 3), default the identity
+        Rotation from that frame to the world.
+    visible : bool, default True
+        Whether it is shown behind all surfaces where the scene has no background of its own.
     """
 
     radiance: Tensor
@@ -68,31 +71,32 @@ class Environment(Light):
 
     @cached_property
     def _magnitude(self) -> Tensor:
-        """(h, w) float64."""
+        """Return (h, w) float64."""
         return self.radiance.detach().double().reshape(*self._size, -1).abs().mean(2)
 
     @cached_property
     def _cosines(self) -> Tensor:
-        """(h + 1,) float64: of the angles from +Y at which rows begin and end."""
+        """Return the cosines (h + 1,) float64 of the angles from +Y at which rows begin and end."""
         h = self._size[0]
         return torch.arange(h + 1, device=self.radiance.device).double().mul(math.pi / h).cos()
 
     @property
     def _solid_angles(self) -> Tensor:
-        """(h, w) float64, of texels."""
+        """Return the solid angles (h, w) float64 of texels."""
         h, w = self._size
         return ((self._cosines[:-1] - self._cosines[1:]) * (2 * math.pi / w))[:, None].expand(h, w)
 
     @cached_property
     def _brightness(self) -> Tensor:
-        """(h · w,) float64: the magnitude of texels, and a share of the mean, so that what is dark has a gradient too."""
+        """Return the magnitude (h · w,) float64 of texels plus a share of the mean, so that what is dark has a gradient,
+        too."""
         mean = (self._magnitude * self._solid_angles).sum() / (4 * math.pi)
         mean = torch.where(mean > 0, mean, 1.0)
         return ((1 - EVEN) * self._magnitude + EVEN * mean).reshape(-1)
 
     @cached_property
     def _table(self) -> tuple[Tensor, Tensor]:
-        """(h · w,) float64: the running sum of the probabilities of texels, and their densities by solid angle."""
+        """Return the running sum (h · w,) float64 of the probabilities of texels, and their pdf by solid angle."""
         with torch.no_grad():
             image = self._magnitude
             # The mean of the bilinear function over a texel.
@@ -114,7 +118,7 @@ class Environment(Light):
         return LightPoints(index, torch.stack([x, v], 1), density[index])
 
     def _own_directions(self, points: LightPoints) -> Tensor:
-        """(N, 3) float64, in the frame of the image."""
+        """Return directions (N, 3) float64 in the frame of the image."""
         w = self._size[1]
         row, column = points.index // w, points.index % w
         y = torch.lerp(self._cosines[row], self._cosines[row + 1], points.uv[:, 1])
@@ -123,7 +127,7 @@ class Environment(Light):
         return torch.stack([across * phi.sin(), y, -across * phi.cos()], 1)
 
     def points_at(self, direction: Tensor) -> LightPoints:
-        """Those at unit directions (N, 3) in the world; without derivatives."""
+        """Return the points at unit directions (N, 3) in the world; without derivatives."""
         with torch.no_grad():
             d = direction.double()
             x, y, z = (d if self.rotation is None else normalize(d @ self.rotation.to(d), dim=-1)).unbind(-1)
@@ -137,7 +141,10 @@ class Environment(Light):
             return LightPoints(index, uv, self._table[1][index])
 
     def above(self, points: LightPoints, normal: Tensor) -> LightPoints:
-        """The same directions, those below surfaces with unit normals (N, 3) mirrored to above them: each stands for both."""
+        """Return the same directions, of which those below surfaces with unit normals (N, 3) are mirrored to above them.
+
+        Each then stands for both.
+        """
         with torch.no_grad():
             d, n = self.place(points), normal.detach().double()
             cosine = (d * n).sum(1, keepdim=True)
@@ -158,23 +165,28 @@ class Environment(Light):
         return (radiance / points.density[:, None]).to(position)
 
     def brightness_at(self, points: LightPoints) -> Tensor:
-        """(N,) float64: about how bright the image is there, for the choice of points alone."""
-        h, w = self._size
-        if h * w == 1:
+        """Return about how bright (N,) float64 the image is there, for the choice of points alone."""
+        if self._size == (1, 1):
             return self._brightness.expand(len(points.index))
+        w = self._size[1]
         column = (points.index % w) + points.uv[:, 0] - 0.5
         row = torch.div(points.index, w, rounding_mode="floor") + points.uv[:, 1] - 0.5
-        c0, r0 = column.floor(), row.floor()
-        a, b = column - c0, row - r0
+        return self._bilinear(self._brightness[:, None], row, column)[:, 0]
+
+    def _bilinear(self, texels: Tensor, row: Tensor, column: Tensor) -> Tensor:
+        """Interpolate texels (h · w, C) at rows and columns (N,), around the whole turn."""
+        h, w = self._size
+        c0, r0 = column.detach().floor(), row.detach().floor()
+        fc, fr = (column - c0).to(texels)[:, None], (row - r0).to(texels)[:, None]
 
         def texel(down: int, right: int) -> Tensor:
-            return self._brightness[(r0 + down).clamp(0, h - 1).long() * w + (c0 + right).long() % w]
+            return texels[(r0 + down).clamp(0, h - 1).long() * w + (c0 + right).long() % w]
 
-        top = torch.lerp(texel(0, 0), texel(0, 1), a)
-        return torch.lerp(top, torch.lerp(texel(1, 0), texel(1, 1), a), b)
+        top = torch.lerp(texel(0, 0), texel(0, 1), fc)
+        return torch.lerp(top, torch.lerp(texel(1, 0), texel(1, 1), fc), fr)
 
     def towards(self, direction: Tensor) -> Tensor:
-        """(N, C): the radiance from where directions (N, 3) in the world point to, of any length; differentiable."""
+        """Return the radiance (N, C) from where directions (N, 3) in the world, of any length, point to; differentiable."""
         return self._looked_up(direction if self.rotation is None else direction @ self.rotation.to(direction))
 
     def _looked_up(self, d: Tensor) -> Tensor:
@@ -188,20 +200,12 @@ class Environment(Light):
         across = torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0)
         column = (torch.atan2(x, -z) / (2 * math.pi) + 0.5) * w - 0.5
         row = torch.atan2(across, y) / math.pi * h - 0.5
-        c0, r0 = column.detach().floor(), row.detach().floor()
-        fc, fr = (column - c0).to(d)[:, None], (row - r0).to(d)[:, None]
-        flat = self.radiance.to(d).reshape(h * w, -1)
-
-        def texel(down: int, right: int) -> Tensor:
-            return flat[(r0 + down).clamp(0, h - 1).long() * w + (c0 + right).long() % w]
-
-        top = torch.lerp(texel(0, 0), texel(0, 1), fc)
-        return torch.lerp(top, torch.lerp(texel(1, 0), texel(1, 1), fc), fr)
+        return self._bilinear(self.radiance.to(d).reshape(h * w, -1), row, column)
 
 
 def pick(running: Tensor, u: Tensor, first: Tensor | int = 0, count: int | None = None) -> tuple[Tensor, Tensor]:
-    """Which parts (N,) of the `count` from `first` on numbers u (N,) in [0, 1) pick by their probabilities, of which `running`
-    (M,) is the running sum; and how far within these: (N,) in [0, 1], uniform as well."""
+    """Return which parts (N,) of the `count` from `first` on numbers u (N,) in [0, 1) pick, and how far within these. `running`
+    (M,) is the running sum of their probabilities. The place within is (N,) in [0, 1], uniform as well."""
     u, count = u.detach().double(), len(running) if count is None else count
     first = torch.zeros_like(u, dtype=torch.int64) + first
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..check import check_flag, check_int, check_positive
 from .mesh import Mesh
-from .nearest import NEIGHBOURS, Places, Surface
+from .nearest import NEIGHBOURS, Places, SurfaceIndex
 from .scene import Scene, as_scene
 from .symmetries import Symmetries, SymmetryAxis, about
 
@@ -45,30 +45,39 @@ def find_symmetries(
     color_tolerance: float = 0.1,
     max_order: int = 24,
 ) -> Symmetries:
-    """The rotations that map a mesh onto itself. The same mesh gives the same, in the same order.
-
-    tolerance        how far points of the turned mesh may be from the mesh, as a share of its size: twice the largest distance
-                     from its centroid. A prism of so many sides that it is a cylinder within it counts as one
-    textured         whether colours must agree too: False finds the symmetries of the shape alone. A plain mesh has none
-    color_tolerance  how far colours of corresponding points may differ, all but one in a hundred of the points, from 0 to 1 of
-                     the brightest; square roots of radiance (or of base colours) are compared, which is about how the eye
-                     sees them
-    max_order        the highest order n of a rotation by 360° / n that is looked for
+    """Return the rotations that map a mesh onto itself. The same mesh gives the same rotations in the same order.
 
     The distance is that of 600 points of the surface and as many vertices: a detail smaller than their spacing that is nearer
     than the tolerance breaks no symmetry. A mesh like a sphere has continuous symmetries about three axes. Mirror images are no
-    symmetries, for no motion makes them. Raises TypeError, ValueError that names the argument, or ImportError without SciPy.
+    symmetries, because no motion makes them. Raises TypeError, ValueError that names the argument, or ImportError without
+    SciPy.
+
+    Parameters
+    ----------
+    mesh : Mesh or Scene
+    tolerance : float, default 0.01
+        Largest distance of points of the rotated mesh from the mesh, as a share of its size: twice the largest distance from
+        its centroid. A prism with so many sides that it is a cylinder within it counts as one.
+    textured : bool, default True
+        Whether colours must agree, too; False finds the symmetries of the shape alone. A plain mesh has none.
+    color_tolerance : float, default 0.1
+        Largest difference of the colours of corresponding points, all but one in a hundred of the points, from 0 to 1 of the
+        brightest. Square roots of radiance (or of base colours) are compared, which is about how the eye sees them.
+    max_order : int, default 24
+        Highest order n of a rotation by 360° / n that is looked for.
     """
     scene = as_scene(mesh)
     check_positive("tolerance", tolerance, least=1e-6, most=0.5)
     check_positive("color_tolerance", color_tolerance, least=0.0, most=1.0)
     check_int("max_order", max_order, 2, 360)
-    return _Search(Surface(scene), tolerance, check_flag("textured", textured), color_tolerance, max_order).run()
+    return _SymmetrySearch(
+        SurfaceIndex(scene), tolerance, check_flag("textured", textured), color_tolerance, max_order
+    ).run()
 
 
 @dataclass
-class _Search:
-    surface: Surface
+class _SymmetrySearch:
+    surface: SurfaceIndex
     tolerance: float
     textured: bool
     color_tolerance: float
@@ -94,7 +103,7 @@ class _Search:
         radius = np.linalg.norm(self.points, axis=1)
         if radius.max() - radius.min() <= self.limit and all(self._maps(self._any(k)) for k in range(TURNS)):
             return self._with([], list(np.eye(3)))
-        # Of the third axis, whether the variances along the two others are equal.
+        # For each axis, this tells whether the variances along the two others are equal.
         equal = [self._equal((i + 1) % 3, (i + 2) % 3) for i in range(3)]
         axes = [self.axes[:, i] for i in range(3)]
         round_one = next((axis for i, axis in enumerate(axes) if equal[i] and self._continuous(axis)), None)
@@ -115,7 +124,7 @@ class _Search:
         return self._with(group[1:], [])
 
     def _with(self, rotations: list[np.ndarray], axes: list[np.ndarray]) -> Symmetries:
-        """With the identity, about the centroid."""
+        """Return the symmetries with the identity, about the centroid."""
         R = torch.from_numpy(np.stack([np.eye(3), *rotations]))
         center = torch.from_numpy(self.center)
         motions = torch.eye(4, dtype=torch.float64).repeat(len(R), 1, 1)
@@ -125,7 +134,8 @@ class _Search:
     # -- what a symmetry is ----------------------------------------------------------------------------------------------
 
     def _maps(self, R: np.ndarray) -> bool:
-        """Whether a rotation about the centroid is one: all points come near the surface, and nearly all to the same colour."""
+        """Return whether a rotation about the centroid is a symmetry: all points come near the surface, and nearly all to the
+        same colour."""
         rough = self.surface.rough_distance(self.few @ R.T + self.center)
         if np.median(rough) > 3.0 * self.limit + 0.02 * self.size:
             return False
@@ -141,12 +151,12 @@ class _Search:
         return float(odd.double().mean()) <= ODD_COLORS
 
     def _seen(self, colors: Tensor) -> Tensor:
-        """(N, C): square roots, of the brightest 1."""
+        """Return square roots (N, C) of colours, of which the brightest is 1."""
         return (colors.clamp(min=0.0) / self.brightest).sqrt()
 
     def _equal(self, i: int, j: int) -> bool:
-        """Whether a surface whose points are off by the tolerance may have these two variances and be symmetric. Shifting points
-        of standard deviation σ by d moves σ² by up to 2 σ d."""
+        """Return whether a surface whose points are off by the tolerance may have these two variances and be symmetric.
+        Shifting points of standard deviation σ by d moves σ² by up to 2 σ d."""
         a, b = self.variances[i], self.variances[j]
         return abs(a - b) <= 4.0 * self.limit * math.sqrt(max(a, b)) + 1e-9 * max(a, b)
 
@@ -154,14 +164,15 @@ class _Search:
         return all(self._maps(_turn(axis, (k + 1) * GOLDEN)) for k in range(TURNS))
 
     def _any(self, k: int) -> np.ndarray:
-        """Rotations about different axes by different angles."""
+        """Return the k-th of some rotations about different axes by different angles."""
         axis = np.array([math.cos(k * GOLDEN), math.sin(k * GOLDEN), (2 * k + 1) / TURNS - 1.0])
         return _turn(axis / np.linalg.norm(axis), 1.0 + 0.7 * k)
 
     # -- where they are looked for ---------------------------------------------------------------------------------------
 
     def _flips(self, axis: np.ndarray) -> list[np.ndarray]:
-        """A half turn about an axis across the given one, or none: the others follow from the rotations about the given one."""
+        """Return a half turn about an axis across the given one, or none: the others follow from the rotations about the given
+        one."""
         side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         side /= np.linalg.norm(side)
         count = 4 * self.max_order
@@ -182,7 +193,7 @@ class _Search:
         return []
 
     def _anywhere(self) -> tuple[list[np.ndarray], np.ndarray | None]:
-        """The group of what a grid of all rotations leads to; or the axis of a continuous one."""
+        """Return the group that a grid of all rotations leads to; or the axis of a continuous one."""
         group = [np.eye(3)]
         grid = _rotations(GRID)
         order = np.argsort(self._rough(grid), kind="stable")
@@ -203,13 +214,13 @@ class _Search:
         return group, None
 
     def _rough(self, rotations: np.ndarray) -> np.ndarray:
-        """(N,): root mean squared distance of a few points, by which candidates are ranked."""
+        """Return the root mean squared distance (N,) of a few points, by which candidates are ranked."""
         moved = np.einsum("nij,pj->npi", rotations, self.few) + self.center
         return np.sqrt((self.surface.rough_distance(moved) ** 2).mean(1))
 
     def _refined(self, R: np.ndarray) -> np.ndarray:
-        """Gauss-Newton steps on the distances to the planes of the nearest faces, about the centroid; left off where they do not
-        lead near a symmetry."""
+        """Take Gauss-Newton steps on the distances to the planes of the nearest faces, about the centroid. They stop where they
+        do not lead near a symmetry."""
         for k in range(STEPS):
             turned = self.few @ R.T
             there = self.surface.nearest(turned + self.center, FEWER if k < STEPS // 2 else NEIGHBOURS)
@@ -228,7 +239,7 @@ class _Search:
     # -- what they make together -----------------------------------------------------------------------------------------
 
     def _with_one_more(self, group: list[np.ndarray], R: np.ndarray) -> list[np.ndarray]:
-        """With all products; the group as it is, if one of these is no symmetry, or there are too many."""
+        """Return the group with R and all products, or as it is if one of these is no symmetry, or there are too many."""
         if self._known(R, group) or not self._maps(R):
             return group
         larger, done = [*group, R], 0
@@ -247,20 +258,20 @@ class _Search:
         return self._nearest_in(R, group) < math.pi / (2 * self.max_order)
 
     def _nearest_in(self, R: np.ndarray, group: list[np.ndarray]) -> float:
-        """Radians from R to the nearest of the group."""
+        """Return the radians from R to the nearest of the group."""
         cosine = 0.5 * (np.einsum("ij,gij->g", R, np.stack(group)).max() - 1.0)
         return math.acos(min(1.0, max(-1.0, cosine)))
 
     def _of_whole_order(self, R: np.ndarray) -> np.ndarray:
-        """The rotation about the same axis with the nearest angle 360° k / n."""
+        """Return the rotation about the same axis with the nearest angle 360° k / n."""
         axis, angle = _axis_angle(R)
         fractions = sorted({k / n for n in range(2, self.max_order + 1) for k in range(1, n // 2 + 1)})
         return _turn(axis, 2.0 * math.pi * min(fractions, key=lambda f: abs(angle - 2.0 * math.pi * f)))
 
 
 def _moments(triangles: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centroid (3,), variances (3,) and principal axes (3, 3) in columns, of the area. Of a triangle the integral of x xᵀ is its
-    area / 12 times (Σ v vᵀ + s sᵀ), with s the sum of its corners v."""
+    """Return centroid (3,), variances (3,) and principal axes (3, 3) in columns, of the area. Of a triangle the integral of x
+    xᵀ is its area / 12 times (Σ v vᵀ + s sᵀ), with s the sum of its corners v."""
     weight = area / area.sum()
     center = weight @ triangles.mean(1)
     v = triangles - center
@@ -274,22 +285,17 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
     return about(torch.from_numpy(axis.copy()), torch.tensor([angle], dtype=torch.float64))[0].numpy()
 
 
-def _angle(R: np.ndarray) -> float:
-    """Radians, 0 … π."""
-    sine = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return math.atan2(sine, 0.5 * (np.trace(R) - 1.0))
-
-
 def _axis_angle(R: np.ndarray) -> tuple[np.ndarray, float]:
-    """The unit axis and the angle, 0 … π."""
+    """Return the unit axis and the angle, 0 … π."""
     # R + Rᵀ has the axis as its eigenvector with the largest eigenvalue, at all angles but 0.
     axis = np.linalg.eigh(R + R.T)[1][:, 2]
     about_it = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return (-axis if axis @ about_it < 0.0 else axis), _angle(R)
+    angle = math.atan2(0.5 * np.linalg.norm(about_it), 0.5 * (np.trace(R) - 1.0))
+    return (-axis if axis @ about_it < 0.0 else axis), angle
 
 
 def _rotations(count: int) -> np.ndarray:
-    """(count, 3, 3), evenly over all rotations: super-Fibonacci spirals (Alexa 2022)."""
+    """Return rotations (count, 3, 3), evenly over all of them: super-Fibonacci spirals (Alexa 2022)."""
     s = np.arange(count) + 0.5
     t, phi, psi = s / count, math.sqrt(2.0), 1.533751168755204288118041
     alpha, beta = 2.0 * math.pi * s / phi, 2.0 * math.pi * s / psi

@@ -21,9 +21,14 @@ from .rows import unit
 class LightPoints(NamedTuple):
     """Points of a light by coordinates that stay while it moves, without derivatives.
 
-    index    (N,) int64: the face of an emissive mesh, the texel of an environment
-    uv       (N, 2) float64: the last two barycentrics there, or the place within the texel
-    density  (N,) float64, by world area or by solid angle; 1 for a light without extent
+    Attributes
+    ----------
+    index : (N,) int64
+        Face of an emissive mesh, or texel of an environment.
+    uv : (N, 2) float64
+        The last two barycentrics there, or the place within the texel.
+    density : (N,) float64
+        pdf by world area or by solid angle; 1 for a light without extent.
     """
 
     index: Tensor  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -31,12 +36,12 @@ class LightPoints(NamedTuple):
     density: Tensor
 
     def select(self, rows: Tensor | slice) -> LightPoints:
-        """Some of them."""
+        """Return some of the points."""
         return LightPoints(self.index[rows], self.uv[rows], self.density[rows])
 
 
 class Light:
-    """What all lights have in common. Negative radiances, intensities and colours are not refused, for an optimisation may pass
+    """Base class of all lights. Negative radiances, intensities and colours are not refused, because an optimisation may pass
     there: they take light away, and images stay linear in them."""
 
     casts = True  # whether it casts shadows
@@ -44,44 +49,44 @@ class Light:
     punctual = True  # whether it is one point
 
     def replace(self, **fields: Any) -> Any:
-        """This light with some fields replaced."""
+        """Return this light with some fields replaced."""
         check_fields(self, fields)
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     @property
     def channels(self) -> int | None:
-        """C, or None for a light of one colour in all channels."""
+        """Return C, or None for a light of one colour in all channels."""
         color = getattr(self, "color", None)
         return None if color is None or color.shape[0] == 1 else color.shape[0]
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Any:
-        """The light, moved as Mesh.transformed moves meshes. Raises TypeError or ValueError."""
-        return self._moved(Affine.of(R, t, scale, torch.empty(0, dtype=torch.float64)))
+        """Return the light, moved as Mesh.transformed moves meshes. Raises TypeError or ValueError."""
+        return self._moved(Affine.from_arguments(R, t, scale, torch.empty(0, dtype=torch.float64)))
 
     def _moved(self, affine: Affine) -> Light:
         raise NotImplementedError
 
     def draw(self, u: Tensor) -> LightPoints:
-        """Points from numbers u (N, 2), uniform in [0, 1)."""
+        """Draw points from numbers u (N, 2), uniform in [0, 1)."""
         count = len(u)
         one = torch.ones(count, dtype=torch.float64, device=u.device)
         return LightPoints(torch.zeros(count, dtype=torch.int64, device=u.device), one[:, None].expand(-1, 2) * 0, one)
 
     def shows(self, points: LightPoints) -> Tensor:
-        """(N,) bool: whether the light is there, not cut out."""
+        """Return (N,) bool whether the light is there, not masked by alpha."""
         return torch.ones(len(points.index), dtype=torch.bool, device=points.index.device)
 
     def place(self, points: LightPoints) -> Tensor:
-        """(N, 3) where they are; if the light is infinite, the unit directions towards them. Differentiable."""
+        """Return (N, 3) where the points are; of an infinite light the unit directions towards them. Differentiable."""
         raise NotImplementedError
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
-        """(N, C) or (N, 1): the irradiance at normal incidence at positions (N, 3), over the density, nothing in between.
-        Differentiable."""
+        """Return the irradiance (N, C) or (N, 1) at normal incidence at positions (N, 3), over the pdf, with nothing in
+        between. Differentiable."""
         raise NotImplementedError
 
     def incident(self, points: LightPoints, position: Tensor) -> Tensor:
-        """(N, 3) unit directions from positions (N, 3), or (1, 3) of what is the same for all. Differentiable."""
+        """Return unit directions (N, 3) from positions (N, 3), or (1, 3) where they are the same for all. Differentiable."""
         place = self.place(points)
         return place.to(position) if self.infinite else unit(place.double() - position.double()).to(position)
 
@@ -106,7 +111,7 @@ class Light:
             self._set("color", "C", fix="a number for all channels is intensity=")
 
     def _power(self, like: Tensor) -> Tensor:
-        """(1, C) or (1, 1): intensity times colour."""
+        """Return intensity times colour, (1, C) or (1, 1)."""
         intensity, color = (getattr(self, name) for name in ("intensity", "color"))
         power = intensity.to(like).reshape(1, 1)
         return power if color is None else power * color.to(like)
@@ -114,13 +119,16 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class DirectionalLight(Light):
-    """Light from infinitely far away, such as the sun's.
+    """Light from infinitely far away, such as the sun's. Raises TypeError or ValueError that names the argument.
 
-    direction  (3,)    in which it travels, world axes, of any length but zero
-    intensity  number  irradiance of a surface that it meets head-on, W/m² (glTF: lux)
-    color      (C,)    multiplies the intensity; ones when None
-
-    Raises TypeError or ValueError that names the argument.
+    Parameters
+    ----------
+    direction : (3,)
+        Direction in which it travels, world axes, of any length but zero.
+    intensity : float, default 1
+        Irradiance of a surface that it meets head-on, W/m² (glTF: lux).
+    color : (C,), default ones
+        Factor of the intensity.
     """
 
     direction: Tensor
@@ -145,13 +153,16 @@ class DirectionalLight(Light):
 
 @dataclass(frozen=True, eq=False)
 class PointLight(Light):
-    """Light from one point in all directions.
+    """Light from one point in all directions. Raises TypeError or ValueError that names the argument.
 
-    position   (3,)    world units
-    intensity  number  W/sr (glTF: cd), for distances in world units
-    color      (C,)    multiplies the intensity; ones when None
-
-    Raises TypeError or ValueError that names the argument.
+    Parameters
+    ----------
+    position : (3,)
+        World units.
+    intensity : float, default 1
+        W/sr (glTF: cd), for distances in world units.
+    color : (C,), default ones
+        Factor of the intensity.
     """
 
     position: Tensor
@@ -163,7 +174,7 @@ class PointLight(Light):
         self._set_power()
 
     def _moved(self, affine: Affine) -> PointLight:
-        # The same irradiance in other units of length.
+        # The irradiance stays the same in other units of length.
         return self.replace(position=affine.points(self.position), intensity=self.intensity * affine.area)
 
     def place(self, points: LightPoints) -> Tensor:
@@ -177,15 +188,23 @@ class PointLight(Light):
 class SpotLight(Light):
     """Light from one point in a cone, as in glTF (KHR_lights_punctual).
 
-    position     (3,)    world units
-    direction    (3,)    of the cone's axis, away from the light, of any length but zero
-    intensity    number  W/sr (glTF: cd) on the axis, for distances in world units
-    color        (C,)    multiplies the intensity; ones when None
-    inner_angle  number  rad from the axis, up to which it is as bright as there
-    outer_angle  number  rad from the axis, where it ends: 0 ≤ inner < outer ≤ π/2
-
-    Between these the intensity falls by the square of (cos θ − cos outer) / (cos inner − cos outer). Raises TypeError or
+    Between the angles the intensity falls by the square of (cos θ − cos outer) / (cos inner − cos outer). Raises TypeError or
     ValueError that names the argument.
+
+    Parameters
+    ----------
+    position : (3,)
+        World units.
+    direction : (3,)
+        Direction of the cone's axis, away from the light, of any length but zero.
+    intensity : float, default 1
+        W/sr (glTF: cd) on the axis, for distances in world units.
+    color : (C,), default ones
+        Factor of the intensity.
+    inner_angle : float, default 0
+        Angle from the axis in radians up to which it is as bright as there.
+    outer_angle : float, default π/4
+        Angle from the axis in radians where it ends: 0 ≤ inner < outer ≤ π/2.
     """
 
     position: Tensor
@@ -230,13 +249,13 @@ class SpotLight(Light):
 
 
 def direction_of(direction: Tensor) -> Tensor:
-    """(3,) unit vector of one of any length but zero: scaled first, for squares of short ones vanish and of long ones
-    overflow."""
+    """Return the unit vector (3,) of one of any length but zero. It is scaled first, because squares of short ones vanish and
+    of long ones overflow."""
     return normalize(direction / direction.detach().abs().max(), dim=0)
 
 
 def inverse_square(v: Tensor) -> Tensor:
-    """(N, 1): 1/|v|² of vectors (N, 3); zero, without a derivative, where they have no direction."""
+    """Return 1/|v|² (N, 1) of vectors (N, 3); zero, without a derivative, where they have no direction."""
     squared = (v * v).sum(-1, keepdim=True)
     some = squared > 0
     return torch.where(some, 1 / torch.where(some, squared, 1.0), 0.0)
@@ -246,11 +265,15 @@ def inverse_square(v: Tensor) -> Tensor:
 class SphericalHarmonics(Light):
     """Irradiance by the direction of the normal, without shadows: cheap and smooth.
 
-    coefficients  (9, C)   E(n) = Σ c_i Y_i(n), in the order Y_00, Y_1−1, Y_10, Y_11, Y_2−2 … Y_22 of the real, orthonormal
-                           spherical harmonics (Ramamoorthi and Hanrahan 2001): coefficients of irradiance, not of radiance
-    rotation      (3, 3)   from the frame of the coefficients to the world; the identity when None
-
     It is scattered by the Lambertian part of a material alone. Raises TypeError or ValueError that names the argument.
+
+    Parameters
+    ----------
+    coefficients : (9, C)
+        E(n) = Σ c_i Y_i(n), in the order Y_00, Y_1−1, Y_10, Y_11, Y_2−2 … Y_22 of the real, orthonormal spherical harmonics
+        (Ramamoorthi and Hanrahan 2001): coefficients of irradiance, not of radiance.
+    rotation : (3, 3), default the identity
+        Rotation from the frame of the coefficients to the world.
     """
 
     coefficients: Tensor
@@ -274,13 +297,13 @@ class SphericalHarmonics(Light):
         return self.replace(rotation=affine.rotated("spherical harmonics", self.rotation))
 
     def irradiance(self, normal: Tensor) -> Tensor:
-        """(N, C) of surfaces with unit normals (N, 3)."""
+        """Return the irradiance (N, C) of surfaces with unit normals (N, 3)."""
         n = normal if self.rotation is None else normal @ self.rotation.to(normal)
         return harmonics(n) @ self.coefficients.to(normal)
 
 
 def harmonics(n: Tensor) -> Tensor:
-    """(N, 9): the real spherical harmonics up to the second order, of unit vectors (N, 3)."""
+    """Return the real spherical harmonics (N, 9) up to the second order, of unit vectors (N, 3)."""
     x, y, z = n.unbind(-1)
     one, c1, c2 = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi)), math.sqrt(15 / (4 * math.pi))
     return torch.stack(
@@ -292,13 +315,16 @@ def harmonics(n: Tensor) -> Tensor:
 
 
 class AreaLight:
-    """Makes meshes that emit light. Any mesh whose material has emission is a light; these are short ways to some. They go among
-    the lights or the meshes of a Scene, and are seen."""
+    """Constructors of meshes that emit light. Any mesh whose material has emission is a light. They go among the lights or the
+    meshes of a Scene, and are seen."""
 
     @staticmethod
     def of(mesh: Mesh, radiance: Tensor | float, two_sided: bool = True) -> Mesh:
-        """A mesh that scatters nothing and emits `radiance`, a number or (C,), W/(sr m²); if not two_sided, only to the side from
-        which the vertices of its faces run counter-clockwise. Raises TypeError or ValueError."""
+        """Return the mesh with a material that scatters nothing and emits `radiance`, a number or (C,), W/(sr m²).
+
+        If not two_sided, it emits only to the side from which the vertices of its faces run counter-clockwise. Raises TypeError
+        or ValueError.
+        """
         if not isinstance(mesh, Mesh):
             raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}")
         return mesh.replace(
@@ -307,8 +333,8 @@ class AreaLight:
 
     @staticmethod
     def rectangle(center: Tensor, u: Tensor, v: Tensor, radiance: Tensor | float, two_sided: bool = True) -> Mesh:
-        """A parallelogram with the corners center ± u ± v, (3,) each, world units; its front is that of u × v.
-        Raises TypeError or ValueError."""
+        """Return a parallelogram with the corners center ± u ± v, (3,) each, world units; its front is that of u × v. Raises
+        TypeError or ValueError."""
         center, u, v = _vectors(center=center, u=u, v=v)
         verts = torch.stack([center - u - v, center + u - v, center + u + v, center - u + v])
         faces = torch.tensor([[0, 1, 2], [0, 2, 3]], device=verts.device)
@@ -318,17 +344,17 @@ class AreaLight:
     def disc(
         center: Tensor, u: Tensor, v: Tensor, radiance: Tensor | float, segments: int = 64, two_sided: bool = True
     ) -> Mesh:
-        """A polygon of `segments` corners center + u cos φ + v sin φ, (3,) each, world units; its front is that of u × v.
-        Raises TypeError or ValueError."""
+        """Return a polygon of `segments` corners center + u cos φ + v sin φ, (3,) each, world units; its front is that of u ×
+        v. Raises TypeError or ValueError."""
         center, u, v = _vectors(center=center, u=u, v=v)
         check_positive_int("segments", segments, most=1 << 20)
         if segments < 3:
             raise ValueError(f"segments: expected at least 3, got {segments}")
         k = torch.arange(segments, device=center.device)
         angle = (2 * math.pi / segments * k).to(center)[:, None]
-        rim = center + angle.cos() * u + angle.sin() * v
+        ring = center + angle.cos() * u + angle.sin() * v
         faces = torch.stack([torch.full_like(k, segments), k, (k + 1) % segments], 1)
-        return AreaLight.of(Mesh(torch.cat([rim, center[None]]), faces), radiance, two_sided)
+        return AreaLight.of(Mesh(torch.cat([ring, center[None]]), faces), radiance, two_sided)
 
 
 def _vectors(**given: Tensor) -> list[Tensor]:

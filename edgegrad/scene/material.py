@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_fields, check_finite, check_float, check_indices, check_integer, check_shape
+from ..check import as_index, as_real, as_tensor, check_fields, check_finite, check_float, check_shape
 from ..library import core
 from .rows import areas, unit
 
@@ -23,17 +23,25 @@ LARGEST_UV = 1e9
 class Texture:
     """An image on the faces of a mesh, whose tensors may all require gradients.
 
-    image     (h, w, K) float   row 0 on top, texel centres at +0.5
-    uvs       (T, 2) float      texture coordinates of its own, v running up; those of the mesh when None
-    uv_faces  (F, 3) int        indices into uvs; given with uvs
-    wrap      what lies beyond the rim: "repeat", "clamp" or "mirror", or a pair of these for u and v
-    filter    "linear" between texel centres; "nearest", the texel that the point lies in; "mipmap", means over squares of 2, 4,
-              8 … texels, so that neighbouring pixels are about a texel apart, linear between two such levels (Williams 1983).
-              Beyond the rim "clamp" goes on with the rim of such means, as GPUs do: where many texels fall on a pixel, with a
-              mean of the border and of what lies within, at last of the whole image
-    factor    a number or (K,)  what the image is multiplied by, as glTF has it
-
     Raises TypeError or ValueError that names the argument.
+
+    Parameters
+    ----------
+    image : (h, w, K) float
+        Row 0 is on top, texel centres are at +0.5.
+    uvs : (T, 2) float, default those of the mesh
+        Texture coordinates of its own, v running up.
+    uv_faces : (F, 3) int
+        Indices into uvs; given with uvs.
+    wrap : "repeat", "clamp" or "mirror", or a pair of these for u and v
+        Continuation beyond the border of the image.
+    filter : "linear", "nearest" or "mipmap", default "linear"
+        "linear" interpolates between texel centres; "nearest" takes the texel that the point lies in. "mipmap" takes means over
+        squares of 2, 4, 8 … texels, so that neighbouring pixels are about a texel apart, linear between two such levels
+        (Williams 1983). "clamp" then continues with the border of such means, as GPUs do: where many texels fall on a pixel,
+        with a mean of the border and of what lies within, at last of the whole image.
+    factor : float or (K,)
+        Factor of the image, as glTF has it.
     """
 
     image: Tensor
@@ -44,29 +52,14 @@ class Texture:
     factor: Tensor | float | None = None
 
     def __post_init__(self) -> None:
-        self._keep("image", as_tensor("image", self.image, floating=True))
-        check_float("image", self.image)
-        check_shape("image", self.image, ("h", "w", "K"))
-        check_finite("image", self.image)
+        self._keep("image", as_real("image", self.image, ("h", "w", "K")))
         if (self.uvs is None) != (self.uv_faces is None):
             missing = "uvs" if self.uvs is None else "uv_faces"
             raise ValueError(f"{missing}: expected both uvs and uv_faces, or none of them, got None; pass it too")
         if self.uvs is not None and self.uv_faces is not None:
-            self._keep("uvs", as_tensor("uvs", self.uvs, floating=True))
-            check_float("uvs", self.uvs)
-            check_shape("uvs", self.uvs, ("T", 2))
-            check_finite("uvs", self.uvs, largest=LARGEST_UV)
-            self._keep("uv_faces", as_tensor("uv_faces", self.uv_faces))
-            check_integer("uv_faces", self.uv_faces)
-            check_shape("uv_faces", self.uv_faces, ("F", 3))
-            check_indices("uv_faces", self.uv_faces, len(self.uvs), "uvs")
-        if isinstance(self.wrap, list):
-            self._keep("wrap", tuple(self.wrap))
-        pair = (self.wrap, self.wrap) if isinstance(self.wrap, str) else self.wrap
-        if not isinstance(pair, tuple) or len(pair) != 2 or any(w not in WRAPS for w in pair):
-            raise ValueError(
-                f"wrap: expected one of {', '.join(WRAPS)}, or a pair of them for u and v, got {self.wrap!r}"
-            )
+            self._keep("uvs", as_real("uvs", self.uvs, ("T", 2), largest=LARGEST_UV))
+            self._keep("uv_faces", as_index("uv_faces", self.uv_faces, ("F", 3), len(self.uvs), "uvs"))
+        self._keep("wrap", checked_wrap(self.wrap))
         if self.filter not in LOOKUPS:
             raise ValueError(f"filter: expected one of {', '.join(LOOKUPS)}, got {self.filter!r}")
         if self.factor is not None:
@@ -79,11 +72,11 @@ class Texture:
 
     @property
     def wraps(self) -> tuple[str, str]:
-        """`wrap` of u and of v."""
+        """Return `wrap` of u and of v."""
         return (self.wrap, self.wrap) if isinstance(self.wrap, str) else self.wrap
 
     def replace(self, **fields: Any) -> Texture:
-        """This texture with some fields replaced."""
+        """Return this texture with some fields replaced."""
         check_fields(self, fields)
         return dataclasses.replace(self, **fields)
 
@@ -91,6 +84,14 @@ class Texture:
         factor = "" if self.factor is None else f", factor {_short(self.factor)}"
         own = "" if self.uvs is None else f", {len(self.uvs)} uvs"
         return f"Texture({tuple(self.image.shape)}, {self.filter}, {' '.join(self.wraps)}{factor}{own})"
+
+
+def checked_wrap(wrap: str | tuple[str, str] | list[str]) -> str | tuple[str, str]:
+    """Return a wrap, or a pair of these. Raises ValueError."""
+    pair = (wrap, wrap) if isinstance(wrap, str) else tuple(wrap) if isinstance(wrap, list) else wrap
+    if not isinstance(pair, tuple) or len(pair) != 2 or any(w not in WRAPS for w in pair):
+        raise ValueError(f"wrap: expected one of {', '.join(WRAPS)}, or a pair of them for u and v, got {wrap!r}")
+    return wrap if isinstance(wrap, str) else pair
 
 
 Parameter = Tensor | Texture
@@ -101,33 +102,40 @@ class Material:
     """How the surface of a mesh scatters light, and what it emits. All tensors may require gradients.
 
     Each of the first four is a number, a constant (C,) or 0-d tensor, a tensor (V, C) or (V, 1) of the mesh's vertices, or a
-    Texture; those of metallic and roughness have one channel.
+    Texture; metallic and roughness have one channel.
 
-    base_color    times the colours or the texture of the mesh: the share of light that is scattered. Alone where the mesh has
-                  none; None: 1
-    metallic      0 … 1, and
-    roughness     0 … 1: see below
-    emission      radiance of its own, W/(sr m²) or whatever unit the lights have; a mesh with emission is a light
-    normal_map    Texture (h, w, 3) of linear numbers in [0, 1], of which 2 n − 1 is the normal in the tangent frame of its uvs,
-                  as in glTF: red along u, green along v (upwards), blue along the normal. Of a mesh with normals, the frames at
-                  the corners of faces are MikkTSpace's. Where it is grey, of a length below 1/128 after all, which 8 bits do not
-                  tell from zero, the normal is not bent and has no derivative by the map: start an optimisation at (½, ½, 1)
-    normal_scale  multiplies the first two of these
-    two_sided     False: seen from behind (vertices clockwise), faces are black and emit nothing
-    alpha_mode    "MASK": the mesh's alpha, if it has one, cuts out where it is below its cutoff. "OPAQUE": it must have none.
-                  "BLEND": what lies behind shows by 1 − alpha, for up to 8 such surfaces in a row, in the order of their depth;
-                  they cast shadows where alpha is at least ½. There are gradients inside faces, by alpha too, and
-                  of what moves before and behind such surfaces; none of borders of nearest texels of its alpha and behind it
-
-    metallic and roughness both None: a Lambertian surface, f = base / π. Else the metallic-roughness model of glTF 2.0 (appendix
-    B): a Lambertian base under microfacets with the GGX distribution, α = roughness² (Walter et al. 2007), Smith's masking with
-    correlated heights (Heitz 2014; glTF's own text has it uncorrelated), and Schlick's Fresnel term from
-    F0 = 0.04 + (base − 0.04) · metallic. One of the two left out is metallic = 0, or roughness = 1. α counts as 1e-4 where it is
-    less, for a mirror has no density. As in glTF, what the layer reflects and what it takes from the base go by different half
-    vectors, so a white dielectric returns more than came at grazing angles (1.14 at 75°, roughness 0.3). Numbers outside of
-    0 … 1 are not refused, for an optimisation may pass there.
+    With metallic and roughness both None the surface is Lambertian, f = base / π. Else it follows the metallic-roughness model
+    of glTF 2.0 (appendix B): a Lambertian base under microfacets with the GGX distribution, α = roughness² (Walter et al.
+    2007), Smith's masking with correlated heights (Heitz 2014; glTF's own text has it uncorrelated), and Schlick's Fresnel term
+    from F0 = 0.04 + (base − 0.04) · metallic. If one of the two is left out, metallic is 0, or roughness is 1. α is at least
+    1e-4, because a mirror has no pdf. As in glTF, what the layer reflects and what it takes from the base follow different half
+    vectors, so a white dielectric returns more than came at grazing angles (1.14 at 75°, roughness 0.3). Numbers outside of 0 …
+    1 are not refused, because an optimisation may pass there.
 
     Raises TypeError or ValueError that names the argument.
+
+    Parameters
+    ----------
+    base_color : default 1
+        Share of light that is scattered: a factor of the colours or the texture of the mesh, and alone where the mesh has none.
+    metallic, roughness : 0 … 1
+        Parameters of the microfacet model; see above.
+    emission
+        Radiance of its own, W/(sr m²) or whatever unit the lights have. A mesh with emission is a light.
+    normal_map : Texture (h, w, 3)
+        Linear numbers in [0, 1]; 2 n − 1 is the normal in the tangent frame of the texture's uvs, as in glTF: red along u,
+        green along v (upwards), blue along the normal. Of a mesh with normals, the frames at the corners of faces are
+        MikkTSpace's. Where 2 n − 1 is shorter than 1/128, which 8 bits do not distinguish from zero, the normal is not bent and
+        has no derivative by the map: start an optimisation at (½, ½, 1).
+    normal_scale : float, default 1
+        Factor of the first two of these.
+    two_sided : bool, default True
+        False: seen from behind (vertices clockwise), faces are black and emit nothing.
+    alpha_mode : "MASK", "OPAQUE" or "BLEND", default "MASK"
+        "MASK" lets rays pass where the mesh's alpha, if it has one, is below its cutoff. "OPAQUE" forbids alpha. "BLEND" shows
+        what lies behind by 1 − alpha, for up to 8 such surfaces in a row, in the order of their depth; they cast shadows where
+        alpha is at least ½. There are gradients inside faces, by alpha, too, and of what moves before and behind such surfaces;
+        there are none of borders of nearest texels of its alpha, nor of those behind it.
     """
 
     base_color: Tensor | Texture | float | None = None
@@ -172,23 +180,23 @@ class Material:
 
     @property
     def channels(self) -> int | None:
-        """C, or None where all is grey."""
+        """Return C, or None where all is grey."""
         counts = (_channels(self.base_color), _channels(self.emission))
         return next((count for count in counts if count not in (None, 1)), None)
 
     @property
     def is_glossy(self) -> bool:
-        """Whether it follows the metallic-roughness model, not Lambert's law."""
+        """Return whether it follows the metallic-roughness model instead of Lambert's law."""
         return self.metallic is not None or self.roughness is not None
 
     @property
     def textures(self) -> dict[str, Texture]:
-        """By the names of the fields."""
+        """Return the textures by the names of the fields."""
         fields = ("base_color", "metallic", "roughness", "emission", "normal_map")
         return {name: t for name in fields if isinstance(t := getattr(self, name), Texture)}
 
     def check_fits(self, V: int, F: int, has_uvs: bool) -> None:
-        """A mesh of V vertices and F faces. Raises ValueError."""
+        """Raise ValueError unless the material suits a mesh of V vertices and F faces."""
         C = self.channels
         for name in ("base_color", "metallic", "roughness", "emission"):
             value = getattr(self, name)
@@ -209,7 +217,7 @@ class Material:
                 )
 
     def replace(self, **fields: Any) -> Material:
-        """This material with some fields replaced."""
+        """Return this material with some fields replaced."""
         check_fields(self, fields)
         return dataclasses.replace(self, **fields)
 
@@ -219,7 +227,7 @@ class Material:
 
 
 def _short(value: Any) -> str:
-    """Few numbers as they are, many by their shape."""
+    """Return few numbers as they are, many by their shape."""
     if not isinstance(value, Tensor):
         return repr(value)
     return str(value.detach().tolist()) if value.numel() <= 4 else f"tensor {tuple(value.shape)}"
@@ -232,7 +240,7 @@ def _channels(value: Any) -> int | None:
 
 
 def numbers(name: str, value: object) -> Tensor:
-    """A number, sequence or tensor as a finite tensor of floating point: Python's own numbers are double, as they are. Raises
+    """Return a number, sequence or tensor as a finite tensor of floating point; Python's own numbers become double. Raises
     TypeError or ValueError."""
     if not isinstance(value, Tensor):
         value = as_tensor(name, value, like=torch.empty(0, dtype=torch.float64, device="cpu"))
@@ -245,21 +253,20 @@ def numbers(name: str, value: object) -> Tensor:
 
 
 def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
-    """(V, 3) unit normals of vertices, differentiable: the mean of the incident faces' by area, on the side from which their
-    vertices run counter-clockwise. Zero where there is no direction.
+    """Return unit normals (V, 3) of vertices, differentiable, for `Mesh(…, normals=eg.vertex_normals(verts, faces))`.
 
-    verts  (V, 3) float
-    faces  (F, 3) int
+    They are the mean of the incident faces' by area, on the side from which their vertices run counter-clockwise, and zero
+    where there is no direction. Raises TypeError or ValueError that names the argument.
 
-    For `Mesh(…, normals=eg.vertex_normals(verts, faces))`. Raises TypeError or ValueError that names the argument.
+    Parameters
+    ----------
+    verts : (V, 3) float
+    faces : (F, 3) int
     """
     verts = as_tensor("verts", verts, floating=True)
     check_float("verts", verts)
     check_shape("verts", verts, ("V", 3))
-    faces = as_tensor("faces", faces).to(verts.device)
-    check_integer("faces", faces)
-    check_shape("faces", faces, ("F", 3))
-    check_indices("faces", faces, len(verts), "verts")
+    faces = as_index("faces", faces, ("F", 3), len(verts), "verts").to(verts.device)
     area, index = areas(verts[faces.long()]), faces.long().reshape(-1)
     total = torch.zeros_like(verts, dtype=area.dtype).index_add(0, index, area.repeat_interleave(3, 0))
     return unit(total).to(verts.dtype)

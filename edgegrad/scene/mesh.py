@@ -1,4 +1,4 @@
-"""Triangle meshes: vertices, faces, and what they look like."""
+"""Triangle meshes: vertices, faces, and their appearance."""
 
 from __future__ import annotations
 
@@ -21,9 +21,8 @@ from ..check import (
     check_shape,
 )
 from ..library import core
-from . import provided
 from .affine import Affine
-from .material import LARGEST_UV, LOOKUPS, WRAPS, Material, Texture
+from .material import LARGEST_UV, LOOKUPS, Material, Texture, checked_wrap
 from .tree import map_tensors, moved
 
 PLAIN = 0.7  # radiance, or base colour, of a mesh without colours, in every channel
@@ -37,33 +36,50 @@ SMALLEST_MESH = 1e-38
 class Mesh:
     """A triangle mesh whose tensors may all require gradients.
 
-    verts          (V, 3) float   positions, in the user's world units and axes
-    faces          (F, 3) int     vertex indices, from zero; both sides of a face are seen
-    At most one of the following gives the radiance (linear, any number of channels C); without any, the mesh is plain grey.
-    colors         (V, C) float   one a vertex, interpolated over the faces
-    face_colors    (F, C) float   one a face, constant over it
-    corner_colors  (F, 3, C) float  one a corner of a face; jumps across edges where they differ
-    texture        (h, w, C) float  image on the faces: row 0 on top, texel centres at +0.5; needs uvs
-    uvs            (T, 2) float   texture coordinates, v running up (as in OBJ), with
-    uv_faces       (F, 3) int     indices into uvs, apart from `faces`, so that vertices stay welded at seams
-    alpha          (h, w) float   another image on the faces, of any size, whatever gives the radiance: where it is below
-    alpha_cutoff   number         this, faces are cut out, and rays pass through; needs uvs
-    wrap           what lies beyond the rim of both images: "repeat", "clamp" (the texels at the rim go on) or "mirror"; or
-                   a pair of these, for u and v
-    filter         "linear" between the centres of texels; "nearest", the texel that the point lies in; "mipmap", for a texture
-                   finer than the pixels: its means over squares of 2, 4, 8 … texels, as of eg.Texture. It takes 1.2 to
-                   1.5 times as long, and is not for screen_gradient(); alpha is then looked up as "linear"
-    material       how it scatters light, and what it emits: then the colours above are base colours. None: it is not lit, and
-                   colours are radiance
-    normals        (N, 3) float   normals, of any length, interpolated over the faces where a material is lit; without, faces
-                   are flat. They are turned to the side of the face that is seen
-    normal_faces   (F, 3) int     indices into normals; those of `faces` when None
-    name           what a file calls it
+    At most one of colors, face_colors, corner_colors and texture gives the radiance (linear, any number of channels C); without
+    any, the mesh is plain grey. Faces of zero area render nothing. Numbers reach up to 3.4e38, the range of float32, also in
+    float64; uvs reach up to 1e9, because beyond that a double does not distinguish the texels of a large texture. The largest
+    of the verts lies above 1e-38, unless all are zero. Raises TypeError for a wrong type, ValueError for a wrong shape, a wrong
+    index or a value that is not finite or out of this range.
 
-    Faces of zero area render nothing. Numbers reach up to 3.4e38, the range of float32, also in float64; uvs up to 1e9, for
-    beyond that a double does not tell the texels of a large texture apart; the largest of the verts lies above 1e-38, unless
-    all are zero. Raises TypeError for a wrong type, ValueError for a wrong shape, a wrong index or a value that is not
-    finite or out of this range.
+    Parameters
+    ----------
+    verts : (V, 3) float
+        Positions, in the user's world units and axes.
+    faces : (F, 3) int
+        Vertex indices, from zero; both sides of a face are seen.
+    colors : (V, C) float
+        Colours of vertices, interpolated over the faces.
+    face_colors : (F, C) float
+        Colours of faces, constant over each.
+    corner_colors : (F, 3, C) float
+        Colours of corners of faces; they jump across edges where they differ.
+    texture : (h, w, C) float
+        Image on the faces: row 0 is on top, texel centres are at +0.5. It needs uvs.
+    uvs : (T, 2) float
+        Texture coordinates, v running up (as in OBJ), given with uv_faces.
+    uv_faces : (F, 3) int
+        Indices into uvs, apart from `faces`, so that vertices stay welded at seams.
+    alpha : (h, w) float
+        Another image on the faces, of any size, whatever gives the radiance. Rays pass through faces where it is below
+        alpha_cutoff. It needs uvs.
+    alpha_cutoff : float, default 0.5
+    wrap : "repeat", "clamp" or "mirror", or a pair of these for u and v
+        Continuation of both images beyond their borders; "clamp" repeats the texels at the border.
+    filter : "linear", "nearest" or "mipmap", default "linear"
+        "linear" interpolates between the centres of texels; "nearest" takes the texel that the point lies in. "mipmap", for a
+        texture finer than the pixels, takes its means over squares of 2, 4, 8 … texels, as of eg.Texture. It takes 1.2 to 1.5
+        times as long, and is not for screen_gradient(); alpha is then looked up as "linear".
+    material : Material
+        How it scatters light, and what it emits; the colours above are then base colours. None: it is not lit, and colours are
+        radiance.
+    normals : (N, 3) float
+        Normals of any length, interpolated over the faces where a material is lit, and turned to the side of the face that is
+        seen. Faces are flat without them.
+    normal_faces : (F, 3) int, default `faces`
+        Indices into normals.
+    name : str
+        Name in a file.
     """
 
     verts: Tensor
@@ -142,7 +158,7 @@ class Mesh:
                 check_indices("normal_faces", self.normal_faces, self.normals.shape[0], "normals")
 
     def _check_lit(self, V: int, F: int) -> None:
-        """The material and the normals, but for their numbers."""
+        """Check the material and the normals, but not their numbers."""
         if self.normals is not None:
             check_float("normals", self.normals)
             check_shape("normals", self.normals, ("N", 3))
@@ -181,37 +197,30 @@ class Mesh:
         if not math.isfinite(self.alpha_cutoff):
             raise ValueError(f"alpha_cutoff: expected a finite number, got {self.alpha_cutoff}")
         object.__setattr__(self, "alpha_cutoff", float(self.alpha_cutoff))
-        if isinstance(self.wrap, list):
-            object.__setattr__(self, "wrap", tuple(self.wrap))
-        if self.wrap not in WRAPS and not (
-            isinstance(self.wrap, tuple) and len(self.wrap) == 2 and all(w in WRAPS for w in self.wrap)
-        ):
-            raise ValueError(
-                f"wrap: expected one of {', '.join(WRAPS)}, or a pair of them for u and v, got {self.wrap!r}"
-            )
+        object.__setattr__(self, "wrap", checked_wrap(self.wrap))
         if self.filter not in LOOKUPS:
             raise ValueError(f"filter: expected one of {', '.join(LOOKUPS)}, got {self.filter!r}")
 
     @property
     def has_textures(self) -> bool:
-        """Whether its colours, or numbers of its material, are textures."""
+        """Return whether its colours, or numbers of its material, are textures."""
         material = self.material
         values = () if material is None else (getattr(material, field.name) for field in dataclasses.fields(material))
         return self.texture is not None or any(isinstance(value, Texture) for value in values)
 
     @property
     def blends(self) -> bool:
-        """Whether what lies behind shows through where alpha is below 1."""
+        """Return whether what lies behind shows through where alpha is below 1."""
         return self.alpha is not None and self.material is not None and self.material.alpha_mode == "BLEND"
 
     @property
     def wraps(self) -> tuple[str, str]:
-        """`wrap` of u and of v."""
+        """Return `wrap` of u and of v."""
         return (self.wrap, self.wrap) if isinstance(self.wrap, str) else self.wrap
 
     @property
     def channels(self) -> int | None:
-        """C, or None for a plain mesh, which takes the channels of its scene."""
+        """Return C, or None for a plain mesh, which takes the channels of its scene."""
         own, of_material = self._color_channels, None if self.material is None else self.material.channels
         return own if of_material is None else of_material if own is None else max(own, of_material)
 
@@ -223,9 +232,9 @@ class Mesh:
         return None
 
     def replace(self, **fields: Any) -> Mesh:
-        """This mesh with some tensors replaced: `mesh.replace(verts=v)` keeps faces and colours.
+        """Return this mesh with some tensors replaced: `mesh.replace(verts=v)` keeps faces and colours.
 
-        Giving another kind of colour removes the one there was, with texture coordinates that nothing else needs.
+        Giving another kind of colour removes the present one, with texture coordinates that nothing else needs.
         """
         check_fields(self, fields)
         appearance = {"colors", "face_colors", "corner_colors", "texture"}
@@ -237,22 +246,22 @@ class Mesh:
         return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Mesh:
-        """The mesh with vertices `scale · R v + t`, differentiable in all four.
+        """Return the mesh with vertices `scale · R v + t`, differentiable in all four.
 
-        R (3, 3) any matrix, identity when None; t (3,) world units, zero when None; scale a number or 0-d tensor. Normals go
-        along. A mirror, R of negative determinant, keeps the faces' corners in their order, so it turns a mesh inside out. Raises
-        TypeError or ValueError.
+        R (3, 3) is any matrix, by default the identity; t (3,) is in world units, by default zero; scale is a number or 0-d
+        tensor. Normals are transformed, too. A mirror, R of negative determinant, keeps the faces' corners in their order, so
+        it turns a mesh inside out. Raises TypeError or ValueError.
         """
-        affine = Affine.of(R, t, scale, self.verts)
+        affine = Affine.from_arguments(R, t, scale, self.verts)
         fields = {} if self.normals is None else {"normals": affine.normals(self.normals)}
         return self.replace(verts=affine.points(self.verts), **fields)
 
     def to(self, *args: Any, **kwargs: Any) -> Mesh:
-        """All tensors moved to a device; floating-point tensors also to a dtype, as `torch.Tensor.to`."""
+        """Return the mesh on a device; floating-point tensors also of a dtype, as `torch.Tensor.to`."""
         return moved(self, *args, **kwargs)
 
     def detach(self) -> Mesh:
-        """The same mesh, cut from the autograd graph."""
+        """Return the mesh cut from the autograd graph."""
         return map_tensors(self, Tensor.detach)
 
     def __repr__(self) -> str:
@@ -262,21 +271,3 @@ class Mesh:
         look += ", lit" if self.material is not None else ""
         name = "" if self.name is None else f"{self.name!r}, "
         return f"Mesh({name}{self.verts.shape[0]} vertices, {self.faces.shape[0]} faces, {look}, {self.verts.dtype})"
-
-    def _repr_png_(self) -> bytes | None:
-        """What notebooks show: the mesh as a whole, under a headlight unless it has colours."""
-        return provided.picture(self)
-
-    # -- trimesh ------------------------------------------------------------------------------------------------------------
-
-    @staticmethod
-    def from_trimesh(mesh: Any) -> Mesh:
-        """From a trimesh.Trimesh: equal vertices welded, with its vertex or face colours or its texture, which are sRGB there,
-        or the colour of its material, which is linear. float64 where float32 would move vertices by more than a millionth of the
-        extent, else float32. Raises TypeError, ValueError or ImportError."""
-        return provided.from_trimesh(mesh)
-
-    def to_trimesh(self) -> Any:
-        """A trimesh.Trimesh, with colours or texture as 8-bit sRGB; vertices are split where texture coordinates or the colours
-        of corners differ. Raises ValueError for other than 1 or 3 channels, ImportError."""
-        return provided.to_trimesh(self)

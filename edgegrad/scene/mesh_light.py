@@ -34,12 +34,12 @@ class MeshLight(Light):
         return OnMesh(self.mesh, face, b).value(material.emission)
 
     def _area(self, face: Tensor) -> Tensor:
-        """(N, 3) float64, normals of faces, as long as their areas."""
+        """Return normals (N, 3) float64 of faces, as long as their areas."""
         return areas(self.mesh.verts[self.mesh.faces[face].long()]) / 2
 
     @cached_property
     def _powers(self) -> tuple[Tensor, Tensor]:
-        """(F,) float64: areas of faces, and areas times the mean magnitude of what they emit."""
+        """Return (F,) float64 areas of faces, and areas times the mean magnitude of what they emit."""
         with torch.no_grad():
             face = torch.arange(len(self.mesh.faces), device=self.mesh.verts.device)
             area = self._area(face).norm(dim=1)
@@ -53,7 +53,7 @@ class MeshLight(Light):
 
     @cached_property
     def _table(self) -> tuple[Tensor, Tensor]:
-        """(F,) float64: the running sum of the probabilities of faces, and their densities by area."""
+        """Return the running sum (F,) float64 of the probabilities of faces, and their pdf by area."""
         with torch.no_grad():
             area, power = self._powers
             share = area / area.sum() if float(area.sum()) > 0 else torch.full_like(area, 1 / len(area))
@@ -62,17 +62,17 @@ class MeshLight(Light):
 
     @cached_property
     def mean_emission(self) -> Tensor:
-        """() float64: the mean magnitude over the area."""
+        """Return the mean magnitude () float64 over the area."""
         return self._powers[1].sum() / self._powers[0].sum().clamp(min=1e-300)
 
     @property
     def density(self) -> Tensor:
-        """(F,) float64, by area, with which points are drawn on each face."""
+        """Return the pdf by area (F,) float64 with which points are drawn on each face."""
         return self._table[1]
 
     @property
     def chance(self) -> Tensor:
-        """(F,) float64 that a point is drawn on a face."""
+        """Return the probability (F,) float64 that a point is drawn on a face."""
         running = self._table[0]
         return running.diff(prepend=running.new_zeros(1))
 
@@ -85,7 +85,7 @@ class MeshLight(Light):
         return LightPoints(face, uv, density[face])
 
     def _weights(self, points: LightPoints) -> Tensor:
-        """(N, 3) float64."""
+        """Return barycentrics (N, 3) float64."""
         return torch.cat([1 - points.uv.sum(1, keepdim=True), points.uv], 1).to(self.mesh.verts.device)
 
     def shows(self, points: LightPoints) -> Tensor:
@@ -95,12 +95,12 @@ class MeshLight(Light):
         return self._at(points.index, self._weights(points))
 
     def _at(self, face: Tensor, weights: Tensor) -> Tensor:
-        # In double: where the rest of the scene is, a point rounded to floats would lie behind its own face half of the time.
+        # Positions are double, because a point rounded to floats would lie behind its own face half of the time.
         corners = self.mesh.verts[self.mesh.faces[face].long()].double()
         return (weights[:, :, None] * corners).sum(1)
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
-        """L cos θ / r², over the density. Barycentrics stay while the faces move, so areas that grow count more."""
+        """Return L cos θ / r², over the pdf. Barycentrics stay while the faces move, so areas that grow count more."""
         material = self.mesh.material
         assert material is not None
         weights = self._weights(points)
@@ -111,9 +111,9 @@ class MeshLight(Light):
         return torch.where(drawn, radiance * facing, 0.0).to(position)
 
     def facing(self, face: Tensor, weights: Tensor, position: Tensor) -> Tensor:
-        """(N, 1) float64: cos θ / r² from places on faces, of barycentrics `weights` (N, 3), to `position` (N, 3), times how many
-        times as large as now the faces become; nothing from behind, unless the material is two-sided, nor from a face without
-        area."""
+        """Return cos θ / r² (N, 1) float64 from places on faces, of barycentrics `weights` (N, 3), to `position` (N, 3). It is
+        multiplied by how many times as large as now the faces become. It is zero from behind, unless the material is two-sided,
+        and of a face without area."""
         material = self.mesh.material
         assert material is not None
         normal = self._area(face)
@@ -127,25 +127,26 @@ class MeshLight(Light):
 
     @property
     def texture(self) -> Texture | None:
-        """Of its emission."""
+        """Return the texture of its emission."""
         emission = None if self.mesh.material is None else self.mesh.material.emission
         return emission if isinstance(emission, Texture) else None
 
     @property
     def has_borders(self) -> bool:
-        """Whether its emission is that of the nearest texel."""
+        """Return whether its emission is that of the nearest texel."""
         return self.texture is not None and self.texture.filter == "nearest"
 
     @property
     def coordinates(self) -> Tensor:
-        """(T, 2) of its texture."""
+        """Return the coordinates (T, 2) of its texture."""
         return coordinates(self.mesh, self.texture)[0]
 
     def borders(self, u: tuple[float, float]) -> TexelBorders | None:
-        """Between the texels of its emission, where there are jumps; of too many those that u picks, the first time."""
+        """Return borders between the texels of its emission, where there are jumps; u picks some of too many, the first
+        time."""
         if self._borders is None:
             assert self.texture is not None
             with torch.no_grad():
                 face = torch.arange(len(self.mesh.faces), device=self.mesh.verts.device)
-                self._borders = (TexelBorders.of(self.mesh, self.texture, self._area(face).norm(dim=1), u),)
+                self._borders = (TexelBorders.from_mesh(self.mesh, self.texture, self._area(face).norm(dim=1), u),)
         return self._borders[0]

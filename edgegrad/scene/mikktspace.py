@@ -1,4 +1,4 @@
-"""Tangents at the corners of faces as MikkTSpace averages them, which glTF asks for (M. S. Mikkelsen, Simulation of Wrinkled
+"""Tangents at the corners of faces as MikkTSpace averages them, which glTF requires (M. S. Mikkelsen, Simulation of Wrinkled
 Surfaces Revisited, 2008, chapter 3.2, and his mikktspace.c of 2011).
 
 Corners share a tangent if their position, normal and texture coordinates are equal and faces with the same handedness connect
@@ -18,15 +18,15 @@ Rows = tuple[np.ndarray, np.ndarray]  # values (N, K), and the indices (F, 3) of
 
 
 class Fans(NamedTuple):
-    """Which corners share a tangent."""
+    """The corners of faces that share a tangent."""
 
     of_corner: Tensor  # (F, 3) int32, from 0
     hand: Tensor  # (F,) float64, −1 where the image is mirrored on the face
     counts: Tensor  # (F,) bool: whether the face has an area in the texture
 
     @classmethod
-    def of(cls, position: Rows, normal: Rows, uv: Rows) -> Fans:
-        """Of faces whose corners have these values (N, K), by indices (F, 3)."""
+    def from_corners(cls, position: Rows, normal: Rows, uv: Rows) -> Fans:
+        """Return the fans of faces whose corners have these values (N, K), by indices (F, 3)."""
         (_, faces), (_, normal_faces), (coordinates, uv_faces) = position, normal, uv
         place, turn, image = (same_rows(values) for values, _ in (position, normal, uv))
         same = np.array_equal(faces, normal_faces) and np.array_equal(faces, uv_faces)
@@ -37,7 +37,7 @@ class Fans(NamedTuple):
         at = coordinates.astype(np.float64)[uv_faces]
         (u1, v1), (u2, v2) = ((at[:, k] - at[:, 0]).T for k in (1, 2))
         area = u1 * v2 - v1 * u2
-        # Nothing is left of it but rounding errors of what is a float32 in files.
+        # Areas this small are rounding errors of the float32 coordinates in files.
         flat = np.abs(area) <= 2.0**-22 * (np.abs(u1 * v2) + np.abs(v1 * u2))
         hand = np.where(flat, 0, np.sign(area)).astype(np.int8)
         own = place[faces]
@@ -46,8 +46,8 @@ class Fans(NamedTuple):
         return cls(torch.from_numpy(fan), torch.from_numpy(hand), torch.from_numpy(~flat))
 
     def tangents(self, corners: Tensor, normal: Tensor, uv: Tensor) -> Tensor:
-        """(F, 3, 4) float64, differentiable: unit tangents at the corners (F, 3, 3) with normals of any length and texture
-        coordinates (F, 3, 2), and the handedness; zero where there is none."""
+        """Return unit tangents at the corners and the handedness, (F, 3, 4) float64, differentiable; zero where there is no
+        tangent. The corners are (F, 3, 3), with normals of any length and texture coordinates (F, 3, 2)."""
         n = _unit(normal.double().permute(2, 0, 1))
         p, uv = corners.double().permute(2, 0, 1).contiguous(), uv.double()
         along = tangents(corners.double(), uv)[0].T[:, :, None]
@@ -65,7 +65,8 @@ class Fans(NamedTuple):
 
 
 def tangents(corners: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Of faces with corners (N, 3, 3) and texture coordinates (N, 3, 2): ∂x/∂u times the determinant's size, and its sign."""
+    """Return ∂x/∂u times the determinant's size, and its sign, of faces with corners (N, 3, 3) and texture coordinates (N, 3,
+    2)."""
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     determinant = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])[:, None]
@@ -75,8 +76,8 @@ def tangents(corners: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=8)  # each step of a fit asks for the same
 def _fans(vertices: bytes, hands: bytes, solids: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) numbers of fans and (F,) handedness from the vertices (F, 3) int32 of faces, their handedness (F,) int8, 0 where
-    there is none, and whether they have three different corners (F,) bool: others join nothing."""
+    """Return numbers (F, 3) of fans and the handedness (F,). The input is the vertices (F, 3) int32 of faces, their handedness
+    (F,) int8, 0 where there is none, and whether they have three different corners (F,) bool: others join nothing."""
     vertex = np.frombuffer(vertices, np.int32).astype(np.int64).reshape(-1, 3)
     hand = np.frombuffer(hands, np.int8).astype(np.float64)
     face, corner, other, other_corner = _neighbours(vertex, np.frombuffer(solids, bool))
@@ -84,7 +85,7 @@ def _fans(vertices: bytes, hands: bytes, solids: bytes) -> tuple[np.ndarray, np.
     while True:
         joins = hand[face] == hand[other]
         fan = _components(vertex.size, begin[joins], end[joins])
-        # Without an area in the texture a face takes the handedness of the first fan that reaches it.
+        # A face without an area in the texture takes the handedness of the first fan that reaches it.
         open_ = np.flatnonzero((hand[face] == 0) & (hand[other] != 0))
         if not len(open_):
             break
@@ -96,7 +97,7 @@ def _fans(vertices: bytes, hands: bytes, solids: bytes) -> tuple[np.ndarray, np.
 
 
 def same_rows(rows: np.ndarray) -> np.ndarray:
-    """(N,) int64: equal numbers for equal rows (N, K)."""
+    """Return equal numbers (N,) int64 for equal rows (N, K)."""
     order = np.lexsort(rows.T)
     ordered = rows[order]
     found = np.empty(len(rows), np.int64)
@@ -105,13 +106,13 @@ def same_rows(rows: np.ndarray) -> np.ndarray:
 
 
 def _pairs(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Equal numbers from 0 for equal pairs of numbers, of which there are some 2³¹."""
+    """Return equal numbers from 0 for equal pairs of numbers, of which there are some 2³¹."""
     return np.unique(a * (int(b.max(initial=0)) + 1) + b, return_inverse=True)[1].reshape(a.shape)
 
 
 def _neighbours(vertex: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Pairs of faces that run along an edge in opposite directions, each twice: face, the corner at which its edge begins, and
-    the same of the other. Of more than two faces at an edge, each one has one partner."""
+    """Return pairs of faces that run along an edge in opposite directions, each twice. They are given as face, the corner at
+    which its edge begins, and the same of the other. Of more than two faces at an edge, each one has one partner."""
     face, corner = np.repeat(np.arange(len(vertex)), 3), np.tile(np.arange(3), len(vertex))
     begin, end = vertex[face, corner], vertex[face, (corner + 1) % 3]
     edge, runs_up = _pairs(np.minimum(begin, end), np.maximum(begin, end)), begin < end
@@ -129,7 +130,7 @@ def _neighbours(vertex: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, ...]
 
 
 def _components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(count,) the smallest number that pairs a–b connect each number with."""
+    """Return the smallest number (count,) that pairs a–b connect each number with."""
     label = np.arange(count)
     while True:
         low, high = np.minimum(label[a], label[b]), np.maximum(label[a], label[b])
@@ -141,13 +142,13 @@ def _components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Of vectors (3, …)."""
+    """Return the dot product of vectors (3, …)."""
     (a0, a1, a2), (b0, b1, b2) = a.unbind(), b.unbind()
     return a0 * b0 + a1 * b1 + a2 * b2
 
 
 def _unit(v: Tensor) -> Tensor:
-    """Vectors (3, …) with the length 1; zero, without a derivative, where they have no direction."""
+    """Return vectors (3, …) with the length 1; zero, without a derivative, where they have no direction."""
     squared = _dot(v, v)
     some = squared > 0
     return v * torch.where(some, torch.where(some, squared, 1.0).rsqrt(), 0.0)

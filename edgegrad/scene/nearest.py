@@ -24,11 +24,9 @@ class Places(NamedTuple):
     b: np.ndarray  # (N, 3) float64, barycentrics
 
 
-class Surface:
-    """All faces of a scene, for queries of the nearest point.
-
-    A tree of samples finds the faces near a point, of which the nearest point is computed. Raises ImportError without SciPy.
-    """
+class SurfaceIndex:
+    """All faces of a scene, for queries of the nearest point. A tree of samples finds the faces near a point, of which the
+    nearest point is computed. Raises ImportError without SciPy."""
 
     def __init__(self, scene: Scene) -> None:
         self.meshes = scene.meshes
@@ -48,7 +46,7 @@ class Surface:
         self._face = np.concatenate([dense.face, np.arange(len(self.triangles))])
 
     def samples(self, count: int, seed: int) -> Places:
-        """Points evenly over the area; the same seed gives the same."""
+        """Return points evenly over the area; the same seed gives the same points."""
         total = self.area.sum()
         if not total > 0.0:
             raise ValueError("mesh: expected faces with an area, got none; give a surface")
@@ -61,11 +59,11 @@ class Surface:
         return Places(np.einsum("nk,nkd->nd", b, self.triangles[face]), face, b)
 
     def rough_distance(self, points: np.ndarray) -> np.ndarray:
-        """(…,) from points (…, 3) to the nearest sample: too large by up to about the spacing of samples."""
+        """Return distances (…,) from points (…, 3) to the nearest sample: too large by up to about the spacing of samples."""
         return self._tree.query(points.reshape(-1, 3))[0].reshape(points.shape[:-1])
 
     def nearest(self, points: np.ndarray, neighbours: int = NEIGHBOURS) -> Places:
-        """The nearest points of the surface to points (N, 3)."""
+        """Return the nearest points of the surface to points (N, 3)."""
         from trimesh.triangles import closest_point, points_to_barycentric
 
         count = min(neighbours, len(self._face))
@@ -86,7 +84,7 @@ class Surface:
         return Places(position, face, np.clip(b, 0.0, 1.0))
 
     def colors(self, places: Places) -> Tensor | None:
-        """(N, C) float64: radiance, or base colours of lit meshes; None where no mesh has any."""
+        """Return radiance (N, C) float64, or base colours of lit meshes; None where no mesh has any."""
         if all(mesh.channels is None for mesh in self.meshes):
             return None
         C = max(mesh.channels or 1 for mesh in self.meshes)

@@ -11,18 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..check import (
-    MOST_ROWS,
-    as_tensor,
-    check_fields,
-    check_finite,
-    check_float,
-    check_shape,
-)
-from . import provided
-from .lights import Light
+from ..check import MOST_ROWS, as_tensor, check_fields, check_finite, check_float, check_shape
+from .environment import Environment
+from .lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
+from .material import Material, Texture
 from .mesh import Mesh
 from .mesh_light import MeshLight
+from .state import from_state, to_state
 from .tree import map_tensors, moved
 
 
@@ -30,14 +25,18 @@ from .tree import map_tensors, moved
 class Scene:
     """Meshes that hide one another, before a background.
 
-    meshes      a sequence of Mesh (or one), all with the same number of channels C
-    background  (C,) or (H, W, C) float, linear radiance where nothing is hit; black when None. An image is laid behind
-                the pixels: I = Σ samples that hit + (1 − coverage) · background
-    lights      a sequence of lights; meshes whose materials have emission are lights too, and those among `lights` join the
-                meshes. All with one channel or C
-
     With a light, or a mesh with a material, the scene is lit: meshes with a material are shaded, those without keep their
     colours for radiance. Raises TypeError or ValueError.
+
+    Parameters
+    ----------
+    meshes : Mesh or a sequence of Mesh
+        All with the same number of channels C.
+    background : (C,) or (H, W, C) float, default black
+        Linear radiance where nothing is hit. An image is laid behind the pixels: I = Σ samples that hit + (1 − coverage) ·
+        background.
+    lights : sequence of lights
+        Meshes whose materials have emission are lights, too; those among `lights` join the meshes. All have one channel or C.
     """
 
     meshes: Sequence[Mesh]
@@ -97,7 +96,7 @@ class Scene:
             check_finite("background", background)
 
     def _check_lights(self, meshes: tuple[Mesh, ...]) -> tuple[Mesh, ...]:
-        """The meshes, with those among the lights. Raises TypeError or ValueError."""
+        """Return the meshes, with those among the lights. Raises TypeError or ValueError."""
         given = (self.lights,) if isinstance(self.lights, (Light, Mesh)) else self.lights
         if not isinstance(given, Sequence):
             raise TypeError(f"lights: expected a sequence of lights, got {type(given).__name__}")
@@ -124,78 +123,96 @@ class Scene:
 
     @property
     def is_lit(self) -> bool:
-        """Whether meshes are shaded: one has a material, or there is a light."""
+        """Return whether meshes are shaded: one has a material, or there is a light."""
         return bool(self.lights) or any(mesh.material is not None for mesh in self.meshes)
 
     @property
     def is_glossy(self) -> bool:
-        """Whether a material scatters otherwise than evenly."""
+        """Return whether a material scatters otherwise than evenly."""
         return any(mesh.material is not None and mesh.material.is_glossy for mesh in self.meshes)
 
     @property
     def is_shaded(self) -> bool:
-        """Whether more than the kernel's own colours is to be seen: light, or mipmaps."""
+        """Return whether more than the kernel's own colours is visible: light, or mipmaps."""
         return self.is_lit or any(mesh.texture is not None and mesh.filter == "mipmap" for mesh in self.meshes)
 
     @property
     def textured_faces(self) -> Tensor | None:
-        """(F,) uint8 on the CPU: the faces whose colours or materials have textures; None: none have."""
+        """Return (F,) uint8 on the CPU, the faces whose colours or materials have textures; None where none have."""
         if not any(mesh.has_textures for mesh in self.meshes):
             return None
         return torch.cat([torch.full((len(m.faces),), m.has_textures, dtype=torch.uint8) for m in self.meshes])
 
     @property
     def blends(self) -> bool:
-        """Whether one sees through a mesh."""
+        """Return whether one sees through a mesh."""
         return any(mesh.blends for mesh in self.meshes)
 
     @cached_property
     def casting(self) -> tuple[Light, ...]:
-        """The lights that cast shadows, in a fixed order: those of `lights`, then the meshes that emit."""
+        """Return the lights that cast shadows, in a fixed order: those of `lights`, then the meshes that emit."""
         emitting = [m for m in self.meshes if m.material is not None and m.material.emission is not None]
         return (*(light for light in self._lights if light.casts), *map(MeshLight, emitting))
 
     @property
     def channels(self) -> int:
-        """Number of channels C; 3 for a plain scene on black."""
+        """Return the number of channels C; 3 for a plain scene on black."""
         for part in (*self.meshes, *self._lights):
             if part.channels is not None:
                 return part.channels
         return 3 if self.background is None else self.background.shape[-1]
 
     def replace(self, **fields: Any) -> Scene:
-        """This scene with some fields replaced."""
+        """Return this scene with some fields replaced."""
         check_fields(self, fields)
         return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:
-        """All meshes and lights moved together; see Mesh.transformed. Surfaces stay as bright: the intensities of points
-        and spots, which fall off with distance, grow as areas do. Of lights from all around R must be a rotation."""
+        """Return the scene with all meshes and lights moved together; see Mesh.transformed.
+
+        Surfaces stay as bright: the intensities of points and spots, which fall off with distance, grow as areas do. For lights
+        from all around R must be a rotation.
+        """
         return self.replace(
             meshes=[mesh.transformed(R, t, scale) for mesh in self.meshes],
             lights=[light.transformed(R, t, scale) for light in self._lights],
         )
 
     def to(self, *args: Any, **kwargs: Any) -> Scene:
-        """All tensors moved to a device or dtype, as `torch.Tensor.to`."""
+        """Return the scene on a device or of a dtype, as `torch.Tensor.to`."""
         return moved(self, *args, **kwargs)
 
     def detach(self) -> Scene:
-        """The same scene, cut from the autograd graph."""
+        """Return the scene cut from the autograd graph."""
         return map_tensors(self, Tensor.detach)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All of the scene in nested dictionaries and lists of tensors, strings and numbers, for torch.save().
+
+        torch.load(…, weights_only=True) reads them. Tensors are detached, and share their memory with the scene's. Raises
+        TypeError for a light of a class of one's own.
+        """
+        return to_state(self, CLASSES)
+
+    @staticmethod
+    def from_state_dict(state: dict[str, Any]) -> Scene:
+        """The scene of a state_dict(), with the same tensors; none requires gradients. Raises TypeError or ValueError, which
+        name missing and unexpected keys."""
+        return from_state(state, Scene, CLASSES)
 
     def __repr__(self) -> str:
         back = "black" if self.background is None else f"background {tuple(self.background.shape)}"
         lights = "".join(f", {type(light).__name__}" for light in self.lights)
         return f"Scene({', '.join(map(repr, self.meshes))}; {back}{lights})"
 
-    def _repr_png_(self) -> bytes | None:
-        """What notebooks show; None where it cannot be drawn."""
-        return provided.picture(self)
+
+CLASSES = (
+    Scene, Mesh, Material, Texture, DirectionalLight, PointLight, SpotLight, SphericalHarmonics, Environment,
+)  # fmt: skip
 
 
 def as_scene(scene: Scene | Mesh) -> Scene:
-    """A mesh alone as a scene. Raises TypeError."""
+    """Return a mesh alone as a scene. Raises TypeError."""
     if isinstance(scene, Mesh):
         return Scene([scene])
     if not isinstance(scene, Scene):

@@ -1,8 +1,8 @@
 """Rigid motions of a mesh after which it is where it was, and poses that differ by no more than these.
 
 A symmetry S (4, 4) maps points of the mesh, in its own coordinates, onto the mesh: poses P and P · S show the same. As in BOP's
-models_info.json there are discrete ones, given one by one, and continuous ones, all rotations about an axis (Hodaň et al.,
-"BOP Challenge 2020 on 6D Object Localization", 2020).
+models_info.json there are discrete ones, given one by one, and continuous ones, all rotations about an axis (Hodaň et al., "BOP
+Challenge 2020 on 6D Object Localization", 2020).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_finite, check_positive, check_shape
+from ..check import as_double, check_positive
 
 RIGID = 1e-3  # how far R Rᵀ may be from 1: files round to a few digits
 PARALLEL = 1e-3  # sine of the angle between axes that are one
@@ -25,10 +25,14 @@ PARALLEL = 1e-3  # sine of the angle between axes that are one
 class SymmetryAxis:
     """The axis of a continuous symmetry: the mesh may be turned about it by any angle.
 
-    direction  (3,)  of any length; kept with the length 1
-    offset     (3,)  a point of the axis, in units of the mesh
+    Both tensors become float64. Raises TypeError or ValueError.
 
-    Both become float64. Raises TypeError or ValueError.
+    Parameters
+    ----------
+    direction : (3,)
+        Of any length; kept with the length 1.
+    offset : (3,), default zeros
+        A point of the axis, in units of the mesh.
     """
 
     direction: Tensor
@@ -36,16 +40,13 @@ class SymmetryAxis:
 
     def __post_init__(self) -> None:
         for name in ("direction", "offset"):
-            value = as_tensor(name, getattr(self, name), floating=True).detach().cpu().double()
-            check_shape(name, value, (3,))
-            check_finite(name, value)
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, as_double(name, getattr(self, name), (3,)).cpu())
         if not float(self.direction.norm()) > 0.0:
             raise ValueError("direction: expected a length above zero, got zeros; give the direction of the axis")
         object.__setattr__(self, "direction", self.direction / self.direction.norm())
 
     def rotations(self, angles: Tensor) -> Tensor:
-        """(N, 4, 4) about the axis by angles (N,) in radians, right-handed."""
+        """Return rotations (N, 4, 4) about the axis by angles (N,) in radians, right-handed."""
         R = about(self.direction, angles)
         return _rigid(R, self.offset - R @ self.offset)
 
@@ -61,11 +62,14 @@ class PoseError(NamedTuple):
 class Symmetries:
     """The symmetries of a mesh: each of the discrete ones, followed by a rotation about each axis.
 
-    discrete    (N, 4, 4)  rigid motions in the mesh's coordinates, for column vectors; the identity is put first where it is
-                           missing, and None is the identity alone
-    continuous  the axes. Two that are not parallel make a sphere: it may be turned in any way about their common point
-
     find_symmetries(mesh) finds them. Raises TypeError or ValueError that names the argument.
+
+    Parameters
+    ----------
+    discrete : (N, 4, 4), default the identity alone
+        Rigid motions in the mesh's coordinates, for column vectors. The identity is put first where it is missing.
+    continuous : sequence of SymmetryAxis
+        Two axes that are not parallel make a sphere: it may be turned in any way about their common point.
     """
 
     discrete: Tensor | None = None
@@ -73,9 +77,7 @@ class Symmetries:
 
     def __post_init__(self) -> None:
         given = torch.eye(4)[None] if self.discrete is None else self.discrete
-        motions = as_tensor("discrete", given, floating=True).detach().cpu().double()
-        check_shape("discrete", motions, ("N", 4, 4))
-        check_finite("discrete", motions)
+        motions = as_double("discrete", given, ("N", 4, 4)).cpu()
         for i, motion in enumerate(motions):
             R = motion[:3, :3]
             if motion[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
@@ -99,8 +101,11 @@ class Symmetries:
 
     @classmethod
     def from_bop(cls, info: Mapping[str, Any]) -> Symmetries:
-        """From an entry of BOP's models_info.json: its keys symmetries_discrete (lists of 16 numbers by rows) and
-        symmetries_continuous (objects with axis and offset); without them, the identity alone. Raises ValueError."""
+        """Return the symmetries of an entry of BOP's models_info.json.
+
+        Its keys are symmetries_discrete (lists of 16 numbers by rows) and symmetries_continuous (objects with axis and offset);
+        without them there is the identity alone. Raises ValueError.
+        """
         motions = info.get("symmetries_discrete", [])
         if any(not isinstance(one, Sequence) or len(one) != 16 for one in motions):
             raise ValueError("symmetries_discrete: expected lists of 16 numbers, 4 × 4 by rows, got something else")
@@ -112,7 +117,7 @@ class Symmetries:
         return cls(_doubles(motions).reshape(-1, 4, 4) if motions else None, axes)
 
     def to_bop(self) -> dict[str, Any]:
-        """What from_bop reads: keys for what there is, without the identity."""
+        """Return the entry that from_bop() reads: keys for what there is, without the identity."""
         found: dict[str, Any] = {}
         if len(self.motions) > 1:
             found["symmetries_discrete"] = [motion.flatten().tolist() for motion in self.motions[1:]]
@@ -124,28 +129,30 @@ class Symmetries:
 
     @property
     def motions(self) -> Tensor:
-        """(N, 4, 4) float64: `discrete`, the identity first."""
+        """Return `discrete` (N, 4, 4) float64, the identity first."""
         assert self.discrete is not None
         return self.discrete
 
     @property
     def trivial(self) -> bool:
-        """Whether there is none but the identity."""
+        """Return whether there is none but the identity."""
         return len(self.motions) == 1 and not self.continuous
 
     @property
     def spherical(self) -> bool:
-        """Whether all rotations about a point are symmetries."""
+        """Return whether all rotations about a point are symmetries."""
         return any(
             float(torch.linalg.cross(self.continuous[0].direction, axis.direction).norm()) > PARALLEL
             for axis in self.continuous[1:]
         )
 
     def transforms(self, step: float = 0.01) -> Tensor:
-        """(T, 4, 4): all of them, continuous ones in ⌈π / step⌉ equal angles each, so that between two of them no point moves by
-        more than `step` of the object's diameter. In the order, and with the angles, of BOP's own toolkit: where there are axes,
-        each discrete one followed by the rotations about each axis. Of a sphere therefore only the rotations about its axes;
-        closest() knows all of them. Raises ValueError."""
+        """Return all symmetries (T, 4, 4), continuous ones in ⌈π / step⌉ equal angles each.
+
+        Between two angles no point moves by more than `step` of the object's diameter. The order and the angles are those of
+        BOP's own toolkit: where there are axes, each discrete one is followed by the rotations about each axis. Of a sphere
+        there are therefore only the rotations about its axes; closest() knows all of them. Raises ValueError.
+        """
         check_positive("step", step, least=1e-4, most=1.0)
         if not self.continuous:
             return self.motions.clone()
@@ -155,14 +162,17 @@ class Symmetries:
         return (turns[None] @ self.motions[:, None]).reshape(-1, 4, 4)
 
     def closest(self, pose: object, reference: object) -> Tensor:
-        """(4, 4) float64: of all poses that show the same as `pose`, the one whose rotation is nearest to the reference's.
+        """Return the pose (4, 4) float64 whose rotation is nearest to the reference's, of all poses that show the same as
+        `pose`.
 
-        pose, reference  mesh to world, (4, 4) for column vectors, a scale included or not; or what has such a `matrix`, as
-                         PoseFit. Of poses that are as near as each other, the first.
+        It is exact for continuous symmetries, too: with A and B the rotations of both, the trace of Bᵀ A S is a sine of the
+        angle about the axis. All symmetries keep one point of the mesh where it is, so no pose is nearer by its translation
+        alone. Of poses that are equally near the first is returned. Raises TypeError or ValueError.
 
-        Exact for continuous symmetries too: with A and B the rotations of both, the trace of Bᵀ A S is a sine of the angle
-        about the axis. All symmetries keep one point of the mesh where it is, so no pose is nearer by its translation alone.
-        Raises TypeError or ValueError.
+        Parameters
+        ----------
+        pose, reference : (4, 4), or an object with such a `matrix`, as PoseFit
+            Mesh to world for column vectors; a scale may be included.
         """
         P, Q = _pose("pose", pose), _pose("reference", reference)
         if self.spherical:
@@ -184,17 +194,18 @@ class Symmetries:
         return P @ motions[best]
 
     def error(self, pose: object, reference: object) -> PoseError:
-        """How far the closest() of the equivalent poses is from the reference. Raises TypeError or ValueError."""
+        """Return how far the closest() of the equivalent poses is from the reference. Raises TypeError or ValueError."""
         P, Q = self.closest(pose, reference), _pose("reference", reference)
         R = Q[:3, :3].T @ P[:3, :3]
         R = R / torch.linalg.det(R) ** (1.0 / 3.0)
-        # By the sine and the cosine, for the cosine alone has no digits near 0.
+        # The sine is needed, too, because the cosine alone has no digits near 0.
         sine = 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]).norm()
         angle = math.atan2(float(sine), float(0.5 * (R.trace() - 1.0)))
         return PoseError(math.degrees(angle), float((P[:3, 3] - Q[:3, 3]).norm()))
 
     def scaled(self, factor: float) -> Symmetries:
-        """Those of the mesh in other units: of a mesh in mm, `scaled(0.001)` are those in m. Raises ValueError."""
+        """Return the symmetries of the mesh in other units: of a mesh in mm, `scaled(0.001)` are those in m. Raises
+        ValueError."""
         check_positive("factor", factor, least=1e-12, most=1e12)
         motions = self.motions.clone()
         motions[:, :3, 3] *= factor
@@ -208,26 +219,26 @@ class Symmetries:
 
 
 def about(axis: Tensor, angles: Tensor) -> Tensor:
-    """(N, 3, 3) float64: rotations about a unit axis (3,) by angles (N,) in radians. Rodrigues' formula."""
+    """Return rotations (N, 3, 3) float64 about a unit axis (3,) by angles (N,) in radians, by Rodrigues' formula."""
     X = _skew(axis)
     s, c = angles.sin()[:, None, None], angles.cos()[:, None, None]
     return torch.eye(3, dtype=torch.float64) + s * X + (1.0 - c) * (X @ X)
 
 
 def _skew(a: Tensor) -> Tensor:
-    """(3, 3) with `_skew(a) @ v = a × v`."""
+    """Return the matrix (3, 3) with `_skew(a) @ v = a × v`."""
     x, y, z = a.tolist()
     return a.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _rigid(R: Tensor, t: Tensor) -> Tensor:
-    """(N, 4, 4) of (N, 3, 3) and (N, 3)."""
+    """Return (N, 4, 4) of (N, 3, 3) and (N, 3)."""
     last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(R), 1, 4)
     return torch.cat([torch.cat([R, t[:, :, None]], 2), last], 1)
 
 
 def _common_point(axes: Sequence[SymmetryAxis]) -> Tensor:
-    """(3,) nearest to all axes, by least squares of the distances: of those of a sphere its centre."""
+    """Return the point (3,) nearest to all axes, by least squares of the distances: of those of a sphere its centre."""
     one = torch.eye(3, dtype=torch.float64)
     across = [one - torch.outer(axis.direction, axis.direction) for axis in axes]
     return torch.linalg.solve(
@@ -237,9 +248,7 @@ def _common_point(axes: Sequence[SymmetryAxis]) -> Tensor:
 
 def _pose(name: str, value: object) -> Tensor:
     """(4, 4) float64. Raises TypeError or ValueError."""
-    matrix = as_tensor(name, getattr(value, "matrix", value), floating=True).detach().cpu().double()
-    check_shape(name, matrix, (4, 4))
-    check_finite(name, matrix)
+    matrix = as_double(name, getattr(value, "matrix", value), (4, 4)).cpu()
     if matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise ValueError(f"{name}: expected the last row 0, 0, 0, 1, got {matrix[3].tolist()}; is it transposed?")
     if not float(torch.linalg.det(matrix[:3, :3])) > 0.0:
@@ -248,7 +257,7 @@ def _pose(name: str, value: object) -> Tensor:
 
 
 def _doubles(value: object) -> Tensor:
-    """Numbers of a file. Raises ValueError."""
+    """Return numbers of a file. Raises ValueError."""
     try:
         return torch.tensor(value, dtype=torch.float64)
     except (TypeError, ValueError) as error:

@@ -28,7 +28,7 @@ MOST_SEGMENTS = 1 << 18
 
 
 class BorderPoints(NamedTuple):
-    """N points on borders, and what each stands for: the jump over the density by its face's area times |∇p|."""
+    """N points on borders, and what each stands for: the jump over the pdf by its face's area times |∇p|."""
 
     face: Tensor  # (N,) int64
     b: Tensor  # (N, 3) float64
@@ -49,13 +49,13 @@ class TexelBorders(NamedTuple):
     running: Tensor  # (M,) float64: the running sum of mean |jump| · dA / |∇p|
 
     @classmethod
-    def of(cls, mesh: Mesh, texture: Texture, area: Tensor, u: tuple[float, float]) -> TexelBorders | None:
-        """Of faces with these areas (F,). Numbers u in [0, 1) pick the borders, and the segments of these, that stand for all
-        where there are too many. None where no border has a jump."""
+    def from_mesh(cls, mesh: Mesh, texture: Texture, area: Tensor, u: tuple[float, float]) -> TexelBorders | None:
+        """Return the borders of faces with these areas (F,), or None where no border has a jump. Numbers u in [0, 1) pick the
+        borders, and the segments of these, that stand for all where there are too many."""
         uvs, uv_faces = coordinates(mesh, texture)
         image = texture.image.detach().cpu()
         corners = in_texels(image, uvs.detach().cpu())[uv_faces.cpu().long()]  # (F, 3, 2)
-        found = _Lines.of(corners, u[0]).segments(corners, u[1])
+        found = _BorderLines.from_corners(corners, u[0]).segments(corners, u[1])
         i, j, across = found.border, found.cell, (found.axis == 0)
         high = torch.stack([torch.where(across, i, j), torch.where(across, j, i)], 1)
         low = high - torch.stack([across.double(), 1 - across.double()], 1)
@@ -71,7 +71,7 @@ class TexelBorders(NamedTuple):
         return cls(mesh, texture, face, begin, end, axis, jump, measure[some].cumsum(0).to(uvs.device))
 
     def draw(self, u: Tensor) -> BorderPoints:
-        """From numbers u (N, 2) in [0, 1)."""
+        """Draw points from numbers u (N, 2) in [0, 1)."""
         k, _ = pick(self.running, u[:, 0])
         b = torch.lerp(self.begin[k], self.end[k], u[:, 1:2])
         jump = self.jump[k]
@@ -79,7 +79,7 @@ class TexelBorders(NamedTuple):
         return BorderPoints(self.face[k], b, self.axis[k], weight)
 
     def motion(self, points: BorderPoints) -> Tensor:
-        """(N, 1) float64 δp: zeros, whose derivatives are those of the texture's coordinates at fixed barycentrics."""
+        """Return δp (N, 1) float64: zeros, whose derivatives are those of the texture's coordinates at fixed barycentrics."""
         uvs, uv_faces = coordinates(self.mesh, self.texture)
         uv = interpolated(points.b, uvs.double()[uv_faces[points.face].long()])
         p = in_texels(self.texture.image, uv).gather(1, points.axis[:, None])
@@ -96,8 +96,8 @@ class _Segments(NamedTuple):
     share: Tensor  # (M,) float64: twice the length over |∇p|, and how many it stands for
 
 
-class _Lines(NamedTuple):
-    """Borders of faces, whole."""
+class _BorderLines(NamedTuple):
+    """Whole borders of faces."""
 
     face: Tensor  # (L,) int64
     axis: Tensor  # (L,) int64
@@ -105,7 +105,7 @@ class _Lines(NamedTuple):
     weight: Tensor  # how many one stands for
 
     @classmethod
-    def of(cls, corners: Tensor, u: float) -> _Lines:
+    def from_corners(cls, corners: Tensor, u: float) -> _BorderLines:
         faces = len(corners)
         first = corners.amin(1).ceil().T.reshape(-1)  # (2 F,), the first coordinate before the second
         count = (corners.amax(1).floor().T.reshape(-1) - first + 1).clamp(min=0)
@@ -113,7 +113,7 @@ class _Lines(NamedTuple):
         return cls(row % max(faces, 1), row // max(faces, 1), first[row] + place, weight)
 
     def segments(self, corners: Tensor, u: float) -> _Segments:
-        """Where they run through the triangles with these corners (F, 3, 2), in texels."""
+        """Return where they run through the triangles with these corners (F, 3, 2), in texels."""
         at = corners[self.face]  # (L, 3, 2)
         rows = torch.arange(len(self.face))
         p, q = at[rows, :, self.axis], at[rows, :, 1 - self.axis]  # (L, 3)
@@ -157,8 +157,8 @@ class _Lines(NamedTuple):
 
 
 def _some(count: Tensor, most: int, u: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Of so many things in each row, count (R,) float64 whole numbers: the rows (M,) and the places in them of all, or of evenly
-    spaced ones where there are more than `most`, and how many each stands for."""
+    """Return rows (M,) and places in them of things of which each row has `count` (R,), and how many things each stands for.
+    They are all, or evenly spaced ones where there are more than `most`."""
     end = count.cumsum(0)
     total = int(end[-1]) if len(end) else 0
     spacing = total / most if total > most else 1.0

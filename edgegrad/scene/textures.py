@@ -1,4 +1,4 @@
-"""Looking up images at texture coordinates."""
+"""Texture look-ups at texture coordinates."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .rows import rows_of
 
 
 def wrapped(cell: Tensor, count: int | Tensor, wrap: str) -> Tensor:
-    """Texels as they are counted in the texture, int64; `count` of them, or (N,) of textures of their own."""
+    """Return texels as they are counted in the texture, int64; of `count` texels, or (N,) of textures of their own."""
     i = cell.detach().long()
     if wrap == "repeat":
         return i % count
@@ -27,7 +27,7 @@ def bilinear(texture: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
 def bilinear_of_rows(
     texels: Tensor, first: int | Tensor, h: int | Tensor, w: int | Tensor, uv: Tensor, wraps: tuple[str, ...]
 ) -> Tensor:
-    """Of textures h by w, row by row from the row `first` of texels (M, K): of one, or (N,) of one for each point."""
+    """Interpolate textures h by w, row by row from the row `first` of texels (M, K): one, or (N,) one for each point."""
     x, y = uv[:, 0].double() * w - 0.5, (1 - uv[:, 1].double()) * h - 0.5
     x0, y0 = x.detach().floor(), y.detach().floor()
     fx, fy = (x - x0).to(texels.dtype)[:, None], (y - y0).to(texels.dtype)[:, None]
@@ -43,19 +43,19 @@ def bilinear_of_rows(
 
 
 def nearest(texture: Tensor, cell: Tensor, wraps: tuple[str, ...]) -> Tensor:
-    """Texels (N, K) of cells (N, 2), counted from the left and from the top."""
+    """Return texels (N, K) of cells (N, 2), counted from the left and from the top."""
     h, w = texture.shape[:2]
     return rows_of(texture.reshape(h * w, -1), wrapped(cell[:, 1], h, wraps[1]) * w + wrapped(cell[:, 0], w, wraps[0]))
 
 
 def in_texels(texture: Tensor, uv: Tensor) -> Tensor:
-    """(N, 2) float64: texture coordinates in texels, to the right and down."""
+    """Return texture coordinates (N, 2) float64 in texels, to the right and down."""
     h, w = texture.shape[:2]
     return torch.stack([uv[:, 0].double() * w, (1 - uv[:, 1].double()) * h], 1)
 
 
 def look_up(texture: Tensor, uv: Tensor, wraps: tuple[str, ...], filter: str) -> Tensor:
-    """(N, K) of a texture (h, w, K) at uv (N, 2): "linear", or "nearest", whose borders have no derivative."""
+    """Return (N, K) of a texture (h, w, K) at uv (N, 2): "linear", or "nearest", whose borders have no derivative."""
     if filter == "nearest":
         return nearest(texture, in_texels(texture, uv).detach().floor(), wraps)
     return bilinear(texture, uv, wraps)

@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 def tensors_in(thing: Any) -> Iterator[Tensor]:
-    """All tensors of a dataclass, and of those within."""
+    """Yield all tensors of a dataclass, and of those within."""
     if isinstance(thing, Tensor):
         yield thing
     elif isinstance(thing, (tuple, list)):
@@ -26,7 +26,7 @@ def tensors_in(thing: Any) -> Iterator[Tensor]:
 
 
 def named_tensors(thing: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
-    """All tensors with the way to them, fields and places joined by dots: "meshes.0.verts"."""
+    """Yield all tensors with their paths, fields and places joined by dots: "meshes.0.verts"."""
     dot = f"{name}." if name else ""
     if isinstance(thing, Tensor):
         yield name, thing
@@ -39,7 +39,7 @@ def named_tensors(thing: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
 
 
 def with_named(thing: T, tensors: Mapping[str, Tensor]) -> T:
-    """With the tensors of these names, as named_tensors() has them, replaced. Raises KeyError for a name that it lacks."""
+    """Replace the tensors of these names, which are named_tensors()'s. Raises KeyError for an unknown name."""
     return _with_named(thing, dict(tensors))
 
 
@@ -70,12 +70,12 @@ def _with_named(thing: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def map_tensors(thing: T, function: Callable[[Tensor], Tensor]) -> T:
-    """The dataclass with `function` of each tensor in it; itself where all are as they were."""
+    """Return the dataclass with `function` applied to each tensor in it; itself where all are unchanged."""
     return _mapped(thing, function)
 
 
 def moved(thing: T, *args: Any, **kwargs: Any) -> T:
-    """With all tensors on a device, and those of floating point also of a dtype, as torch.Tensor.to()."""
+    """Return all tensors on a device, and those of floating point also of a dtype, as torch.Tensor.to() does."""
 
     def to(tensor: Tensor) -> Tensor:
         if tensor.is_floating_point():
@@ -103,14 +103,14 @@ def _mapped(thing: Any, function: Callable[[Tensor], Tensor]) -> Any:
 
 
 def savable(thing: T) -> T:
-    """With copies of tensors that were made in torch.inference_mode(), which autograd does not save, unless that mode is on."""
+    """Copy tensors that were made in torch.inference_mode(), which autograd does not save, unless that mode is on."""
     if torch.compiler.is_compiling() or torch.is_inference_mode_enabled():
         return thing
     return _mapped(thing, lambda tensor: tensor.clone() if tensor.is_inference() else tensor)
 
 
 def to_text(thing: Any, tensors: list[Tensor]) -> str:
-    """What a dataclass is beside its tensors, which it adds to `tensors`: JSON that torch.compile can trace."""
+    """Return all of a dataclass but its tensors, which are added to `tensors`, as JSON that torch.compile can trace."""
     if isinstance(thing, Tensor):
         tensors.append(thing)
         return f'{{"tensor": {len(tensors) - 1}}}'
@@ -130,7 +130,7 @@ def to_text(thing: Any, tensors: list[Tensor]) -> str:
 
 
 def from_text(text: str, tensors: Sequence[Tensor], classes: Sequence[type]) -> Any:
-    """What to_text() was given, of dataclasses among `classes`."""
+    """Return the object that to_text() was given, of dataclasses among `classes`."""
     known = {kind.__name__: kind for kind in classes}
 
     def whole(thing: Any) -> Any:

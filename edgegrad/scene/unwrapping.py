@@ -13,13 +13,19 @@ from .mesh import Mesh
 
 
 def unwrap(mesh: Mesh, size: int = 512, gap: int = 4) -> Mesh:
-    """The mesh with texture coordinates for fit_texture(): charts of little stretch, side by side in a square, by xatlas.
-    Vertices and faces stay as they are; colours and textures are left away.
+    """Return the mesh with texture coordinates for fit_texture(): charts of little stretch, side by side in a square, by
+    xatlas.
 
-    size  texels on a side of the texture that it is for
-    gap   texels between charts, so that a texel belongs to one of them
+    Vertices and faces stay as they are; colours and textures are left away. Needs xatlas (`pip install 'edgegrad[fit]'`).
+    Raises TypeError or ValueError that names the argument, ImportError.
 
-    Needs xatlas (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError that names the argument, ImportError.
+    Parameters
+    ----------
+    mesh : Mesh
+    size : int, default 512
+        Texels on a side of the texture that it is for.
+    gap : int, default 4
+        Texels between charts, so that a texel belongs to one of them.
     """
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}")

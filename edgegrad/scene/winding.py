@@ -1,4 +1,4 @@
-"""The order of the corners of faces, which says where their front is."""
+"""The order of the corners of faces, which determines their front."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from .mesh import Mesh
 
 
 def flipped(mesh: Mesh) -> Mesh:
-    """The mesh inside out: the corners of all faces in reverse order, with all that is indexed by corners, and normals negated.
-
-    A mesh that was mirrored by `transformed` has its front outside again."""
+    """Return the mesh inside out: the corners of all faces in reverse order, with all that is indexed by corners, and normals
+    negated. A mesh that was mirrored by `transformed` has its front outside again."""
 
     def reversed_rows(value: object, name: str) -> dict[str, object]:
         rows = getattr(value, name)

@@ -1,4 +1,4 @@
-// Directions in fours, in which what the derivatives of a glossy lobe have of both signs cancels.
+// Directions in antithetic sets, in which what the derivatives of a glossy lobe have of both signs cancels.
 #pragma once
 
 #include <algorithm>
@@ -11,18 +11,18 @@ namespace edgegrad {
 // A direction l to a light and its companions, by the half vector h = unit(v + l), at the angle θ from the normal n: h
 // turned by π about n, h at the angle θ' with tan θ tan θ' = α², and that one turned.
 //
-// The derivative of the density of normals D by n changes its sign with the half turn. That by α is negative for
+// The derivative of the pdf of normals D by n changes its sign with the half turn. That by α is negative for
 // tan θ < α and positive beyond; both parts have the same mass 1/(2α), and the same distribution of
 // u = 4 α² t / (α² + t)², t = tan² θ, for which there are two angles (pairs of signed parts: Zhang, Dong, Doggett and
-// Zhao 2021; Belhe et al. 2024). Both maps are their own inverse, and they commute: so normals fall into fours, and
-// whichever member is drawn, its four have the density Σ p(h_k) |dh_k / dh|.
-struct Companions {
+// Zhao 2021; Belhe et al. 2024). Both maps are their own inverse, and they commute: so normals fall into antithetic
+// sets, and whichever member is drawn, its four have the pdf Σ p(h_k) |dh_k / dh|.
+struct AntitheticSet {
     static constexpr int most = 4;
     int count = 1;
     Vec3 l[most];
     double measure[most] = {1};  // solid angle of each direction, over that of the normal of the first
 
-    Companions(Vec3 v, Vec3 n, double alpha, Vec3 first) : l{first} {
+    AntitheticSet(Vec3 v, Vec3 n, double alpha, Vec3 first) : l{first} {
         const Vec3 h = unit(v + first), sine = cross(n, h);
         const double cosine = dot(n, h), t = dot(sine, sine) / (cosine * cosine);
         if (!(cosine > 0 && t > least_tangent2)) return;  // the lobe of a normal that is turned away, or its middle

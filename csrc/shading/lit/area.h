@@ -1,4 +1,4 @@
-// Faces that emit: E = L cos θ / r² over the density by area of a point that stays at its barycentrics while they move.
+// Faces that emit: E = L cos θ / r² over the pdf by area of a point that stays at its barycentrics while they move.
 #pragma once
 
 #include "shading/lit/light.h"
@@ -22,11 +22,11 @@ struct Emitter {
     Vector<S> corner[3], away;  // from its point to the surface
     Vector<S> normal, along;    // as long as the area; the unit of `away`
     S squared, facing;
-    double sign = 1, per_density = 0;
+    double sign = 1, per_pdf = 0;
     S radiance[most_lit_channels];
 
-    bool gives() const { return plain(squared) > 0 && per_density > 0; }
-    S scale() const { return facing / (squared * S(per_density)); }
+    bool gives() const { return plain(squared) > 0 && per_pdf > 0; }
+    S scale() const { return facing / (squared * S(per_pdf)); }
 };
 template <class S>
 FacePoint<S> on_emitter(const EmissiveFaces& from, const LightPoint& p) {
@@ -48,7 +48,7 @@ Emitter<S> emitter(const std::vector<Table>& tables, const EmissiveFaces& from, 
     if (plain(o.facing) < 0) o.sign = from.two_sided ? -1 : 0;
     o.facing = S(o.sign) * o.facing;
     // Over its value, the normal as long as the area is the cosine times the Jacobian of the barycentrics.
-    o.per_density = p.density * length(plain(o.normal));
+    o.per_pdf = p.pdf * length(plain(o.normal));
     value(tables, from.emission, at, channels, o.radiance);
     return o;
 }
@@ -72,7 +72,7 @@ inline void from_faces_vjp(const std::vector<Table>& tables, const EmissiveFaces
     FacePointBar unused;
     const FacePoint<double> at = on_emitter<double>(from, p);
     value_vjp(tables, from.emission, at, channels, radiance_bar, unused, to);
-    const double facing_bar = e.sign * scale_bar / (e.squared * e.per_density);
+    const double facing_bar = e.sign * scale_bar / (e.squared * e.per_pdf);
     const Vec3 along_bar = facing_bar * e.normal - bar.l;
     const Vec3 away_bar = unit_vjp(e.away, along_bar) - 2 * scale_bar * scale / e.squared * e.away;
     y_bar += away_bar;

@@ -29,7 +29,7 @@ inline void diffuse_vjp(const Scattering<double>& s, int c, double bar, Scatteri
 template <class S>
 struct Lobe {
     Vector<S> half, sine;
-    S a2, nh, d, D;                    // α², n·h, |n × h|² + α² (n·h)², and the density of normals
+    S a2, nh, d, D;                    // α², n·h, |n × h|² + α² (n·h)², and the pdf of normals
     S nv, nl, towards, back, masking;  // Smith's term over 4 (n·v)(n·l), 1 / (2 (n·l towards + n·v back))
     S grazing, grazing5;               // (1 − v·h)⁵
 
@@ -42,7 +42,7 @@ Lobe<S> lobe(S roughness, Vector<S> v, Vector<S> n, Vector<S> l) {
     const S squared = roughness * roughness;
     const S alpha = plain(squared) < least_alpha ? S(least_alpha) : squared;
     o.a2 = alpha * alpha;
-    // Walter et al. 2007. The sine is that of a cross product: 1 − cos² would round away what a small α looks at.
+    // Walter et al. 2007. The sine is that of a cross product: 1 − cos² would round away what a small α depends on.
     o.sine = cross(n, o.half), o.nh = dot(n, o.half);
     o.d = dot(o.sine, o.sine) + o.a2 * o.nh * o.nh;
     o.D = o.a2 / (S(M_PI) * o.d * o.d);

@@ -9,7 +9,7 @@
 
 namespace edgegrad {
 
-// Above this roughness a lobe is so wide that directions drawn by it only cost (docs/performance.md).
+// Above this roughness a lobe is so wide that directions drawn by it only cost.
 constexpr double widest_lobe = 0.65;
 
 // Two unit vectors across n, and n (Duff et al. 2017, "Building an orthonormal basis, revisited").
@@ -18,7 +18,7 @@ inline Mat3 axes_around(Vec3 n) {
     return {{{1 + sign * n.x * n.x * a, sign * b, -sign * n.x}, {b, sign + n.y * n.y * a, -n.y}, n}};
 }
 
-// From numbers in [0, 1): a direction above n with the density n·l / π.
+// From numbers in [0, 1): a direction above n with the pdf n·l / π.
 inline Vec3 draw_by_cosine(Vec3 n, Vec2 u) {
     const double across = std::sqrt(u.y), phi = 2 * M_PI * u.x;
     return transposed_times(axes_around(n), {across * std::cos(phi), across * std::sin(phi), std::sqrt(1 - u.y)});
@@ -49,13 +49,13 @@ class DrawnLobe {
 
     // Where a flat mirror would look.
     Vec3 mirrored() const { return unit(2 * nv_ * n_ - v_); }
-    // One over the density there; of wide lobes all above the surface.
+    // One over the pdf there; of wide lobes all above the surface.
     double solid_angle() const {
         return exists() ? std::min(2 * M_PI * alpha_ * alpha_ * spread(), 2 * M_PI) : 2 * M_PI;
     }
 
     // By solid angle: D(h) / 2 (k n·v + √(α² + (1 − α²) (n·v)²)), k the bound.
-    double density(Vec3 l) const {
+    double pdf(Vec3 l) const {
         const Vec3 h = unit(v_ + l), sine = cross(n_, h);
         const double a2 = alpha_ * alpha_, nh = dot(n_, h), d = dot(sine, sine) + a2 * nh * nh;
         return a2 / (M_PI * d * d) / (2 * spread());

@@ -1,4 +1,5 @@
-// The points of lights that surfaces are lit by; where only derivatives are wanted, on glossy surfaces in fours.
+// The points of lights that surfaces are lit by; where only derivatives are wanted, on glossy surfaces in antithetic
+// sets.
 #pragma once
 
 #include <algorithm>
@@ -11,100 +12,100 @@ namespace edgegrad {
 
 // As Resampled, but what is drawn, weighted and kept are directions with their companions (antithetic.h): the target
 // of four is what all of them give, and each of them is lit.
-class ResampledFours {
+class ResampledAntitheticSets {
    public:
     template <class S>
-    ResampledFours(const LitScene& lit, const Lamp& lamp, const Numbers& numbers, const Surface<S>& o, int count,
-                   double dark)
-        : tables_(lit.tables), lamp_(lamp), target_(o, lit.channels, dark), lobe_(o), v_(plain(o.v)), n_(plain(o.n)) {
+    ResampledAntitheticSets(const LitScene& lit, const Light& light, const RandomNumbers& numbers, const Surface<S>& o,
+                            int count, double dark)
+        : tables_(lit.tables), light_(light), target_(o, lit.channels, dark), lobe_(o), v_(plain(o.v)), n_(plain(o.n)) {
         const double roughness = plain(o.scattering.roughness);
         alpha_ = std::max(roughness * roughness, least_alpha);
-        draw_candidates(lit, lamp, lobe_, numbers, each * count, shares_,
+        draw_candidates(lit, light, lobe_, numbers, each * count, shares_,
                         [&](const Candidate& c, bool of_lobe) { add(c.point, c.l, of_lobe); });
     }
 
-    // Writes `count` fours of points; ones that do not exist where nothing arrives.
+    // Writes `count` antithetic sets of points; ones that do not exist where nothing arrives.
     void keep(double u, int count, LightPoint* out) const {
-        std::fill(out, out + Companions::most * count, LightPoint{0, 0, 0, 0});
+        std::fill(out, out + AntitheticSet::most * count, LightPoint{0, 0, 0, 0});
         if (kept_.empty()) return;
         size_t j = 0;
-        for (int s = 0; s < count; ++s, out += Companions::most) {
+        for (int s = 0; s < count; ++s, out += AntitheticSet::most) {
             const double at = (s + u) / count * total_;
             while (j + 1 < kept_.size() && kept_[j].running <= at) ++j;
-            const Four& four = kept_[j];
-            for (int k = 0; k < Companions::most; ++k) {
-                out[k] = four.point[k];
-                const double measure = Companions::most * four.point[k].density * total_;
-                out[k].density = measure > 0 ? four.target / measure : 0;
+            const AntitheticPoints& antithetic_set = kept_[j];
+            for (int k = 0; k < AntitheticSet::most; ++k) {
+                out[k] = antithetic_set.point[k];
+                const double measure = AntitheticSet::most * antithetic_set.point[k].pdf * total_;
+                out[k].pdf = measure > 0 ? antithetic_set.target / measure : 0;
             }
         }
     }
 
    private:
     static constexpr int each = 8;  // candidates for four that are kept
-    struct Four {
-        LightPoint point[Companions::most] = {{0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}};
-        double target = 0, running = 0;  // the density of a point is the measure that it stands for
+    struct AntitheticPoints {
+        LightPoint point[AntitheticSet::most] = {{0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}};
+        double target = 0, running = 0;  // the pdf of a point is the measure that it stands for
     };
 
-    // The density of the lobe is known above the surface alone (bsdf_sampling.h): what it draws below is dropped.
+    // The pdf of the lobe is known above the surface alone (bsdf_sampling.h): what it draws below is dropped.
     void add(const LightPoint& p, Vec3 l, bool of_lobe) {
         if (of_lobe && !(dot(n_, l) > 0)) return;
-        const Companions all(v_, n_, alpha_, l);
-        Four four;
+        const AntitheticSet all(v_, n_, alpha_, l);
+        AntitheticPoints antithetic_set;
         double by_light = 0, by_lobe = 0;
         for (int k = 0; k < all.count; ++k) {
             const double measure = all.measure[k];
             if (!(measure > 0)) continue;
-            LightPoint& point = four.point[k] = k == 0 ? p : point_towards(tables_, lamp_, all.l[k]);
-            by_light += measure * point.density;
-            if (lobe_.exists() && dot(n_, all.l[k]) > 0) by_lobe += measure * lobe_.density(all.l[k]);
+            LightPoint& point = antithetic_set.point[k] = k == 0 ? p : point_towards(tables_, light_, all.l[k]);
+            by_light += measure * point.pdf;
+            if (lobe_.exists() && dot(n_, all.l[k]) > 0) by_lobe += measure * lobe_.pdf(all.l[k]);
             const double scattered = target_(all.l[k]);
-            if (scattered > 0) four.target += measure * scattered * brightness(lamp_, point);
-            point.density = measure;
+            if (scattered > 0) antithetic_set.target += measure * scattered * brightness(light_, point);
+            point.pdf = measure;
         }
-        if (!(four.target > 0)) return;
+        if (!(antithetic_set.target > 0)) return;
         by_light *= shares_.light, by_lobe *= shares_.lobe;
-        total_ += four.target * (of_lobe ? by_lobe : by_light) / (by_light * by_light + by_lobe * by_lobe);
-        four.running = total_;
-        kept_.push_back(four);
+        total_ += antithetic_set.target * (of_lobe ? by_lobe : by_light) / (by_light * by_light + by_lobe * by_lobe);
+        antithetic_set.running = total_;
+        kept_.push_back(antithetic_set);
     }
 
     const std::vector<Table>& tables_;
-    const Lamp& lamp_;
+    const Light& light_;
     Resampled::Target target_;
     DrawnLobe lobe_;
     Vec3 v_, n_;
     Shares shares_;
     double alpha_ = 0, total_ = 0;
-    std::vector<Four> kept_;
+    std::vector<AntitheticPoints> kept_;
 };
 
-// How many fours stand for one sample of a light. Where a face is seen from aside and its normal differs from the
-// shading normal n by a part of that angle, light sets behind the face within the lobe (terminator()): all derivatives
-// are noisier there, and nearly all of the noise of how such surfaces move is theirs.
+// How many antithetic sets stand for one sample of a light. Where a face is seen from aside and its normal differs from
+// the shading normal n by a part of that angle, light sets behind the face within the lobe (terminator()): all
+// derivatives are noisier there, and nearly all of the noise of how such surfaces move is theirs.
 template <class S>
-int fours_of(const Surface<S>& o) {
+int sets_of(const Surface<S>& o) {
     constexpr double aside = 0.2, part = 0.1;
     const Vec3 n = plain(o.n), g = plain(o.g), apart = cross(g, n);
     const double nv = std::max(dot(n, plain(o.v)), 0.0);
-    return nv < aside && dot(apart, apart) > part * part * nv * nv ? most_fours_for_one : fours_for_one;
+    return nv < aside && dot(apart, apart) > part * part * nv * nv ? most_sets_for_one : sets_for_one;
 }
 
 // The first `drawn` of `count` points, as if they were all.
 inline void stand_for_all(LightPoint* points, int drawn, int count) {
-    for (int s = 0; s < drawn; ++s) points[s].density *= double(drawn) / count;
+    for (int s = 0; s < drawn; ++s) points[s].pdf *= double(drawn) / count;
     std::fill(points + drawn, points + count, LightPoint{0, 0, 0, 0});
 }
 
 // Points of a sky that is the same all around, for a surface that scatters evenly: by the cosine. Direct light alone
 // keeps its even draws.
-inline void draw_even_sky(const LitScene& lit, const Lamp& lamp, const Numbers& numbers, Vec3 n, int count,
+inline void draw_even_sky(const LitScene& lit, const Light& light, const RandomNumbers& numbers, Vec3 n, int count,
                           LightPoint* out) {
-    const Numbers::Parts of_light = numbers.of_light(count);
+    const RandomNumbers::Parts of_light = numbers.of_light(count);
     for (int s = 0; s < count; ++s) {
         const Vec3 l = draw_by_cosine(n, of_light(s));
-        out[s] = point_towards(lit.tables, lamp, l), out[s].density = dot(n, l) / M_PI;
+        out[s] = point_towards(lit.tables, light, l), out[s].pdf = dot(n, l) / M_PI;
     }
 }
 
@@ -113,22 +114,22 @@ template <class S>
 void light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options,
                   const std::vector<LightSample>& lights, int64_t i, const Surface<S>& o, LightPoint* out) {
     for (size_t k = 0; k < lights.size(); k += lights[k].count) {
-        const int number = lights[k].lamp, count = lights[k].count;
-        const Lamp& lamp = lit.lamps[number];
+        const int number = lights[k].light, count = lights[k].count;
+        const Light& light = lit.lights[number];
         LightPoint* own = out + k;
-        if (options.bounces > 1 && lamp.kind == Lamp::Kind::environment && !lamp.is_image && o.scattering.lambertian &&
-            points.forced.lamp != number) {
-            draw_even_sky(lit, lamp, Numbers{lamp, uint64_t(points.seed[i])}, plain(o.n), count, own);
-        } else if (!draws_fours(lit, options, lamp)) {
+        if (options.bounces > 1 && light.kind == Light::Kind::environment && !light.is_image &&
+            o.scattering.lambertian && points.forced.light != number) {
+            draw_even_sky(lit, light, RandomNumbers{light, uint64_t(points.seed[i])}, plain(o.n), count, own);
+        } else if (!draws_antithetic(lit, options, light)) {
             light_points(lit, points, i, number, count, options.dark, o, own);
-        } else if (o.scattering.lambertian || points.forced.lamp == number) {
+        } else if (o.scattering.lambertian || points.forced.light == number) {
             light_points(lit, points, i, number, options.samples, options.dark, o, own);
             stand_for_all(own, options.samples, count);
         } else {
-            const int fours = options.samples * fours_of(o);
-            const Numbers numbers{lamp, uint64_t(points.seed[i])};
-            ResampledFours(lit, lamp, numbers, o, fours, options.dark).keep(numbers.of_choice(), fours, own);
-            stand_for_all(own, Companions::most * fours, count);
+            const int sets = options.samples * sets_of(o);
+            const RandomNumbers numbers{light, uint64_t(points.seed[i])};
+            ResampledAntitheticSets(lit, light, numbers, o, sets, options.dark).keep(numbers.of_choice(), sets, own);
+            stand_for_all(own, AntitheticSet::most * sets, count);
         }
     }
 }

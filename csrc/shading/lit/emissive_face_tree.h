@@ -1,5 +1,5 @@
 // The faces of a mesh that emits, in a tree of boxes: which of them lie in a direction. In double and ray by ray, for
-// each point of a surface asks for a few directions of its own, and what it finds decides about densities.
+// each point of a surface asks for a few directions of its own, and what it finds decides about pdfs.
 #pragma once
 
 #include <algorithm>
@@ -13,12 +13,12 @@
 
 namespace edgegrad {
 
-class LampTree {
+class EmissiveFaceTree {
    public:
     static constexpr int64_t most_faces = 1 << 16;  // of which a tree is made: it is made anew when they move
 
     // Of faces (F, 3) with vertices (V, 3), world units.
-    LampTree(const double* verts, int64_t n_verts, const int32_t* faces, int64_t n_faces) {
+    EmissiveFaceTree(const double* verts, int64_t n_verts, const int32_t* faces, int64_t n_faces) {
         const auto vertex = [&](int32_t v) { return Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]}; };
         Vec3 low = vertex(faces[0]), high = low;
         for (int64_t f = 0; f < n_faces; ++f) {
@@ -45,7 +45,7 @@ class LampTree {
     double radius() const { return radius_; }
     double size() const { return size_; }
     double area() const { return area_; }
-    // Whether all faces lie in one plane; whether they are the rim of a convex body, and look outwards.
+    // Whether all faces lie in one plane; whether they are the border of a convex body, and look outwards.
     bool is_flat() const { return flat_; }
     bool is_convex() const { return convex_; }
     // Whether most lines through the ball meet the faces: of lines that meet a convex body the share that meets one
@@ -93,7 +93,7 @@ class LampTree {
         int32_t face;
 
         Vec3 corner(int i) const { return i == 0 ? q0 : q0 + (i == 1 ? e1 : e2); }
-        // Möller and Trumbore 1997; a rounding beside the rim is on it, for the neighbour may be missed as well.
+        // Möller and Trumbore 1997; a rounding next to the border is on it, for the neighbour may be missed as well.
         bool meets(Vec3 origin, Vec3 direction, Crossing& c) const {
             constexpr double rounding = 1e-12;
             const Vec3 p = cross(direction, e2), s = origin - q0;

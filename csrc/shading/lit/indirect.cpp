@@ -48,9 +48,9 @@ namespace {
 
 // Of a path from the point at(0): the cotangent of its place on its face, as that of what does not come from nearby.
 template <class At>
-void leave_out_near(const LitScene& lit, const LitOptions& options, const Path& path, At at, const double* total_bar,
-                    const PathBuffers& found, FacePointBar& at_bar) {
-    const NearPart near(options.near);
+void leave_out_near_field(const LitScene& lit, const LitOptions& options, const Path& path, At at,
+                          const double* total_bar, const PathBuffers& found, FacePointBar& at_bar) {
+    const NearField near(options.near);
     const Surface<double>& o = at(0);
     const Vec3 d = at(1).y - o.y;
     if (!(near.share(d) > 0)) return;
@@ -74,8 +74,8 @@ void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaste
         const Path path = paths.path(i);
         path_radiance(lit, paths.lights(), path, at, total);
         double share = 1;
-        if (paths.options().only_near)
-            share = path.points > 1 ? NearPart(paths.options().near).share(at(1).y - at(0).y) : 0;
+        if (paths.options().only_near_field)
+            share = path.points > 1 ? NearField(paths.options().near).share(at(1).y - at(0).y) : 0;
         for (int c = 0; c < lit.channels; ++c) out[i * lit.channels + c] += share * total[c];
     }
 }
@@ -117,7 +117,7 @@ void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
                 path_radiance_vjp(lit, paths.lights(), path, at, bar + (first + i) * lit.channels, buffers, at_bar,
                                   chunk);
                 if (options.near > 0)
-                    leave_out_near(lit, options, path, at, bar + (first + i) * lit.channels, buffers, at_bar);
+                    leave_out_near_field(lit, options, path, at, bar + (first + i) * lit.channels, buffers, at_bar);
                 write(at_bar, places, first + i);
             }
         }
@@ -146,9 +146,9 @@ void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
                            find(dot, total);
                            for (int c = 0; c < lit.channels; ++c) out[c] = total[c].dot;
                            if (!(options.near > 0) || !dot.b || path.points < 2) continue;
-                           // Without what nearby gives as the point slides, as leave_out_near() has it.
+                           // Without what nearby gives as the point slides, as leave_out_near_field() has it.
                            const Vec3 d = paths.surface(i, 1).y - paths.surface(i, 0).y;
-                           const NearPart near(options.near);
+                           const NearField near(options.near);
                            Vec3 slid;
                            for (int k = 0; k < 3; ++k)
                                slid += dot.b[3 * (first + i) + k] * paths.surface(i, 0).frame.corner[k];

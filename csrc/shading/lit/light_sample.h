@@ -15,64 +15,64 @@ namespace edgegrad {
 
 // What arrives at y from a point of a light.
 template <class S>
-Arriving<S> arriving(const LitScene& lit, const Lamp& lamp, const LightPoint& point, Vector<S> y) {
-    switch (lamp.kind) {
-        case Lamp::Kind::directional:
-            return from_direction<S>(lit.tables, lamp, lit.channels);
-        case Lamp::Kind::environment:
-            return from_environment<S>(lit.tables, lamp, lit.channels, point);
-        case Lamp::Kind::mesh:
-            return from_faces<S>(lit.tables, lit.emitter(lamp), point, lit.channels, y);
+Arriving<S> arriving(const LitScene& lit, const Light& light, const LightPoint& point, Vector<S> y) {
+    switch (light.kind) {
+        case Light::Kind::directional:
+            return from_direction<S>(lit.tables, light, lit.channels);
+        case Light::Kind::environment:
+            return from_environment<S>(lit.tables, light, lit.channels, point);
+        case Light::Kind::mesh:
+            return from_faces<S>(lit.tables, lit.emitter(light), point, lit.channels, y);
         default:
-            return from_point<S>(lit.tables, lamp, lit.channels, y);
+            return from_point<S>(lit.tables, light, lit.channels, y);
     }
 }
-inline void arriving_vjp(const LitScene& lit, const Lamp& lamp, const LightPoint& point, Vec3 y,
+inline void arriving_vjp(const LitScene& lit, const Light& light, const LightPoint& point, Vec3 y,
                          const Arriving<double>& bar, Vec3& y_bar, Cotangents& to) {
-    switch (lamp.kind) {
-        case Lamp::Kind::directional:
-            return from_direction_vjp(lit.tables, lamp, lit.channels, bar, to);
-        case Lamp::Kind::environment:
-            return from_environment_vjp(lit.tables, lamp, lit.channels, point, bar, to);
-        case Lamp::Kind::mesh:
-            return from_faces_vjp(lit.tables, lit.emitter(lamp), point, lit.channels, y, bar, y_bar, to);
+    switch (light.kind) {
+        case Light::Kind::directional:
+            return from_direction_vjp(lit.tables, light, lit.channels, bar, to);
+        case Light::Kind::environment:
+            return from_environment_vjp(lit.tables, light, lit.channels, point, bar, to);
+        case Light::Kind::mesh:
+            return from_faces_vjp(lit.tables, lit.emitter(light), point, lit.channels, y, bar, y_bar, to);
         default:
-            return from_point_vjp(lit.tables, lamp, lit.channels, y, bar, y_bar, to);
+            return from_point_vjp(lit.tables, light, lit.channels, y, bar, y_bar, to);
     }
 }
 
 // The place of a point of a light; of one at infinity, the unit direction towards it.
-inline Vec3 place(const LitScene& lit, const Lamp& lamp, const LightPoint& p) {
+inline Vec3 place(const LitScene& lit, const Light& light, const LightPoint& p) {
     const std::vector<Table>& tables = lit.tables;
-    switch (lamp.kind) {
-        case Lamp::Kind::directional:
-            return -unit(direction_of<double>(tables, lamp));
-        case Lamp::Kind::environment:
-            return unit(Rotation<double>::of(tables, lamp).to_world(own_direction(lamp, p)));
-        case Lamp::Kind::mesh: {
-            const EmissiveFaces from = lit.emitter(lamp);
+    switch (light.kind) {
+        case Light::Kind::directional:
+            return -unit(direction_of<double>(tables, light));
+        case Light::Kind::environment:
+            return unit(Rotation<double>::of(tables, light).to_world(own_direction(light, p)));
+        case Light::Kind::mesh: {
+            const EmissiveFaces from = lit.emitter(light);
             const FacePoint<double> at = on_emitter<double>(from, p);
             Vec3 sum;
             for (int i = 0; i < 3; ++i) sum += at.b[i] * tables[lit.verts].vector_at<double>(at.vertex[i]);
             return sum;
         }
         default:
-            return tables[lamp.position].vector_at<double>(0);
+            return tables[light.position].vector_at<double>(0);
     }
 }
 
-// Uniform numbers of one point and lamp, that fill the unit square evenly over the points of a pixel, and of blocks of
+// Uniform numbers of one point and light, that fill the unit square evenly over the points of a pixel, and of blocks of
 // pixels (edgegrad/points/sobol.py). The upper half of a seed says which sequence, the lower which of its points: each
 // takes as many in a row as it has parts.
-struct Numbers {
-    const Lamp& lamp;
+struct RandomNumbers {
+    const Light& light;
     uint64_t seed;
 
     // So many numbers of one kind, by their index.
     class Parts {
        public:
-        Parts(const Numbers& of, int kind, int count)
-            : sobol_(hash(of.seed >> 32, of.lamp.stream[kind])), first_(uint32_t(of.seed) * uint32_t(count)) {}
+        Parts(const RandomNumbers& of, int kind, int count)
+            : sobol_(hash(of.seed >> 32, of.light.stream[kind])), first_(uint32_t(of.seed) * uint32_t(count)) {}
         Vec2 operator()(int j) const { return sobol_(first_ + uint32_t(j)); }
 
        private:
@@ -94,13 +94,13 @@ struct Shares {
 // asked, and says before how many of both kinds there are. by_light(numbers, add) and towards(direction, add) say what
 // they are.
 template <class ByLight, class Towards, class Add>
-void draw_candidates(const DrawnLobe& lobe, const Numbers& numbers, int all, bool ask_lobe, Shares& shares,
+void draw_candidates(const DrawnLobe& lobe, const RandomNumbers& numbers, int all, bool ask_lobe, Shares& shares,
                      ByLight by_light, Towards towards, Add add) {
     const int of_all = ask_lobe ? all / 2 : 0, others = all - of_all;
     shares.light = others, shares.lobe = of_all;
-    const Numbers::Parts of_light = numbers.of_light(others);
+    const RandomNumbers::Parts of_light = numbers.of_light(others);
     for (int j = 0; j < others; ++j) by_light(of_light(j), [&](const Candidate& c) { add(c, false); });
-    const Numbers::Parts of_lobe = numbers.of_lobe(of_all);
+    const RandomNumbers::Parts of_lobe = numbers.of_lobe(of_all);
     for (int j = 0; j < of_all; ++j) {
         const Vec2 u = of_lobe(j);
         towards(lobe.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
@@ -108,43 +108,43 @@ void draw_candidates(const DrawnLobe& lobe, const Numbers& numbers, int all, boo
 }
 // Those of an environment.
 template <class Add>
-void draw_candidates(const LitScene& lit, const Lamp& lamp, const DrawnLobe& lobe, const Numbers& numbers, int all,
-                     Shares& shares, Add add) {
-    const Rotation<double> turn = Rotation<double>::of(lit.tables, lamp);
+void draw_candidates(const LitScene& lit, const Light& light, const DrawnLobe& lobe, const RandomNumbers& numbers,
+                     int all, Shares& shares, Add add) {
+    const Rotation<double> turn = Rotation<double>::of(lit.tables, light);
     draw_candidates(
         lobe, numbers, all, lobe.exists(), shares,
         [&](Vec2 u, auto add_one) {
-            const LightPoint p = draw(lamp, u);
-            const Vec3 own = own_direction(lamp, p);
-            add_one(Candidate{p, lamp.rotation == no_table ? own : unit(turn.to_world(own)), brightness(lamp, p)});
+            const LightPoint p = draw(light, u);
+            const Vec3 own = own_direction(light, p);
+            add_one(Candidate{p, light.rotation == no_table ? own : unit(turn.to_world(own)), brightness(light, p)});
         },
         [&](Vec3 l, auto add_one) {
-            const LightPoint p = point_towards(lit.tables, lamp, l);
-            add_one(Candidate{p, l, brightness(lamp, p)});
+            const LightPoint p = point_towards(lit.tables, light, l);
+            add_one(Candidate{p, l, brightness(light, p)});
         },
         add);
 }
 
 // Points of a light, drawn by what they give to a glossy surface where nothing lies between, the target: of
 // candidates that the light and the lobe have drawn, and that the power heuristic weights (Veach and Guibas 1995),
-// `count` are kept in proportion to target / density (resampled importance sampling, Talbot et al. 2005). Their density
+// `count` are kept in proportion to target / pdf (resampled importance sampling, Talbot et al. 2005). Their pdf
 // is the target over its integral as the candidates estimate it.
 class Resampled {
    public:
     static constexpr int each = 8;  // candidates for one that is kept
 
     template <class S>
-    Resampled(const LitScene& lit, const Lamp& lamp, const Numbers& numbers, const Surface<S>& o, int count,
+    Resampled(const LitScene& lit, const Light& light, const RandomNumbers& numbers, const Surface<S>& o, int count,
               double dark)
         : target_(o, lit.channels, dark), lobe_(o) {
         kept_.reserve(each * count), running_.reserve(each * count);
         const auto add_one = [&](const Candidate& c, bool of_lobe) { add(c, of_lobe); };
-        if (lamp.kind == Lamp::Kind::environment) {
-            draw_candidates(lit, lamp, lobe_, numbers, each * count, shares_, add_one);
+        if (light.kind == Light::Kind::environment) {
+            draw_candidates(lit, light, lobe_, numbers, each * count, shares_, add_one);
         } else {
-            const MeshTowards mesh(lit, lamp, lobe_, plain(o.y), o.at.face + o.mesh->first_face);
+            const MeshTowards mesh(lit, light, lobe_, plain(o.y), o.at.face + o.mesh->first_face);
             draw_candidates(
-                lobe_, numbers, mesh.are_alike() ? count : each * count, mesh.by_lobe(), shares_,
+                lobe_, numbers, mesh.interchangeable() ? count : each * count, mesh.by_lobe(), shares_,
                 [&](Vec2 u, auto add) { mesh.draw_by_light(u, add); },
                 [&](Vec3 l, auto add) { mesh.each_towards(l, add); }, add_one);
         }
@@ -157,7 +157,7 @@ class Resampled {
         for (int s = 0; s < count; ++s) {
             const double at = (s + u) / count * total_;
             while (j + 1 < kept_.size() && running_[j] <= at) ++j;
-            out[s] = kept_[j], out[s].density /= total_;
+            out[s] = kept_[j], out[s].pdf /= total_;
         }
     }
 
@@ -193,12 +193,12 @@ class Resampled {
         if (!(c.solid_angle > 0)) return;
         const double target = target_(c.l) * c.brightness * c.solid_angle;
         if (!(target > 0)) return;
-        const double by_light = shares_.light * c.point.density,
-                     by_lobe = shares_.lobe > 0 ? shares_.lobe * lobe_.density(c.l) * c.solid_angle : 0;
+        const double by_light = shares_.light * c.point.pdf,
+                     by_lobe = shares_.lobe > 0 ? shares_.lobe * lobe_.pdf(c.l) * c.solid_angle : 0;
         const double own = of_lobe ? by_lobe : by_light;
         total_ += target * own / (by_light * by_light + by_lobe * by_lobe);
         kept_.push_back(c.point), running_.push_back(total_);
-        kept_.back().density = target;
+        kept_.back().pdf = target;
     }
 
     Target target_;
@@ -209,43 +209,42 @@ class Resampled {
     std::vector<double> running_;
 };
 
-// The points of a lamp that point i of a surface is lit by: `count` of them.
+// The points of a light that point i of a surface is lit by: `count` of them.
 template <class S>
 void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int number, int count, double dark,
                   const Surface<S>& o, LightPoint* out) {
-    const Lamp& lamp = lit.lamps[number];
+    const Light& light = lit.lights[number];
     const ForcedLight& forced = points.forced;
-    const Numbers numbers{lamp, uint64_t(points.seed[i])};
-    if (lamp.is_punctual()) {
+    const RandomNumbers numbers{light, uint64_t(points.seed[i])};
+    if (light.is_punctual()) {
         out[0] = {};
-    } else if (forced.lamp == number) {
-        std::fill(out, out + count,
-                  LightPoint{forced.index[i], forced.uv[2 * i], forced.uv[2 * i + 1], forced.density[i]});
-    } else if ((lamp.kind == Lamp::Kind::environment || lamp.tree) && !o.scattering.lambertian) {
-        Resampled(lit, lamp, numbers, o, count, dark).keep(numbers.of_choice(), count, out);
+    } else if (forced.light == number) {
+        std::fill(out, out + count, LightPoint{forced.index[i], forced.uv[2 * i], forced.uv[2 * i + 1], forced.pdf[i]});
+    } else if ((light.kind == Light::Kind::environment || light.tree) && !o.scattering.lambertian) {
+        Resampled(lit, light, numbers, o, count, dark).keep(numbers.of_choice(), count, out);
     } else {
-        const Numbers::Parts of_light = numbers.of_light(count);
+        const RandomNumbers::Parts of_light = numbers.of_light(count);
         for (int s = 0; s < count; ++s) {
-            out[s] = draw(lamp, of_light(s));
-            if (lamp.kind == Lamp::Kind::environment) out[s] = above(lit.tables, lamp, out[s], plain(o.g));
+            out[s] = draw(light, of_light(s));
+            if (light.kind == Light::Kind::environment) out[s] = above(lit.tables, light, out[s], plain(o.g));
         }
     }
 }
 
 // What one light sample adds, before it is known to be seen: f E max(0, n·l).
 template <class S>
-void add_light(const LitScene& lit, const Lamp& lamp, const LightPoint& point, double share, const Surface<S>& o,
+void add_light(const LitScene& lit, const Light& light, const LightPoint& point, double share, const Surface<S>& o,
                S* total) {
-    const Arriving<S> a = arriving<S>(lit, lamp, point, o.y);
+    const Arriving<S> a = arriving<S>(lit, light, point, o.y);
     S f[most_lit_channels];
     scatter(o.scattering, o.v, o.n, a.l, lit.channels, f);
     S cosine = S(share) * dot(o.n, a.l);
     if (!o.mesh->normal.is_flat()) cosine *= terminator<S>(o.g, o.n, a.l);
     for (int c = 0; c < lit.channels; ++c) total[c] += f[c] * a.E[c] * cosine;
 }
-inline void add_light_vjp(const LitScene& lit, const Lamp& lamp, const LightPoint& point, double share,
+inline void add_light_vjp(const LitScene& lit, const Light& light, const LightPoint& point, double share,
                           const Surface<double>& o, const double* total_bar, SurfaceBar& bar, Cotangents& to) {
-    const Arriving<double> a = arriving<double>(lit, lamp, point, o.y);
+    const Arriving<double> a = arriving<double>(lit, light, point, o.y);
     double f[most_lit_channels], f_bar[most_lit_channels];
     scatter(o.scattering, o.v, o.n, a.l, lit.channels, f);
     const double nl = dot(o.n, a.l), t = o.mesh->normal.is_flat() ? 1 : terminator<double>(o.g, o.n, a.l);
@@ -258,7 +257,7 @@ inline void add_light_vjp(const LitScene& lit, const Lamp& lamp, const LightPoin
     scatter_vjp(o.scattering, o.v, o.n, a.l, lit.channels, f_bar, bar.scattering, bar.v, bar.n, a_bar.l);
     dot_vjp(o.n, a.l, cosine_bar * share * t, bar.n, a_bar.l);
     if (!o.mesh->normal.is_flat()) terminator_vjp(o.g, o.n, a.l, cosine_bar * share * nl, bar.g, bar.n, a_bar.l);
-    arriving_vjp(lit, lamp, point, o.y, a_bar, bar.y, to);
+    arriving_vjp(lit, light, point, o.y, a_bar, bar.y, to);
 }
 
 }  // namespace edgegrad

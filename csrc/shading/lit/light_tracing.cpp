@@ -20,7 +20,7 @@ class LightPaths {
    public:
     LightPaths(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const CameraConnections& camera)
         : lit_(lit), scene_(scene), caster_(caster), camera_(camera), C_(lit.channels) {
-        for (const Lamp& lamp : lit.lamps) eps_ = std::max(eps_, lamp.eps);
+        for (const Light& light : lit.lights) eps_ = std::max(eps_, light.eps);
         filtered_ = lit.is_filtered();
     }
 
@@ -121,7 +121,7 @@ class LightPaths {
         leaving_.clear(), rays_.clear();
         for (const End& end : ends_) {
             const uint64_t seed = uint64_t(end.seed);
-            const BounceNumbers numbers(seed, k);
+            const PathRandomNumbers numbers(seed, k);
             const Vec2 choice = numbers.of_choice(seed);
             double survival = 1;
             if (k >= steps_without_roulette) {
@@ -129,11 +129,11 @@ class LightPaths {
                 if (choice.y >= survival) continue;
             }
             const Surface<double>& o = end.o;
-            const BounceDraw draw(o, C_);
+            const PathSample draw(o, C_);
             const Vec3 w = draw.draw(choice.x, numbers.of_direction(seed));
             double f[most_lit_channels];
             if (!scatters(o, w, end.in, f)) continue;
-            const double weight = dot(o.g, w) / (draw.density(w) * survival);
+            const double weight = dot(o.g, w) / (draw.pdf(w) * survival);
             if (!std::isfinite(weight)) continue;
             End& next = leaving_.emplace_back(end);
             for (int c = 0; c < C_; ++c) f[c] *= weight, next.carried[c] *= f[c], f[c] = std::fabs(f[c]);

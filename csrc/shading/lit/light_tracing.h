@@ -9,7 +9,7 @@
 //     f(i → e) B_k t (n · i) / |g · i| · |∂x/∂A|       to the camera in the direction e, per px²,
 //     B_{k+1} = f(i → w) B_k t (n · i) / |g · i| · |g · w| / p(w)     to the point that the direction w meets,
 //
-// drawn with the density p by solid angle. B is radiance times an area across the ray: what light of the radiance L
+// drawn with the pdf p by solid angle. B is radiance times an area across the ray: what light of the radiance L
 // brings through a projected area |g · i| dA has B = L |g · i| dA. The quotients are those of shading normals (Veach
 // 1996).
 #pragma once

@@ -39,14 +39,14 @@ void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& cast
                    });
 }
 
-void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int lamp,
+void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int light,
                        LightPoint* out, Team& team) {
     team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             Surface<double> o;
             set_surface<double>(lit, points.face[i], points.b + 3 * i, points.spread_at(i), o);
             if (!o.scattering.lambertian) look_up_material(lit, o);
-            light_points(lit, points, i, lamp, options.samples, options.dark, o, out + i * options.samples);
+            light_points(lit, points, i, light, options.samples, options.dark, o, out + i * options.samples);
         }
     });
 }

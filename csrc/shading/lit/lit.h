@@ -29,8 +29,8 @@ std::shared_ptr<ShadeBuffers> shade_buffers(const LitScene& lit, const LitOption
 template <class T>
 void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                 const LitOptions& options, ShadeBuffers& buffers, double* radiance, int8_t* seen);
-// The points of one lamp that these are lit by, `options.samples` for each.
-void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int lamp,
+// The points of one light that these are lit by, `options.samples` for each.
+void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int light,
                        LightPoint* out, Team& team);
 // From what shade() found. Adds to the cotangents of the tables, and writes those of the points.
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,

@@ -35,9 +35,9 @@ template <class S>
 void add_unshadowed(const LitScene& lit, const Surface<S>& o, S* total) {
     if (!o.mesh->has_material) return;
     S E[most_lit_channels];
-    for (const Lamp& lamp : lit.lamps) {
-        if (lamp.casts()) continue;
-        irradiance<S>(lit.tables, lamp, lit.channels, o.n, E);
+    for (const Light& light : lit.lights) {
+        if (light.casts()) continue;
+        irradiance<S>(lit.tables, light, lit.channels, o.n, E);
         for (int c = 0; c < lit.channels; ++c) total[c] += S(1 / M_PI) * o.scattering.diffuse(c) * E[c];
     }
 }
@@ -45,14 +45,14 @@ inline void add_unshadowed_vjp(const LitScene& lit, const Surface<double>& o, co
                                Cotangents& to) {
     if (!o.mesh->has_material) return;
     double E[most_lit_channels], E_bar[most_lit_channels];
-    for (const Lamp& lamp : lit.lamps) {
-        if (lamp.casts()) continue;
-        irradiance<double>(lit.tables, lamp, lit.channels, o.n, E);
+    for (const Light& light : lit.lights) {
+        if (light.casts()) continue;
+        irradiance<double>(lit.tables, light, lit.channels, o.n, E);
         for (int c = 0; c < lit.channels; ++c) {
             E_bar[c] = total_bar[c] / M_PI * o.scattering.diffuse(c);
             diffuse_vjp(o.scattering, c, total_bar[c] / M_PI * E[c], bar.scattering);
         }
-        irradiance_vjp(lit.tables, lamp, lit.channels, o.n, E_bar, bar.n, to);
+        irradiance_vjp(lit.tables, light, lit.channels, o.n, E_bar, bar.n, to);
     }
 }
 
@@ -61,14 +61,14 @@ template <class S>
 void add_lights(const LitScene& lit, const std::vector<LightSample>& lights, const LightPoint* points,
                 const Surface<S>& o, const int8_t* seen, S* total) {
     for (size_t k = 0; k < lights.size(); ++k)
-        if (seen[k] > 0) add_light<S>(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total);
+        if (seen[k] > 0) add_light<S>(lit, lit.lights[lights[k].light], points[k], 1.0 / lights[k].count, o, total);
 }
 inline void add_lights_vjp(const LitScene& lit, const std::vector<LightSample>& lights, const LightPoint* points,
                            const Surface<double>& o, const int8_t* seen, const double* total_bar, SurfaceBar& bar,
                            Cotangents& to) {
     for (size_t k = 0; k < lights.size(); ++k)
         if (seen[k] > 0)
-            add_light_vjp(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total_bar, bar, to);
+            add_light_vjp(lit, lit.lights[lights[k].light], points[k], 1.0 / lights[k].count, o, total_bar, bar, to);
 }
 
 template <class S>
@@ -83,7 +83,7 @@ void radiance(const LitScene& lit, const LitOptions& options, const std::vector<
 inline bool is_unlit(const LitScene& lit, const LitMesh& mesh, const int8_t* seen, size_t lights) {
     if (!mesh.has_material || mesh.emission.exists()) return false;
     return std::none_of(seen, seen + lights, [](int8_t s) { return s > 0; }) &&
-           std::all_of(lit.lamps.begin(), lit.lamps.end(), [](const Lamp& lamp) { return lamp.casts(); });
+           std::all_of(lit.lights.begin(), lit.lights.end(), [](const Light& light) { return light.casts(); });
 }
 inline void radiance_vjp(const LitScene& lit, const LitOptions& options, const std::vector<LightSample>& lights,
                          const LightPoint* points, const Surface<double>& o, const int8_t* seen,

@@ -31,7 +31,7 @@ struct LitMesh {
 struct LitScene {
     std::vector<Table> tables;
     std::vector<LitMesh> meshes;  // ascending by first face
-    std::vector<Lamp> lamps;
+    std::vector<Light> lights;
     const int32_t* faces = nullptr;  // (F, 3) rows of `verts`
     int verts = no_table;
     int eye = no_table;  // where it is; in an orthographic view, the unit direction towards it
@@ -52,17 +52,17 @@ struct LitScene {
             return std::any_of(all.begin(), all.end(), [](const Source* s) { return s->levels > 1; });
         });
     }
-    EmissiveFaces emitter(const Lamp& lamp) const {
-        const LitMesh& mesh = meshes[lamp.mesh];
+    EmissiveFaces emitter(const Light& light) const {
+        const LitMesh& mesh = meshes[light.mesh];
         return {faces, mesh.first_face, mesh.first_vertex, verts, mesh.emission, mesh.two_sided};
     }
 };
 
 // What is known of the shadow of one light, instead of being drawn and traced: a row for each point.
 struct ForcedLight {
-    int lamp = -1;  // −1: nothing
+    int light = -1;  // −1: nothing
     const int64_t* index = nullptr;
-    const double *uv = nullptr, *density = nullptr;
+    const double *uv = nullptr, *pdf = nullptr;
     const uint8_t* lit = nullptr;
 };
 
@@ -79,8 +79,8 @@ struct LitPoints {
     // So many from `first` on, or those that there are.
     LitPoints part(int64_t first, int64_t count) const {
         LitPoints o{std::min(count, size - first), face + first, b + 3 * first, seed + first, forced, spread_at(first)};
-        if (forced.lamp >= 0)
-            o.forced = {forced.lamp, forced.index + first, forced.uv + 2 * first, forced.density + first,
+        if (forced.light >= 0)
+            o.forced = {forced.light, forced.index + first, forced.uv + 2 * first, forced.pdf + first,
                         forced.lit + first};
         return o;
     }
@@ -101,16 +101,16 @@ constexpr int paths_of_point = 4;
 struct LitOptions {
     bool shadows = true;
     int samples = 1;  // points of each light with an extent, for each point that is shaded
-    int only = -1;    // the lamp of which alone radiance is wanted; −1: of all that there is
-    // Whether only derivatives are wanted: on glossy surfaces points of environments are then drawn in fours.
-    bool in_fours = false;
+    int only = -1;    // the light of which alone radiance is wanted; −1: of all that there is
+    // Whether only derivatives are wanted: on glossy surfaces points of environments are then drawn in antithetic sets.
+    bool antithetic = false;
     double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
     int bounces = 1;  // how often light is scattered on its way, at most (path.h)
     // World units, 0: none. Derivatives by where points lie on their faces, of light that is scattered more than once,
-    // are those of what does not come from nearer (near_field.h); `only_near`: values are those of what does.
+    // are those of what does not come from nearer (near_field.h); `only_near_field`: values are those of what does.
     double near = 0;
-    bool only_near = false;
-    int by_paths = -1;  // a lamp of which no points are drawn for Lambertian surfaces: paths from them find it
+    bool only_near_field = false;
+    int by_paths = -1;  // a light of which no points are drawn for Lambertian surfaces: paths from them find it
 };
 
 // Whether a point sees a light sample: 1, or 0 where it is in shadow, or that it was not asked, for the surface is
@@ -118,23 +118,23 @@ struct LitOptions {
 constexpr int8_t not_asked = -1;
 
 struct LightSample {
-    int lamp, sample, count;  // one of so many of a lamp
+    int light, sample, count;  // one of so many of a light
 };
-// What is cast for one sample of a light, where points come in fours: the image has many more points that are lit, and
-// derivatives have both signs (docs/tried.md).
-constexpr int fours_for_one = 2;
-// The most of them (fours_of() in derivative_points.h).
-constexpr int most_fours_for_one = 8;
-inline bool draws_fours(const LitScene& lit, const LitOptions& options, const Lamp& lamp) {
-    return options.in_fours && lamp.kind == Lamp::Kind::environment &&
+// What is cast for one sample of a light, where points come in antithetic sets: the image has many more points that are
+// lit, and derivatives have both signs (docs/tried.md).
+constexpr int sets_for_one = 2;
+// The most of them (sets_of() in derivative_points.h).
+constexpr int most_sets_for_one = 8;
+inline bool draws_antithetic(const LitScene& lit, const LitOptions& options, const Light& light) {
+    return options.antithetic && light.kind == Light::Kind::environment &&
            std::any_of(lit.meshes.begin(), lit.meshes.end(), [](const LitMesh& mesh) { return !mesh.lambertian; });
 }
 inline std::vector<LightSample> light_samples(const LitScene& lit, const LitOptions& options) {
     std::vector<LightSample> out;
-    for (int k = 0; k < int(lit.lamps.size()); ++k) {
-        if (!lit.lamps[k].casts() || !(options.only < 0 || options.only == k)) continue;
-        const int each = draws_fours(lit, options, lit.lamps[k]) ? most_fours_for_one * Companions::most : 1;
-        const int count = lit.lamps[k].is_punctual() ? 1 : each * options.samples;
+    for (int k = 0; k < int(lit.lights.size()); ++k) {
+        if (!lit.lights[k].casts() || !(options.only < 0 || options.only == k)) continue;
+        const int each = draws_antithetic(lit, options, lit.lights[k]) ? most_sets_for_one * AntitheticSet::most : 1;
+        const int count = lit.lights[k].is_punctual() ? 1 : each * options.samples;
         for (int s = 0; s < count; ++s) out.push_back({k, s, count});
     }
     return out;

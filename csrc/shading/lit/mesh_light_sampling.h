@@ -1,9 +1,9 @@
 // Points of a mesh that emits as a point y of a surface meets them: with the direction towards them, by how much solid
 // angle grows with area there, and what lies in a direction that a lobe has drawn.
 //
-// A direction l may pass through several faces. Each point q of them is then drawn with the density p(l) |dl/dq|, for
-// on one face l says q and q says l; so all of them are candidates, and the density of a point asks nothing about
-// others. But what surely lies behind another face of the lamp is left out, since no light comes from there.
+// A direction l may pass through several faces. Each point q of them is then drawn with the pdf p(l) |dl/dq|, for
+// on one face l says q and q says l; so all of them are candidates, and the pdf of a point asks nothing about
+// others. But what surely lies behind another face of the light is left out, since no light comes from there.
 #pragma once
 
 #include <algorithm>
@@ -22,30 +22,31 @@ struct Candidate {
     LightPoint point;
     Vec3 l;                  // unit, towards it
     double brightness = 0;   // about, but nowhere zero
-    double solid_angle = 1;  // |dl/dq| of the coordinates that its density counts
+    double solid_angle = 1;  // |dl/dq| of the coordinates that its pdf counts
 };
 
-// Whether directions are drawn by the lobe as well: where all of the lamp lies within a part of it they would only
-// miss, and far off the lobe scatters alike to all of the lamp.
-constexpr double least_lamp = 0.25;    // solid angle over that of the lobe
-constexpr double least_round = 1;      // the same of round lamps, whose own draws are better
-constexpr double farthest_lobe = 4;    // between them, in half angles of the lobe
-constexpr double smallest_lamp = 0.1;  // solid angle over that of the lobe, below which points of a flat lamp are alike
-constexpr double most_uneven = 4;      // the largest density of points over the mean, of lamps that emit about alike
+// Whether directions are drawn by the lobe as well: where all of the light lies within a part of it they would only
+// miss, and far off the lobe scatters evenly to all of the light.
+constexpr double least_emitter = 0.25;  // solid angle over that of the lobe
+constexpr double least_round = 1;       // the same of round lights, whose own draws are better
+constexpr double farthest_lobe = 4;     // between them, in half angles of the lobe
+constexpr double smallest_emitter =
+    0.1;                           // solid angle over that of the lobe, below which points of a flat light are equal
+constexpr double most_uneven = 4;  // the largest pdf of points over the mean, of lights that emit about evenly
 
-// Whether a lamp is drawn by directions to a ball around it, whose own points are drawn with such densities by area. Of
+// Whether a light is drawn by directions to a ball around it, whose own points are drawn with such pdfs by area. Of
 // these half would be seen from behind; and directions that fill a cone evenly give about the same light each.
-inline bool is_round(const LampTree& tree, const double* density, int64_t n) {
-    return tree.fills_ball() && *std::max_element(density, density + n) * tree.area() <= most_uneven;
+inline bool is_round(const EmissiveFaceTree& tree, const double* pdf, int64_t n) {
+    return tree.fills_ball() && *std::max_element(pdf, pdf + n) * tree.area() <= most_uneven;
 }
 
 class MeshTowards {
    public:
     // `own`: the surface's face, as the scene counts them.
-    MeshTowards(const LitScene& lit, const Lamp& lamp, const DrawnLobe& lobe, Vec3 y, int64_t own)
-        : lit_(lit), lamp_(lamp), from_(lit.emitter(lamp)), tree_(*lamp.tree), y_(y), own_(own - from_.first) {
+    MeshTowards(const LitScene& lit, const Light& light, const DrawnLobe& lobe, Vec3 y, int64_t own)
+        : lit_(lit), light_(light), from_(lit.emitter(light)), tree_(*light.tree), y_(y), own_(own - from_.first) {
         const double size = std::max({std::fabs(y.x), std::fabs(y.y), std::fabs(y.z), tree_.size()});
-        contact_ = 32 * lamp.eps * size;
+        contact_ = 32 * light.eps * size;
         const Vec3 to = tree_.center() - y;
         distance_ = length(to);
         if (distance_ > tree_.radius()) {
@@ -53,26 +54,26 @@ class MeshTowards {
             middle_ = (1 / distance_) * to;
         }
         by_lobe_ = is_drawn_by(lobe), by_ball_ = is_round() && !by_lobe_;
-        are_alike_ = by_ball_ || (tree_.is_flat() && solid_angle() < smallest_lamp * lobe.solid_angle());
+        interchangeable_ = by_ball_ || (tree_.is_flat() && solid_angle() < smallest_emitter * lobe.solid_angle());
         if (by_ball_) around_ = axes_around(middle_);
     }
 
     // Whether directions are drawn by the lobe as well.
     bool by_lobe() const { return by_lobe_; }
-    // Whether points that the lamp draws are so much alike that one is as good as another.
-    bool are_alike() const { return are_alike_; }
+    // Whether points that the light draws are nearly equal, so that one is as good as another.
+    bool interchangeable() const { return interchangeable_; }
 
-    // Calls found(candidate) for what the lamp draws from numbers in [0, 1).
+    // Calls found(candidate) for what the light draws from numbers in [0, 1).
     template <class Found>
     void draw_by_light(Vec2 u, Found found) const {
-        if (!by_ball_) return found(of(draw(lamp_, u)));
+        if (!by_ball_) return found(of(draw(light_, u)));
         // Uniform in the cone around the ball.
         const double z = u.y * one_minus_cosine(), across = std::sqrt(z * (2 - z)), phi = 2 * M_PI * u.x;
         const Vec3 l{across * std::cos(phi), across * std::sin(phi), 1 - z};
         each_towards(transposed_times(around_, l), found);
     }
 
-    // A point that was drawn, whatever by, with the density of the lamp's draws.
+    // A point that was drawn, whatever by, with the pdf of the light's draws.
     Candidate of(const LightPoint& p) const {
         const FacePoint<double> at = on_emitter<double>(from_, p);
         Vec3 corner[3], away = y_;
@@ -87,11 +88,11 @@ class MeshTowards {
         c.l = -unit(away);
         if (facing < 0 && (!from_.two_sided || hides_back(p, away))) return c;
         c.solid_angle = std::fabs(facing) / (area * squared * std::sqrt(squared));
-        if (by_ball_) c.point.density = c.solid_angle / solid_angle();
+        if (by_ball_) c.point.pdf = c.solid_angle / solid_angle();
         double radiance[most_lit_channels];
         value(lit_.tables, from_.emission, at, lit_.channels, radiance);
         for (int k = 0; k < lit_.channels; ++k) c.brightness += std::fabs(radiance[k]) / lit_.channels;
-        c.brightness += lamp_.brightness[0];
+        c.brightness += light_.brightness[0];
         return c;
     }
 
@@ -100,26 +101,26 @@ class MeshTowards {
     void each_towards(Vec3 l, Found found) const {
         crossings_.clear();
         double nearest = INFINITY;
-        tree_.each_crossing(y_, l, contact_, INFINITY, [&](const LampTree::Crossing& c) {
+        tree_.each_crossing(y_, l, contact_, INFINITY, [&](const EmissiveFaceTree::Crossing& c) {
             if (c.face != own_) crossings_.push_back(c), nearest = std::min(nearest, c.t);
-            return lamp_.hides ? nearest + contact_ : INFINITY;
+            return light_.hides ? nearest + contact_ : INFINITY;
         });
         // Whatever the tree's order: by distance, and of what is as far by number.
         std::sort(crossings_.begin(), crossings_.end(),
                   [](const auto& a, const auto& b) { return a.t != b.t ? a.t < b.t : a.face < b.face; });
-        for (const LampTree::Crossing& c : crossings_) {
-            if (lamp_.hides && c.t > nearest + contact_) break;
-            Candidate found_there = of({c.face, c.u, c.v, lamp_.density[c.face]});
+        for (const EmissiveFaceTree::Crossing& c : crossings_) {
+            if (light_.hides && c.t > nearest + contact_) break;
+            Candidate found_there = of({c.face, c.u, c.v, light_.pdf[c.face]});
             if (found_there.solid_angle > 0) found(found_there);
         }
     }
 
    private:
-    bool is_round() const { return lamp_.is_round && sine_ < 1; }
+    bool is_round() const { return light_.is_round && sine_ < 1; }
     bool is_drawn_by(const DrawnLobe& lobe) const {
         if (!lobe.exists()) return false;
         const double wide = lobe.solid_angle();
-        if (solid_angle() < (is_round() ? least_round : least_lamp) * wide) return false;
+        if (solid_angle() < (is_round() ? least_round : least_emitter) * wide) return false;
         const Vec3 mirrored = lobe.mirrored();
         if (sine_ >= 1) return true;
         const double half = std::acos(1 - wide / (2 * M_PI));
@@ -129,13 +130,13 @@ class MeshTowards {
     double one_minus_cosine() const { return sine_ * sine_ / (1 + cosine_); }
     double solid_angle() const { return sine_ < 1 ? 2 * M_PI * one_minus_cosine() : 4 * M_PI; }
 
-    // Whether the lamp hides a point that is seen from behind.
+    // Whether the light hides a point that is seen from behind.
     bool hides_back(const LightPoint& p, Vec3 away) const {
-        if (!lamp_.hides || tree_.is_flat()) return false;
+        if (!light_.hides || tree_.is_flat()) return false;
         if (tree_.is_convex() && sine_ < 1) return true;
         const double r = length(away);
         bool hidden = false;
-        tree_.each_crossing(y_, (-1 / r) * away, contact_, r - contact_, [&](const LampTree::Crossing& c) {
+        tree_.each_crossing(y_, (-1 / r) * away, contact_, r - contact_, [&](const EmissiveFaceTree::Crossing& c) {
             hidden |= c.face != p.index && c.face != own_;
             return hidden ? 0 : r - contact_;
         });
@@ -143,15 +144,15 @@ class MeshTowards {
     }
 
     const LitScene& lit_;
-    const Lamp& lamp_;
+    const Light& light_;
     const EmissiveFaces from_;
-    const LampTree& tree_;
+    const EmissiveFaceTree& tree_;
     Vec3 y_, middle_;
     int64_t own_;
-    double contact_, distance_, sine_ = 1, cosine_ = 0;  // of half the angle of the ball around the lamp
-    bool by_lobe_ = false, by_ball_ = false, are_alike_ = false;
+    double contact_, distance_, sine_ = 1, cosine_ = 0;  // of half the angle of the ball around the light
+    bool by_lobe_ = false, by_ball_ = false, interchangeable_ = false;
     Mat3 around_;  // axes around the direction to the middle
-    mutable std::vector<LampTree::Crossing> crossings_;
+    mutable std::vector<EmissiveFaceTree::Crossing> crossings_;
 };
 
 }  // namespace edgegrad

@@ -3,9 +3,9 @@
 //
 //     φ = (1 − d² / r²)² for d < r, else 0.
 //
-// As x₁ slides on its face with x₂ held on its own, light changes by up to 1 / d of it, and beside corners the variance
-// of that is infinite. So of what is near no such derivatives are taken: it is compared at places that lie apart
-// (edgegrad/light/sliding.py). Of the rest they are bounded by some 1 / r.
+// As x₁ slides on its face with x₂ held on its own, light changes by up to 1 / d of it, and next to corners the
+// variance of that is infinite. So of what is near no such derivatives are taken: it is compared at places that lie
+// apart (edgegrad/light/near_field.py). Of the rest they are bounded by some 1 / r.
 #pragma once
 
 #include <algorithm>
@@ -14,9 +14,9 @@
 
 namespace edgegrad {
 
-class NearPart {
+class NearField {
    public:
-    explicit NearPart(double radius) : squared_(radius * radius) {}
+    explicit NearField(double radius) : squared_(radius * radius) {}
 
     bool exists() const { return squared_ > 0; }
     // φ of a place at x₂ − x₁, and its derivative by x₂.

@@ -66,19 +66,19 @@ constexpr double faintest_normal = 1.0 / 128;
 
 // The frame of texture coordinates at the point, and what the map says in it.
 template <class S>
-struct BentNormal {
+struct MappedNormal {
     S d1 = 0, d2 = 0;                       // how v changes along the edges from the first corner
     Vector<S> e1, e2;                       // these
     double hand = 1;                        // −1 where the image is mirrored
     Vector<S> along, across, t, bitangent;  // ∂x/∂u of any length; what of it is normal to n; unit vectors
-    S bent[3], scale;
+    S mapped[3], scale;
     Vector<S> m;
     bool exists = false;
 };
 template <class S>
-BentNormal<S> bent_normal(const std::vector<Table>& tables, const NormalSource& source, const FacePoint<S>& at,
-                          const FaceFrame<Vector<S>>& frame, Vector<S> n) {
-    BentNormal<S> o;
+MappedNormal<S> mapped_normal(const std::vector<Table>& tables, const NormalSource& source, const FacePoint<S>& at,
+                              const FaceFrame<Vector<S>>& frame, Vector<S> n) {
+    MappedNormal<S> o;
     if (source.tangents.exists()) {
         S tangent[4];
         value(tables, source.tangents, at, 4, tangent);
@@ -93,18 +93,18 @@ BentNormal<S> bent_normal(const std::vector<Table>& tables, const NormalSource& 
         o.along = o.hand * (o.d2 * o.e1 - o.d1 * o.e2);
     }
     o.across = o.along - dot(n, o.along) * n;
-    value(tables, source.map, at, 3, o.bent);
-    for (S& x : o.bent) x = S(2) * x - S(1);
+    value(tables, source.map, at, 3, o.mapped);
+    for (S& x : o.mapped) x = S(2) * x - S(1);
     o.scale = tables[source.map_scale].at<S>(0);
     if (!(dot(plain(o.across), plain(o.across)) > 0)) return o;
     o.t = unit(o.across), o.bitangent = o.hand * cross(n, o.t);
-    o.m = o.scale * (o.bent[0] * o.t + o.bent[1] * o.bitangent) + o.bent[2] * n;
+    o.m = o.scale * (o.mapped[0] * o.t + o.mapped[1] * o.bitangent) + o.mapped[2] * n;
     o.exists = dot(plain(o.m), plain(o.m)) > faintest_normal * faintest_normal;
     return o;
 }
 
 // Of d2 e1 − d1 e2.
-inline void face_tangent_vjp(const Source& map, const FacePoint<double>& at, const BentNormal<double>& o, Vec3 bar,
+inline void face_tangent_vjp(const Source& map, const FacePoint<double>& at, const MappedNormal<double>& o, Vec3 bar,
                              FaceFrame<Vec3>& frame_bar, Cotangents& to) {
     frame_bar.corner[0] -= (o.d2 - o.d1) * bar;
     frame_bar.corner[1] += o.d2 * bar, frame_bar.corner[2] -= o.d1 * bar;
@@ -121,7 +121,7 @@ Vector<S> shading_normal(const std::vector<Table>& tables, const NormalSource& s
                          const FaceFrame<Vector<S>>& frame) {
     const Vector<S> n = smooth_normal(tables, source, at, frame.g).n;
     if (!source.map.exists()) return n;
-    const BentNormal<S> o = bent_normal(tables, source, at, frame, n);
+    const MappedNormal<S> o = mapped_normal(tables, source, at, frame, n);
     return o.exists ? unit(o.m) : n;
 }
 
@@ -133,17 +133,17 @@ inline void shading_normal_vjp(const std::vector<Table>& tables, const NormalSou
     const Vec3 n = smooth.n;
     Vec3 n_bar = bar;
     if (source.map.exists()) {
-        const BentNormal<double> o = bent_normal(tables, source, at, frame, n);
+        const MappedNormal<double> o = mapped_normal(tables, source, at, frame, n);
         if (o.exists) {
             const Vec3 m_bar = unit_vjp(o.m, bar);
-            const double scale_bar = dot(m_bar, o.bent[0] * o.t + o.bent[1] * o.bitangent);
+            const double scale_bar = dot(m_bar, o.mapped[0] * o.t + o.mapped[1] * o.bitangent);
             to.add(source.map_scale, 0, &scale_bar);
             double map_bar[3] = {2 * o.scale * dot(m_bar, o.t), 2 * o.scale * dot(m_bar, o.bitangent),
                                  2 * dot(m_bar, n)};
             value_vjp(tables, source.map, at, 3, map_bar, at_bar, to);
-            n_bar = o.bent[2] * m_bar;
-            Vec3 t_bar = o.scale * o.bent[0] * m_bar;
-            cross_vjp(n, o.t, o.hand * o.scale * o.bent[1] * m_bar, n_bar, t_bar);
+            n_bar = o.mapped[2] * m_bar;
+            Vec3 t_bar = o.scale * o.mapped[0] * m_bar;
+            cross_vjp(n, o.t, o.hand * o.scale * o.mapped[1] * m_bar, n_bar, t_bar);
             // across = along − n (n · along)
             const Vec3 across_bar = unit_vjp(o.across, t_bar);
             const double kept = dot(n, across_bar);

@@ -1,6 +1,6 @@
 // Paths along which light comes to points of surfaces that has been scattered before: light, xₙ, …, x₂, x₁, viewer.
 // They are drawn and found once, without derivatives; path_radiance.h says what they carry, as a function of what
-// moves. Each point x₂ … stays at the barycentrics of its face while faces move, and the densities of all draws are
+// moves. Each point x₂ … stays at the barycentrics of its face while faces move, and the pdfs of all draws are
 // constants: with paths that keep their directions instead, a moving surface would be differentiated with a bias
 // (Worchel, Finnendahl and Alexa 2025).
 //
@@ -34,10 +34,10 @@ S solid_angle(const Surface<S>& o, Vector<S> d) {
     return S(plain(facing) < 0 ? -1 : 1) * facing / (squared * sqrt(squared));
 }
 
-// A point of a lamp that the direction in which a path goes on has met. Its density, and that of points of the lamp
+// A point of a light that the direction in which a path goes on has met. Its pdf, and that of points of the light
 // that light the same point of the path, is that of both ways to draw it (the balance heuristic).
-struct MetLamp {
-    int lamp = -1;  // none
+struct EmitterHit {
+    int light = -1;  // none
     LightPoint point;
 };
 
@@ -46,20 +46,20 @@ struct MetLamp {
 struct Path {
     int points;
     const int64_t* face;
-    const double* b;        // (3,) barycentrics
-    const double* density;  // of the last two of them, as the point before draws them, times the chance to come so far
+    const double* b;    // (3,) barycentrics
+    const double* pdf;  // of the last two of them, as the point before draws them, times the chance to come so far
     const LightPoint* drawn;
     const int8_t* seen;
     size_t stride, lights;
-    const MetLamp* met;  // null: not asked
+    const EmitterHit* met;  // null: not asked
 
     int64_t face_at(int k) const { return face[k * stride]; }
     const double* b_at(int k) const { return b + 3 * k * stride; }
-    double density_at(int k) const { return density[k * stride]; }
+    double pdf_at(int k) const { return pdf[k * stride]; }
     const LightPoint* drawn_at(int k) const { return drawn + k * stride * lights; }
     const int8_t* seen_at(int k) const { return seen + k * stride * lights; }
-    bool has_met(int k) const { return met && met[k * stride].lamp >= 0; }
-    const MetLamp& met_at(int k) const { return met[k * stride]; }
+    bool has_met(int k) const { return met && met[k * stride].light >= 0; }
+    const EmitterHit& met_at(int k) const { return met[k * stride]; }
 };
 
 // The paths of some points, about shaded_at_once of them, point by point of all paths. It is kept from one call to the
@@ -67,14 +67,14 @@ struct Path {
 class Paths {
    public:
     Paths(const LitScene& lit, const LitOptions& options) : lit_(lit), options_(options), C_(lit.channels) {
-        options_.samples = 1, options_.only = -1, options_.in_fours = false;
+        options_.samples = 1, options_.only = -1, options_.antithetic = false;
         lights_ = light_samples(lit, options_);
-        lamp_of_.assign(lit.meshes.size(), -1);
-        for (int k = 0; k < int(lit.lamps.size()); ++k) {
-            const Lamp& lamp = lit.lamps[k];
-            eps_ = std::max(eps_, lamp.eps);
-            if (lamp.kind == Lamp::Kind::mesh) lamp_of_[lamp.mesh] = k;
-            if (lamp.kind == Lamp::Kind::environment && sky_ < 0) sky_ = k;
+        light_of_.assign(lit.meshes.size(), -1);
+        for (int k = 0; k < int(lit.lights.size()); ++k) {
+            const Light& light = lit.lights[k];
+            eps_ = std::max(eps_, light.eps);
+            if (light.kind == Light::Kind::mesh) light_of_[light.mesh] = k;
+            if (light.kind == Light::Kind::environment && sky_ < 0) sky_ = k;
         }
     }
 
@@ -91,13 +91,13 @@ class Paths {
         });
         go_on(scene, caster, from);
     }
-    // For an image: lights are asked for the first points, too, and lamps that paths meet count. From each point go
+    // For an image: lights are asked for the first points, too, and lights that paths meet count. From each point go
     // paths_of_point paths, path(paths_of_point · i) and those after it, of which the first has what is asked of
     // lights.
     template <class T>
     void find_whole(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
         meets_ = options_.shadows, each_ = paths_of_point;
-        by_paths_ = meets_ && sky_ >= 0 && !lit_.lamps[sky_].is_image ? sky_ : -1;
+        by_paths_ = meets_ && sky_ >= 0 && !lit_.lights[sky_].is_image ? sky_ : -1;
         find_lit(scene, caster, from, [&](int64_t i, Surface<double>& o) {
             set_surface<double>(lit_, from.face[i], from.b + 3 * i, from.spread_at(i), o);
             return true;
@@ -108,7 +108,7 @@ class Paths {
     template <class T, class Place>
     void find_lit(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Place place) {
         begin(from, place);
-        light(scene, caster, from, 0);
+        sample_lights(scene, caster, from, 0);
         go_on(scene, caster, from);
     }
 
@@ -118,7 +118,7 @@ class Paths {
         return {length_[i],
                 &face_[i],
                 &b_[3 * i],
-                density_.data() + i,
+                pdf_.data() + i,
                 drawn_.data() + i * K(),
                 seen_.data() + i * K(),
                 size_t(n_),
@@ -133,11 +133,11 @@ class Paths {
     struct Rays {
         std::vector<int64_t> index;
         std::vector<int32_t> face, hit;
-        std::vector<double> b, direction, contact, survival, density, hit_b;
+        std::vector<double> b, direction, contact, survival, pdf, hit_b;
 
         void clear() {
             index.clear(), face.clear(), b.clear(), direction.clear(), contact.clear(), survival.clear();
-            density.clear();
+            pdf.clear();
         }
     };
 
@@ -145,9 +145,9 @@ class Paths {
     void begin(const LitPoints& from, Place place) {
         n_ = from.size * each_;
         const int64_t all = n_ * options_.bounces;
-        surfaces_.resize(all), density_.resize(all), face_.resize(all), b_.resize(3 * all), seed_.resize(all);
+        surfaces_.resize(all), pdf_.resize(all), face_.resize(all), b_.resize(3 * all), seed_.resize(all);
         drawn_.resize(all * lights_.size()), seen_.resize(all * lights_.size());
-        length_.assign(n_, 0), through_.assign(n_ * C_, 1.0);
+        length_.assign(n_, 0), throughput_.assign(n_ * C_, 1.0);
         if (meets_) met_.assign(all, {});
         for (int64_t i = 0; i < from.size; ++i) {
             const int64_t first = i * each_;
@@ -172,7 +172,7 @@ class Paths {
             leave(from, k);
             if (rays_.index.empty()) break;
             arrive(scene, caster, k);
-            light(scene, caster, from, k + 1);
+            sample_lights(scene, caster, from, k + 1);
         }
     }
 
@@ -181,7 +181,7 @@ class Paths {
     // Draws where the paths go on to from their points after k steps.
     void leave(const LitPoints& from, int k) {
         rays_.clear();
-        std::optional<BounceNumbers> numbers;
+        std::optional<PathRandomNumbers> numbers;
         for (int64_t i = 0; i < n_; ++i) {
             if (length_[i] != k + 1) continue;
             const int64_t at = k * n_ + i;
@@ -191,12 +191,12 @@ class Paths {
             const Vec2 choice = numbers->of_choice(seed);
             double survival = 1;
             if (k >= steps_without_roulette) {
-                const double* through = &through_[i * C_];
-                survival = std::clamp(*std::max_element(through, through + C_), least_survival, 1.0);
+                const double* throughput = &throughput_[i * C_];
+                survival = std::clamp(*std::max_element(throughput, throughput + C_), least_survival, 1.0);
             }
-            if (meets_ && o.scattering.lambertian && (k > 0 || i % each_ == 0)) share_lamps(at, paths_at(k) * survival);
+            if (meets_ && o.scattering.lambertian && (k > 0 || i % each_ == 0)) apply_mis(at, paths_at(k) * survival);
             if (choice.y >= survival) continue;
-            const BounceDraw draw(o, C_);
+            const PathSample draw(o, C_);
             const Vec3 l = draw.draw(choice.x, numbers->of_direction(seed));
             if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
             const double size = std::max({std::fabs(o.y.x), std::fabs(o.y.y), std::fabs(o.y.z)});
@@ -204,7 +204,7 @@ class Paths {
             rays_.b.insert(rays_.b.end(), {o.at.b[1], o.at.b[2]});
             rays_.direction.insert(rays_.direction.end(), {l.x, l.y, l.z});
             rays_.contact.push_back(16 * eps_ * size), rays_.survival.push_back(survival);
-            rays_.density.push_back(draw.density(l));
+            rays_.pdf.push_back(draw.pdf(l));
         }
     }
 
@@ -230,74 +230,75 @@ class Paths {
             const Vec3 d = next.y - o.y, l = unit(d);
             const double measure = solid_angle(next, d);
             set_view(lit_, -l, next);
-            if (const int lamp = lamp_of_[next.mesh - lit_.meshes.data()];
-                meets_ && lamp >= 0 && o.scattering.lambertian) {
-                const double by_light = lit_.lamps[lamp].density[next.at.face];
-                met_[k * n_ + i] = {lamp, {next.at.face, u, v, by_light + paths_at(k) * by_area(rays_, r, next, d)}};
+            if (const int light = light_of_[next.mesh - lit_.meshes.data()];
+                meets_ && light >= 0 && o.scattering.lambertian) {
+                const double by_light = lit_.lights[light].pdf[next.at.face];
+                met_[k * n_ + i] = {light, {next.at.face, u, v, by_light + paths_at(k) * by_area(rays_, r, next, d)}};
             }
             if (!scatters(next) || !(measure > 0) || !(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
-            density_[at] = rays_.density[r] * rays_.survival[r] * measure;
+            pdf_[at] = rays_.pdf[r] * rays_.survival[r] * measure;
             length_[i] = k + 2;
             double f[most_lit_channels];
             scatter(o.scattering, o.v, o.n, l, C_, f);
-            const double weight = dot(o.n, l) / (rays_.density[r] * rays_.survival[r]);
-            for (int c = 0; c < C_; ++c) through_[i * C_ + c] *= std::fabs(f[c]) * weight;
+            const double weight = dot(o.n, l) / (rays_.pdf[r] * rays_.survival[r]);
+            for (int c = 0; c < C_; ++c) throughput_[i * C_ + c] *= std::fabs(f[c]) * weight;
         }
     }
 
     // How many draw what a point is lit by after k steps.
     int paths_at(int k) const { return k == 0 ? each_ : 1; }
 
-    // -- lamps that are found in two ways ----------------------------------------------------------------------------
+    // -- lights that are found in two ways ----------------------------------------------------------------------------
 
-    // The density of a direction by area on the lamp that it meets, d away.
-    static double by_area(double density, Vec3 normal, Vec3 d) {
+    // The pdf of a direction by area on the light that it meets, d away.
+    static double by_area(double pdf, Vec3 normal, Vec3 d) {
         const double squared = dot(d, d);
-        return density * std::fabs(dot(normal, d)) / (squared * std::sqrt(squared));
+        return pdf * std::fabs(dot(normal, d)) / (squared * std::sqrt(squared));
     }
-    static double by_area(const Rays& rays, size_t r, const Surface<double>& lamp, Vec3 d) {
-        return by_area(rays.density[r] * rays.survival[r], lamp.frame.g, d);
+    static double by_area(const Rays& rays, size_t r, const Surface<double>& light, Vec3 d) {
+        return by_area(rays.pdf[r] * rays.survival[r], light.frame.g, d);
     }
     void meet_sky(size_t r, int k) {
         const int64_t i = rays_.index[r];
         const Surface<double>& o = surfaces_[k * n_ + i];
         if (!o.scattering.lambertian) return;
         const double* l = &rays_.direction[3 * r];
-        const Lamp& lamp = lit_.lamps[sky_];
-        LightPoint p = point_towards(lit_.tables, lamp, {l[0], l[1], l[2]});
-        if (lamp.is_image) p = above(lit_.tables, lamp, p, o.g);
-        else p.density = k == 0 && by_paths_ >= 0 ? 0 : rays_.density[r];  // by the cosine as well: draw_even_sky()
-        p.density += paths_at(k) * rays_.density[r] * rays_.survival[r];
+        const Light& light = lit_.lights[sky_];
+        LightPoint p = point_towards(lit_.tables, light, {l[0], l[1], l[2]});
+        if (light.is_image) p = above(lit_.tables, light, p, o.g);
+        else p.pdf = k == 0 && by_paths_ >= 0 ? 0 : rays_.pdf[r];  // by the cosine as well: draw_even_sky()
+        p.pdf += paths_at(k) * rays_.pdf[r] * rays_.survival[r];
         met_[k * n_ + i] = {sky_, p};
     }
     // Of the points of lights that a point of a path sees.
-    void share_lamps(int64_t at, double paths) {
+    void apply_mis(int64_t at, double paths) {
         const Surface<double>& o = surfaces_[at];
         for (int64_t j = 0; j < K(); ++j) {
-            const int number = lights_[j].lamp;
-            const Lamp& lamp = lit_.lamps[number];
-            if (seen_[at * K() + j] <= 0 || !(number == sky_ || lamp.kind == Lamp::Kind::mesh)) continue;
+            const int number = lights_[j].light;
+            const Light& light = lit_.lights[number];
+            if (seen_[at * K() + j] <= 0 || !(number == sky_ || light.kind == Light::Kind::mesh)) continue;
             LightPoint& p = drawn_[at * K() + j];
-            Vec3 l = place(lit_, lamp, p);
+            Vec3 l = place(lit_, light, p);
             if (number == sky_) {
-                p.density += paths * BounceDraw(o, C_).density(l);
+                p.pdf += paths * PathSample(o, C_).pdf(l);
                 continue;
             }
-            const EmissiveFaces from = lit_.emitter(lamp);
+            const EmissiveFaces from = lit_.emitter(light);
             Vec3 corner[3];
             for (int c = 0; c < 3; ++c) corner[c] = lit_.tables[from.verts].vector_at<double>(from.vertex(p.index)[c]);
             const Vec3 d = l - o.y, normal = cross(corner[1] - corner[0], corner[2] - corner[0]);
             if (!(dot(d, d) > 0 && dot(normal, normal) > 0)) continue;
-            p.density += by_area(paths * BounceDraw(o, C_).density(unit(d)), unit(normal), d);
+            p.pdf += by_area(paths * PathSample(o, C_).pdf(unit(d)), unit(normal), d);
         }
     }
 
     // Lights the points that paths have come to after k steps.
     template <class T>
-    void light(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, int k) {
+    void sample_lights(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, int k) {
         const int64_t first = k * n_;
         for (int64_t i = 0; i < n_; ++i)
-            seed_[first + i] = BounceNumbers::of_lights(k == 0 ? uint64_t(from.seed[i / each_]) : seed_of(from, i), k);
+            seed_[first + i] =
+                PathRandomNumbers::of_lights(k == 0 ? uint64_t(from.seed[i / each_]) : seed_of(from, i), k);
         LitOptions options = options_;
         if (k == 0) options.by_paths = by_paths_;
         const LitPoints here{n_, &face_[first], &b_[3 * first], &seed_[first], {}, nullptr};
@@ -311,24 +312,24 @@ class Paths {
     const LitScene& lit_;
     LitOptions options_;
     const int C_;
-    double eps_ = 0;            // relative spacing of places
-    std::vector<int> lamp_of_;  // of each mesh, −1: none
-    int sky_ = -1;              // the lamp that paths meet in the open
-    bool meets_ = false;        // whether lamps that paths meet count
-    int each_ = 1;              // paths from one point
-    int by_paths_ = -1;         // the lamp of which these find enough there
+    double eps_ = 0;             // relative spacing of places
+    std::vector<int> light_of_;  // of each mesh, −1: none
+    int sky_ = -1;               // the light that paths meet in the open
+    bool meets_ = false;         // whether lights that paths meet count
+    int each_ = 1;               // paths from one point
+    int by_paths_ = -1;          // the light of which these find enough there
     std::vector<LightSample> lights_;
     int64_t n_ = 0;  // paths
     // Of the points of paths after no step, one step, …, and of the points of lights for each.
     std::vector<Surface<double>> surfaces_;
-    std::vector<double> density_, b_;
+    std::vector<double> pdf_, b_;
     std::vector<int64_t> face_, seed_;
     std::vector<LightPoint> drawn_;
     std::vector<int8_t> seen_;
-    std::vector<MetLamp> met_;
+    std::vector<EmitterHit> met_;
     // Of each path how many points it has, and what its end gives to its beginning.
     std::vector<int> length_;
-    std::vector<double> through_;
+    std::vector<double> throughput_;
     Rays rays_;
     ShadowRays shadow_rays_;
 };

@@ -4,7 +4,7 @@
 //     L_k = D_k + f(x_k) (n_k · l_k) |M_{k+1} · d_k| / |d_k|³ / p_{k+1} · L_{k+1},    d_k = x_{k+1} − x_k, l_k = d_k /
 //     |d_k|
 //
-// where p_{k+1} is the density of the barycentrics of x_{k+1}, and M_{k+1} the cross product of two sides of its face.
+// where p_{k+1} is the pdf of the barycentrics of x_{k+1}, and M_{k+1} the cross product of two sides of its face.
 // D₁ is left out: lit_radiance.h has it.
 #pragma once
 
@@ -22,11 +22,11 @@ struct Step {
     Vector<S> d, l;
     S f[most_lit_channels], cosine, terminated = 1, measure;
 
-    Step(const LitScene& lit, const Surface<S>& o, const Surface<S>& next, double density) {
+    Step(const LitScene& lit, const Surface<S>& o, const Surface<S>& next, double pdf) {
         d = next.y - o.y, l = unit(d), cosine = dot(o.n, l);
         scatter(o.scattering, o.v, o.n, l, lit.channels, f);
         if (!o.mesh->normal.is_flat()) terminated = terminator<S>(o.g, o.n, l);
-        measure = S(1 / density) * solid_angle(next, d);
+        measure = S(1 / pdf) * solid_angle(next, d);
     }
     S factor() const { return cosine * terminated * measure; }
 };
@@ -57,7 +57,7 @@ inline void step_vjp(const LitScene& lit, const Surface<double>& o, const Surfac
     next_bar.y += d_bar, bar.y -= d_bar;
 }
 
-// What a point scatters of direct light: by the points of lights that are drawn for it, and by the lamp that the path
+// What a point scatters of direct light: by the points of lights that are drawn for it, and by the light that the path
 // meets there.
 template <class S>
 void add_drawn(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,
@@ -67,7 +67,7 @@ void add_drawn(const LitScene& lit, const std::vector<LightSample>& lights, cons
 }
 template <class S>
 void add_met(const LitScene& lit, const Path& path, int k, const Surface<S>& o, S* total) {
-    if (path.has_met(k)) add_light(lit, lit.lamps[path.met_at(k).lamp], path.met_at(k).point, 1.0, o, total);
+    if (path.has_met(k)) add_light(lit, lit.lights[path.met_at(k).light], path.met_at(k).point, 1.0, o, total);
 }
 template <class S>
 void add_direct(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,
@@ -83,7 +83,7 @@ void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, 
     for (int k = path.points - 1; k >= 0; --k) {
         const Surface<S>& o = at(k);
         if (k + 1 < path.points) {
-            const Step<S> step(lit, o, at(k + 1), path.density_at(k + 1));
+            const Step<S> step(lit, o, at(k + 1), path.pdf_at(k + 1));
             const S factor = step.factor();
             for (int c = 0; c < C; ++c) total[c] *= step.f[c] * factor;
         }
@@ -118,7 +118,7 @@ void path_radiance_vjp(const LitScene& lit, const std::vector<LightSample>& ligh
                        const double* total_bar, PathBuffers& own, FacePointBar& at_bar, Cotangents& to) {
     const int n = path.points, C = lit.channels;
     own.steps.clear(), own.L.assign(n * C, 0.0), own.L_bar.assign(n * C, 0.0), own.bars.assign(n, SurfaceBar(C));
-    for (int k = 0; k + 1 < n; ++k) own.steps.emplace_back(lit, at(k), at(k + 1), path.density_at(k + 1));
+    for (int k = 0; k + 1 < n; ++k) own.steps.emplace_back(lit, at(k), at(k + 1), path.pdf_at(k + 1));
     for (int k = n - 1; k > 0; --k) {
         double* L = &own.L[k * C];
         if (k + 1 < n) {

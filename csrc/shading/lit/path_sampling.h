@@ -11,9 +11,9 @@
 namespace edgegrad {
 
 // By the cosine, or by the lobe of a glossy surface, in the proportion of what both send to the viewer.
-class BounceDraw {
+class PathSample {
    public:
-    BounceDraw(const Surface<double>& o, int channels) : n_(o.n), lobe_(o) {
+    PathSample(const Surface<double>& o, int channels) : n_(o.n), lobe_(o) {
         if (!lobe_.exists()) return;
         const Scattering<double>& s = o.scattering;
         const double grazing = std::pow(1 - std::clamp(dot(o.n, o.v), 0.0, 1.0), 5);
@@ -34,9 +34,9 @@ class BounceDraw {
     }
 
     // By solid angle, of a direction above the normal.
-    double density(Vec3 l) const {
+    double pdf(Vec3 l) const {
         const double cosine = dot(n_, l) / M_PI;
-        return by_lobe_ > 0 ? by_lobe_ * lobe_.density(l) + (1 - by_lobe_) * cosine : cosine;
+        return by_lobe_ > 0 ? by_lobe_ * lobe_.pdf(l) + (1 - by_lobe_) * cosine : cosine;
     }
 
    private:
@@ -50,9 +50,9 @@ class BounceDraw {
 // Uniform numbers of the points of paths that are reached after so many steps, from the seeds of the first ones. The
 // upper half of a seed says which sequences, the lower which of their points. They know nothing of each other, and each
 // is spread evenly over pixels (core/sobol.h).
-class BounceNumbers {
+class PathRandomNumbers {
    public:
-    BounceNumbers(uint64_t seed, int steps)
+    PathRandomNumbers(uint64_t seed, int steps)
         : sequence_(seed >> 32), direction_(start(direction, steps)), choice_(start(choice, steps)) {}
 
     // Whether a seed has the same sequences.

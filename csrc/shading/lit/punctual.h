@@ -6,16 +6,17 @@
 namespace edgegrad {
 
 template <class S>
-Arriving<S> from_direction(const std::vector<Table>& tables, const Lamp& lamp, int channels) {
+Arriving<S> from_direction(const std::vector<Table>& tables, const Light& light, int channels) {
     Arriving<S> o;
-    o.l = -1.0 * unit(direction_of<S>(tables, lamp));
-    power(tables, lamp, channels, o.E);
+    o.l = -1.0 * unit(direction_of<S>(tables, light));
+    power(tables, light, channels, o.E);
     return o;
 }
-inline void from_direction_vjp(const std::vector<Table>& tables, const Lamp& lamp, int channels,
+inline void from_direction_vjp(const std::vector<Table>& tables, const Light& light, int channels,
                                const Arriving<double>& bar, Cotangents& to) {
-    if (to.wants(lamp.direction)) direction_vjp(tables, lamp, -unit_vjp(direction_of<double>(tables, lamp), bar.l), to);
-    power_vjp(tables, lamp, channels, bar.E, to);
+    if (to.wants(light.direction))
+        direction_vjp(tables, light, -unit_vjp(direction_of<double>(tables, light), bar.l), to);
+    power_vjp(tables, light, channels, bar.E, to);
 }
 
 // How much of the intensity on its axis a spot has towards a point: the square of (cos θ − cos outer) / (cos inner −
@@ -29,18 +30,18 @@ struct Cone {
     S ramp() const { return x * x; }
 };
 template <class S>
-Cone<S> cone(const std::vector<Table>& tables, const Lamp& lamp, Vector<S> away) {
+Cone<S> cone(const std::vector<Table>& tables, const Light& light, Vector<S> away) {
     Cone<S> o;
-    o.direction = unit(direction_of<S>(tables, lamp)), o.away = unit(away), o.cosine = dot(o.away, o.direction);
-    o.inner = cos(tables[lamp.inner_angle].at<S>(0)), o.outer = cos(tables[lamp.outer_angle].at<S>(0));
+    o.direction = unit(direction_of<S>(tables, light)), o.away = unit(away), o.cosine = dot(o.away, o.direction);
+    o.inner = cos(tables[light.inner_angle].at<S>(0)), o.outer = cos(tables[light.outer_angle].at<S>(0));
     const S width = o.inner - o.outer;
     o.scale = S(1) / (plain(width) < least_ramp ? S(least_ramp) : width);
     o.x = clamped((o.cosine - o.outer) * o.scale, 0, 1);
     return o;
 }
-inline void cone_vjp(const std::vector<Table>& tables, const Lamp& lamp, Vec3 away, double ramp_bar, Vec3& away_bar,
+inline void cone_vjp(const std::vector<Table>& tables, const Light& light, Vec3 away, double ramp_bar, Vec3& away_bar,
                      Cotangents& to) {
-    const Cone<double> o = cone<double>(tables, lamp, away);
+    const Cone<double> o = cone<double>(tables, light, away);
     if (!(o.x > 0 && o.x < 1)) return;
     const double x_bar = 2 * o.x * ramp_bar, cosine_bar = x_bar * o.scale;
     double inner_bar = 0, outer_bar = -cosine_bar;
@@ -48,18 +49,18 @@ inline void cone_vjp(const std::vector<Table>& tables, const Lamp& lamp, Vec3 aw
         const double width_bar = -x_bar * (o.cosine - o.outer) * o.scale * o.scale;
         inner_bar += width_bar, outer_bar -= width_bar;
     }
-    inner_bar *= -std::sin(tables[lamp.inner_angle].at<double>(0));
-    outer_bar *= -std::sin(tables[lamp.outer_angle].at<double>(0));
-    to.add(lamp.inner_angle, 0, &inner_bar), to.add(lamp.outer_angle, 0, &outer_bar);
+    inner_bar *= -std::sin(tables[light.inner_angle].at<double>(0));
+    outer_bar *= -std::sin(tables[light.outer_angle].at<double>(0));
+    to.add(light.inner_angle, 0, &inner_bar), to.add(light.outer_angle, 0, &outer_bar);
     away_bar += unit_vjp(away, cosine_bar * o.direction);
-    direction_vjp(tables, lamp, unit_vjp(direction_of<double>(tables, lamp), cosine_bar * o.away), to);
+    direction_vjp(tables, light, unit_vjp(direction_of<double>(tables, light), cosine_bar * o.away), to);
 }
 
 // Zero, without a derivative, at the light itself.
 template <class S>
-Arriving<S> from_point(const std::vector<Table>& tables, const Lamp& lamp, int channels, Vector<S> y) {
+Arriving<S> from_point(const std::vector<Table>& tables, const Light& light, int channels, Vector<S> y) {
     Arriving<S> o;
-    const Vector<S> towards = tables[lamp.position].vector_at<S>(0) - y;
+    const Vector<S> towards = tables[light.position].vector_at<S>(0) - y;
     const S squared = dot(towards, towards);
     if (!(plain(squared) > 0)) {
         std::fill(o.E, o.E + channels, S(0));
@@ -67,30 +68,30 @@ Arriving<S> from_point(const std::vector<Table>& tables, const Lamp& lamp, int c
     }
     o.l = unit(towards);
     S scale = S(1) / squared;
-    if (lamp.kind == Lamp::Kind::spot) scale *= cone<S>(tables, lamp, -1.0 * towards).ramp();
-    power(tables, lamp, channels, o.E);
+    if (light.kind == Light::Kind::spot) scale *= cone<S>(tables, light, -1.0 * towards).ramp();
+    power(tables, light, channels, o.E);
     for (int c = 0; c < channels; ++c) o.E[c] *= scale;
     return o;
 }
-inline void from_point_vjp(const std::vector<Table>& tables, const Lamp& lamp, int channels, Vec3 y,
+inline void from_point_vjp(const std::vector<Table>& tables, const Light& light, int channels, Vec3 y,
                            const Arriving<double>& bar, Vec3& y_bar, Cotangents& to) {
-    const Vec3 towards = tables[lamp.position].vector_at<double>(0) - y;
+    const Vec3 towards = tables[light.position].vector_at<double>(0) - y;
     const double squared = dot(towards, towards);
     if (!(squared > 0)) return;
-    const bool spot = lamp.kind == Lamp::Kind::spot;
-    const double ramp = spot ? cone<double>(tables, lamp, -towards).ramp() : 1;
+    const bool spot = light.kind == Light::Kind::spot;
+    const double ramp = spot ? cone<double>(tables, light, -towards).ramp() : 1;
     double full[most_lit_channels], full_bar[most_lit_channels], scale_bar = 0;
-    power(tables, lamp, channels, full);
+    power(tables, light, channels, full);
     for (int c = 0; c < channels; ++c) scale_bar += bar.E[c] * full[c], full_bar[c] = bar.E[c] * ramp / squared;
-    power_vjp(tables, lamp, channels, full_bar, to);
+    power_vjp(tables, light, channels, full_bar, to);
     Vec3 towards_bar = unit_vjp(towards, bar.l) - 2 * scale_bar * ramp / (squared * squared) * towards;
     if (spot) {
         Vec3 away_bar;
-        cone_vjp(tables, lamp, -towards, scale_bar / squared, away_bar, to);
+        cone_vjp(tables, light, -towards, scale_bar / squared, away_bar, to);
         towards_bar -= away_bar;
     }
     y_bar -= towards_bar;
-    to.add(lamp.position, 0, towards_bar);
+    to.add(light.position, 0, towards_bar);
 }
 
 }  // namespace edgegrad

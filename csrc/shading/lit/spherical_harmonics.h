@@ -36,31 +36,31 @@ inline void components(DualVec3 n, Dual* out) {
 
 // E (channels,) of a surface with the unit normal n.
 template <class S>
-void irradiance(const std::vector<Table>& tables, const Lamp& lamp, int channels, Vector<S> n, S* E) {
+void irradiance(const std::vector<Table>& tables, const Light& light, int channels, Vector<S> n, S* E) {
     S own[3], Y[n_harmonics];
-    components(Rotation<S>::of(tables, lamp).from_world(n), own);
+    components(Rotation<S>::of(tables, light).from_world(n), own);
     harmonics(own[0], own[1], own[2], Y);
     for (int c = 0; c < channels; ++c) {
         E[c] = 0;
-        for (int i = 0; i < n_harmonics; ++i) E[c] += Y[i] * tables[lamp.radiance].channel<S>(i, c);
+        for (int i = 0; i < n_harmonics; ++i) E[c] += Y[i] * tables[light.radiance].channel<S>(i, c);
     }
 }
-inline void irradiance_vjp(const std::vector<Table>& tables, const Lamp& lamp, int channels, Vec3 n,
+inline void irradiance_vjp(const std::vector<Table>& tables, const Light& light, int channels, Vec3 n,
                            const double* E_bar, Vec3& n_bar, Cotangents& to) {
-    const Rotation<double> rotation = Rotation<double>::of(tables, lamp);
+    const Rotation<double> rotation = Rotation<double>::of(tables, light);
     const Vec3 own = rotation.from_world(n);
-    const Table& table = tables[lamp.radiance];
+    const Table& table = tables[light.radiance];
     double Y[n_harmonics], Y_bar[n_harmonics], row_bar[most_lit_channels];
     harmonics(own.x, own.y, own.z, Y);
     for (int i = 0; i < n_harmonics; ++i) {
         Y_bar[i] = 0;
         for (int c = 0; c < channels; ++c)
             Y_bar[i] += E_bar[c] * table.channel<double>(i, c), row_bar[c] = E_bar[c] * Y[i];
-        to.add_channels(lamp.radiance, i, table.width, channels, row_bar);
+        to.add_channels(light.radiance, i, table.width, channels, row_bar);
     }
     const Vec3 own_bar = harmonics_vjp(own, Y_bar);
     n_bar += rotation.to_world(own_bar);
-    if (lamp.rotation != no_table) rotation_vjp(lamp, n, own_bar, to);
+    if (light.rotation != no_table) rotation_vjp(light, n, own_bar, to);
 }
 
 }  // namespace edgegrad

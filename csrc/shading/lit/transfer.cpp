@@ -13,16 +13,16 @@ void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaste
     const int C = lit.channels;
     std::fill(out, out + lines.size * C, 0.0);
     std::vector<Surface<double>> receivers(lines.size);
-    const auto place = [&](int64_t i, Surface<double>& sender) {
+    const auto place = [&](int64_t i, Surface<double>& reflector) {
         Surface<double>& receiver = receivers[i];
         set_place<double>(lit, lines.receiver[i], lines.receiver_b + 3 * i, nullptr, receiver);
-        set_place<double>(lit, lines.sender[i], lines.sender_b + 3 * i, nullptr, sender);
-        const Vec3 l = unit(sender.y - receiver.y);
+        set_place<double>(lit, lines.reflector[i], lines.reflector_b + 3 * i, nullptr, reflector);
+        const Vec3 l = unit(reflector.y - receiver.y);
         set_view<double>(lit, received == Received::by_viewer ? towards_viewer<double>(lit, receiver.y) : l, receiver);
-        set_view<double>(lit, -l, sender);
+        set_view<double>(lit, -l, reflector);
         return Paths::scatters(receiver) && dot(receiver.n, l) > 0 && dot(receiver.g, l) > 0;
     };
-    paths.find_lit(scene, caster, {lines.size, lines.sender, lines.sender_b, lines.seed, {}, nullptr}, place);
+    paths.find_lit(scene, caster, {lines.size, lines.reflector, lines.reflector_b, lines.seed, {}, nullptr}, place);
     double sent[most_lit_channels], f[most_lit_channels];
     for (int64_t i = 0; i < lines.size; ++i) {
         const Path path = paths.path(i);

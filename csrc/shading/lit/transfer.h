@@ -1,5 +1,6 @@
-// Light that goes from one point of a surface to another, were nothing between them: the sender gets it from lights, or
-// by way of further surfaces. With its radiance L towards the receiver, without what it emits itself, the viewer sees
+// Light that goes from one point of a surface to another, were nothing between them: the reflector gets it from lights,
+// or by way of further surfaces. With its radiance L towards the receiver, without what it emits itself, the viewer
+// sees
 //
 //     f(v, l) L (n · l) / |g · l|
 //
@@ -15,16 +16,16 @@
 
 namespace edgegrad {
 
-// Points by face and barycentrics (N, 3), and seeds of the numbers that are drawn at senders.
+// Points by face and barycentrics (N, 3), and seeds of the numbers that are drawn at reflectors.
 struct LitLines {
     int64_t size = 0;
-    const int64_t *receiver = nullptr, *sender = nullptr;
-    const double *receiver_b = nullptr, *sender_b = nullptr;
+    const int64_t *receiver = nullptr, *reflector = nullptr;
+    const double *receiver_b = nullptr, *reflector_b = nullptr;
     const int64_t* seed = nullptr;
 };
 
 // (N, channels), of few lines on one thread: what the viewer sees, or L, that comes to the receiver from wherever it is
-// seen. `paths`: from senders, by which light is scattered so often at most as it may be up to there.
+// seen. `paths`: from reflectors, by which light is scattered so often at most as it may be up to there.
 enum class Received { by_viewer, there };
 template <class T>
 void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitLines& lines,

@@ -22,12 +22,13 @@ struct ShadowRays {
     std::vector<uint8_t> found;
 
     void clear() { face.clear(), b.clear(), to.clear(), contact.clear(), result.clear(); }
-    void add(const LitScene& lit, const Lamp& lamp, int64_t face_, const Surface<double>& o, Vec3 there, int8_t* seen) {
+    void add(const LitScene& lit, const Light& light, int64_t face_, const Surface<double>& o, Vec3 there,
+             int8_t* seen) {
         const auto largest = [](Vec3 v) { return std::max({std::fabs(v.x), std::fabs(v.y), std::fabs(v.z)}); };
         double size = largest(o.y);
-        if (lamp.is_infinite()) there = o.y + (length(o.y - lit.center) + 1.01 * lit.radius) * there;
+        if (light.is_infinite()) there = o.y + (length(o.y - lit.center) + 1.01 * lit.radius) * there;
         else size = std::max(size, largest(there));
-        face.push_back(int32_t(face_)), result.push_back(seen), contact.push_back(16 * lamp.eps * size);
+        face.push_back(int32_t(face_)), result.push_back(seen), contact.push_back(16 * light.eps * size);
         b.insert(b.end(), {o.at.b[1], o.at.b[2]}), to.insert(to.end(), {there.x, there.y, there.z});
     }
     template <class T>
@@ -67,31 +68,31 @@ void query_lights(const LitScene& lit, const SceneView<T>& scene, const RayCaste
             if (!o.scattering.lambertian) look_up_material(lit, o);
             light_points(lit, points, options, lights, i, o, query.drawn + i * K);
         }
-    // Light by light, for rays that are cast together are the faster the more alike they are.
+    // Light by light, for rays that are cast together are the faster the more similar they are.
     for (size_t k = 0; k < K; ++k) {
-        const Lamp& lamp = lit.lamps[lights[k].lamp];
-        const Vec3 only_place = lamp.is_punctual() ? place(lit, lamp, {}) : Vec3();
+        const Light& light = lit.lights[lights[k].light];
+        const Vec3 only_place = light.is_punctual() ? place(lit, light, {}) : Vec3();
         for (int64_t i = 0; i < points.size; ++i) {
             if (!wanted(i)) continue;
             const Surface<double>& o = query.surfaces[i];
             int8_t& found = query.seen[i * K + k] = not_asked;
             if (!o.mesh->has_material || o.is_black()) continue;
-            if (lights[k].lamp == options.by_paths && o.scattering.lambertian) {
+            if (lights[k].light == options.by_paths && o.scattering.lambertian) {
                 found = 0;
                 continue;
             }
             const LightPoint& point = query.drawn[i * K + k];
             if (!point.exists()) continue;
-            if (lamp.kind == Lamp::Kind::mesh &&
-                !shows(scene, lit.emitter(lamp).first + point.index, {point.u, point.v}))
-                continue;  // the lamp is cut out there
-            const Vec3 there = lamp.is_punctual() ? only_place : place(lit, lamp, point);
-            const Vec3 l = lamp.is_infinite() ? there : unit(there - o.y);
+            if (light.kind == Light::Kind::mesh &&
+                !shows(scene, lit.emitter(light).first + point.index, {point.u, point.v}))
+                continue;  // the light is alpha-tested there
+            const Vec3 there = light.is_punctual() ? only_place : place(lit, light, point);
+            const Vec3 l = light.is_infinite() ? there : unit(there - o.y);
             if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
             found = 1;
             if (!options.shadows) continue;
-            if (points.forced.lamp == lights[k].lamp) found = int8_t(points.forced.lit[i]);
-            else rays.add(lit, lamp, points.face[i], o, there, &found);
+            if (points.forced.light == lights[k].light) found = int8_t(points.forced.lit[i]);
+            else rays.add(lit, light, points.face[i], o, there, &found);
         }
     }
     rays.cast(scene, caster);

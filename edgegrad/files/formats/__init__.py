@@ -1,1 +1,1 @@
-"""What mesh and camera files hold, format by format."""
+"""Readers and writers of mesh and camera files, one format a module."""

@@ -12,14 +12,14 @@ import torch
 from ...camera.camera import Camera
 from ...optional import require
 from . import kalibr
+from .context import UnreadLog
 from .keys import image_size, matrix, note_unread, read_keys
-from .part import Fault
-from .source import Unsupported
+from .part import FormatError
 from .views import View
 
 MATRICES = ("camera_matrix", "cameraMatrix", "intrinsic", "K", "k", "M1")
 COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "dist_coeff", "distortion", "D", "d", "D1")
-# Of a stereo pair: matrices and coefficients of the first and the second camera.
+# A stereo pair has matrices and coefficients of the first and the second camera.
 PAIRS = {
     ("M1", "M2"): ("D1", "D2"),
     ("K1", "K2"): ("D1", "D2"),
@@ -27,7 +27,7 @@ PAIRS = {
 }
 SIZES = ("image_size", "imageSize", "size", "resolution")  # (width, height)
 BROWN_CONRADY, FISHEYES = ("plumb_bob", "rational_polynomial"), ("equidistant", "fisheye")
-# How the calibration was done, and what follows from the rest: rectified cameras, essential and fundamental matrices.
+# These keys describe the calibration's procedure, or follow from the rest: rectified cameras, essential matrices.
 HARMLESS = {
     "calibration_time", "nframes", "nr_of_frames", "board_width", "board_height", "square_size", "marker_size", "aspectRatio",
     "fix_aspect_ratio", "flags", "flagValue", "avg_reprojection_error", "per_view_reprojection_errors", "image_points",
@@ -37,13 +37,13 @@ HARMLESS = {
 
 
 class _Fields:
-    """A file's keys, of which those that were asked for are read."""
+    """The keys of a file, and which of them were asked for."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.values, self.read = values, set[str]()
 
     def matrix(self, *names: str) -> np.ndarray | None:
-        """Of the first name that is there."""
+        """Return the matrix of the first name that is there."""
         for name in names:
             if name in self.values:
                 self.read.add(name)
@@ -52,12 +52,12 @@ class _Fields:
         return None
 
     def number(self, *names: str) -> float:
-        """0 where it is not there."""
+        """Return a number, or 0 where it is not there."""
         self.read.update(names)
         return next((float(self.values[n]) for n in names if isinstance(self.values.get(n), (int, float))), 0.0)
 
     def size(self, otherwise: tuple[int, int] | None) -> tuple[int, int]:
-        """(H, W). Raises Fault."""
+        """Return the image size (H, W). Raises FormatError."""
         height, width = self.number("image_height", "height"), self.number("image_width", "width")
         for name in SIZES:
             pair = self.values.get(name)
@@ -67,13 +67,13 @@ class _Fields:
         if height and width:
             return image_size(width, height)
         if otherwise is None:
-            raise Fault("image_width: expected this key and image_height, got none; pass size=(height, width)")
+            raise FormatError("image_width: expected this key and image_height, got none; pass size=(height, width)")
         return otherwise
 
 
-def read(file: Path, size: tuple[int, int] | None, unread: Unsupported) -> dict[str, View]:
-    """By name: that of a matrix of a pair, of a camera of ROS or Kalibr, else "camera", or "view 0" … where the file has several
-    poses. Raises Fault, or ImportError without OpenCV or PyYAML."""
+def read(file: Path, size: tuple[int, int] | None, unread: UnreadLog) -> dict[str, View]:
+    """Return views by name: that of a matrix of a pair, of a camera of ROS or Kalibr, else "camera", or "view 0" … for several
+    poses. Raises FormatError, or ImportError without OpenCV or PyYAML."""
     values = read_keys(file)
     if kalibr.is_chain(values):
         return kalibr.read(values, unread)
@@ -82,7 +82,7 @@ def read(file: Path, size: tuple[int, int] | None, unread: Unsupported) -> dict[
     try:
         views = _single(fields, size) if pair is None else _stereo(fields, pair, file, size, unread)
     except ValueError as error:
-        raise Fault(str(error)) from error
+        raise FormatError(str(error)) from error
     known = fields.read | HARMLESS
     if "distortion_model" in values:  # of ROS, whose R and P rectify
         known |= {"R", "P", "r", "p"}
@@ -100,7 +100,7 @@ def _single(fields: _Fields, size: tuple[int, int] | None) -> dict[str, View]:
     poses = fields.matrix("extrinsic_parameters")
     poses = np.zeros((1, 6)) if poses is None else poses
     if poses.ndim != 2 or poses.shape[1] != 6:
-        raise Fault(
+        raise FormatError(
             f"extrinsic_parameters: expected (N, 6), rotation vectors and shifts, got {poses.shape}; save them so"
         )
     whole, fisheye = fields.size(size), _is_fisheye(fields)
@@ -113,14 +113,10 @@ def _single(fields: _Fields, size: tuple[int, int] | None) -> dict[str, View]:
 
 
 def _stereo(
-    fields: _Fields,
-    pair: tuple[str, str],
-    file: Path,
-    size: tuple[int, int] | None,
-    unread: Unsupported,
+    fields: _Fields, pair: tuple[str, str], file: Path, size: tuple[int, int] | None, unread: UnreadLog
 ) -> dict[str, View]:
-    """The first camera at the origin, the second by R and T: of this file, or of extrinsics beside intrinsics, as OpenCV's
-    example of stereo calibration writes them."""
+    """Return the first camera at the origin and the second at R and T. These stand in this file, or in extrinsics next to
+    intrinsics, as OpenCV's example of stereo calibration writes them."""
     places = fields
     beside = file.with_name(f"extrinsics{file.suffix}")
     if not {"R", "T"} <= fields.values.keys() and file.stem == "intrinsics" and beside.is_file():
@@ -130,7 +126,7 @@ def _stereo(
         unread.note(f"the pose of {pair[1]}", "R and T are not there, so it stands where the first does")
         R, T = np.zeros(3), np.zeros(3)
     if R.size not in (3, 9) or T.size != 3:
-        raise Fault(f"R, T: expected a rotation of 9 or 3 numbers and a shift of 3, got {R.size} and {T.size}")
+        raise FormatError(f"R, T: expected a rotation of 9 or 3 numbers and a shift of 3, got {R.size} and {T.size}")
     whole, fisheye = fields.size(size), _is_fisheye(fields)
     views = {}
     for name, coefficients, turn, shift in zip(pair, PAIRS[pair], (np.zeros(3), R), (np.zeros(3), T), strict=True):
@@ -145,32 +141,32 @@ def _lens(
     K, distortion = fields.matrix(*matrices), fields.matrix(*coefficients)
     if K is None:
         if fields.values.keys() >= {"R", "T"}:
-            raise Fault(
+            raise FormatError(
                 "expected the matrices of cameras, got how a pair stands alone; name the file of its intrinsics"
             )
         others = f", or one of {', '.join(matrices[1:])}" * (len(matrices) > 1)
-        raise Fault(
+        raise FormatError(
             f"{matrices[0]}: expected this key{others}, got {', '.join(fields.values) or 'none'}; save K by this name"
         )
     return K.reshape(3, 3) if K.size == 9 else K, distortion
 
 
 def _is_fisheye(fields: _Fields) -> bool:
-    """Raises Fault for lenses that are neither Brown and Conrady's nor a fisheye of OpenCV."""
+    """Return whether the lens is a fisheye of OpenCV, else Brown and Conrady's. Raises FormatError for others."""
     if fields.number("xi"):
-        raise Fault("xi: expected none, got a lens of cv2.omnidir; undistort the images")
+        raise FormatError("xi: expected none, got a lens of cv2.omnidir; undistort the images")
     model = fields.values.get("distortion_model", "")
     fields.read.add("distortion_model")
     if model not in ("", *BROWN_CONRADY, *FISHEYES):
         known = ", ".join(BROWN_CONRADY + FISHEYES)
-        raise Fault(f"distortion_model: expected one of {known}, got {model!r}; undistort the images")
+        raise FormatError(f"distortion_model: expected one of {known}, got {model!r}; undistort the images")
     return model in FISHEYES or bool(fields.number("fisheye_model"))
 
 
 def _view(
     turn: np.ndarray, shift: np.ndarray, K: np.ndarray, distortion: np.ndarray | None, size: tuple[int, int], fisheye: bool,
 ) -> View:  # fmt: skip
-    """`turn` is a rotation matrix or vector."""
+    """Return the view of a camera whose rotation is a matrix or a rotation vector."""
     if turn.size == 9:
         turn = turn.reshape(3, 3)
     elif turn.any():

@@ -1,4 +1,4 @@
-"""What primitives of glTF files look like, unlit and lit."""
+"""Appearance of glTF primitives, unlit and lit."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from ...scene.material import Material, Texture
+from .context import LoadContext, linear_colors
 from .gltf import GLOSS, MATT, entry
 from .gltf_arrays import Geometry
-from .gltf_texture import Images, Lookup, Place
-from .part import Fault
-from .source import Source, linear_colors
+from .gltf_texture import Images, Lookup, TextureTransform
+from .part import FormatError
 
 WHITE = (1.0, 1.0, 1.0)
 RAMP = torch.tensor([[0.0, 1.0]])  # alpha that is looked up where it is known
@@ -26,24 +26,23 @@ class Primitive(NamedTuple):
     positions: np.ndarray  # (N, 3)
     triangles: np.ndarray  # (F, 3)
     images: Images
-    source: Source
+    context: LoadContext
 
     @classmethod
-    def of(cls, geometry: Geometry, images: Images, source: Source) -> Primitive:
-        """Raises Fault or FileNotFoundError."""
+    def from_geometry(cls, geometry: Geometry, images: Images, context: LoadContext) -> Primitive:
         positions = geometry.attribute("POSITION")
         if positions is None:
-            raise Fault("expected the attribute POSITION, got none; export it again")
-        return cls(geometry, positions, geometry.triangles(), images, source)
+            raise FormatError("expected the attribute POSITION, got none; export it again")
+        return cls(geometry, positions, geometry.triangles(), images, context)
 
     @property
     def given(self) -> dict[str, Any]:
-        """As the file has it."""
+        """Return the primitive's JSON."""
         return self.geometry.given
 
     @property
     def material(self) -> dict[str, Any]:
-        """Without one, that of glTF: white, and a rough metal where it is lit."""
+        """Return the material's JSON; without one, that of glTF: white, and a rough metal where it is lit."""
         return entry(self.geometry.arrays.tree, "materials", self.given["material"]) if "material" in self.given else {}
 
     @property
@@ -52,21 +51,21 @@ class Primitive(NamedTuple):
 
     @property
     def factor(self) -> tuple[float, ...]:
-        """Of the base colour; trimesh has it in 8 bit only."""
+        """Return the factor of the base colour, which trimesh has in 8 bit only."""
         return tuple(float(f) for f in self.base.get("baseColorFactor", WHITE)[:3])
 
     def lookup(self, field: str, within: dict[str, Any] | None = None) -> Lookup | None:
-        """The texture of a field of the material."""
+        """Return the texture of a field of the material."""
         reference = (self.material if within is None else within).get(field)
-        return None if reference is None else Lookup.of(self.images, reference)
+        return None if reference is None else Lookup.from_reference(self.images, reference)
 
     def colors(self) -> Tensor | None:
-        """(N, 3) of the vertices."""
+        """Return the colours (N, 3) of the vertices."""
         values = self.geometry.attribute("COLOR_0")
         return None if values is None else linear_colors("vertex", values, srgb=False)
 
     def opacities(self) -> Tensor | None:
-        """(N,) float32, the fourth number of the vertices' colours, if there is one. Raises Fault."""
+        """Return the fourth number (N,) float32 of the vertices' colours, if there is one. Raises FormatError."""
         values = self.geometry.attribute("COLOR_0")
         if values is None or values.shape[1] < 4:
             return None
@@ -74,74 +73,74 @@ class Primitive(NamedTuple):
         good = (alpha >= 0.0) & (alpha <= 1.0)
         if not good.all():
             bad = int(np.argwhere(~good)[0, 0])
-            raise Fault(f"expected alpha of COLOR_0 from 0 to 1, got {alpha[bad]} at vertex {bad}; repair it")
+            raise FormatError(f"expected alpha of COLOR_0 from 0 to 1, got {alpha[bad]} at vertex {bad}; repair it")
         return torch.from_numpy(np.array(alpha)).float()
 
-    def uvs(self, place: Place, needed_by: str | None = None) -> np.ndarray | None:
-        """(N, 2) float32, v running up. Raises Fault where something needs what is not there."""
+    def uvs(self, place: TextureTransform, needed_by: str | None = None) -> np.ndarray | None:
+        """Return texture coordinates (N, 2) float32, v running up. Raises FormatError where something needs missing ones."""
         own = self.geometry.attribute(f"TEXCOORD_{place.set}")
         if own is None and needed_by is not None:
-            raise Fault(
+            raise FormatError(
                 f"expected texture coordinates TEXCOORD_{place.set} for the texture of {needed_by}, got none; unwrap the mesh"
             )
         if own is not None and own.shape != (len(self.positions), 2):
             got = f"shape {own.shape}"
-            raise Fault(f"expected TEXCOORD_{place.set} for {len(self.positions)} vertices, got {got}; repair it")
+            raise FormatError(f"expected TEXCOORD_{place.set} for {len(self.positions)} vertices, got {got}; repair it")
         return None if own is None else place.moved(own)
 
 
-def look(primitive: Primitive, known: dict[object, tuple[Material, dict[str, Place]]]) -> dict[str, object]:
-    """The fields of a part that say what it looks like. Raises Fault.
-
-    known   materials by their numbers, which grows
-    """
-    wanted, material, colors = primitive.source.wanted, primitive.material, primitive.colors()
-    found: dict[str, object] = {"uvs": primitive.uvs(Place()), "colors": colors}
-    lit = wanted.lit and not ("KHR_materials_unlit" in material.get("extensions", {}) and wanted.materials)
+def appearance(
+    primitive: Primitive, known: dict[object, tuple[Material, dict[str, TextureTransform]]]
+) -> dict[str, object]:
+    """Return the fields of a part that determine its appearance. Raises FormatError. `known` caches materials by their
+    numbers."""
+    options, material, colors = primitive.context.options, primitive.material, primitive.colors()
+    found: dict[str, object] = {"uvs": primitive.uvs(TextureTransform()), "colors": colors}
+    lit = options.lit and not ("KHR_materials_unlit" in material.get("extensions", {}) and options.materials)
     if lit:
         found["normals"] = primitive.geometry.attribute("NORMAL")
-    if not wanted.materials:
+    if not options.materials:
         return {**found, "material": known.setdefault(None, (Material(), {}))[0] if lit else None}
     if "material" not in primitive.given and not lit:
         return found
     if GLOSS in material.get("extensions", {}):
         if primitive.base:
-            primitive.source.unsupported.note(GLOSS, "shown in the metallic-roughness material beside it")
+            primitive.context.unread.note(GLOSS, "shown in the metallic-roughness material beside it")
         else:
-            raise Fault("expected a metallic-roughness material, got specular-glossiness alone; convert it")
+            raise FormatError("expected a metallic-roughness material, got specular-glossiness alone; convert it")
     texture = primitive.lookup("baseColorTexture", primitive.base)
-    place = Place() if texture is None else texture.place
+    place = TextureTransform() if texture is None else texture.transform
     if texture is not None:
         found |= {"uvs": primitive.uvs(place, "base_color"), "wrap": texture.wrap, "filter": texture.near}
-    cut_out = _alpha(primitive, texture)
+    alpha_mask = _alpha(primitive, texture)
     if lit:
-        # What cuts out by vertices takes the mesh's own coordinates.
-        return {**found, **cut_out, **_lit(primitive, None if "uvs" in cut_out else place, known)}
-    return {**found, **cut_out, **_unlit(primitive, texture, colors)}
+        # An alpha mask by vertices takes the mesh's own coordinates.
+        return {**found, **alpha_mask, **_lit(primitive, None if "uvs" in alpha_mask else place, known)}
+    return {**found, **alpha_mask, **_unlit(primitive, texture, colors)}
 
 
 def _alpha(primitive: Primitive, texture: Lookup | None) -> dict[str, object]:
-    """What is cut out or seen through: by the texture's alpha, or by that of the vertices, times the factor's."""
-    material, source = primitive.material, primitive.source
+    """Return what masks or blends the part: the texture's alpha, or that of the vertices, times the factor's."""
+    material, context = primitive.material, primitive.context
     mode, cutoff = material.get("alphaMode", "OPAQUE"), float(material.get("alphaCutoff", 0.5))
     if mode not in ("OPAQUE", "MASK", "BLEND"):
-        raise Fault(f"expected alphaMode OPAQUE, MASK or BLEND, got {mode!r}; export it again")
-    blended = mode == "BLEND" and source.wanted.lit
+        raise FormatError(f"expected alphaMode OPAQUE, MASK or BLEND, got {mode!r}; export it again")
+    blended = mode == "BLEND" and context.options.lit
     if mode != "MASK" and not blended:
         return {}
     opacity = float((*primitive.base.get("baseColorFactor", ()), 1.0, 1.0, 1.0, 1.0)[3])
     of_vertices = primitive.opacities()
     if of_vertices is not None and float(of_vertices.min()) == float(of_vertices.max()):
         opacity, of_vertices = opacity * float(of_vertices[0]), None
-    own = None if texture is None else source.textures.alpha(texture.image, opacity)
+    own = None if texture is None else context.textures.alpha(texture.image, opacity)
     everywhere = blended and own is None and of_vertices is None
     if everywhere or (opacity < cutoff and not blended):  # the same, or cut out, whatever else there is
         uvs = np.zeros((len(primitive.positions), 2), np.float32)
         return {"cutoff": cutoff, "alpha": torch.full((1, 1), opacity), "uvs": uvs}
     if of_vertices is None:
         return {"cutoff": cutoff, "alpha": own}
-    if texture is not None and (own is not None or not source.wanted.lit):
-        raise Fault(
+    if texture is not None and (own is not None or not context.options.lit):
+        raise FormatError(
             f"expected the texture {texture.name!r} or the alpha of COLOR_0 to cut out, got both; bake the alpha into the texture"
         )
     # Linear over a face, as the texture coordinates by which a ramp of two texels is looked up.
@@ -151,7 +150,7 @@ def _alpha(primitive: Primitive, texture: Lookup | None) -> dict[str, object]:
 
 
 def _unlit(primitive: Primitive, texture: Lookup | None, colors: Tensor | None) -> dict[str, object]:
-    """Texture, factor and vertex colours multiplied, as radiance."""
+    """Return texture, factor and vertex colours multiplied, as radiance."""
     factor = primitive.factor
     if texture is None:
         if colors is not None:
@@ -159,49 +158,53 @@ def _unlit(primitive: Primitive, texture: Lookup | None, colors: Tensor | None) 
         return {"face_colors": torch.tensor(factor, dtype=torch.float32).repeat(len(primitive.triangles), 1)}
     if colors is not None:
         if not bool((colors == colors[0]).all()):
-            lit = "" if primitive.source.wanted.lit else "lit=True, which multiplies them, or "
-            raise Fault(
+            lit = "" if primitive.context.options.lit else "lit=True, which multiplies them, or "
+            raise FormatError(
                 f"expected the texture {texture.name!r} or vertex colours that differ, got both, of which an unlit mesh has one; "
                 f"load it with {lit}materials=False, which leaves out the texture, or bake one into the other"
             )
         factor = tuple((colors[0] * colors.new_tensor(factor)).tolist())
-    return {"colors": None, "texture": primitive.source.textures.get(texture.name, texture.image, factor)}
+    return {"colors": None, "texture": primitive.context.textures.get(texture.name, texture.image, factor)}
 
 
 def _lit(
-    primitive: Primitive, shared: Place | None, known: dict[object, tuple[Material, dict[str, Place]]]
+    primitive: Primitive,
+    shared: TextureTransform | None,
+    known: dict[object, tuple[Material, dict[str, TextureTransform]]],
 ) -> dict[str, object]:
-    """The material, and the texture coordinates of those of its textures that do not lie as the mesh's own do."""
+    """Return the material, and the texture coordinates of its textures whose transform differs from the mesh's own."""
     key = primitive.given.get("material", -1)
     if key not in known:
         try:
             known[key] = _material(primitive)
         except ValueError as error:
-            raise Fault(f"material {str(primitive.material.get('name', key))[:60]!r}: {error}") from error
+            raise FormatError(f"material {str(primitive.material.get('name', key))[:60]!r}: {error}") from error
     material, places = known[key]
     uvs = {name: primitive.uvs(own, name) for name, own in places.items()}
     if material.normal_map is not None and "TANGENT" in primitive.given["attributes"]:
-        primitive.source.unsupported.note("TANGENT", "frames of normal maps follow from texture coordinates")
+        primitive.context.unread.note("TANGENT", "frames of normal maps follow from texture coordinates")
     return {"material": material, "material_uvs": {name: uvs[name] for name in uvs if places[name] != shared}}
 
 
-def _material(primitive: Primitive) -> tuple[Material, dict[str, Place]]:
-    """And how its textures lie."""
-    given, base, source = primitive.material, primitive.base, primitive.source
+def _material(primitive: Primitive) -> tuple[Material, dict[str, TextureTransform]]:
+    """Return the material, and the transforms of its textures."""
+    given, base, context = primitive.material, primitive.base, primitive.context
     extensions = given.get("extensions", {})
     matt = extensions.get(MATT, {}).get("specularFactor") == 0 and base.get("metallicFactor") == 0
     if MATT in extensions and not matt:
-        source.unsupported.note(MATT)
-    places: dict[str, Place] = {}
+        context.unread.note(MATT)
+    places: dict[str, TextureTransform] = {}
 
     def textured(name: str, lookup: Lookup, image: Tensor, factor: Tensor | float | None = None) -> Texture:
-        places[name] = lookup.place
+        places[name] = lookup.transform
         one = factor is None or bool((torch.as_tensor(factor) == 1.0).all())
         return Texture(image, wrap=lookup.wrap, filter=lookup.filter, factor=None if one else factor)
 
     def colored(name: str, factor: Tensor, lookup: Lookup | None) -> Tensor | Texture:
         return (
-            factor if lookup is None else textured(name, lookup, source.textures.get(lookup.name, lookup.image), factor)
+            factor
+            if lookup is None
+            else textured(name, lookup, context.textures.get(lookup.name, lookup.image), factor)
         )
 
     fields: dict[str, Any] = {"two_sided": bool(given.get("doubleSided", False))}
@@ -213,15 +216,15 @@ def _material(primitive: Primitive) -> tuple[Material, dict[str, Place]]:
     for name, channel in () if matt else (("roughness", slice(1, 2)), ("metallic", slice(2, 3))):
         fields[name] = factor = float(base.get(f"{name}Factor", 1.0))
         if both is not None and factor != 0.0:
-            fields[name] = textured(name, both, source.textures.data(both.name, both.image, channel), factor)
+            fields[name] = textured(name, both, context.textures.data(both.name, both.image, channel), factor)
     strength = float(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
     emission = strength * torch.tensor([float(f) for f in given.get("emissiveFactor", (0.0, 0.0, 0.0))])
     if bool((emission != 0).any()):
         fields["emission"] = colored("emission", emission, primitive.lookup("emissiveTexture"))
     bent = primitive.lookup("normalTexture")
     if bent is not None:
-        fields["normal_map"] = textured("normal_map", bent, source.textures.data(bent.name, bent.image))
+        fields["normal_map"] = textured("normal_map", bent, context.textures.data(bent.name, bent.image))
         fields["normal_scale"] = float(given["normalTexture"].get("scale", 1.0))
     if "occlusionTexture" in given:
-        source.unsupported.note("occlusionTexture", "left out, for shadows are computed")
+        context.unread.note("occlusionTexture", "left out, for shadows are computed")
     return Material(**fields), places

@@ -13,11 +13,11 @@ import torch
 from ...camera.camera import Camera
 from ...optional import require
 from ...scene.lights import DirectionalLight, Light, PointLight, SpotLight
+from .context import LoadContext, UnreadLog
 from .gltf import PUNCTUAL, VISIBILITY, entry
 from .gltf_schema import explained
-from .names import free_name
-from .part import Fault
-from .source import Source, Unsupported
+from .names import unique_name
+from .part import FormatError
 
 ROUNDED = 0.01  # what rounding to normalised bytes may change of a quaternion's length
 INSTEAD_OF_RANGE = "light falls off with the square of the distance, without an end"
@@ -33,11 +33,12 @@ class Placed(NamedTuple):
     visible: bool  # it and all nodes above it (KHR_node_visibility)
 
     def skins(self, primitive: dict[str, Any]) -> bool:
-        """Whether the node's skin moves a primitive of its mesh; one without JOINTS_0 is rigid with the node."""
+        """Return whether the node's skin moves a primitive of its mesh; one without JOINTS_0 is rigid with the node."""
         return "skin" in self.node and "JOINTS_0" in primitive["attributes"]
 
     def of_primitive(self, primitive: dict[str, Any]) -> np.ndarray:
-        """(4, 4): what a skin moves stands where its joints do (glTF 2.0, section 3.7.3.3), all else where the node is."""
+        """Return the matrix (4, 4) of a primitive: a skinned one stands where its joints do (glTF 2.0, section 3.7.3.3), else
+        at the node."""
         return np.eye(4) if self.skins(primitive) else self.world
 
     @property
@@ -46,7 +47,8 @@ class Placed(NamedTuple):
 
 
 def placed(tree: dict[str, Any]) -> Iterator[Placed]:
-    """The nodes of the scene, each before those below it; without scenes, of all nodes. Raises Fault where they are no tree."""
+    """Yield the nodes of the scene, each before those below it; without scenes, all nodes. Raises FormatError where they are no
+    tree."""
     if tree.get("scenes"):
         roots = entry(tree, "scenes", tree.get("scene", 0)).get("nodes", [])
     else:
@@ -58,7 +60,7 @@ def placed(tree: dict[str, Any]) -> Iterator[Placed]:
         index, parent, above, visible = waiting.pop()
         if index in seen:
             name = entry(tree, "nodes", index).get("name", "without a name")
-            raise Fault(
+            raise FormatError(
                 f"expected a tree of nodes, got node {index} ({name}) below itself or two others; export it again"
             )
         seen.add(index)
@@ -71,12 +73,12 @@ def placed(tree: dict[str, Any]) -> Iterator[Placed]:
 def _is_visible(node: dict[str, Any]) -> bool:
     visible = node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
     if not isinstance(visible, bool):
-        raise Fault(f"expected true or false for visible of {VISIBILITY}, got {visible!r}; export it again")
+        raise FormatError(f"expected true or false for visible of {VISIBILITY}, got {visible!r}; export it again")
     return visible
 
 
 def matrix_of(node: dict[str, Any]) -> np.ndarray:
-    """(4, 4) of a node within the one above it: the product of shift, rotation and scaling."""
+    """Return the matrix (4, 4) of a node within its parent: the product of shift, rotation and scaling."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     transformations = require("trimesh.transformations", "trimesh", "reading meshes")
@@ -87,7 +89,7 @@ def matrix_of(node: dict[str, Any]) -> np.ndarray:
 
 
 def rotation_of(node: dict[str, Any]) -> np.ndarray:
-    """(4,) unit quaternion x, y, z, w; the identity where the file has zeros or numbers that are not finite."""
+    """Return the unit quaternion (4,) x, y, z, w; the identity where the file has zeros or numbers that are not finite."""
     given = np.asarray(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64)
     length = float(np.linalg.norm(given))
     return given / length if 0.0 < length < math.inf else np.array([0.0, 0.0, 0.0, 1.0])
@@ -97,18 +99,18 @@ def node_name(number: int, node: dict[str, Any]) -> str:
     return str(node.get("name") or f"node {number}")
 
 
-def note_rotations(tree: dict[str, Any], unsupported: Unsupported) -> None:
-    """Notes the rotations that are no unit quaternions."""
+def note_rotations(tree: dict[str, Any], unread: UnreadLog) -> None:
+    """Note the rotations that are no unit quaternions."""
     for number, node in enumerate(tree.get("nodes", [])):
         length = float(np.linalg.norm(node.get("rotation", (0.0, 0.0, 0.0, 1.0))))
         if not abs(length - 1.0) <= ROUNDED:
             instead = "divided by it" if 0.0 < length < math.inf else "left out"
-            unsupported.note(f"rotation of node {node_name(number, node)[:60]!r} of length {length:.3g}", instead)
+            unread.note(f"rotation of node {node_name(number, node)[:60]!r} of length {length:.3g}", instead)
 
 
-def lights(tree: dict[str, Any], source: Source) -> list[Light]:
-    """Those of KHR_lights_punctual at visible nodes, in float64. Scales of nodes change where they are, and nothing else
-    of them. Notes which cannot be read."""
+def lights(tree: dict[str, Any], context: LoadContext) -> list[Light]:
+    """Return the lights of KHR_lights_punctual at visible nodes, in float64, and note those that cannot be read. Scales of
+    nodes change their positions and nothing else."""
     found = []
     for at in placed(tree):
         reference = at.node.get("extensions", {}).get(PUNCTUAL)
@@ -118,16 +120,16 @@ def lights(tree: dict[str, Any], source: Source) -> list[Light]:
                 with explained(tree):
                     light = entry(tree.get("extensions", {}).get(PUNCTUAL, {}), "lights", reference["light"])
                     name = str(light.get("name") or name)
-                    found.append(_light(light, at.world, source))
-            except (Fault, TypeError, ValueError, KeyError) as error:
-                source.unsupported.note(f"light {name[:60]!r}", f"left out: {error}")
+                    found.append(_light(light, at.world, context))
+            except (FormatError, TypeError, ValueError, KeyError) as error:
+                context.unread.note(f"light {name[:60]!r}", f"left out: {error}")
                 continue
             if "range" in light:
-                source.unsupported.note("range of lights", INSTEAD_OF_RANGE)
+                context.unread.note("range of lights", INSTEAD_OF_RANGE)
     return found
 
 
-def _light(given: dict[str, Any], world: np.ndarray, source: Source) -> Light:
+def _light(given: dict[str, Any], world: np.ndarray, context: LoadContext) -> Light:
     position, direction = (torch.tensor(v, dtype=torch.float64) for v in (world[:3, 3], -world[:3, 2]))
     intensity = float(given.get("intensity", 1.0))
     color = torch.tensor([float(c) for c in given.get("color", (1.0, 1.0, 1.0))], dtype=torch.float64)
@@ -137,13 +139,13 @@ def _light(given: dict[str, Any], world: np.ndarray, source: Source) -> Light:
     if kind == "point":
         return PointLight(position, intensity, color)
     if kind == "spot":
-        return SpotLight(position, direction, intensity, color, *_cone(given, source))
-    raise Fault(f"expected a light of type directional, point or spot, got {kind!r}; export it again")
+        return SpotLight(position, direction, intensity, color, *_cone(given, context))
+    raise FormatError(f"expected a light of type directional, point or spot, got {kind!r}; export it again")
 
 
-def _cone(light: dict[str, Any], source: Source) -> tuple[float, float]:
-    """The inner and outer angle of a spot light. Where they are not 0 ≤ inner < outer ≤ π/2, as the extension wants them, they
-    become so: the cosines differ by 0.001 at least, as in the formula of its text."""
+def _cone(light: dict[str, Any], context: LoadContext) -> tuple[float, float]:
+    """Return the inner and outer angle of a spot light. Where they are not 0 ≤ inner < outer ≤ π/2, as the extension requires,
+    they become so: the cosines differ by 0.001 at least, as in the formula of its text."""
     given = light.get("spot", {})
     inner, outer = float(given.get("innerConeAngle", 0.0)), float(given.get("outerConeAngle", math.pi / 4))
     if 0.0 <= inner < outer <= math.pi / 2 or not 0.0 < outer < math.inf or not math.isfinite(inner):
@@ -151,33 +153,34 @@ def _cone(light: dict[str, Any], source: Source) -> tuple[float, float]:
     end = min(outer, math.pi / 2)
     start = min(max(inner, 0.0), math.acos(min(math.cos(end) + 1e-3, 1.0)))
     name = str(light.get("name", "without a name"))[:60]
-    source.unsupported.note(
+    context.unread.note(
         f"spot light {name!r} with innerConeAngle {inner:.6g} and outerConeAngle {outer:.6g}",
         f"shown with {start:.6g} and {end:.6g}",
     )
     return start, end
 
 
-def cameras(tree: dict[str, Any], size: tuple[int, int]) -> dict[str, Camera | Fault]:
-    """In float64, by the names of their nodes and in their order, (H, W) pixels, which are square: of aspectRatio, yfov and
-    ymag these give the height. In place of one that cannot be read its Fault. Raises ValueError about the size."""
-    found: dict[str, Camera | Fault] = {}
+def cameras(tree: dict[str, Any], size: tuple[int, int]) -> dict[str, Camera | FormatError]:
+    """Return cameras in float64 by the names of their nodes, in order; a FormatError stands in place of one that cannot be
+    read. The size (H, W) is in square pixels: of aspectRatio, yfov and ymag the latter two give the height. Raises ValueError
+    about it."""
+    found: dict[str, Camera | FormatError] = {}
     for at in placed(tree):  # also where nothing else of it is visible
         if "camera" not in at.node:
             continue
         name = str(at.node.get("name") or f"camera {len(found)}")
-        name = free_name(found, name, f"{name} ({len(found)})")
+        name = unique_name(found, name, f"{name} ({len(found)})")
         try:
             with explained(tree):
                 found[name] = _camera(entry(tree, "cameras", at.node["camera"]), at.world, size)
-        except (Fault, TypeError, ValueError, KeyError) as error:
-            found[name] = Fault(str(error))
+        except (FormatError, TypeError, ValueError, KeyError) as error:
+            found[name] = FormatError(str(error))
     return found
 
 
 def _camera(given: dict[str, Any], world: np.ndarray, size: tuple[int, int]) -> Camera:
     if np.linalg.det(world[:3, :3]) < 0.0:
-        raise Fault(
+        raise FormatError(
             "expected a camera that turns and shifts, got one below a node that mirrors; export it without mirroring"
         )
     length = np.linalg.norm(world[:3, :3], axis=0)  # a camera has no scale
@@ -190,4 +193,4 @@ def _camera(given: dict[str, Any], world: np.ndarray, size: tuple[int, int]) -> 
         scale = size[0] / (2.0 * given["orthographic"]["ymag"])
         K = pose.new_tensor([[scale, 0.0, size[1] / 2], [0.0, scale, size[0] / 2], [0.0, 0.0, 1.0]])
         return dataclasses.replace(Camera.from_opengl(pose, size, K=K), projection="orthographic")
-    raise Fault(f"expected a camera of type perspective or orthographic, got {kind!r}; export it again")
+    raise FormatError(f"expected a camera of type perspective or orthographic, got {kind!r}; export it again")

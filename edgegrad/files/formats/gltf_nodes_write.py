@@ -1,4 +1,4 @@
-"""Lights and cameras as glTF has them: what gltf_nodes.py reads."""
+"""Lights and cameras in the terms of glTF, which gltf_nodes.py reads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ NEAR, FAR = 1e-3, 10.0  # the planes of a camera between which other programs lo
 
 
 def light_of(light: Light) -> tuple[dict[str, Any] | None, list[str]]:
-    """Its entry in KHR_lights_punctual, or None where glTF has no such light; and what of it the entry does not say."""
+    """Return the light's entry in KHR_lights_punctual, or None where glTF has no such light; and what the entry does not hold
+    of it."""
     kind = KINDS.get(type(light))
     if kind is None:
         return None, []
@@ -41,7 +42,7 @@ def light_of(light: Light) -> tuple[dict[str, Any] | None, list[str]]:
 
 
 def place_of(light: Light) -> np.ndarray:
-    """(4, 4) to the world of the node at which the light stands, which shines along −Z."""
+    """Return the matrix (4, 4) to the world of the node at which the light stands, which shines along −Z."""
     world = np.eye(4)
     if isinstance(light, DirectionalLight | SpotLight):
         back = -_double(light.direction).numpy()
@@ -56,7 +57,7 @@ def place_of(light: Light) -> np.ndarray:
 
 
 def camera_of(camera: Camera, meshes: Sequence[Mesh]) -> tuple[dict[str, Any], np.ndarray] | str:
-    """Its entry and its place in the world, looking along −Z with +Y up; or why glTF has no such camera."""
+    """Return the camera's entry and its place in the world, looking along −Z with +Y up; or why glTF has no such camera."""
     H, W = camera.size
     K, pose = _double(camera.K), _double(camera.world_to_camera)
     if camera.projection not in ("perspective", "orthographic") or camera.distortion is not None:

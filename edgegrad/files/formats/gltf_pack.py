@@ -1,8 +1,8 @@
 """Meshes with their materials, lights and cameras as glTF and GLB files.
 
-trimesh packs arrays and images. What it drops or rounds is said in the JSON that it hands over before writing: factors
-in full, samplers, several sets of texture coordinates, the strength of emission, the scale of normal maps, lights and cameras.
-What several meshes share stands in the file once.
+trimesh packs arrays and images. What it drops or rounds is added to the JSON before writing: factors in full, samplers, several
+sets of texture coordinates, the strength of emission, the scale of normal maps, lights and cameras. What several meshes share
+is written once.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from .gltf import PUNCTUAL
 from .gltf_nodes_write import camera_of, light_of, node_of, place_of
-from .gltf_write import Look, split
+from .gltf_write import GltfAppearance, split
 
 
 def to_glb(mesh: Mesh) -> tuple[bytes, list[str]]:
-    """The file, and what of the mesh it does not hold. Raises ImportError without trimesh, or pillow for textures."""
+    """Return the file, and the names of what it does not hold of the mesh. Raises ImportError without trimesh, or pillow for
+    textures."""
     return _packed([mesh], [], {}, "glb", unlit=False)
 
 
 def scene_to_gltf(scene: Scene, cameras: Mapping[str, Camera], kind: str) -> tuple[bytes, list[str]]:
-    """A "glb", or a "gltf" that holds its arrays and images itself, and what of the scene and cameras it does not hold. Raises
+    """Return a "glb", or a "gltf" that embeds its arrays and images, and what it does not hold of the scene and cameras. Raises
     ImportError as to_glb() does."""
     content, lost = _packed(scene.meshes, [light for light in scene.lights if isinstance(light, Light)], cameras, kind)
     return content, [*lost, *(["background"] if scene.background is not None else [])]
@@ -40,24 +41,26 @@ def _packed(
 ) -> tuple[bytes, list[str]]:
     trimesh = require("trimesh", "trimesh", "saving meshes")
     gltf = require("trimesh.exchange.gltf", "trimesh", "saving meshes")
-    looks = [Look(mesh, unlit) for mesh in meshes]
+    appearances = [GltfAppearance(mesh, unlit) for mesh in meshes]
     parts = {}
-    for k, look in enumerate(looks):
-        verts, faces, attributes = split(look)
+    for k, appearance in enumerate(appearances):
+        verts, faces, attributes = split(appearance)
         made = trimesh.Trimesh(verts, faces, process=False, vertex_attributes=attributes)
-        if look.material:
-            images = {name: _picture(image) for name, image in look.images.items()}
-            # Of another name each, or trimesh takes those with the same images for one.
+        if appearance.material:
+            images = {name: _picture(image) for name, image in appearance.images.items()}
+            # Names differ, because trimesh joins materials with the same images.
             material = trimesh.visual.material.PBRMaterial(name=f"material {k}", **images)
             made.visual = trimesh.visual.TextureVisuals(material=material)
         parts[str(k)] = made
-    lost = [f"{what}{_which(k, len(looks))}" for k, look in enumerate(looks) for what in look.lost]
+    lost = [
+        f"{what}{_which(k, len(appearances))}" for k, appearance in enumerate(appearances) for what in appearance.lost
+    ]
 
     def write(tree: dict[str, Any]) -> None:
         for mesh in tree["meshes"]:
             number = int(mesh["name"])
             mesh["name"] = meshes[number].name or f"geometry_{number}"
-            looks[number].write(tree, mesh["primitives"][0])
+            appearances[number].write(tree, mesh["primitives"][0])
         for node in tree["nodes"]:
             if "mesh" in node:
                 node["name"] = tree["meshes"][node["mesh"]]["name"]
@@ -83,7 +86,7 @@ def _picture(image: np.ndarray) -> Any:
 
 
 def _share(tree: dict[str, Any]) -> None:
-    """Images, samplers, textures and materials that are alike become one."""
+    """Join images, samplers, textures and materials that are equal."""
     images, samplers = (_unique(tree, name) for name in ("images", "samplers"))
     for texture in tree.get("textures", []):
         texture["source"] = images[texture["source"]]
@@ -103,7 +106,7 @@ def _share(tree: dict[str, Any]) -> None:
 
 
 def _unique(tree: dict[str, Any], name: str) -> list[int]:
-    """Leaves one of each in a list of the file, and gives the new number of each old one."""
+    """Keep one of each in a list of the file, and return the new number of each old one."""
     kept: dict[str, int] = {}
     numbers = [kept.setdefault(json.dumps(entry, sort_keys=True), len(kept)) for entry in tree.get(name, [])]
     if kept:
@@ -114,7 +117,7 @@ def _unique(tree: dict[str, Any], name: str) -> list[int]:
 def _place(
     tree: dict[str, Any], lights: Sequence[Light], cameras: Mapping[str, Camera], meshes: Sequence[Mesh]
 ) -> list[str]:
-    """Adds the nodes of lights and cameras, and says which of them cannot be there."""
+    """Add the nodes of lights and cameras, and return the names of those that cannot be there."""
     lost: list[str] = []
     nodes: list[dict[str, Any]] = []
     written: list[dict[str, Any]] = []

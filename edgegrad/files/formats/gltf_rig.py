@@ -1,4 +1,4 @@
-"""What bends in glTF files: nodes that move one another, skins, morph targets and animations, as numbers."""
+"""Moving parts of glTF files as numbers: nodes that move one another, skins, morph targets and animations."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...optional import require
+from .context import LoadContext
 from .gltf import File, entry
 from .gltf_arrays import Arrays, Geometry, normalised
 from .gltf_material import Primitive
 from .gltf_nodes import ROUNDED, Placed, matrix_of, node_name, placed, rotation_of
 from .gltf_scene import primitives
 from .gltf_texture import Images
-from .names import free_name
-from .part import Fault
-from .source import Source
+from .names import unique_name
+from .part import FormatError
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3, "weights": 0}
 INTERPOLATIONS = ("LINEAR", "STEP", "CUBICSPLINE")
 WHOLE = 0.01  # by so much the weights of a vertex may differ from 1 in all, which is rounding
 
 
-class Node(NamedTuple):
+class RigNode(NamedTuple):
     """A node of the scene, as a joint."""
 
     name: str
@@ -31,8 +32,8 @@ class Node(NamedTuple):
     stretch: np.ndarray  # (3, 3), applied before the rotation
 
 
-class Bound(NamedTuple):
-    """How the vertices of a primitive hang on joints, and what moves them before."""
+class SkinBinding(NamedTuple):
+    """The joints and weights of a primitive's vertices, and the morph targets that move them before."""
 
     joints: np.ndarray  # (n,) nodes
     inverse_binds: np.ndarray  # (n, 4, 4), from where the vertices are to each joint
@@ -42,8 +43,8 @@ class Bound(NamedTuple):
     normal_targets: np.ndarray  # (M, N, 3) of normals
 
 
-class Channel(NamedTuple):
-    """What an animation does to a node."""
+class AnimationChannel(NamedTuple):
+    """The keys of an animation for one node."""
 
     path: str  # one of PATHS
     node: int
@@ -53,19 +54,18 @@ class Channel(NamedTuple):
 
 
 class RigFile(NamedTuple):
-    """All of a file."""
+    """All nodes, parts, morph targets and animations of a file."""
 
-    nodes: list[Node]  # each after its parent
-    parts: list[tuple[str, Primitive, Bound]]
+    nodes: list[RigNode]  # each after its parent
+    parts: list[tuple[str, Primitive, SkinBinding]]
     morphs: list[str]  # their names
     morph_weights: list[float]  # at rest
     morphs_of: dict[int, tuple[int, int]]  # by node, its first morph and their number
-    animations: list[tuple[str, list[Channel]]]
+    animations: list[tuple[str, list[AnimationChannel]]]
 
 
-def read(file: File, source: Source) -> RigFile:
-    """Raises Fault or FileNotFoundError."""
-    arrays = Arrays(file, source.folder)
+def read(file: File, context: LoadContext) -> RigFile:
+    arrays = Arrays(file, context.folder)
     images = Images(arrays)
     there = list(placed(file.tree))
     places = {at.number: k for k, at in enumerate(there)}
@@ -75,43 +75,43 @@ def read(file: File, source: Source) -> RigFile:
     rig = RigFile(nodes, [], [], [], {}, [])
     for k, at in enumerate(there):
         if at.visible and "mesh" in at.node:
-            _add_mesh(rig, k, at, file, images, source, places)
-    rig.animations.extend(_animations(arrays, file.tree, places, source))
+            _add_mesh(rig, k, at, file, images, context, places)
+    rig.animations.extend(_animations(arrays, file.tree, places, context))
     return rig
 
 
 def _add_mesh(
-    rig: RigFile, k: int, at: Placed, file: File, images: Images, source: Source, places: dict[int, int]
+    rig: RigFile, k: int, at: Placed, file: File, images: Images, context: LoadContext, places: dict[int, int]
 ) -> None:
     mesh, first = entry(file.tree, "meshes", at.node["mesh"]), len(rig.morphs)
-    found = list(primitives(file, at.node["mesh"], images, source))
+    found = list(primitives(file, at.node["mesh"], images, context))
     count = max((len(primitive.given.get("targets", [])) for _, primitive in found), default=0)
     try:
         moves = [[_targets(p.geometry, key, p.positions, count) for key in ("POSITION", "NORMAL")] for _, p in found]
-    except Fault as fault:
-        source.unsupported.note(f"morph targets of {_mesh_name(at, mesh)!r}", f"left out: {fault}")
+    except FormatError as error:
+        context.unread.note(f"morph targets of {_mesh_name(at, mesh)!r}", f"left out: {error}")
         count, moves = 0, [[np.zeros((0, *primitive.positions.shape))] * 2 for _, primitive in found]
     if count:
         rig.morphs.extend(_morph_names(rig, k, mesh, count))
-        rig.morph_weights.extend(_morph_weights(at, mesh, count, source))
+        rig.morph_weights.extend(_morph_weights(at, mesh, count, context))
         rig.morphs_of[k] = first, count
     for (name, primitive), targets in zip(found, moves, strict=True):
         try:
             if at.skins(primitive.given):
                 joints, inverse_binds = _skin(images.arrays, file.tree, at.node["skin"], places)
-                weights = _weights(primitive.geometry, len(primitive.positions), len(joints), name, source)
+                weights = _weights(primitive.geometry, len(primitive.positions), len(joints), name, context)
                 used = np.flatnonzero(weights.any(0))  # the others move nothing
                 joints, inverse_binds, weights = joints[used], inverse_binds[used], weights[:, used]
             else:
                 joints, inverse_binds, weights = np.array([k]), np.eye(4)[None], np.ones((len(primitive.positions), 1))
                 if "skin" in at.node:
-                    source.unsupported.note(
+                    context.unread.note(
                         f"the skin of {name[:60]!r}, which has no JOINTS_0",
                         f"rigid with node {rig.nodes[k].name[:60]!r}",
                     )
-        except Fault as fault:
-            raise Fault(f"part {name[:60]!r}: {fault}") from fault.__cause__
-        rig.parts.append((name, primitive, Bound(joints, inverse_binds, weights, first, *targets)))
+        except FormatError as error:
+            raise FormatError(f"part {name[:60]!r}: {error}") from error.__cause__
+        rig.parts.append((name, primitive, SkinBinding(joints, inverse_binds, weights, first, *targets)))
 
 
 def _mesh_name(at: Placed, mesh: dict[str, Any]) -> str:
@@ -126,54 +126,44 @@ def _morph_names(rig: RigFile, k: int, mesh: dict[str, Any], count: int) -> list
     found: list[str] = []
     for number, own in enumerate(given):
         name = str(own) if own else f"target {number}"
-        found.append(free_name({*rig.morphs, *found}, name, f"{rig.nodes[k].name}: {name}"))
+        found.append(unique_name({*rig.morphs, *found}, name, f"{rig.nodes[k].name}: {name}"))
     return found
 
 
-def _morph_weights(at: Placed, mesh: dict[str, Any], count: int, source: Source) -> list[float]:
+def _morph_weights(at: Placed, mesh: dict[str, Any], count: int, context: LoadContext) -> list[float]:
     """Return the weights at rest."""
     given = at.node.get("weights", mesh.get("weights", [0.0] * count))
     if len(given) != count:
         what = f"weights of {_mesh_name(at, mesh)!r}, {len(given)} for {count} morph targets"
-        source.unsupported.note(what, "0 for each in their place")
+        context.unread.note(what, "0 for each in their place")
         return [0.0] * count
     return [float(weight) for weight in given]
 
 
 def _names(there: list[Placed]) -> list[str]:
-    """Each once."""
+    """Return a unique name for each node."""
     found: dict[str, None] = {}
     for at in there:
-        found[free_name(found, at.name, f"{at.name} ({at.number})")] = None
+        found[unique_name(found, at.name, f"{at.name} ({at.number})")] = None
     return list(found)
 
 
-def _node(name: str, at: Placed, places: dict[int, int]) -> Node:
+def _node(name: str, at: Placed, places: dict[int, int]) -> RigNode:
     parent = -1 if at.above is None else places[at.above]
     matrix = matrix_of(at.node)
     if "matrix" not in at.node:
         scale = np.diag(np.asarray(at.node.get("scale", (1.0, 1.0, 1.0)), np.float64))
-        return Node(name, parent, matrix[:3, 3], rotation_of(at.node), scale)
+        return RigNode(name, parent, matrix[:3, 3], rotation_of(at.node), scale)
     # The polar decomposition A = R S; a scale by the axes gives a diagonal S.
     U, s, Vt = np.linalg.svd(matrix[:3, :3])
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
     R, S = U @ mirror @ Vt, Vt.T @ mirror @ np.diag(s) @ Vt
-    return Node(name, parent, matrix[:3, 3], _quaternion(R), S)
-
-
-def _quaternion(R: np.ndarray) -> np.ndarray:
-    """(4,) x, y, z, w of a rotation: the eigenvector of Bar-Itzhack's matrix (2000), exact for a rotation."""
-    K = np.array([
-        [R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],
-        [R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], R[2, 1] + R[1, 2], R[0, 2] - R[2, 0]],
-        [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1], R[1, 0] - R[0, 1]],
-        [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], R[0, 0] + R[1, 1] + R[2, 2]],
-    ])  # fmt: skip
-    return np.linalg.eigh(K)[1][:, -1]
+    transformations = require("trimesh.transformations", "trimesh", "reading meshes")
+    return RigNode(name, parent, matrix[:3, 3], np.roll(transformations.quaternion_from_matrix(R), -1), S)
 
 
 def _check_joints(tree: dict[str, Any], places: dict[int, int]) -> None:
-    """Raises Fault where the scene lacks a joint of its skins."""
+    """Raise FormatError where the scene lacks a joint of its skins."""
     for number in sorted(
         {node["skin"] for k, node in enumerate(tree.get("nodes", [])) if k in places and "skin" in node}
     ):
@@ -181,7 +171,7 @@ def _check_joints(tree: dict[str, Any], places: dict[int, int]) -> None:
         for joint in skin["joints"]:
             if joint not in places:
                 node = entry(tree, "nodes", joint)
-                raise Fault(
+                raise FormatError(
                     f"skin {skin.get('name', number)!r}: expected joints in the scene, got node {joint} "
                     f"({str(node.get('name', 'without a name'))[:60]!r}), which is not; add its root to the scene"
                 )
@@ -194,48 +184,50 @@ def _skin(arrays: Arrays, tree: dict[str, Any], number: Any, places: dict[int, i
         return joints, np.tile(np.eye(4), (len(joints), 1, 1))
     rows = arrays.get(skin["inverseBindMatrices"])
     if rows.dtype.kind != "f" or rows.shape[1] != 16 or len(rows) < len(joints):
-        raise Fault(
+        raise FormatError(
             f"expected {len(joints)} inverse bind matrices of floats, got {rows.shape} {rows.dtype}; export it again"
         )
     return joints, rows[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
 
 
-def _weights(geometry: Geometry, count: int, joints: int, name: str, source: Source) -> np.ndarray:
-    """(N, n), whose rows add up to 1."""
+def _weights(geometry: Geometry, count: int, joints: int, name: str, context: LoadContext) -> np.ndarray:
+    """Return weights (N, n), whose rows add up to 1."""
     found, number = np.zeros((count, joints)), 0
     while (index := geometry.integers(f"JOINTS_{number}")) is not None:
         weights = geometry.attribute(f"WEIGHTS_{number}")
         if weights is None or weights.shape != (count, 4) or index.shape != (count, 4):
             got = "none" if weights is None else f"{index.shape} and {weights.shape}"
-            raise Fault(
+            raise FormatError(
                 f"expected JOINTS_{number} and WEIGHTS_{number} of shape {(count, 4)}, got {got}; export it again"
             )
         if not np.isfinite(weights).all() or (weights < 0.0).any():
             bad = int(np.argwhere(~((weights >= 0.0) & np.isfinite(weights)))[0, 0])
-            raise Fault(f"expected WEIGHTS_{number} from 0 up, got {weights[bad].tolist()} at vertex {bad}; repair it")
+            raise FormatError(
+                f"expected WEIGHTS_{number} from 0 up, got {weights[bad].tolist()} at vertex {bad}; repair it"
+            )
         index = np.where(weights > 0.0, index, 0)  # what has no weight may point anywhere
         if int(index.max()) >= joints:
-            raise Fault(f"expected JOINTS_{number} from 0 to {joints - 1}, got {int(index.max())}; export it again")
+            raise FormatError(
+                f"expected JOINTS_{number} from 0 to {joints - 1}, got {int(index.max())}; export it again"
+            )
         np.add.at(found, (np.arange(count)[:, None], index), weights)
         number += 1
     loose = found.sum(1) <= 0.0
     if loose.any():
         found[loose, 0] = 1.0
-        source.unsupported.note(
+        context.unread.note(
             f"{int(loose.sum())} of {count} vertices of {name[:60]!r} whose weights are all 0, as vertex {int(loose.argmax())}",
             "bound to the first joint of the skin",
         )
     total = found.sum(1, keepdims=True)
     worst = float(np.abs(total - 1.0).max())
     if worst > WHOLE:
-        source.unsupported.note(
-            f"weights of {name!r} that add up to 1 only within {worst:.2g}", "divided by their sums"
-        )
+        context.unread.note(f"weights of {name!r} that add up to 1 only within {worst:.2g}", "divided by their sums")
     return found / total
 
 
 def _targets(geometry: Geometry, name: str, positions: np.ndarray, count: int) -> np.ndarray:
-    """(M, N, 3) of so many targets, zeros of those that the primitive lacks. Raises Fault."""
+    """Return differences (M, N, 3) of `count` targets, zeros for those that the primitive lacks. Raises FormatError."""
     rows = geometry.targets(name, positions.shape)
     rows += [None] * (count - len(rows))
     whole = [np.zeros(positions.shape) if row is None else row for row in rows]
@@ -243,28 +235,28 @@ def _targets(geometry: Geometry, name: str, positions: np.ndarray, count: int) -
 
 
 def _animations(
-    arrays: Arrays, tree: dict[str, Any], places: dict[int, int], source: Source
-) -> list[tuple[str, list[Channel]]]:
+    arrays: Arrays, tree: dict[str, Any], places: dict[int, int], context: LoadContext
+) -> list[tuple[str, list[AnimationChannel]]]:
     """Return the channels of each animation by its name, and note those that cannot be read."""
-    found: dict[str, list[Channel]] = {}
+    found: dict[str, list[AnimationChannel]] = {}
     for number, animation in enumerate(tree.get("animations", [])):
         name = str(animation.get("name") or f"animation {number}")
-        name = free_name(found, name, f"{name} ({number})")
+        name = unique_name(found, name, f"{name} ({number})")
         found[name] = channels = []
         for channel in animation["channels"]:
             target = channel["target"]
             if target["path"] not in PATHS:
-                source.unsupported.note(f"animation of {target['path']!r}")
+                context.unread.note(f"animation of {target['path']!r}")
             elif (node := target.get("node")) in places:
                 what = (
                     f"{target['path']} of node {node_name(node, tree['nodes'][node])[:60]!r} in animation {name[:60]!r}"
                 )
                 try:
-                    channels.append(_channel(arrays, tree, animation, channel, places, what, source))
-                except Fault as fault:
-                    source.unsupported.note(what, f"left out: {fault}")
+                    channels.append(_channel(arrays, tree, animation, channel, places, what, context))
+                except FormatError as error:
+                    context.unread.note(what, f"left out: {error}")
             elif node is not None and not 0 <= node < len(tree.get("nodes", [])):
-                source.unsupported.note(
+                context.unread.note(
                     f"{target['path']} of node {node} in animation {name[:60]!r}", "left out: there is no such node"
                 )
     return list(found.items())
@@ -272,12 +264,12 @@ def _animations(
 
 def _channel(
     arrays: Arrays, tree: dict[str, Any], animation: dict[str, Any], channel: dict[str, Any], places: dict[int, int],
-    what: str, source: Source,
-) -> Channel:  # fmt: skip
+    what: str, context: LoadContext,
+) -> AnimationChannel:  # fmt: skip
     sampler, target = entry(animation, "samplers", channel["sampler"]), channel["target"]
     path, interpolation = target["path"], sampler.get("interpolation", "LINEAR")
     if interpolation not in INTERPOLATIONS:
-        raise Fault(
+        raise FormatError(
             f"expected an interpolation among {', '.join(INTERPOLATIONS)}, got {interpolation!r}; export it again"
         )
     times = arrays.get(sampler["input"])
@@ -286,7 +278,9 @@ def _channel(
         or times.shape[1] != 1
         or not (np.isfinite(times).all() and (np.diff(times[:, 0]) > 0).all())
     ):
-        raise Fault(f"expected ascending times in seconds for {path}, got {times[:5, 0].tolist()}, …; export it again")
+        raise FormatError(
+            f"expected ascending times in seconds for {path}, got {times[:5, 0].tolist()}, …; export it again"
+        )
     values = arrays.get(sampler["output"])
     values = values.astype(np.float64) if values.dtype.kind == "f" else normalised(values)
     node = entry(tree, "nodes", target["node"])
@@ -295,22 +289,22 @@ def _channel(
     )
     each = 3 if interpolation == "CUBICSPLINE" else 1
     if columns == 0 or values.size != len(times) * each * columns or not np.isfinite(values).all():
-        raise Fault(
+        raise FormatError(
             f"expected {len(times)} × {each} × {columns} finite numbers for {path}, got shape {values.shape}; export it again"
         )
     values = values.reshape((len(times), 3, columns) if each == 3 else (len(times), columns))
     if path == "rotation":
-        values = _unit(values, each == 3, what, source)
-    return Channel(path, places[target["node"]], times[:, 0].astype(np.float64), values, interpolation)
+        values = _unit(values, each == 3, what, context)
+    return AnimationChannel(path, places[target["node"]], times[:, 0].astype(np.float64), values, interpolation)
 
 
-def _unit(values: np.ndarray, cubic: bool, what: str, source: Source) -> np.ndarray:
-    """Keys of rotations divided by the lengths of their quaternions, tangents of splines with them. Bytes and shorts have these
-    lengths to rounding; notes others. Raises Fault for a quaternion of zeros."""
+def _unit(values: np.ndarray, cubic: bool, what: str, context: LoadContext) -> np.ndarray:
+    """Return keys of rotations divided by the lengths of their quaternions, and tangents of splines with them. Bytes and shorts
+    have these lengths to rounding; others are noted. Raises FormatError for a quaternion of zeros."""
     length = np.linalg.norm(values[:, 1] if cubic else values, axis=-1)
     worst = int(np.abs(length - 1.0).argmax())
     if not length.all():
-        raise Fault(f"expected unit quaternions, got zeros at key {int(length.argmin())}; repair it")
+        raise FormatError(f"expected unit quaternions, got zeros at key {int(length.argmin())}; repair it")
     if abs(length[worst] - 1.0) > ROUNDED:
-        source.unsupported.note(f"{what}, whose key {worst} is of length {length[worst]:.3g}", "divided by it")
+        context.unread.note(f"{what}, whose key {worst} is of length {length[worst]:.3g}", "divided by it")
     return values / length.reshape(-1, *[1] * (values.ndim - 1))

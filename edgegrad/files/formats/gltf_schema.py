@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from ...optional import require
-from .part import Fault
+from .part import FormatError
 
 TYPES: dict[str, Any] = {
     "object": dict,
@@ -22,12 +22,12 @@ TYPES: dict[str, Any] = {
 
 @functools.cache
 def schema() -> dict[str, Any]:
-    """Of a whole file."""
+    """Return the schema of a whole file."""
     return require("trimesh.exchange.gltf", "trimesh", "reading meshes").get_schema()
 
 
 def properties(schema: dict[str, Any]) -> dict[str, Any]:
-    """The schemas of the properties of an object, by name."""
+    """Return the schemas of the properties of an object, by name."""
     found = dict(schema.get("properties", {}))
     for base in schema.get("allOf", ()):
         for name, inner in properties(base).items():
@@ -37,20 +37,20 @@ def properties(schema: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def explained(tree: dict[str, Any]) -> Iterator[None]:
-    """Makes what goes wrong in the block a Fault that names the value at fault by its way through the JSON, where the schema
-    forbids one. Files are not held to the schema as long as they can be read."""
+    """Turn an error in the block into a FormatError that names the bad value by its path in the JSON, where the schema forbids
+    one. Files are not held to the schema as long as they can be read."""
     try:
         yield
-    except (Fault, FileNotFoundError, ImportError):
+    except (FormatError, FileNotFoundError, ImportError):
         raise
     except Exception as error:
         for place, expected, got in _departures(tree, schema(), ""):
-            raise Fault(f"expected {expected} at {place}, got {got}; export it again") from error
+            raise FormatError(f"expected {expected} at {place}, got {got}; export it again") from error
         raise
 
 
 def _departures(value: Any, schema: dict[str, Any], place: str) -> Iterator[tuple[str, str, str]]:
-    """(place, what was expected there, what came), of types and of what is required."""
+    """Yield (place, what was expected there, what came) for wrong types and missing values."""
     kind = _declared(schema, "type")
     if kind in TYPES and (not isinstance(value, TYPES[kind]) or (isinstance(value, bool) and kind != "boolean")):
         yield place, f"{'an' if kind[0] in 'aeio' else 'a'} {kind}", repr(value)[:60]
@@ -71,7 +71,7 @@ def _departures(value: Any, schema: dict[str, Any], place: str) -> Iterator[tupl
 
 
 def _declared(schema: dict[str, Any], word: str) -> Any:
-    """What a schema, or one that it builds on, says by a keyword."""
+    """Return the value of a keyword in a schema, or in one that it builds on."""
     if word in schema:
         return schema[word]
     found = (_declared(base, word) for base in schema.get("allOf", ()))

@@ -1,4 +1,4 @@
-"""What a glTF file holds that nobody reads: extensions, properties, attributes of vertices, kinds of primitives."""
+"""Content of a glTF file that nobody reads: extensions, properties, attributes of vertices, kinds of primitives."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from .context import LoadContext
 from .gltf import MATT, READ
 from .gltf_nodes import note_rotations
 from .gltf_schema import properties, schema
-from .source import Source
 
 INSTEAD = {
     "EXT_mesh_gpu_instancing": "shown once",
@@ -23,34 +23,33 @@ OF_LIGHT = re.compile(r"[A-Z0-9]+_(materials|lights)_")  # without lit=True left
 ATTRIBUTES = re.compile(r"POSITION|NORMAL|TANGENT|COLOR_0|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+")
 
 
-def note_unread(tree: dict[str, Any], source: Source) -> None:
-    """Notes it all, but what has no effect on a picture, and without lit=True what is of light."""
-    lit, found = source.wanted.lit, list(_unknown(tree, schema(), "the file"))
+def note_unread(tree: dict[str, Any], context: LoadContext) -> None:
+    """Note all unread content that affects a picture; without lit=True content of lights and materials is left out."""
+    lit, found = context.options.lit, list(_unknown(tree, schema(), "the file"))
     extensions = {name for kind, name in found if kind == "extension"} | set(tree.get("extensionsUsed", []))
     for name in sorted(extensions - READ - COPIES - {MATT}):  # MATT by material
         if name in INSTEAD or lit or not OF_LIGHT.match(name):
-            source.unsupported.note(name, INSTEAD.get(name, "left out"))
+            context.unread.note(name, INSTEAD.get(name, "left out"))
     for kind, name in sorted(set(found)):
         if kind != "extension":
-            source.unsupported.note(f"{name!r} of {kind}")
+            context.unread.note(f"{name!r} of {kind}")
     for name, instead in {"animations": "shown at rest", "skins": "shown in the pose of their binding"}.items():
-        if tree.get(name) and not source.wanted.rigged:
-            source.unsupported.note(name, f"{instead}; load_rig() has them")
-    note_rotations(tree, source.unsupported)
+        if tree.get(name) and not context.options.rigged:
+            context.unread.note(name, f"{instead}; load_rig() has them")
+    note_rotations(tree, context.unread)
     used = {f"TEXCOORD_{number}" for number in _values(tree.get("materials", []), "texCoord")}
     primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
     attributes = {name for primitive in primitives for name in primitive["attributes"]}
     for name in sorted(name for name in attributes - used if not ATTRIBUTES.fullmatch(name)):
-        source.unsupported.note(f"attribute {name}")
-    if any("targets" in primitive for primitive in primitives) and not source.wanted.rigged:
-        source.unsupported.note("morph targets", "shown without; load_rig() has them")
+        context.unread.note(f"attribute {name}")
+    if any("targets" in primitive for primitive in primitives) and not context.options.rigged:
+        context.unread.note("morph targets", "shown without; load_rig() has them")
     if any(primitive.get("mode", 4) in (0, 1, 2, 3) for primitive in primitives):
-        source.unsupported.note("points and lines")
+        context.unread.note("points and lines")
 
 
 def _unknown(value: Any, schema: dict[str, Any], kind: str) -> Iterator[tuple[str, str]]:
-    """Where and by what name there is something that the format does not know: ("extension", its name), or the name of the
-    list that it stands in."""
+    """Yield content that the format does not know: ("extension", its name), or the list that it stands in and its name."""
     if isinstance(value, list):
         for element in value:
             yield from _unknown(element, schema.get("items", {}), kind)
@@ -72,7 +71,7 @@ def _unknown(value: Any, schema: dict[str, Any], kind: str) -> Iterator[tuple[st
 
 
 def _values(thing: Any, name: str) -> Iterator[Any]:
-    """All that stands under a name, however deep."""
+    """Yield all values under a name, at any depth."""
     for key, inner in thing.items() if isinstance(thing, dict) else enumerate(thing) if isinstance(thing, list) else ():
         if key == name:
             yield inner

@@ -1,4 +1,4 @@
-"""What a mesh looks like, in the terms of glTF: its material, textures, and attributes of vertices."""
+"""Appearance of a mesh in the terms of glTF: its material, textures, and attributes of vertices."""
 
 from __future__ import annotations
 
@@ -20,11 +20,9 @@ UNEVEN = 1e-3  # lengths that differ by so little are rounded
 WRAP_CODES = {name: code for code, name in WRAPS.items()}
 
 
-class Look:
-    """What a mesh looks like in the terms of glTF.
-
-    unlit  whether one without a material is said to be unlit (KHR_materials_unlit), so that it comes back without
-    """
+class GltfAppearance:
+    """The appearance of a mesh in the terms of glTF. With `unlit`, a mesh without a material is marked as unlit
+    (KHR_materials_unlit), so that it is read back without one."""
 
     def __init__(self, mesh: Mesh, unlit: bool = False) -> None:
         self.mesh = mesh
@@ -65,7 +63,7 @@ class Look:
     # -- what it looks like -----------------------------------------------------------------------------------------
 
     def _base(self, material: Material) -> tuple[Texture | None, Tensor]:
-        """Texture and factor of the base colour, apart from colours of vertices."""
+        """Return texture and factor of the base colour, apart from colours of vertices."""
         mesh, given, texture = self.mesh, material.base_color, None
         if mesh.texture is not None:
             texture = Texture(mesh.texture, mesh.uvs, mesh.uv_faces, mesh.wrap, mesh.filter)
@@ -95,15 +93,14 @@ class Look:
         return texture, factor
 
     def _alpha(self, base: Texture | None) -> float | None:
-        """What cuts out or is seen through is the fourth channel of the base colour: of its texture, and of its factor,
-        which this gives; None where nothing is."""
+        """Write alpha as the fourth channel of the base colour's texture, and return that of its factor; None without alpha."""
         mesh = self.mesh
         if mesh.alpha is None:
             return None
         alpha = self._within("alpha", mesh.alpha.detach().cpu().double())
         if alpha.numel() == 1:
             return float(alpha)
-        # Where texels are larger than pixels, mipmaps are linear.
+        # Mipmaps are linear where texels are larger than pixels.
         near = base is not None and FILTERS[base.filter][0] == FILTERS[mesh.filter][0]
         lies = Texture(
             alpha[..., None], None, None, mesh.wrap, base.filter if base is not None and near else mesh.filter
@@ -121,7 +118,7 @@ class Look:
         return 1.0
 
     def _surface(self, material: Material) -> None:
-        """How it scatters light."""
+        """Write the parameters of scattering."""
         base = self.material["pbrMetallicRoughness"]
         if not material.is_glossy:
             base["metallicFactor"] = 0.0
@@ -167,7 +164,7 @@ class Look:
             }
 
     def _constant(self, name: str, value: Tensor | float) -> Tensor:
-        """(), (1,) or (3,)."""
+        """Return a constant of shape (), (1,) or (3,)."""
         value = torch.as_tensor(value).detach().cpu().double()
         if value.dim() < 2:
             return value
@@ -175,7 +172,7 @@ class Look:
         return _mean(value)
 
     def _values(self, name: str, texture: Texture) -> tuple[Tensor, Tensor]:
-        """Image and factor, both from 0 to 1; the factor goes into the image where one of them is not."""
+        """Return image and factor, both from 0 to 1; the factor goes into the image where one of them is not."""
         image = texture.image.detach().cpu().double()
         factor = torch.as_tensor(1.0 if texture.factor is None else texture.factor).detach().cpu().double()
         if _is_within(image) and _is_within(factor):
@@ -199,7 +196,7 @@ class Look:
         self._set(texture)
 
     def _set(self, texture: Texture) -> int:
-        """The number of its texture coordinates."""
+        """Return the number of the texture's coordinates."""
         given = coordinates(self.mesh, texture)
         known = next((k for k, others in enumerate(self.sets) if _are_equal(given, others)), None)
         if known is not None:
@@ -208,14 +205,14 @@ class Look:
         return len(self.sets) - 1
 
     def _alike(self, a: Texture, b: Texture) -> bool:
-        """Whether both can be channels of one image."""
+        """Return whether both can be channels of one image."""
         same = [(t.image.shape[:2], t.wraps, t.filter) for t in (a, b)]
         return same[0] == same[1] and _are_equal(coordinates(self.mesh, a), coordinates(self.mesh, b))
 
     # -- in the file ------------------------------------------------------------------------------------------------
 
     def write(self, tree: dict[str, Any], primitive: dict[str, Any]) -> None:
-        """Into the JSON that trimesh made, where attributes of vertices have names of their own, and the material is
+        """Write into the JSON that trimesh made, where attributes of vertices have names of their own, and the material is
         images alone."""
         primitive["attributes"] = {name.lstrip("_"): index for name, index in primitive["attributes"].items()}
         if not self.material:
@@ -242,7 +239,7 @@ def _merge(into: dict[str, Any], given: dict[str, Any]) -> None:
 
 
 def _colors(mesh: Mesh) -> tuple[str, tuple[Tensor, Tensor] | None]:
-    """Kind, rows (N, C) and indices (F, 3) of what is not a texture."""
+    """Return kind, rows (N, C) and indices (F, 3) of colours other than a texture."""
     F = len(mesh.faces)
     if mesh.colors is not None:
         return "colors", (mesh.colors, mesh.faces)
@@ -253,18 +250,18 @@ def _colors(mesh: Mesh) -> tuple[str, tuple[Tensor, Tensor] | None]:
     return "", None
 
 
-def split(look: Look) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Vertices, faces, and attributes of vertices, with a leading _ as trimesh wants them: a glTF has one index for all."""
-    mesh = look.mesh
+def split(appearance: GltfAppearance) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return vertices, faces, and attributes of vertices with a leading _, as trimesh expects; a glTF has one index for all."""
+    mesh = appearance.mesh
     given: dict[str, tuple[Tensor, Tensor]] = {"": (mesh.verts, mesh.faces)}
     if mesh.normals is not None:
         unit = torch.nn.functional.normalize(mesh.normals.detach().double(), dim=-1)
         given["_NORMAL"] = unit, mesh.faces if mesh.normal_faces is None else mesh.normal_faces
-    for number, (uvs, uv_faces) in enumerate(look.sets):
+    for number, (uvs, uv_faces) in enumerate(appearance.sets):
         down = torch.stack([uvs[:, 0], 1.0 - uvs[:, 1].double()], 1)
         given[f"_TEXCOORD_{number}"] = down, uv_faces
-    if look.colors is not None:
-        given["_COLOR_0"] = look.colors
+    if appearance.colors is not None:
+        given["_COLOR_0"] = appearance.colors
     rows = {name: values.detach().cpu().float().numpy() for name, (values, _) in given.items()}
     index = np.stack([faces.cpu().long().numpy().reshape(-1) for _, faces in given.values()], 1)
     corners = np.arange(len(index))
@@ -283,7 +280,7 @@ def _are_equal(these: tuple[Tensor, Tensor], others: tuple[Tensor, Tensor]) -> b
 
 
 def _mean(value: Tensor | Texture) -> Tensor:
-    """What stands for it where a number is all that can be said."""
+    """Return the mean, which stands for the values where glTF has one number."""
     if isinstance(value, Texture):
         return value.image.mean((0, 1)) * torch.as_tensor(1.0 if value.factor is None else value.factor)
     return value.mean(0)

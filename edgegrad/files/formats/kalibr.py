@@ -1,4 +1,4 @@
-"""Kalibr's camera chains (camchain.yaml): cameras of a rig, each placed by the one before."""
+"""Kalibr's camera chains (camchain.yaml): cameras of a rig, each placed relative to the one before."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from ...camera.camera import Camera
+from .context import UnreadLog
 from .keys import image_size, matrix, note_unread
-from .part import Fault
-from .source import Unsupported
+from .part import FormatError
 from .views import View
 
 NAME = re.compile(r"cam(\d+)")
@@ -26,15 +26,15 @@ def is_chain(fields: Mapping[str, Any]) -> bool:
     return any(NAME.fullmatch(name) and isinstance(value, dict) for name, value in fields.items())
 
 
-def read(fields: Mapping[str, Any], unread: Unsupported) -> dict[str, View]:
-    """By the chain's names. The world is the first camera's: it stands at the origin. Raises Fault."""
+def read(fields: Mapping[str, Any], unread: UnreadLog) -> dict[str, View]:
+    """Return views by the chain's names. The first camera is at the origin of the world. Raises FormatError."""
     names = sorted(filter(NAME.fullmatch, fields), key=lambda name: int(name[3:]))
     views: dict[str, View] = {}
     pose = np.eye(4)
     for name in names:
         given = fields[name]
         if not isinstance(given, dict):
-            raise Fault(f"{name}: expected the keys of a camera of Kalibr, got {type(given).__name__}")
+            raise FormatError(f"{name}: expected the keys of a camera of Kalibr, got {type(given).__name__}")
         given = {key: value for key, value in given.items() if value is not None}
         try:
             if "T_cn_cnm1" in given:
@@ -42,21 +42,22 @@ def read(fields: Mapping[str, Any], unread: Unsupported) -> dict[str, View]:
             elif views:
                 unread.note(f"{name} without T_cn_cnm1", f"it stands where {list(views)[-1]} does")
             views[name] = View(_camera(given, pose), None)
-        except (Fault, ValueError) as error:
-            raise Fault(f"{name}: {error}") from error
+        except (FormatError, ValueError) as error:
+            raise FormatError(f"{name}: {error}") from error
         note_unread(given, READ | HARMLESS, unread, INSTEAD)
     note_unread(fields, names, unread)
     return views
 
 
 def _camera(given: Mapping[str, Any], pose: np.ndarray) -> Camera:
-    """Raises Fault or ValueError."""
     model, bend = given.get("camera_model", "pinhole"), given.get("distortion_model", "none")
     if model != "pinhole":
-        raise Fault(f"camera_model: expected pinhole, got {model!r}; undistort the images, or calibrate as pinhole")
+        raise FormatError(
+            f"camera_model: expected pinhole, got {model!r}; undistort the images, or calibrate as pinhole"
+        )
     if bend not in BROWN_CONRADY + EQUIDISTANT:
         known = ", ".join(BROWN_CONRADY + EQUIDISTANT)
-        raise Fault(f"distortion_model: expected one of {known}, got {bend!r}; undistort the images")
+        raise FormatError(f"distortion_model: expected one of {known}, got {bend!r}; undistort the images")
     fx, fy, cx, cy = _matrix(given, "intrinsics", (1, 4))[0]
     width, height = _matrix(given, "resolution", (1, 2))[0]
     coefficients = None
@@ -72,8 +73,8 @@ def _camera(given: Mapping[str, Any], pose: np.ndarray) -> Camera:
 
 def _matrix(given: Mapping[str, Any], key: str, shape: tuple[int, int]) -> np.ndarray:
     if key not in given:
-        raise Fault(f"{key}: expected this key, got only {', '.join(map(str, given)) or 'none'}")
+        raise FormatError(f"{key}: expected this key, got only {', '.join(map(str, given)) or 'none'}")
     found = matrix(key, given[key])
     if found.shape != shape:
-        raise Fault(f"{key}: expected {shape[0]} × {shape[1]} numbers, got {found.shape[0]} × {found.shape[1]}")
+        raise FormatError(f"{key}: expected {shape[0]} × {shape[1]} numbers, got {found.shape[0]} × {found.shape[1]}")
     return found

@@ -1,4 +1,5 @@
-"""Files of keys and values: OpenCV's YAML and XML by OpenCV, other YAML by PyYAML; and what nobody read of them."""
+"""Files of keys and values: OpenCV's YAML and XML by OpenCV, other YAML by PyYAML; and a record of the keys that nobody
+read."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ...optional import require
-from .part import Fault
-from .source import Unsupported
+from .context import UnreadLog
+from .part import FormatError
 
 MOST_NUMBERS = 1 << 20  # of a matrix; YAML's references announce more than they hold
 MOST_PIXELS = 1 << 24  # on a side
@@ -23,20 +24,22 @@ OPENCV = ("%YAML:", "opencv-matrix", "opencv_storage")  # in files of cv2.FileSt
 
 
 def read_keys(file: Path) -> dict[str, Any]:
-    """Numbers, text, lists, dicts and, of OpenCV, arrays. Raises Fault or ImportError."""
+    """Return numbers, text, lists, dicts and, from OpenCV, arrays. Raises FormatError or ImportError."""
     text = file.read_text(encoding="utf-8", errors="replace")
     if file.suffix.lower() == ".xml" or any(mark in text for mark in OPENCV):
         if _is_deep(text.encode()):  # on which OpenCV ends the process
-            raise Fault(f"expected a calibration, got lists or keys inside one another more than {DEEP} times")
+            raise FormatError(f"expected a calibration, got lists or keys inside one another more than {DEEP} times")
         return _of_opencv(file)
     yaml = require("yaml", "edgegrad[cameras]", "reading YAML")
     try:
-        # Of several documents the first: a message of ROS, which `ros2 topic echo` ends by ---.
+        # The first of several documents counts: `ros2 topic echo` ends a message of ROS by ---.
         found = next((document for document in yaml.safe_load_all(text) if document is not None), None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise Fault(f"expected YAML, got a file that PyYAML does not read ({' '.join(str(error).split())})") from error
+        raise FormatError(
+            f"expected YAML, got a file that PyYAML does not read ({' '.join(str(error).split())})"
+        ) from error
     if not isinstance(found, dict):
-        raise Fault(f"expected YAML or XML of keys and values, got {type(found).__name__}")
+        raise FormatError(f"expected YAML or XML of keys and values, got {type(found).__name__}")
     return {str(key): value for key, value in found.items() if value is not None}
 
 
@@ -47,11 +50,11 @@ def _of_opencv(file: Path) -> dict[str, Any]:
         root = storage.root()
         return _value(root) if root.isMap() else {}
     except (cv2.error, SystemError, RecursionError) as error:
-        raise Fault("expected YAML or XML of cv2.FileStorage, got a file that OpenCV does not read") from error
+        raise FormatError("expected YAML or XML of cv2.FileStorage, got a file that OpenCV does not read") from error
 
 
 def _is_deep(text: bytes) -> bool:
-    """By brackets, by tags, or by what YAML begins a line with."""
+    """Return whether values nest too deeply, by brackets, by tags, or by the indentation of YAML."""
     letters = np.frombuffer(text + b" ", np.uint8)
     first, second = letters[:-1], letters[1:]
     brackets = np.isin(first, list(b"[{")).astype(np.int64) - np.isin(first, list(b"]}"))
@@ -71,7 +74,7 @@ def _value(node: Any) -> Any:
 
 
 def _matrix(node: Any) -> np.ndarray:
-    """Raises Fault, or cv2.error. Checked before OpenCV reads it, which writes past its memory where numbers do not match."""
+    """Return a matrix, whose size is checked first because OpenCV writes past its memory where numbers do not match."""
     shape, data, dt = node.getNode("sizes"), node.getNode("data"), node.getNode("dt")
     sides = [shape.at(i) for i in range(shape.size())] if shape.isSeq() else [node.getNode(n) for n in ("rows", "cols")]
     known = ELEMENT.fullmatch(dt.string()) if dt.isString() else None
@@ -79,7 +82,7 @@ def _matrix(node: Any) -> np.ndarray:
     sizes = [node.real() if node.isInt() else -1.0 for node in sides]
     if known is None or min(sizes, default=-1.0) < 0 or math.prod(sizes) * int(known[1] or 1) != count:
         shown = " × ".join(f"{size:g}" if size >= 0 else "?" for size in sizes)
-        raise Fault(
+        raise FormatError(
             f"{node.name()}: expected rows, cols and dt of a matrix of OpenCV and as many numbers, got {shown}, dt "
             f"{dt.string() if dt.isString() else 'none'!r} and {count} numbers; save it again by cv2.FileStorage"
         )
@@ -87,7 +90,7 @@ def _matrix(node: Any) -> np.ndarray:
 
 
 def matrix(name: str, value: object) -> np.ndarray:
-    """(rows, columns) float64 from OpenCV's or ROS's matrices, or from lists; a single list is a row. Raises Fault."""
+    """Return (rows, columns) float64 of OpenCV's or ROS's matrices, or of lists; a single list is a row. Raises FormatError."""
     try:
         if isinstance(value, np.ndarray):
             return value.astype(np.float64)
@@ -101,22 +104,22 @@ def matrix(name: str, value: object) -> np.ndarray:
             raise ValueError("too many numbers")
         return np.array([[float(x) for x in row] for row in rows])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise Fault(
+        raise FormatError(
             f"{name}: expected a matrix of OpenCV, or rows, cols and data, or a list of rows, got something else ({error})"
         ) from error
 
 
 def image_size(width: float, height: float) -> tuple[int, int]:
-    """(H, W). Raises Fault."""
+    """Return (H, W). Raises FormatError."""
     if not all(0 < side <= MOST_PIXELS and side == round(side) for side in (width, height)):  # nor NaN
-        raise Fault(f"size: expected whole numbers of pixels, got width {width:g} and height {height:g}")
+        raise FormatError(f"size: expected whole numbers of pixels, got width {width:g} and height {height:g}")
     return round(height), round(width)
 
 
 def note_unread(
-    fields: Mapping[str, Any], known: Container[str], unread: Unsupported, instead: Mapping[str, str] | None = None
+    fields: Mapping[str, Any], known: Container[str], unread: UnreadLog, instead: Mapping[str, str] | None = None
 ) -> None:
-    """Notes the keys that are not known, unless they say nothing: null, zeros, nothing at all."""
+    """Note the keys that are not known, unless their values are null, zeros or empty."""
     for key, value in fields.items():
         if key not in known and not _says_nothing(value):
             unread.note(key, (instead or {}).get(key, "left out"))

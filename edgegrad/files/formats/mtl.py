@@ -1,4 +1,4 @@
-"""Material libraries of OBJ files (MTL), and what their materials make of a part."""
+"""Material libraries of OBJ files (MTL), and the appearance that their materials give a part."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from ...scene.material import Material
-from .mtl_texture import Texture
-from .part import Fault
-from .source import Source
+from .context import LoadContext
+from .mtl_textures import MtlTexture
+from .part import FormatError
 from .text import as_utf8
 
 READ = {"kd", "map_kd", "ke", "ks", "ns", "illum", "d", "tr", "map_d", "pr", "pm"}
-# What changes no picture here: light from all sides, the index of refraction (dielectrics have that of 1.5), hints.
+# These change no picture: ambient light, the index of refraction (dielectrics have that of 1.5), hints.
 HARMLESS = {"ka", "ni", "sharpness", "map_aat"}
-# What nothing reads, and only lit scenes would: maps, and numbers that are nothing where they have this value.
+# Only lit scenes would use these, which nothing reads: maps, and numbers that have no effect at this value.
 MAPS = {
     "map_ka", "map_ks", "map_ns", "map_ke", "map_pr", "map_pm", "map_ps", "map_bump", "bump", "norm", "disp", "decal",
     "refl", "map_refl", "map_tr", "map_tf", "map_ni",
@@ -27,10 +27,10 @@ NUMBERS = {"tf": 1.0, "ps": 0.0, "pc": 0.0, "pcr": 0.0, "aniso": 0.0, "anisor": 
 
 
 class Library:
-    """The materials of an OBJ file; parts share images, and what scatters light, where these are equal."""
+    """The materials of an OBJ file; parts share images, and materials that scatter light equally."""
 
-    def __init__(self, source: Source) -> None:
-        self.source = source
+    def __init__(self, context: LoadContext) -> None:
+        self.context = context
         self.materials: dict[str, dict[str, str]] = {}  # what follows each keyword, which is in lower case
         self.files: dict[str, str] = {}  # by material
         self.images: dict[str, Any] = {}
@@ -46,63 +46,67 @@ class Library:
             elif rest and not keyword.startswith("#"):  # some programs write keywords with nothing after them
                 current[keyword.lower()] = rest
 
-    def look(self, name: str | None, uvs: np.ndarray | None, count: int) -> dict[str, Any]:
-        """The fields of a part of `count` triangles that say what it looks like; without a material, those of none. Raises Fault,
+    def appearance(self, name: str | None, uvs: np.ndarray | None, count: int) -> dict[str, Any]:
+        """Return the appearance fields of a part of `count` triangles; without a material, those of none. Raises FormatError,
         which names the material, or FileNotFoundError."""
         given = self.materials.get(name or "", {})
         try:
-            return self._look(given, uvs, count)
-        except Fault as fault:
-            raise Fault(f"newmtl {name} in {self.files.get(name or '')}: {fault}") from fault.__cause__
+            return self._appearance(given, uvs, count)
+        except FormatError as error:
+            raise FormatError(f"newmtl {name} in {self.files.get(name or '')}: {error}") from error.__cause__
 
-    def _look(self, given: Mapping[str, str], uvs: np.ndarray | None, count: int) -> dict[str, Any]:
-        look = self._base(given, uvs, count)
+    def _appearance(self, given: Mapping[str, str], uvs: np.ndarray | None, count: int) -> dict[str, Any]:
+        appearance = self._base(given, uvs, count)
         self._note_unread(given)
-        if self.source.wanted.lit:
-            look |= {"material": self._material(given), "alpha": self._alpha(given, look)}
-            if look["alpha"] is not None and look["alpha"].numel() == 1 and look.get("uvs") is None:
-                look |= {"uvs": np.zeros((1, 2), np.float32), "uv_faces": np.zeros((count, 3), np.int64)}
-        return look
+        if self.context.options.lit:
+            appearance |= {"material": self._material(given), "alpha": self._alpha(given, appearance)}
+            if appearance["alpha"] is not None and appearance["alpha"].numel() == 1 and appearance.get("uvs") is None:
+                appearance |= {"uvs": np.zeros((1, 2), np.float32), "uv_faces": np.zeros((count, 3), np.int64)}
+        return appearance
 
     def _base(self, given: Mapping[str, str], uvs: np.ndarray | None, count: int) -> dict[str, Any]:
-        """map_Kd times Kd, as the format says, or Kd alone."""
+        """Return map_Kd times Kd, as the format says, or Kd alone."""
         color = None
         if given.get("kd", "").split()[:1] in (["spectral"], ["xyz"]):
-            self.source.unsupported.note(f"Kd {given['kd']}", "not read")
+            self.context.unread.note(f"Kd {given['kd']}", "not read")
         elif color := _numbers(given, "kd"):
             if len(color) not in (1, 3):
-                raise Fault(f"expected one number or three for Kd in the material, got {given['kd']!r}; repair it")
+                raise FormatError(
+                    f"expected one number or three for Kd in the material, got {given['kd']!r}; repair it"
+                )
             if min(color) < 0.0:
-                raise Fault(f"expected numbers from 0 on for Kd in the material, got {given['kd']!r}; repair it")
+                raise FormatError(f"expected numbers from 0 on for Kd in the material, got {given['kd']!r}; repair it")
             color = np.broadcast_to(color, 3).tolist()
         if "map_kd" in given:
             if color and not any(color):
-                self.source.unsupported.note("map_Kd times a Kd of 0", "black, as the format says; set Kd to 1 1 1")
-            texture = Texture.of(given["map_kd"], "map_Kd", self.source)
-            texels = self.source.textures.get(texture.name, self._image(texture.name), tuple(color or (1.0, 1.0, 1.0)))
-            return {"texture": texels, "wrap": texture.wrap} | ({} if uvs is None else {"uvs": texture.placed(uvs)})
+                self.context.unread.note("map_Kd times a Kd of 0", "black, as the format says; set Kd to 1 1 1")
+            texture = MtlTexture.from_statement(given["map_kd"], "map_Kd", self.context)
+            texels = self.context.textures.get(texture.name, self._image(texture.name), tuple(color or (1.0, 1.0, 1.0)))
+            return {"texture": texels, "wrap": texture.wrap} | (
+                {} if uvs is None else {"uvs": texture.transformed_uvs(uvs)}
+            )
         return {} if not color else {"face_colors": torch.tensor(color, dtype=torch.float32).repeat(count, 1)}
 
     def _image(self, name: str) -> Any:
         if name not in self.images:
-            self.images[name] = self.source.folder.image(name)
+            self.images[name] = self.context.folder.image(name)
         return self.images[name]
 
     def _note_unread(self, given: Mapping[str, str]) -> None:
-        """What a lit scene would need, and what nobody knows."""
+        """Note keywords that a lit scene would need, and unknown ones."""
         for name in given:
-            if name in READ | HARMLESS or (name in MAPS | set(NUMBERS) and not self.source.wanted.lit):
+            if name in READ | HARMLESS or (name in MAPS | set(NUMBERS) and not self.context.options.lit):
                 continue
             if name not in NUMBERS or any(v != NUMBERS[name] for v in _numbers(given, name)):
-                self.source.unsupported.note(name)
+                self.context.unread.note(name)
 
     def _material(self, given: Mapping[str, str]) -> Material:
-        """Lambertian, or, where it has highlights, a dielectric whose roughness says by Ns how sharp they are. Phong's exponent
-        Ns is as wide as a lobe of α² = 2 / (Ns + 2), and α = roughness² (Walter et al. 2007, section 5.2)."""
+        """Return a Lambertian material or, with highlights, a dielectric whose roughness follows from Ns. Phong's exponent Ns
+        is as wide as a lobe of α² = 2 / (Ns + 2), and α = roughness² (Walter et al. 2007, section 5.2)."""
         metallic, roughness = _number(given, "pm"), _number(given, "pr")
         shiny = _number(given, "illum", 2.0) not in (0.0, 1.0) and any(_numbers(given, "ks"))
         if metallic is None and roughness is None and shiny:
-            self.source.unsupported.note("Ks", "a dielectric of 4 %, by Ns")
+            self.context.unread.note("Ks", "a dielectric of 4 %, by Ns")
             exponent = _number(given, "ns", 0.0)
             assert exponent is not None
             roughness = (2.0 / (max(exponent, 0.0) + 2.0)) ** 0.25
@@ -113,37 +117,37 @@ class Library:
             self.scattering[key] = Material(metallic=metallic, roughness=roughness, emission=glow)
         return self.scattering[key]
 
-    def _alpha(self, given: Mapping[str, str], look: dict[str, Any]) -> Tensor | None:
-        """(h, w) float32: d times map_d, the alpha of an image or else its grey, where either is less than one."""
+    def _alpha(self, given: Mapping[str, str], appearance: dict[str, Any]) -> Tensor | None:
+        """Return alpha (h, w) float32: d times map_d, an image's alpha or else its grey, where either is less than one."""
         opacity = _number(given, "d", 1.0)
         assert opacity is not None
         if _number(given, "tr", 0.0):
-            self.source.unsupported.note("Tr", "left out, for writers differ in what 1 means; d says it")
+            self.context.unread.note("Tr", "left out, for writers differ in what 1 means; d says it")
         if opacity < 1.0:
-            self.source.unsupported.note("d", "shown where it is 0.5 or more, cut out elsewhere")
+            self.context.unread.note("d", "shown where it is 0.5 or more, cut out elsewhere")
         if "map_d" not in given:
             return torch.full((1, 1), opacity) if opacity < 0.5 else None
-        texture = Texture.of(given["map_d"], "map_d", self.source)
+        texture = MtlTexture.from_statement(given["map_d"], "map_d", self.context)
         if "map_kd" not in given:
-            look["wrap"] = texture.wrap
-            if look.get("uvs") is not None:
-                look["uvs"] = texture.placed(look["uvs"])
-        elif texture.place != Texture.of(given["map_kd"], "map_Kd", self.source).place:
-            self.source.unsupported.note("options of map_d", "those of map_Kd")
+            appearance["wrap"] = texture.wrap
+            if appearance.get("uvs") is not None:
+                appearance["uvs"] = texture.transformed_uvs(appearance["uvs"])
+        elif texture.transform != MtlTexture.from_statement(given["map_kd"], "map_Kd", self.context).transform:
+            self.context.unread.note("options of map_d", "those of map_Kd")
         image = self._image(texture.name)
-        grey = self.source.textures.data(texture.name, image, slice(0, 1))[..., 0]
-        own = self.source.textures.alpha(image, opacity)
+        grey = self.context.textures.data(texture.name, image, slice(0, 1))[..., 0]
+        own = self.context.textures.alpha(image, opacity)
         return opacity * grey if own is None else own
 
 
 def _numbers(given: Mapping[str, str], name: str) -> list[float]:
-    """Those after a keyword, up to a comment. Raises Fault."""
+    """Return the numbers after a keyword, up to a comment. Raises FormatError."""
     try:
         values = [float(word) for word in given.get(name, "").split("#")[0].split()]
     except ValueError as error:
-        raise Fault(f"expected numbers for {name} in the material, got {given[name]!r}; repair it") from error
+        raise FormatError(f"expected numbers for {name} in the material, got {given[name]!r}; repair it") from error
     if not np.isfinite(values).all():
-        raise Fault(f"expected finite numbers for {name} in the material, got {given[name]!r}; repair it")
+        raise FormatError(f"expected finite numbers for {name} in the material, got {given[name]!r}; repair it")
     return values
 
 

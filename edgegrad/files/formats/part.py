@@ -1,4 +1,4 @@
-"""What a mesh file holds, before equal vertices are welded, and what is wrong with it."""
+"""The content of a mesh file before equal vertices are welded, and errors of its format."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ...scene.material import Material
 from ..paths import PathLike
 
 
-class Fault(Exception):
-    """What is wrong with a file, said without its name."""
+class FormatError(Exception):
+    """An error of a file's content; the message does not name the file."""
 
 
 class Part(NamedTuple):
@@ -46,16 +46,16 @@ class Part(NamedTuple):
         return self._replace(**{n: np.ascontiguousarray(i[:, ::-1]) for n, i in indices.items() if i is not None})
 
 
-class Model(NamedTuple):
-    """All of a file."""
+class MeshFile(NamedTuple):
+    """All parts and lights of a mesh file."""
 
     parts: list[Part]  # at least one, each with at least one triangle
     lights: list[Light]
     dtype: torch.dtype = torch.float32  # of the meshes
 
 
-class Wanted(NamedTuple):
-    """What of a file is wanted."""
+class LoadOptions(NamedTuple):
+    """Options of what is read from a mesh file."""
 
     materials: bool = True  # textures and material colours
     lit: bool = False  # materials that scatter light, normals and lights
@@ -65,12 +65,12 @@ class Wanted(NamedTuple):
 
 
 @contextmanager
-def naming(path: PathLike) -> Iterator[None]:
-    """Makes every fault of a file an error that names the file."""
+def errors_with_path(path: PathLike) -> Iterator[None]:
+    """Turn FormatError and ValueError into a ValueError that names the file."""
     try:
         yield
-    except Fault as fault:
-        raise ValueError(f"{path}: {fault}") from fault.__cause__
+    except FormatError as error:
+        raise ValueError(f"{path}: {error}") from error.__cause__
     except ValueError as error:
         if str(error).startswith(str(path)):
             raise

@@ -1,4 +1,4 @@
-"""Parts from the elements of PLY files. What is read is taken out of them; what is left at the end nobody read, and is noted."""
+"""Parts from the elements of PLY files. Columns that are read are taken out; those left at the end are noted as unread."""
 
 from __future__ import annotations
 
@@ -10,57 +10,57 @@ import torch
 from torch import Tensor
 
 from ...scene.material import Material
-from .part import Fault, Part
+from .context import LoadContext, linear_colors
+from .part import FormatError, Part
 from .ply_elements import Element, Lists, read_elements, read_header
 from .polygons import triangulate
-from .source import Source, linear_colors
 
 CORNERS = ("vertex_indices", "vertex_index")
 COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 UVS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
-# What changes no picture: alpha, which is dropped from all files but those that cut out, and what scanners say of a point.
+# These change no picture: alpha, which only glTF and OBJ files use, and what scanners say of a point.
 HARMLESS = {"alpha", "diffuse_alpha", "a", "confidence", "quality", "flags"}
 
 
-def read(data: bytes, source: Source) -> list[Part]:
-    """One part, or none. Raises Fault."""
+def read(data: bytes, context: LoadContext) -> list[Part]:
+    """Return one part, or none. Raises FormatError."""
     header = read_header(data)
     rest = read_elements(data, header)
     if rest:
-        source.unsupported.note(f"{rest} {'bytes' if header.order else 'numbers'} after the last element", "not read")
+        context.unread.note(f"{rest} {'bytes' if header.order else 'numbers'} after the last element", "not read")
     elements = {element.name: element for element in header.elements}
     vertex, face, strips = (elements.pop(n, Element(n, 0, [], {})) for n in ("vertex", "face", "tristrips"))
     for name, element in elements.items():
         if element.size:
-            source.unsupported.note(f"element {name}", "not read")
+            context.unread.note(f"element {name}", "not read")
     if not vertex.size or not face.size + strips.size:
         return []
     verts = _take(vertex, ("x", "y", "z"))
     if verts is None:
-        raise Fault("expected numbers x, y and z of each vertex, got others; export it again")
+        raise FormatError("expected numbers x, y and z of each vertex, got others; export it again")
     verts = verts.astype(np.float32 if verts.dtype.kind == "f" and verts.dtype.itemsize <= 4 else np.float64)
     corners = _corners(face) if face.size else Lists(np.empty(0, np.int64), np.empty(0, np.int64))
     more = _strips(_corners(strips).values) if strips.size else np.empty(0, np.int64)
     index = np.concatenate([corners.values, more])
     counts = np.concatenate([corners.counts, np.full(len(more) // 3, 3)])
-    triangles, origin = triangulate(verts, index, counts, source)
-    look: dict[str, Any] = {"normals": _take(vertex, ("nx", "ny", "nz"))} | _uvs(vertex, face, corners, triangles)
-    look |= _texture(header.comments, face, look, source)
-    if look["texture"] is None:
-        look["colors"] = _colors(vertex, source)
-        if look["colors"] is None and not strips.size and (colors := _colors(face, source)) is not None:
-            look["face_colors"] = colors[torch.from_numpy(origin)]
-    if not source.wanted.lit:
-        del look["normals"]
+    triangles, origin = triangulate(verts, index, counts, context)
+    appearance: dict[str, Any] = {"normals": _take(vertex, ("nx", "ny", "nz"))} | _uvs(vertex, face, corners, triangles)
+    appearance |= _texture(header.comments, face, appearance, context)
+    if appearance["texture"] is None:
+        appearance["colors"] = _colors(vertex, context)
+        if appearance["colors"] is None and not strips.size and (colors := _colors(face, context)) is not None:
+            appearance["face_colors"] = colors[torch.from_numpy(origin)]
+    if not context.options.lit:
+        del appearance["normals"]
     for element in (vertex, face, strips):
         left = [name for name in element.columns if name not in HARMLESS]
         if left and element.size:
-            source.unsupported.note(f"{', '.join(left)} of {element.name}", "not read")
-    return [Part("", verts, index[triangles], material=Material() if source.wanted.lit else None, **look)]
+            context.unread.note(f"{', '.join(left)} of {element.name}", "not read")
+    return [Part("", verts, index[triangles], material=Material() if context.options.lit else None, **appearance)]
 
 
 def _take(element: Element, names: tuple[str, ...]) -> np.ndarray | None:
-    """Columns (n, K) of numbers by name; None where some are not there, and none is taken."""
+    """Take columns (n, K) of numbers by name out of an element; None where some are missing, and none is taken."""
     columns = [element.columns.get(name) for name in names]
     found = [column for column in columns if isinstance(column, np.ndarray)]
     if len(found) < len(names):
@@ -71,24 +71,25 @@ def _take(element: Element, names: tuple[str, ...]) -> np.ndarray | None:
 
 
 def _corners(element: Element) -> Lists:
-    """The vertices of each face: by name, or the only list of integers. Raises Fault."""
+    """Return the vertices of each face: the list of a known name, or the only list of integers. Raises FormatError."""
     lists = {name: c for name, c in element.columns.items() if isinstance(c, Lists)}
     whole = [name for name, column in lists.items() if column.values.dtype.kind in "iu"]
     name = next((name for name in CORNERS if name in lists), whole[0] if len(whole) == 1 else None)
     if name is None:
-        raise Fault(
+        raise FormatError(
             f"expected a list vertex_indices in {element.name}, got {', '.join(element.columns)}; export it again"
         )
     del element.columns[name]
     index = lists[name].values.astype(np.int64)
     if (bad := np.flatnonzero(index != lists[name].values)).size:
         got = lists[name].values[bad[0]]
-        raise Fault(f"expected whole numbers for {name} in {element.name}, got {got:g}; export it again")
+        raise FormatError(f"expected whole numbers for {name} in {element.name}, got {got:g}; export it again")
     return Lists(lists[name].counts, index)
 
 
 def _strips(index: np.ndarray) -> np.ndarray:
-    """Corners of the triangles in strips that -1 parts; every other one is turned round, and what is no triangle left out."""
+    """Return corners of the triangles in strips that −1 separates. Every other triangle is flipped, degenerate ones are left
+    out."""
     if len(index) < 3:
         return np.empty(0, np.int64)
     at = np.arange(len(index))
@@ -101,7 +102,7 @@ def _strips(index: np.ndarray) -> np.ndarray:
 
 
 def _uvs(vertex: Element, face: Element, corners: Lists, triangles: np.ndarray) -> dict[str, Any]:
-    """Those of the corners of faces, or else of the vertices."""
+    """Return texture coordinates of the corners of faces, or else of the vertices."""
     own = face.columns.get("texcoord")
     strips = len(triangles) > 0 and int(triangles.max()) >= len(corners.values)
     if isinstance(own, Lists) and not strips and (own.counts == 2 * corners.counts).all():
@@ -113,23 +114,23 @@ def _uvs(vertex: Element, face: Element, corners: Lists, triangles: np.ndarray) 
     return {"uvs": None}
 
 
-def _texture(comments: list[str], face: Element, look: dict[str, Any], source: Source) -> dict[str, Any]:
+def _texture(comments: list[str], face: Element, appearance: dict[str, Any], context: LoadContext) -> dict[str, Any]:
     found = [re.match(r"comment\s+texturefile\s+(.*)", line, re.IGNORECASE) for line in comments]
     names = [match[1].strip() for match in found if match is not None]
-    if not names or not source.wanted.materials:
+    if not names or not context.options.materials:
         return {"texture": None}
     if len(names) == 1:
         face.columns.pop("texnumber", None)
     for name in names[1:]:
-        source.unsupported.note(f"the texture {name!r}", f"{names[0]!r} in its place")
-    image = source.folder.image(names[0])
-    if look["uvs"] is None:
-        raise Fault(f"expected texture coordinates for its texture {names[0]!r}, got none; unwrap the mesh")
-    return {"texture": source.textures.get(names[0], image)}
+        context.unread.note(f"the texture {name!r}", f"{names[0]!r} in its place")
+    image = context.folder.image(names[0])
+    if appearance["uvs"] is None:
+        raise FormatError(f"expected texture coordinates for its texture {names[0]!r}, got none; unwrap the mesh")
+    return {"texture": context.textures.get(names[0], image)}
 
 
-def _colors(element: Element, source: Source) -> Tensor | None:
-    """Linear (n, 3). Integers are of 8 bits, or as many as they need. Raises Fault."""
+def _colors(element: Element, context: LoadContext) -> Tensor | None:
+    """Return linear colours (n, 3). Integers have 8 bits, or as many as they need. Raises FormatError."""
     for names in COLORS:
         if (values := _take(element, names)) is None:
             continue
@@ -138,9 +139,7 @@ def _colors(element: Element, source: Source) -> Tensor | None:
         elif values.dtype.kind in "iu" and values.dtype.itemsize > 1:
             most = values.max(initial=0)
             if values.dtype.name == "uint16" and 0 < most <= 255:
-                source.unsupported.note(
-                    f"ushort colours of {element.name} up to {most}", "taken for 0 to 255, not 65535"
-                )
+                context.unread.note(f"ushort colours of {element.name} up to {most}", "taken for 0 to 255, not 65535")
             kind = next((k for k in (np.uint8, np.uint16) if most <= np.iinfo(k).max), values.dtype.type)
             values = values / float(np.iinfo(kind).max)
         return linear_colors(element.name, values, srgb=True)

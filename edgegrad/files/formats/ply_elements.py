@@ -1,6 +1,6 @@
 """The elements of PLY files as arrays, in text or binary, whatever they are called.
 
-trimesh reads lists of one length only, refuses bytes after the last element, and drops what it does not know without a word.
+trimesh reads lists of one length only, refuses bytes after the last element, and silently drops what it does not know.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .part import Fault
+from .part import FormatError
 from .text import as_utf8, numbers
 
 TYPES = {
@@ -49,10 +49,9 @@ class Header(NamedTuple):
 
 
 def read_header(data: bytes) -> Header:
-    """Raises Fault."""
     end = re.search(rb"end_header[ \t]*(\r\n|\n|\r|$)", data)
     if not data.startswith(b"ply") or end is None:
-        raise Fault("expected a PLY file from ply to end_header, which cannot be read here; it may be truncated")
+        raise FormatError("expected a PLY file from ply to end_header, which cannot be read here; it may be truncated")
     order, elements, comments = None, list[Element](), []
     for line in as_utf8(data[: end.start()]).decode(errors="replace").split("\n")[1:]:
         words = line.split()
@@ -72,11 +71,11 @@ def read_header(data: bytes) -> Header:
                 case [_, *_]:
                     raise ValueError
         except (ValueError, KeyError, IndexError):
-            raise Fault(
+            raise FormatError(
                 f"expected a line of a PLY header, got {line.strip()!r}, which cannot be read; repair it"
             ) from None
     if order is None or any(element.size < 0 for element in elements):
-        raise Fault(
+        raise FormatError(
             "expected a PLY header with its format and sizes of elements, got one that cannot be read; repair it"
         )
     return Header(order, elements, comments, end.end())
@@ -87,18 +86,19 @@ def _type(name: str, order: str | None) -> np.dtype:
 
 
 def read_elements(data: bytes, header: Header) -> int:
-    """Fills the columns of all elements; how many bytes, or numbers of a text, come after the last. Raises Fault."""
+    """Fill the columns of all elements, and return how many bytes, or numbers of a text, come after the last. Raises
+    FormatError."""
     if header.order:
-        units: _Bytes | _Numbers = _Bytes(np.frombuffer(data, np.uint8)[header.start :])
+        units: _BinaryData | _TextData = _BinaryData(np.frombuffer(data, np.uint8)[header.start :])
     else:
-        units = _Numbers(numbers(as_utf8(data[header.start :]), "a PLY file"))
+        units = _TextData(numbers(as_utf8(data[header.start :]), "a PLY file"))
     at = 0
     for element in header.elements:
         at = _read(element, units, at)
     return len(units.array) - at
 
 
-class _Bytes(NamedTuple):
+class _BinaryData(NamedTuple):
     """The data of a binary file."""
 
     array: np.ndarray
@@ -110,8 +110,8 @@ class _Bytes(NamedTuple):
         return np.ascontiguousarray(units).reshape(-1).view(kind)
 
 
-class _Numbers(NamedTuple):
-    """The data of a text."""
+class _TextData(NamedTuple):
+    """The numbers of a text."""
 
     array: np.ndarray
 
@@ -123,12 +123,12 @@ class _Numbers(NamedTuple):
         if kind.kind == "f":
             return units  # stay double, for a text may say more than its header does
         if not (np.isfinite(units).all() and (units == np.floor(units)).all()):
-            raise Fault("expected whole numbers where the header announces integers, got others; repair it")
+            raise FormatError("expected whole numbers where the header announces integers, got others; repair it")
         return units.astype(np.int64).astype(kind)
 
 
-def _read(element: Element, data: _Bytes | _Numbers, at: int) -> int:
-    """One element that begins at `at`; where the next does. Raises Fault."""
+def _read(element: Element, data: _BinaryData | _TextData, at: int) -> int:
+    """Read one element that begins at `at`, and return where the next one does. Raises FormatError."""
     n, columns, room = element.size, element.properties, len(data.array) - at
     least = sum(data.width(p.length or p.type) for p in columns)
     if n * least > room:  # before anything of this size is made
@@ -154,8 +154,8 @@ def _read(element: Element, data: _Bytes | _Numbers, at: int) -> int:
     return at
 
 
-def _read_even(element: Element, data: _Bytes | _Numbers, at: int) -> int | None:
-    """As _read(), at once, where the lists of all rows are as long as those of the first; None where they are not."""
+def _read_even(element: Element, data: _BinaryData | _TextData, at: int) -> int | None:
+    """Read as _read() does, at once, where the lists of all rows are as long as those of the first; else return None."""
     n, width, lengths, begins = element.size, 0, [], []
     for p in element.properties:
         lengths.append(1 if p.length is None else _length(element, 0, data, at + width, p.length))
@@ -177,27 +177,27 @@ def _read_even(element: Element, data: _Bytes | _Numbers, at: int) -> int | None
     return end
 
 
-def _length(element: Element, row: int, data: _Bytes | _Numbers, at: int, kind: np.dtype) -> int:
-    """Of a list. Raises Fault."""
+def _length(element: Element, row: int, data: _BinaryData | _TextData, at: int, kind: np.dtype) -> int:
+    """Return the length of a list. Raises FormatError."""
     width, room = data.width(kind), len(data.array) - at
     if width > room:
         raise _truncated(element, row)
     value = data.array.item(at) if width == 1 else data.cast(data.array[at : at + width], kind).item()
     if not 0 <= value <= room or value != int(value):
-        raise Fault(
+        raise FormatError(
             f"expected the length of a list in row {row} of {element.name}, got {value:g}; the file cannot be read"
         )
     return int(value)
 
 
-def _truncated(element: Element, found: int) -> Fault:
-    return Fault(
+def _truncated(element: Element, found: int) -> FormatError:
+    return FormatError(
         f"expected {element.size} rows of {element.name}, as the header announces, got {found}; the file cannot be read "
         "as a whole, for it is truncated or damaged"
     )
 
 
 def _spans(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """The numbers from starts[i] up to starts[i] + counts[i], one span after the other."""
+    """Return the numbers from starts[i] up to starts[i] + counts[i], one span after the other."""
     ends = np.cumsum(counts)
     return np.arange(counts.sum()) + (starts - ends + counts).repeat(counts)

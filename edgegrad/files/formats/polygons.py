@@ -5,34 +5,31 @@ from __future__ import annotations
 import numpy as np
 
 from ...optional import require
-from .part import Fault
-from .source import Source
+from .context import LoadContext
+from .part import FormatError
 
-# Of the area of a face: how far a triangle may be turned over, which rounded coordinates make of a corner of 180 degrees.
+# Rounded coordinates may turn a triangle over by this share of its face's area, at a corner of 180 degrees.
 SLACK = 1e-6
 
 
 def triangulate(
-    verts: np.ndarray, index: np.ndarray, counts: np.ndarray, source: Source
+    verts: np.ndarray, index: np.ndarray, counts: np.ndarray, context: LoadContext
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (T, 3) as positions in `index`, which names the vertices of the corners of all faces one after the other; and
-    the face (T,) that each is from. `counts` (F,) says how many corners a face has; those of fewer than three are left out.
-
-    A face is a fan around its first corner where this covers it once, as it does every convex one; a quad is then split along
-    its other diagonal, and what is left goes to earcut, all in Newell's plane. Faces that cross themselves are noted.
-
-    Raises Fault, or ImportError without mapbox_earcut, which only concave faces with more than four corners need.
-    """
+    """Return triangles (T, 3) as positions in `index`, and the face (T,) that each is from. `index` names the vertices of the
+    corners of all faces one after the other. `counts` (F,) says how many corners a face has; faces of fewer than three are left
+    out. A face is a fan around its first corner where this covers it once, as it does every convex one. Else a quad is split
+    along its other diagonal, and what remains goes to earcut, all in Newell's plane. Faces that cross themselves are noted.
+    Raises FormatError, or ImportError without mapbox_earcut, which only concave faces with more than four corners need."""
     if not (whole := counts >= 3).all():
-        source.unsupported.note(f"{np.count_nonzero(~whole)} faces of fewer than three corners")
+        context.unread.note(f"{np.count_nonzero(~whole)} faces of fewer than three corners")
         if not whole.any():
             return np.empty((0, 3), np.int64), np.empty(0, np.int64)
         rows = np.flatnonzero(whole.repeat(counts))
-        triangles, origin = triangulate(verts, index[rows], counts[whole], source)
+        triangles, origin = triangulate(verts, index[rows], counts[whole], context)
         return rows[triangles], np.flatnonzero(whole)[origin]
     low, high = int(index.min()), int(index.max())
     if low < 0 or high >= len(verts):
-        raise Fault(
+        raise FormatError(
             f"expected vertex indices from 0 to {len(verts) - 1}, got {low if low < 0 else high}; repair the mesh"
         )
     if (counts == 3).all():
@@ -49,7 +46,7 @@ def triangulate(
         triangles[first[faces, None] + np.arange(k - 2)] = np.where(local < 0, -1, rows)
         crossing += faces[crossed].tolist()
     if crossing:
-        source.unsupported.note(
+        context.unread.note(
             f"{len(crossing)} faces that cross themselves, the first of them face {min(crossing)}, counted from 0",
             "triangles that may overlap",
         )
@@ -59,8 +56,8 @@ def triangulate(
 
 
 def _split(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (m, k - 2, 3) of polygons (m, k, 3) by number of the corner, -1 where there are fewer; and which of the polygons
-    (c,) cross themselves."""
+    """Return triangles (m, k - 2, 3) of polygons (m, k, 3) by number of the corner, −1 where there are fewer; and which
+    polygons (c,) cross themselves."""
     m, k, _ = points.shape
     fan = np.stack([np.zeros(k - 2, np.int64), np.arange(1, k - 1), np.arange(2, k)], -1)
     triangles = np.broadcast_to(fan, (m, k - 2, 3)).copy()
@@ -84,8 +81,8 @@ def _split(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fan(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Newell's unit normals (m, 3) and twice the areas (m,) of polygons (m, k, 3), zero where they are no more than rounding; and
-    whether a fan around the first corner covers each once (m,)."""
+    """Return Newell's unit normals (m, 3), twice the areas (m,) and whether a fan around the first corner covers each polygon
+    once (m,). The polygons are (m, k, 3). Areas are zero where they are no more than rounding."""
     spokes = points[:, 1:] - points[:, :1]
     a, b = spokes[:, :-1], spokes[:, 1:]
     cross = np.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in ((1, 2), (2, 0), (0, 1))], -1)
@@ -102,7 +99,7 @@ def _fan(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _earcut(points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray | None, bool]:
-    """Triangles (t, 3) of one polygon (k, 3), up to k - 2, and whether it is simple; None where there are none."""
+    """Return triangles (t, 3) of one polygon (k, 3), up to k - 2, and whether it is simple; None where there are none."""
     earcut = require("mapbox_earcut", "edgegrad[files]", "splitting concave faces into triangles")
     axis = int(np.abs(normal).argmax())
     flat = (points - points[0])[:, [(axis + 1) % 3, (axis + 2) % 3]]

@@ -7,9 +7,9 @@ import re
 import numpy as np
 
 from ...scene.material import Material
-from .part import Fault, Part
+from .context import LoadContext
+from .part import FormatError, Part
 from .polygons import triangulate
-from .source import Source
 from .text import MARKS, as_utf8, table
 
 HEADER = 84  # bytes of a binary file before its faces
@@ -19,45 +19,45 @@ WORDS = SILENT | {b"vertex", b"endloop"}
 TEXT = re.compile(rb"\s*((#|//)[^\r\n]*[\r\n]\s*)*(solid|facet)", re.IGNORECASE)
 
 
-def read(data: bytes, source: Source) -> list[Part]:
-    """A part for each solid of a text. Raises Fault."""
-    material = Material() if source.wanted.lit else None
+def read(data: bytes, context: LoadContext) -> list[Part]:
+    """Return a part for each solid of a text, one for a binary file. Raises FormatError."""
+    material = Material() if context.options.lit else None
     if data.startswith(MARKS):
         data = as_utf8(data)
     count = int.from_bytes(data[80:HEADER], "little")
     exact = len(data) == HEADER + count * FACE.itemsize
     text = TEXT.match(data[:1000]) and b"\0" not in data  # a binary one has zeros somewhere
-    parts = _read_text(as_utf8(data), source) if text and not exact else _read_binary(data, count, source)
+    parts = _read_text(as_utf8(data), context) if text and not exact else _read_binary(data, count, context)
     return [part._replace(material=material) for part in parts]
 
 
-def _read_binary(data: bytes, count: int, source: Source) -> list[Part]:
+def _read_binary(data: bytes, count: int, context: LoadContext) -> list[Part]:
     if b"\0" not in data and data[:HEADER].isascii():
-        raise Fault("expected an STL file, got text without solid or facet at its start; export it again")
+        raise FormatError("expected an STL file, got text without solid or facet at its start; export it again")
     if len(data) < HEADER:
-        raise Fault(f"expected an STL file, got {len(data)} bytes that cannot be read as one; export it again")
+        raise FormatError(f"expected an STL file, got {len(data)} bytes that cannot be read as one; export it again")
     there, odd = divmod(len(data) - HEADER, FACE.itemsize)
     if not count and there and not odd:
-        source.unsupported.note("0 as the number of faces", f"{there}, by the length of the file")
+        context.unread.note("0 as the number of faces", f"{there}, by the length of the file")
         count = there
     if there < count:
-        raise Fault(
+        raise FormatError(
             f"expected the {count} faces that the file announces, got {max(there, 0)}; it is truncated or damaged"
         )
     rest = len(data) - HEADER - count * FACE.itemsize
     if rest:
-        source.unsupported.note(f"{rest} bytes after the last of {count} faces", "not read")
+        context.unread.note(f"{rest} bytes after the last of {count} faces", "not read")
     faces = np.frombuffer(data, FACE, count, HEADER)
     if faces["attribute"].any():
-        source.unsupported.note("the attributes of faces, where some writers keep colours", "not read")
+        context.unread.note("the attributes of faces, where some writers keep colours", "not read")
     if b"COLOR=" in data[:80]:
-        source.unsupported.note("COLOR= of the header", "a colour by Materialise is not read")
+        context.unread.note("COLOR= of the header", "a colour by Materialise is not read")
     if not count:
         return []
     return [Part("", faces["verts"].reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))]
 
 
-def _read_text(text: bytes, source: Source) -> list[Part]:
+def _read_text(text: bytes, context: LoadContext) -> list[Part]:
     solids: list[tuple[str, list[bytes], list[int]]] = []  # name, positions, and how many of them a face has
     corners, start = list[bytes](), 0
     ended = True
@@ -85,14 +85,16 @@ def _read_text(text: bytes, source: Source) -> list[Part]:
         elif word == b"endsolid":
             ended = True
         else:
-            source.unsupported.note(word.decode(errors="replace")[:40], "not read")
+            context.unread.note(word.decode(errors="replace")[:40], "not read")
     if not ended or start < len(corners):
-        raise Fault("expected endsolid at the end of the file, got none: it is truncated or damaged; export it again")
+        raise FormatError(
+            "expected endsolid at the end of the file, got none: it is truncated or damaged; export it again"
+        )
     parts = []
     for name, rows, counts in solids:
         if counts:
             verts = table(rows, "the vertices", 3, 3)[0]
             index = np.arange(len(verts))
-            triangles, _ = triangulate(verts, index, np.array(counts), source)
+            triangles, _ = triangulate(verts, index, np.array(counts), context)
             parts.append(Part(name, verts, triangles))
     return parts

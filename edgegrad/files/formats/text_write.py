@@ -1,4 +1,4 @@
-"""OBJ and OFF files in text, whose numbers say all that the mesh's type holds.
+"""OBJ and OFF files in text, whose numbers keep all digits of the mesh's type.
 
 trimesh writes a fixed number of decimals, by which a mesh that is a millionth large loses its vertices.
 """
@@ -13,14 +13,14 @@ DIGITS = {"float32": 9, "float64": 17}  # significant ones that give the number 
 
 
 def to_off(made: Any, dtype: np.dtype) -> str:
-    """The file of a trimesh.Trimesh that was made of a mesh of some type."""
+    """Return the file of a trimesh.Trimesh that was made of a mesh of some type."""
     verts, faces = made.vertices, made.faces
     return f"OFF\n{len(verts)} {len(faces)} 0\n{_rows('', verts, dtype)}{_rows('3 ', faces, faces.dtype)}"
 
 
 def to_obj(made: Any, dtype: np.dtype, stem: str) -> tuple[str, dict[str, bytes]]:
-    """The file, and those that lie beside it: the material library of this stem, and the image, so that two files in one folder
-    have their own."""
+    """Return the file, and the material library of this stem and the image by name, so that two files in one folder have their
+    own."""
     faces, rows, visual = made.faces + 1, made.vertices, made.visual
     if visual.kind != "texture":
         if visual.kind is not None:
@@ -39,7 +39,7 @@ def to_obj(made: Any, dtype: np.dtype, stem: str) -> tuple[str, dict[str, bytes]
 
 
 def _rows(before: str, values: np.ndarray, dtype: np.dtype) -> str:
-    """A line for each row, that begins as given."""
+    """Return a line for each row, that begins as given."""
     form = f"%.{DIGITS[dtype.name]}g" if dtype.kind == "f" else "%d"
     line = before + " ".join([form] * values.shape[1]) + "\n"
     return line * len(values) % tuple(np.asarray(values).reshape(-1).tolist())

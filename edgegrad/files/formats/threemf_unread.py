@@ -1,11 +1,11 @@
-"""What a 3MF holds that nobody reads: elements and attributes, by namespace."""
+"""Elements and attributes of a 3MF that nobody reads, by namespace."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from ...optional import require
-from .source import Source
+from .context import LoadContext
 
 MICROSOFT = "http://schemas.microsoft.com/3dmanufacturing"
 CORE, MATERIAL = f"{MICROSOFT}/core/2015/02", f"{MICROSOFT}/material/2015/02"
@@ -39,11 +39,11 @@ KNOWN = {
 HARMLESS = {f"{{{CORE}}}metadata", f"{{{CORE}}}metadatagroup", f"{{{SETS}}}trianglesets"}
 
 
-def note_unread(root: Any, source: Source) -> None:
-    """Notes elements of a model part, each with all that lies below it, and attributes that nobody reads."""
+def note_unread(root: Any, context: LoadContext) -> None:
+    """Note elements of a model part, each with all that lies below it, and attributes that nobody reads."""
     elements: dict[str, str] = {}  # tag to a name with the prefix of the file
     attributes: dict[str, set[str]] = {}
-    # Not one by one the many vertices and triangles that hold no more than they must.
+    # The many vertices and triangles without further attributes are not visited one by one.
     odd = require("lxml.etree", "edgegrad[files]", "reading 3MF").XPath(
         "*[@*[4] or not(self::c:vertex or self::c:triangle)]", namespaces={"c": CORE}
     )
@@ -58,10 +58,10 @@ def note_unread(root: Any, source: Source) -> None:
         attributes.setdefault(element.tag, set()).update(element.keys())
         waiting.extend(odd(element))
     for name in sorted(elements.values()):
-        source.unsupported.note(f"element {name}")
+        context.unread.note(f"element {name}")
     for tag, names in sorted(attributes.items()):
         for name in sorted(map(_local, names - KNOWN[tag])):
-            source.unsupported.note(f"attribute {name} of {_local(tag)}")
+            context.unread.note(f"attribute {name} of {_local(tag)}")
 
 
 def _local(name: str) -> str:

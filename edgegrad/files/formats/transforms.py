@@ -13,10 +13,10 @@ import torch
 from ...camera.camera import Camera
 from ..image import IMAGES, read_size
 from ..paths import StoredPath
+from .context import UnreadLog
 from .keys import image_size, note_unread
-from .names import free_name
-from .part import Fault
-from .source import Unsupported
+from .names import unique_name
+from .part import FormatError
 from .views import View
 
 PINHOLES, FISHEYES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV"), ("OPENCV_FISHEYE",)
@@ -25,7 +25,7 @@ READ = {
     "frames", "file_path", "transform_matrix", "w", "h", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy",
     "camera_model", "is_fisheye", *COEFFICIENTS,
 }  # fmt: skip
-# What cameras and images do not depend on: how instant-ngp trains, where nerfstudio's points and lists of images are.
+# Cameras and images do not depend on these: how instant-ngp trains, where nerfstudio's points and lists of images are.
 HARMLESS = {
     "aabb", "aabb_scale", "scale", "offset", "up", "sharpness", "n_frames", "n_extra_learnable_dims", "render_aabb",
     "enable_depth_loading", "enable_ray_loading", "integer_depth_scale", "white_transparent", "black_transparent", "fix_premult",
@@ -40,27 +40,27 @@ INSTEAD = {
 
 
 class Found(NamedTuple):
-    """What a file_path leads to."""
+    """The file that a file_path leads to."""
 
     file: Path | None
     outside: bool  # of the folder, so that nobody looks there
 
 
 def read(
-    fields: Mapping[str, Any], folder: Path, images: Path | None, size: tuple[int, int] | None, unread: Unsupported
+    fields: Mapping[str, Any], folder: Path, images: Path | None, size: tuple[int, int] | None, unread: UnreadLog
 ) -> dict[str, View]:
-    """By the frames' file_path. What a frame says goes before what the file says of all. Images lie in `folder`, that of the
-    file, or below it; or in `images` or below it. Raises Fault."""
+    """Return views by the frames' file_path. A frame's own keys take precedence over the file's. Raises FormatError. Images lie
+    in `folder`, that of the file, or below it; or in `images` or below it."""
     frames = fields["frames"]
     if not isinstance(frames, list) or not frames:
-        raise Fault("frames: expected a list of frames, got none; export it again")
+        raise FormatError("frames: expected a list of frames, got none; export it again")
     shared = _given(fields)
     views: dict[str, View] = {}
     lost: list[str] = []
     outside: list[str] = []
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
-            raise Fault(f"frames[{i}]: expected transform_matrix, 4 × 4, got none; export it again")
+            raise FormatError(f"frames[{i}]: expected transform_matrix, 4 × 4, got none; export it again")
         own = _given(frame)
         name = str(own.get("file_path", i))
         try:
@@ -70,9 +70,9 @@ def read(
                 if found.file is None:
                     (outside if found.outside else lost).append(name)
             view = View(_camera(own, shared, found, size), found.file)
-        except (Fault, TypeError, ValueError, KeyError, OverflowError) as error:
-            raise Fault(f"frames[{i}], {name}: {error}") from error
-        views[free_name(views, name, f"{name} (frame {i})")] = view
+        except (FormatError, TypeError, ValueError, KeyError, OverflowError) as error:
+            raise FormatError(f"frames[{i}], {name}: {error}") from error
+        views[unique_name(views, name, f"{name} (frame {i})")] = view
         note_unread(own, READ | HARMLESS, unread, INSTEAD)
     note_unread(shared, READ | HARMLESS, unread, INSTEAD)
     for names, why in (
@@ -86,25 +86,25 @@ def read(
 
 
 def _check_apart(views: Mapping[str, View], images: Path | None) -> None:
-    """No two paths lead to one file. Raises Fault."""
+    """Raise FormatError where two paths lead to one file."""
     known: dict[Path, tuple[str, tuple[str, ...]]] = {}
     for name, view in views.items():
         if images is not None and view.image is not None:
             other, parts = known.setdefault(view.image, (name, _parts(name)))
             if parts != _parts(name) and " (frame " not in name:
-                raise Fault(
+                raise FormatError(
                     f"images: expected a folder that has {other!r} and {name!r} apart, got {images}, where both are "
                     f"{view.image.name}; pass the one above"
                 )
 
 
 def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Without those that are null."""
+    """Return the keys that are not null."""
     return {key: value for key, value in fields.items() if value is not None}
 
 
 def _beside(folder: Path, name: str) -> Found:
-    """Beside the file or below it; the synthetic scenes leave out the ending, and Windows writes backslashes."""
+    """Look next to the file or below it. The synthetic scenes leave out the ending, and Windows writes backslashes."""
     inside = folder.resolve()
     outside = PureWindowsPath(name).is_absolute() or normpath(name.replace("\\", "/")).startswith(("..", "/"))
     for stem in dict.fromkeys((name, name.replace("\\", "/"))):
@@ -118,7 +118,7 @@ def _beside(folder: Path, name: str) -> Found:
 
 
 def _below(images: Path, name: str) -> Path | None:
-    """By as much of the path's end as leads to a file."""
+    """Look for as much of the path's end as leads to a file."""
     parts = _parts(name)
     for first in range(len(parts)):
         for ending in ("", *IMAGES):
@@ -132,12 +132,7 @@ def _parts(name: str) -> tuple[str, ...]:
     return tuple(part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..") and ":" not in part)
 
 
-def _camera(
-    own: Mapping[str, Any],
-    shared: Mapping[str, Any],
-    found: Found,
-    size: tuple[int, int] | None,
-) -> Camera:
+def _camera(own: Mapping[str, Any], shared: Mapping[str, Any], found: Found, size: tuple[int, int] | None) -> Camera:
     given = {**shared, **own}
     if "w" in given and "h" in given:
         H, W = image_size(float(given["w"]), float(given["h"]))
@@ -169,7 +164,6 @@ def _camera(
 
 
 def _model(own: Mapping[str, Any], shared: Mapping[str, Any]) -> str:
-    """Raises ValueError."""
     for fields in (own, shared):
         if "camera_model" in fields or "is_fisheye" in fields:
             model = fields.get("camera_model", "OPENCV_FISHEYE" if fields.get("is_fisheye") else "OPENCV")
@@ -184,7 +178,8 @@ def _model(own: Mapping[str, Any], shared: Mapping[str, Any]) -> str:
 
 
 def _focals(own: Mapping[str, Any], shared: Mapping[str, Any], pixels: tuple[int, int]) -> tuple[float, float]:
-    """Of x and y, in pixels. Where a frame has one of them alone, the file's pixels keep their shape. Raises ValueError."""
+    """Return the focal lengths of x and y in pixels. Raises ValueError. Where a frame has one of them alone, the file's pixels
+    keep their shape."""
     (fx, fy), (file_x, file_y) = (
         (_focal(fields, "fl_x", "camera_angle_x", pixels[0]), _focal(fields, "fl_y", "camera_angle_y", pixels[1]))
         for fields in (own, shared)

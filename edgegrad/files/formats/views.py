@@ -9,11 +9,19 @@ from typing import NamedTuple
 from ...camera.camera import Camera
 from ..image import read_size
 from ..paths import StoredPath
-from .source import Unsupported
+from .context import UnreadLog
 
 
 class View(NamedTuple):
-    """What load_cameras() finds of each image."""
+    """A camera of load_cameras() with its image.
+
+    Parameters
+    ----------
+    camera : Camera
+    image : Path or None
+        File whose pixels read_image() reads as the camera describes them; None where none is named, found or fits: see
+        load_cameras.
+    """
 
     camera: Camera
     # The image's file, whose pixels read_image() reads as the camera speaks of them; None where none is named, found or fits:
@@ -22,17 +30,16 @@ class View(NamedTuple):
 
 
 def resized(camera: Camera, size: tuple[int, int]) -> Camera | None:
-    """The camera for (H, W) pixels, where these are in proportion to its own; None where they are not."""
+    """Return the camera for (H, W) pixels, or None where these are not in proportion to its own."""
     (H, W), (h, w) = size, camera.size
-    # One that is scaled to the other ends less than a pixel from it: sizes of scaled images are rounded.
+    # A scaled size ends less than a pixel from the other one, because sizes of scaled images are rounded.
     return camera.resized(size) if abs(H * w - W * h) <= max(H, W, h, w) else None
 
 
-def matched(views: Mapping[str, View], unread: Unsupported) -> dict[str, View]:
-    """Views whose cameras have the sizes of their images.
-
-    A camera speaks of the pixels that are stored. Where the upright image alone is in proportion to it, it speaks of that.
-    Where neither is, the view loses its image. Notes which cameras are scaled and which images do not fit."""
+def matched(views: Mapping[str, View], unread: UnreadLog) -> dict[str, View]:
+    """Return views whose cameras have the sizes of their images, and note scaled cameras and images that do not fit. A camera
+    describes the pixels that are stored. Where the upright image alone is in proportion to it, it describes that one. Where
+    neither is, the view loses its image."""
     found: dict[str, View] = {}
     scaled: list[str] = []
     unfit: list[str] = []

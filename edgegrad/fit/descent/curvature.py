@@ -1,8 +1,8 @@
-"""The curvature JᵀWJ of a loss of images by some hundred numbers, by forward mode.
+"""The curvature JᵀWJ of a loss of images by some hundred numbers, in forward mode.
 
-J is the derivative of the images by the numbers, a direction each, and W what the loss makes of differences r: the gradient of a
-loss ρ(r) is that of ½ w r² with w = ρ′(r)/r held fixed (iteratively reweighted least squares, Holland and Welsch 1977), for a
-squared loss the exact one (Gauss-Newton).
+J is the derivative of the images by the numbers, one direction each. W is what the loss makes of differences r: the gradient of
+a loss ρ(r) is that of ½ w r² with w = ρ′(r)/r held fixed (iteratively reweighted least squares, Holland and Welsch 1977). For a
+squared loss it is exact (Gauss-Newton).
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from torch.autograd import forward_ad
 from ...camera.camera import Camera
 from ...render import jvp
 from ...scene.tree import map_tensors, tensors_in
-from .building import Built
 from .objective import Objective
+from .scene_builder import Built
 
-MOST = 400  # numbers, each of which is a direction
-CHUNK = 32  # of them at a time, where scenes are made in batches
-ROOM = 2**23  # numbers of a channel's derivatives in one call
-FAINT = 1e-3  # of the range of the pictures: differences below count as these, for some losses have no weight at 0
+MAX_NUMBERS = 400  # each is a direction of differentiation
+CHUNK = 32  # directions at a time, where scenes are made in batches
+MAX_DERIVATIVES = 2**23  # elements of a channel's derivatives in one call
+MIN_RESIDUAL = 1e-3  # of the pictures' range: smaller differences count as this, for some losses have no weight at 0
 
 
 def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> Tensor:
-    """(n, n) float64 by all numbers of the tensors, one after the other. Raises TypeError where something has no forward mode."""
+    """Return JᵀWJ (n, n) float64 by all numbers of the tensors, one after the other. Raises TypeError where something has no
+    forward mode."""
     plain = {name: value.detach() for name, value in tensors.items()}
     n = sum(value.numel() for value in plain.values())
     total = torch.zeros(n, n, dtype=torch.float64)
@@ -48,7 +49,7 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
 
 
 def scores(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> tuple[Tensor, Tensor]:
-    """The curvature (n, n) of the pictures alone, and Σ s sᵀ (n, n) over the scores of all pixels, s = w r J."""
+    """Return the curvature (n, n) of the pictures alone, and Σ s sᵀ (n, n) over the scores s = w r J of all pixels."""
     plain = {name: value.detach() for name, value in tensors.items()}
     n, count = sum(value.numel() for value in plain.values()), len(objective.picks(step))
     H, S = (torch.zeros(n, n, dtype=torch.float64) for _ in range(2))
@@ -60,9 +61,8 @@ def scores(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> tu
         else:
             weight = regions.curvature(group, render)
             slopes = [regions.blurred(J) for J in slopes]
-            off = (
-                weight * regions.shares(group)
-            ).sqrt()  # a log likelihood's squared score is its curvature on average
+            # The mean of a log likelihood's squared score is its curvature.
+            off = (weight * regions.shares(group)).sqrt()
         for w, s, J in zip(weight / count, off / count, slopes, strict=True):
             rows = J.reshape(n, -1)
             H += ((rows * w.flatten()) @ rows.T).double()
@@ -72,8 +72,8 @@ def scores(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> tu
 
 
 def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
-    """How far pixels are from their pictures where each number moves them, Σ |J| |r| / Σ |J|, of the tensors' shapes: large of
-    what lies in a wrong place, also where its slope is zero."""
+    """Return Σ |J| |r| / Σ |J| for each number, in the tensors' shapes: how far pixels are from their pictures where it moves
+    them. It is large for what lies in a wrong place, also where the slope of the loss is zero."""
     plain = {name: value.detach() for name, value in tensors.items()}
     n = sum(value.numel() for value in plain.values())
     off, all = torch.zeros(n, dtype=torch.float64), torch.full((n,), 1e-30, dtype=torch.float64)
@@ -83,24 +83,22 @@ def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> di
                 rows = J.abs().reshape(n, -1)
                 off += (rows @ (image - wanted).abs().flatten()).double()
                 all += rows.sum(1).double()
-    parts = (off / all).split([value.numel() for value in plain.values()])
-    return {name: part.reshape(value.shape) for (name, value), part in zip(plain.items(), parts, strict=True)}
+    return _by_name(off / all, plain)
 
 
-def left(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
-    """What is left of the squared differences where each number moves pixels, Σ J² r² / Σ J² n², in units of the noise n² of the
-    render's samples, of the tensors' shapes: about 1 of what is where the pictures have it."""
+def residuals(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
+    """Return Σ J² r² / Σ J² n² for each number, in the tensors' shapes, with the noise n² of the render's samples. It is about
+    1 for what lies where the pictures have it."""
     plain = {name: value.detach() for name, value in tensors.items()}
     n = sum(value.numel() for value in plain.values())
     off, noise = (torch.full((n,), 1e-30, dtype=torch.float64) for _ in range(2))
     with torch.no_grad():
         scene, cameras = objective.build(plain)
         picks = objective.picks(step)
+        renders = objective.renders(scene, cameras, picks, objective.options.spp, objective.seed(step + 1))
         again = {
             (name, i): image
-            for group, channels in objective.renders(
-                scene, cameras, picks, objective.options.spp, objective.seed(step + 1)
-            )
+            for group, channels in renders
             for name, images in channels.items()
             for i, image in zip(group, images, strict=True)
         }
@@ -110,15 +108,19 @@ def left(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict
                 rows = J.square().reshape(n, -1)
                 off += (rows @ (image - wanted).square().flatten()).double()
                 noise += (rows @ (0.5 * (image - again[name, i]).square()).flatten()).double()
-    parts = (off / noise).split([value.numel() for value in plain.values()])
-    return {name: part.reshape(value.shape) for (name, value), part in zip(plain.items(), parts, strict=True)}
+    return _by_name(off / noise, plain)
+
+
+def _by_name(numbers: Tensor, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    parts = numbers.split([value.numel() for value in tensors.values()])
+    return {name: part.reshape(value.shape) for (name, value), part in zip(tensors.items(), parts, strict=True)}
 
 
 def derivatives(
     objective: Objective, plain: Mapping[str, Tensor], step: int
 ) -> Iterator[tuple[str, list[int], Tensor, list[Tensor]]]:
-    """Of views of one kind, a channel's name, their places, it (B, H, W, c), and its derivatives (n, H, W, c) by all numbers.
-    Raises TypeError where something has no forward mode."""
+    """Yield for each batch of views and channel its name, the views' indices, the channel (B, H, W, c), and its derivatives (n,
+    H, W, c) by all numbers, one tensor a view. Raises TypeError where something has no forward mode."""
     options = objective.options
     try:
         (scene, cameras), tangents = _tangents(objective, plain)
@@ -152,26 +154,26 @@ def derivatives(
 def _together(
     cameras: Sequence[Camera], group: Sequence[int], tangents: Sequence[tuple[Tensor, Tensor]]
 ) -> list[list[int]]:
-    """Places of views whose derivatives are taken in one call, which costs less than one each where pictures are small. A camera
-    that moves has its own."""
+    """Return the indices of views whose derivatives are taken in one call, which is cheaper where pictures are small. A camera
+    that moves is alone."""
     moved = {id(tensor) for tensor, _ in tangents}
     if any(id(tensor) in moved for i in group for tensor in tensors_in(cameras[i])):
         return [[i] for i in group]
     height, width = cameras[group[0]].size
-    count = max(1, ROOM // (len(tangents[0][1]) * height * width)) if tangents else len(group)
+    count = max(1, MAX_DERIVATIVES // (len(tangents[0][1]) * height * width)) if tangents else len(group)
     return [list(group[k : k + count]) for k in range(0, len(group), count)]
 
 
 def _tangents(objective: Objective, tensors: Mapping[str, Tensor]) -> tuple[Built, list[tuple[Tensor, Tensor]]]:
-    """Scene and cameras, and the derivative (n, *shape) of each of their tensors that depends on the numbers."""
+    """Return scene and cameras, and each of their tensors that depends on the numbers with its derivatives (n, *shape)."""
     rows: list[list[Tensor | None]] = []
-    for moved in _moved(tensors, CHUNK if objective.many is not None else 1):
+    for moved in _moved(tensors, CHUNK if objective.build_batch is not None else 1):
         with forward_ad.dual_level():
             duals = {name: forward_ad.make_dual(value, unit) for name, (value, unit) in moved.items()}
-            if objective.many is None:
+            if objective.build_batch is None:
                 found = [objective.build({name: dual[0] for name, dual in duals.items()})]
             else:
-                found = objective.many(duals)
+                found = objective.build_batch(duals)
             rows += [[forward_ad.unpack_dual(tensor).tangent for tensor in _floating(one)] for one in found]
     with torch.no_grad():
         scene, cameras = objective.build(tensors)
@@ -185,8 +187,8 @@ def _tangents(objective: Objective, tensors: Mapping[str, Tensor]) -> tuple[Buil
 
 
 def _moved(tensors: Mapping[str, Tensor], count: int) -> Iterator[dict[str, tuple[Tensor, Tensor]]]:
-    """For each of all numbers the values and their derivatives by it, so many numbers at a time, (count, *shape). Copies, for a
-    dual number is made in place of what it is made of."""
+    """Yield copies of the values (count, *shape) and their derivatives by the next `count` numbers. A dual number is made in
+    place of what it is made of."""
     units = torch.eye(sum(value.numel() for value in tensors.values()), dtype=torch.float64)
     for chunk in units.split(count):
         parts = chunk.split([value.numel() for value in tensors.values()], 1)
@@ -201,13 +203,13 @@ def _floating(thing: Any) -> list[Tensor]:
 
 
 def weights_of(objective: Objective, name: str, group: list[int], render: Tensor) -> Tensor:
-    """w (B, H, W, c) of these views' channel, by the sum of their losses."""
+    """Return the weights w (B, H, W, c) that the sum of these views' losses gives a channel's pixels."""
     target = torch.stack([objective.views[i].wanted[name] for i in group])
-    return _weights(lambda image: objective.of_group(name, group, image), render.detach(), target)
+    return _weights(lambda image: objective.group_loss(name, group, image), render.detach(), target)
 
 
 def _weights(loss: Callable[[Tensor], Tensor], render: Tensor, target: Tensor) -> Tensor:
-    least = FAINT * float((target.amax() - target.amin()).clamp(min=1e-12))
+    least = MIN_RESIDUAL * float((target.amax() - target.amin()).clamp(min=1e-12))
     r = render - target
     r = torch.where(r.abs() < least, torch.where(r < 0, -least, least), r)
     with torch.enable_grad():
@@ -217,7 +219,7 @@ def _weights(loss: Callable[[Tensor], Tensor], render: Tensor, target: Tensor) -
 
 
 def check_pointwise(objective: Objective) -> None:
-    """That each pixel has a loss of its own: its weight does not change with differences elsewhere. Raises ValueError."""
+    """Check that no pixel's weight changes with differences at other pixels. Raises ValueError."""
     if objective.regions is not None:
         return
     generator = torch.Generator().manual_seed(0)
@@ -240,7 +242,7 @@ def check_pointwise(objective: Objective) -> None:
 
 
 def _of_term(term: Callable[[dict[str, Tensor]], Tensor], tensors: Mapping[str, Tensor]) -> Tensor:
-    """The second derivative of a number, without what curves down."""
+    """Return the second derivative of a number by the tensors, with negative eigenvalues set to zero."""
     leaves = [value.clone().requires_grad_() for value in tensors.values()]
     with torch.enable_grad():
         slope = _gradient(term(dict(zip(tensors, leaves, strict=True))), leaves)
@@ -250,7 +252,7 @@ def _of_term(term: Callable[[dict[str, Tensor]], Tensor], tensors: Mapping[str, 
 
 
 def _gradient(value: Tensor, leaves: list[Tensor]) -> Tensor:
-    """(n,) float64, differentiable; zero where nothing depends on a leaf."""
+    """Return the gradient (n,) float64, differentiable, and zero by leaves on which nothing depends."""
     if not value.requires_grad:
         return torch.zeros(sum(leaf.numel() for leaf in leaves), dtype=torch.float64)
     found = torch.autograd.grad(value, leaves, create_graph=True, allow_unused=True)

@@ -1,4 +1,4 @@
-"""fit_scene(): any tensors of a scene, found by following the gradient of a loss between renders and pictures."""
+"""fit_scene(): find any tensors of a scene by following the gradient of a loss between renders and pictures."""
 
 from __future__ import annotations
 
@@ -17,28 +17,30 @@ from ..history import Record
 from ..losses import REGION
 from ..options import Options, Parameter
 from ..placement import Coordinates, Placement, PoseParameter
-from ..upside_down import warn_of_masks
-from ..views import Images, View, outlined_views, views_of
-from .adam_steps import AdamSteps
-from .building import Build, Built, Values, builder, built, checked_parameters, like
-from .gauss_newton import GaussNewtonSteps
-from .loop import Way, descend
-from .objective import Objective, judged
-from .result import Fit
+from ..row_order import check_mask_rows
+from ..views import Images, Observation, region_views, views_of
+from .adam_steps import AdamOptimizer
+from .gauss_newton import GaussNewtonOptimizer
+from .loop import Optimizer, descend
+from .objective import Objective
+from .result import Fit, make_fit
+from .scene_builder import Build, Built, Values, build_detached, builder, checked_parameters, suggestion
 
 
 class Progress(Record):
-    """What the callback of a fit by descent gets: the record of a step, and what the fit has reached by it. Scene and cameras are
-    those of the moment when they are asked for, which is during the call."""
+    """The callback's argument in a fit by descent: the record of a step, and the state that the fit has reached by it.
 
-    views: list[View]  # what is compared; on coarse levels of fit_shape at fewer pixels
+    Scene and cameras are built when they are asked for, from the values at that moment: use them during the call.
+    """
+
+    views: list[Observation]  # what is compared; on coarse levels of fit_shape with fewer pixels
     _values: Values
     _build: Build
     _bones: Callable[[Values], Tensor | None] | None
 
     @property
     def bones(self) -> Tensor | None:
-        """(K, 2, 3) ends of the bones of what bends, of the moment as the scene; None of other fits."""
+        """Ends (K, 2, 3) of the bones, built like the scene; None in fits without a rig."""
         return None if self._bones is None else self._bones(self._values)
 
     @property
@@ -51,15 +53,15 @@ class Progress(Record):
 
     @cached_property
     def _built(self) -> Built:
-        # Copies, for the next step changes the values in place.
-        return built(self._build, {name: value.detach().clone() for name, value in self._values.items()})
+        # The next step changes the values in place.
+        return build_detached(self._build, {name: value.detach().clone() for name, value in self._values.items()})
 
 
 def reporter(
-    build: Build, views: list[View], coordinates: Coordinates | None = None,
+    build: Build, views: list[Observation], coordinates: Coordinates | None = None,
     bones: Callable[[Values], Tensor | None] | None = None,
 ) -> Callable[[Record, Values], Progress]:  # fmt: skip
-    """What makes a Progress of a step."""
+    """Return a function that makes a Progress of a step's record and the tensors after it."""
 
     def progress(record: Record, values: Values) -> Progress:
         made = Progress(*(record if coordinates is None else coordinates.recorded(record)))
@@ -80,21 +82,21 @@ def fit_scene(
     regularizer: Callable[[Scene], Tensor] | None = None,
     **options: Any,
 ) -> Fit:
-    """Finds tensors of a scene and its cameras, and where objects stand, for which renders look like the pictures.
+    """Find tensors of a scene and its cameras, and poses of objects, whose renders match the pictures.
 
-    scene        where the fit starts; or a function of the parameters' values, a dict of tensors, that makes a Scene, a Mesh, or
-                 a pair of one and a list of cameras
+    scene        initial Scene or Mesh; or a function of the parameters' values, a dict of tensors, that returns a Scene, a
+                 Mesh, or a pair of one and a list of cameras
     cameras      one, a batch, or a sequence of cameras, of any sizes
     images       linear radiance, (H, W, C) for one camera, else (B, H, W, C) or a sequence; None: masks alone
-    parameters   by name, a learning rate or a Parameter. Names are those of the fields: "verts" or "texture" of a Mesh,
-                 "meshes.0.verts", "lights.1.direction", "background" of a Scene, "cameras.0.K" of a camera; for a function they
-                 are its own, each with a Parameter that has a value. Or a PoseParameter: "pose" moves a Mesh, "meshes.0.pose"
-                 one of a Scene, "cameras.0.pose" a camera, about the middle of the scene; a function gets a Pose under its
-                 name, with R, t and scale for mesh.transformed(), differentiable, and names the object by PoseParameter(of=…)
-    masks        (H, W) each, 1 on the object, 0 elsewhere: then pictures are multiplied by them and compared over black,
-                 and alpha is compared with the mask; where a soft mask is between, alpha alone
-    weights      (H, W) each, from 0: how much a pixel counts
-    regularizer  of the scene, added to the loss
+    parameters   by name, a learning rate, a Parameter or a PoseParameter. Names are those of fields: "verts" or "texture" of a
+                 Mesh; "meshes.0.verts", "lights.1.direction" or "background" of a Scene; "cameras.0.K" of a camera. Poses are
+                 named "pose" of a Mesh, "meshes.0.pose" of a Scene's mesh, "cameras.0.pose" of a camera, which turns about the
+                 middle of the scene. A function has names of its own: each Parameter needs a value, and each PoseParameter its
+                 object, PoseParameter(of=…); it gets a Pose with R, t and scale for mesh.transformed()
+    masks        (H, W) each, 1 on the object, 0 elsewhere. Pictures are multiplied by them and compared over black, and alpha
+                 is compared with the mask; where a soft mask is between 0 and 1, alpha alone is compared. None: whole pictures
+    weights      (H, W) each, ≥ 0: how much a pixel counts; None: all count the same
+    regularizer  function of the scene that is added to the loss; None: nothing is
     options      see edgegrad.fit.Options: loss, method, steps, spp, seed, callback, checkpoint, …
 
     Raises TypeError or ValueError that names the argument.
@@ -102,48 +104,50 @@ def fit_scene(
     opts = options_of(options)
     views = views_of(cameras, images, masks, weights)
     if opts.loss == REGION:
-        views = outlined_views(views)
+        views = region_views(views)
     build, known = builder(scene, [view.camera for view in views], drop_background=masks is not None)
     wanted = checked_parameters(parameters, known)
     return fit_views(build, views, wanted, opts, {"scene": scene, "parameters": wanted}, regularizer)
 
 
 def options_of(options: Mapping[str, Any]) -> Options:
-    """Raises TypeError that names what is unknown."""
+    """Return Options. Raises TypeError that names an unknown option."""
     names = list(Options.__dataclass_fields__)
     for name in options:
         if name not in names:
-            raise TypeError(f"expected options among {', '.join(names)}, got {name!r}{like(name, names)}")
+            raise TypeError(f"expected options among {', '.join(names)}, got {name!r}{suggestion(name, names)}")
     return Options(**options)
 
 
-def way_of(parameters: Mapping[str, Parameter], options: Options) -> Way:
-    """By the method of the options. Raises ValueError where it does not serve."""
-    return {"adam": AdamSteps, "gauss-newton": GaussNewtonSteps}[options.method](parameters, options)
+def make_optimizer(parameters: Mapping[str, Parameter], options: Options) -> Optimizer:
+    """Return the optimizer that `options.method` names. Raises ValueError where it cannot serve."""
+    return {"adam": AdamOptimizer, "gauss-newton": GaussNewtonOptimizer}[options.method](parameters, options)
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
 def fit_views(
     build: Build,
-    views: list[View],
+    views: list[Observation],
     parameters: Mapping[str, Parameter | Placement],
     options: Options,
     given: Mapping[str, Any],
     regularizer: Callable[[Scene], Tensor] | None = None,
 ) -> Fit:
-    """fit_scene() with everything checked; `given` are the arguments of which views and options do not tell."""
-    checkpoint = Checkpoint.of(options, views, given)
+    """Run fit_scene() on checked arguments. `given` are the arguments that views and options do not hold."""
+    checkpoint = Checkpoint.from_fit(options, views, given)
     saved = checkpoint.read()
     coordinates = Coordinates(parameters)
 
     def whole(tensors: Mapping[str, Tensor]) -> Built:
         return build(coordinates.values(tensors))
 
-    start, cameras = built(whole, {n: p.value for n, p in coordinates.parameters.items() if p.value is not None})
-    warn_of_masks(views, start, cameras)
+    start, cameras = build_detached(
+        whole, {n: p.value for n, p in coordinates.parameters.items() if p.value is not None}
+    )
+    check_mask_rows(views, start, cameras)
     objective = Objective(whole, views, options, regularizer)
     objective.check({n: p.value for n, p in coordinates.parameters.items() if p.value is not None})
-    way = way_of(coordinates.parameters, options)
-    descent = descend(way, objective, checkpoint.write, saved, report=reporter(whole, views, coordinates))
-    return judged(objective, descent, start, coordinates)
+    optimizer = make_optimizer(coordinates.parameters, options)
+    descent = descend(optimizer, objective, checkpoint.write, saved, report=reporter(whole, views, coordinates))
+    return make_fit(objective, descent, start, coordinates)

@@ -1,4 +1,4 @@
-"""fit_shape(): the vertices of a mesh, from coarse to fine."""
+"""fit_shape(): find the vertices of a mesh, from coarse to fine."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
 from ..ending import Ending
 from ..history import Record
+from ..laplacian import LaplacianSolver
 from ..losses import REGION
 from ..measured import Measured
 from ..options import Options, Parameter
 from ..placement import Coordinates
-from ..remeshing import crowded_edges, remeshed
-from ..smooth import Smooth
-from ..upside_down import warn_of_masks
-from ..views import Images, View, outlined_views, views_of
-from .fit_scene import options_of, reporter, way_of
+from ..remeshing import count_nonmanifold_edges, remeshed
+from ..row_order import check_mask_rows
+from ..views import Images, Observation, region_views, views_of
+from .fit_scene import make_optimizer, options_of, reporter
 from .loop import Descent, descend
-from .objective import Objective, judged
-from .result import Fit
+from .objective import Objective
+from .result import Fit, make_fit
 
 SMOOTHNESS = 4.0  # λ of I + λ L
-SMALLEST = 64  # pixels on the shorter side of pictures of coarse levels
+MIN_PIXELS = 64  # on the shorter side of pictures of coarse levels
 
 
 def fit_shape(
@@ -51,26 +51,27 @@ def fit_shape(
     regularizer: Callable[[Scene], Tensor] | None = None,
     **options: Any,
 ) -> Fit:
-    """Finds the shape of a mesh from pictures, masks, or measured depths, normals or positions of it.
+    """Find the shape of a mesh from pictures, masks, or measured depths, normals or positions of it.
 
-    mesh        where the fit starts: a sphere around the object will do, where the object has no holes
+    mesh        initial shape: a sphere around the object will do, unless the object has holes
     depths      (H, W) each, along the optical axis, +Z of the camera, in world units, as sensors give them
-    normals     (H, W, 3) each, of length 1, world axes, outwards
-    positions   (H, W, 3) each, world coordinates
-                These three are measured where they are finite and not 0; Measured(values, …) says with which weights. A camera
-                may have only some of the pictures, None standing for what it has not: a sensor beside the camera is one more
-    levels      after each but the last the mesh is remeshed to triangles of even size, half as long on each level as on the one
-                before; 1: the mesh as it is
-    faces       about so many on the last level; None: four times as many as on the level before
-    lr          the learning rate on the first level, in diagonals of the mesh's bounding box; half as large on each further level
-    smoothness  λ of the coordinates (I + λ L) v in which steps are taken: the larger, the farther a vertex takes its neighbours
+    normals     (H, W, 3) each, of length 1, in world axes, outwards
+    positions   (H, W, 3) each, world coordinates These three are measured where they are finite and not 0; Measured(values, …)
+                adds weights. None stands for a picture that a camera does not have; a sensor with a camera of its own is one
+                more camera
+    levels      number of levels; before each but the first, the mesh is remeshed to even triangles of half the size. 1: the
+                mesh keeps its faces
+    faces       about so many faces on the last level; None: four times as many as on the level before
+    lr          learning rate on the first level, in diagonals of the mesh's bounding box; halved on each further level
+    smoothness  λ of the coordinates (I + λ L) v in which steps are taken: the larger, the farther a vertex moves its neighbours
                 along (Nicolet, Jacobson and Jakob, Large Steps in Inverse Rendering of Geometry, 2021)
-    look        makes of a mesh of bare vertices and faces what is rendered: with normals, a material, lights. None: plain
-    background  behind the mesh where there are no masks, (C,) or (H, W, C)
-    options     see edgegrad.fit.Options; `steps` are those of each level, pictures of coarse levels are smaller
+    look        function that makes of a mesh of bare vertices and faces what is rendered: a Mesh with normals and a material,
+                or a Scene with lights; None: the plain mesh
+    background  radiance behind the mesh where there are no masks, (C,) or (H, W, C); None: black
+    options     see edgegrad.fit.Options; `steps` counts on each level, and coarse levels have smaller pictures
 
-    The rest is as for fit_scene(). Needs cholespy, and gpytoolbox for more than one level (`pip install 'edgegrad[fit]'`).
-    Raises TypeError or ValueError that names the argument, ImportError.
+    The other arguments are those of fit_scene(). Needs cholespy, and gpytoolbox for more than one level (`pip install
+    'edgegrad[fit]'`). Raises TypeError or ValueError that names the argument, ImportError.
     """
     opts = options_of(options)
     if not isinstance(mesh, Mesh):
@@ -80,8 +81,8 @@ def fit_shape(
         check_positive(name, value, least=0.0, most=1e9)
     if faces is not None:
         check_positive_int("faces", faces)
-    # Before the first level rather than after it.
-    if levels > 1 and (count := crowded_edges(mesh)):
+    # Remeshing would fail after the first level only.
+    if levels > 1 and (count := count_nonmanifold_edges(mesh)):
         raise ValueError(
             f"mesh: expected no more than two triangles at each edge, as remeshing needs, got {count} edges with more; "
             "give levels=1, or a sphere around the object"
@@ -89,21 +90,21 @@ def fit_shape(
     measured = {"depths": depths, "normals": normals, "positions": positions}
     views = views_of(cameras, images, masks, weights, measured)
     if opts.loss == REGION:
-        views = outlined_views(views)
+        views = region_views(views)
     behind = None if masks is not None else background
     bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())
-    return _Search(views, opts, levels, faces, lr, smoothness, look or _itself, behind, regularizer).run(bare)
+    return _ShapeFit(views, opts, levels, faces, lr, smoothness, look or _itself, behind, regularizer).run(bare)
 
 
 def _itself(mesh: Mesh) -> Mesh:
     return mesh
 
 
-class _Search:
+class _ShapeFit:
     """The levels of one fit."""
 
     def __init__(
-        self, views: list[View], options: Options, levels: int, faces: int | None, lr: float, smoothness: float,
+        self, views: list[Observation], options: Options, levels: int, faces: int | None, lr: float, smoothness: float,
         look: Callable[[Mesh], Scene | Mesh], background: Tensor | None, regularizer: Callable[[Scene], Tensor] | None,
     ) -> None:  # fmt: skip
         self.views, self.options, self.levels, self.faces, self.lr = views, options, levels, faces, lr
@@ -113,21 +114,16 @@ class _Search:
     @torch.enable_grad()
     def run(self, mesh: Mesh) -> Fit:
         start, level, history, seconds = mesh, 0, [], 0.0
-        checkpoint = Checkpoint.of(
-            self.options,
-            self.views,
-            {
-                "mesh": mesh, "levels": self.levels, "faces": self.faces, "lr": self.lr, "smoothness": self.smoothness,
-                "background": self.background,
-            },
-        )  # fmt: skip
+        names = ("levels", "faces", "lr", "smoothness", "background")
+        given = {"mesh": mesh, **{name: getattr(self, name) for name in names}}
+        checkpoint = Checkpoint.from_fit(self.options, self.views, given)
         saved = checkpoint.read()
         last = self.faces or len(mesh.faces) * 4 ** (self.levels - 1)
         if saved is not None:
             level, mesh = saved["level"], Mesh(saved["verts"], saved["faces"])
             history, seconds = [Record(*record) for record in saved["history"]], saved["seconds"]
         else:
-            warn_of_masks(self.views, self.scene(mesh), [view.camera for view in self.views])
+            check_mask_rows(self.views, self.scene(mesh), [view.camera for view in self.views])
         while True:
             stage = {
                 "level": level, "verts": mesh.verts, "faces": mesh.faces,
@@ -150,15 +146,15 @@ class _Search:
         def build(values: Mapping[str, Tensor]) -> tuple[Scene, list[Camera]]:
             return self.scene(mesh.replace(verts=values["verts"])), [view.camera for view in self.views]
 
-        return judged(Objective(build, self.views, self.options), whole, self.scene(start), Coordinates({}))
+        return make_fit(Objective(build, self.views, self.options), whole, self.scene(start), Coordinates({}))
 
     def descend(
         self, mesh: Mesh, level: int, save: Callable[[dict[str, Any]], None], saved: dict[str, Any] | None
     ) -> Descent:
-        """One level, from `mesh`; the best vertices are in its values."""
-        smooth = Smooth(mesh.faces, len(mesh.verts), self.smoothness)
+        """Run one level from `mesh` and return the best vertices as its values."""
+        smooth = LaplacianSolver(mesh.faces, len(mesh.verts), self.smoothness)
         smallest = min(min(view.camera.size) for view in self.views)
-        factor = min(1.0, max(0.5 ** (self.levels - 1 - level), SMALLEST / smallest))
+        factor = min(1.0, max(0.5 ** (self.levels - 1 - level), MIN_PIXELS / smallest))
         views = [view.resized(factor) for view in self.views]
         low, high = mesh.verts.aminmax(dim=0)
         rate = self.lr * float((high - low).norm()) * 0.5**level
@@ -167,12 +163,12 @@ class _Search:
             return self.scene(mesh.replace(verts=smooth(values["verts"]))), [view.camera for view in views]
 
         objective = Objective(build, views, self.options, self.regularizer)
-        first = smooth.times(mesh.verts)
+        first = smooth.to_differential(mesh.verts)
         if level == 0 and saved is None:
             objective.check({"verts": first})
         parameters = {"verts": Parameter(rate, first, uniform=True)}
         title = f"level {level + 1} of {self.levels}"
-        found = descend(way_of(parameters, self.options), objective, save, saved, title, reporter(build, views))
+        found = descend(make_optimizer(parameters, self.options), objective, save, saved, title, reporter(build, views))
         return found._replace(values={"verts": smooth(found.values["verts"])})
 
     def scene(self, mesh: Mesh) -> Scene:

@@ -1,4 +1,4 @@
-"""fit_texture(): the colours on a known shape."""
+"""fit_texture(): find the colours on a known shape."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..views import Images, views_of
 from .fit_scene import fit_views, options_of
 from .result import Fit
 
-COARSEST = 4  # texels on a side
+COARSEST_TEXELS = 4  # on a side
 
 
 def fit_texture(
@@ -35,16 +35,16 @@ def fit_texture(
     regularizer: Callable[[Scene], Tensor] | None = None,
     **options: Any,
 ) -> Fit:
-    """Finds the texture of a mesh from pictures of it.
+    """Find the texture of a mesh from pictures of it.
 
-    mesh        with texture coordinates, as unwrap() makes them; a texture that it has is where the fit starts
+    mesh        with texture coordinates, as unwrap() makes them; its texture, if it has one, is where the fit starts
     size        texels: one number, or (h, w)
-    lr          the learning rate, radiance a step
-    background  behind the mesh, (C,) or (H, W, C)
+    lr          learning rate, radiance per step
+    background  radiance behind the mesh, (C,) or (H, W, C); None: black
 
-    The rest is as for fit_scene(). The texture is the sum of an image pyramid, and the fit finds all its levels at once: what no
-    picture shows takes the colours of its surroundings from the coarse ones. Colours stay above 0. The mesh found is
-    `fit.mesh`, its texture `fit.mesh.texture`. Raises TypeError or ValueError that names the argument.
+    The other arguments are those of fit_scene(). The texture is the sum of an image pyramid whose levels are fitted at once, so
+    texels that no picture shows take the colours of their surroundings from coarse levels. Colours stay above 0. `fit.mesh` is
+    the mesh with the texture found, `fit.mesh.texture`. Raises TypeError or ValueError that names the argument.
     """
     opts = options_of(options)
     if opts.loss == REGION:
@@ -72,12 +72,12 @@ def fit_texture(
 
     def build(values: dict[str, Tensor]) -> tuple[Scene, list[Camera]]:
         total = sum((resampled(level, (h, w)) for level in values.values()), first)
-        # Clamped, but for the gradient: a texel that went below 0 comes back.
+        # The gradient ignores the clamp, so that a texel which went below 0 comes back.
         texture = total + (total.clamp(min=0.0) - total).detach()
         return Scene([shape.replace(texture=texture)], behind), [view.camera for view in views]
 
     sizes = [(h, w)]
-    while min(sizes[-1]) > COARSEST:
+    while min(sizes[-1]) > COARSEST_TEXELS:
         sizes.append((max(1, sizes[-1][0] // 2), max(1, sizes[-1][1] // 2)))
     levels = {f"level{k}": Parameter(lr / len(sizes), torch.zeros(*s, C)) for k, s in enumerate(sizes)}
     given = {"mesh": shape, "size": (h, w), "lr": lr, "background": behind}
@@ -85,7 +85,7 @@ def fit_texture(
 
 
 def resampled(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """(h, w, C) of another size, bilinear."""
+    """Resize (h, w, C) bilinearly."""
     if tuple(image.shape[:2]) == size:
         return image
     batch = image.movedim(-1, 0)[None]

@@ -1,7 +1,6 @@
-"""The loop of a fit by descent: steps until they lead no further, and a state to go on from.
+"""The loop of a fit by descent: it takes steps until they lead no further, and keeps a state to go on from.
 
-The loop knows nothing of what is fitted: an objective gives the loss of the parameters' values at a step. Steps are those of Adam
-(adam_steps.py) or of Gauss and Newton (gauss_newton.py).
+An optimizer takes the steps (adam_steps.py, gauss_newton.py); an objective gives the loss of the values at a step.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,17 +17,14 @@ from tqdm import tqdm
 from ..ending import Ending
 from ..history import Record
 from ..options import Options, Parameter
-from .falls import Falls
+from .convergence import ConvergenceMonitor
+from .objective import Objective
 
-if TYPE_CHECKING:
-    from .objective import Objective
-
-SMALL = 64  # values of up to so many numbers are kept for each step
-_PLAIN = ("best", "step", "seconds", "flat", "renewed")
+MAX_RECORDED = 64  # numbers of a parameter whose values the history holds
 
 
 class Descent(NamedTuple):
-    """How a loop ended."""
+    """The result of descend()."""
 
     values: dict[str, Tensor]  # the best
     history: list[Record]
@@ -36,8 +32,10 @@ class Descent(NamedTuple):
     ending: Ending
 
 
-class Way:
-    """The state of a descent: where it is, what was best, and whether the steps still lead down."""
+class Optimizer:
+    """The state of a descent: its values, the best ones so far, and whether steps still lead down."""
+
+    saved: ClassVar[tuple[str, ...]] = ("best", "step", "seconds", "flat", "renewed")  # attributes in checkpoints
 
     def __init__(self, parameters: Mapping[str, Parameter], options: Options, apart: bool = True) -> None:
         self.parameters, self.options = parameters, options
@@ -45,30 +43,30 @@ class Way:
         self.best = self.copied()
         self.history: list[Record] = []
         self.step, self.seconds, self.flat = 0, 0.0, False
-        self.falls = Falls(self.values, apart)
+        self.monitor = ConvergenceMonitor(self.values, apart)
         self.renewed: tuple[int, dict[str, Tensor]] | None = None  # step and values of the objective's last renewal
 
     def advance(self, objective: Objective) -> Record:
-        """One step, with the record of the point where it began."""
+        """Take one step and return the record of the point where it began."""
         raise NotImplementedError
 
     def renew(self, objective: Objective, values: Mapping[str, Tensor]) -> bool:
-        """What the objective holds fixed between steps, where it is time to; False where losses stay comparable."""
+        """Renew what the objective holds fixed, if it is due. Return whether losses stop being comparable by that."""
         if not objective.renews(self.step):
             return False
         self.renewed = self.step, {name: value.detach().clone() for name, value in values.items()}
         objective.renew(self.renewed[1], self.step)
-        self.falls.part()
+        self.monitor.split_losses()
         return True
 
     @property
     def falling(self) -> bool:
-        """Whether as many more steps as the patience promise more than the tolerance allows, and than can be told from noise."""
-        return self.falls.promise(self.options.patience) > self.falls.least(self.options)
+        """Whether as many more steps as the patience are predicted to lower the loss by more than tolerance and noise."""
+        return self.monitor.predicted_decrease(self.options.patience) > self.monitor.least_decrease(self.options)
 
     @property
     def impatient(self) -> bool:
-        """Whether it leads down no longer, by a tolerance that says what counts; never by one of 0."""
+        """Whether the steps lead down no longer. With a tolerance of 0 this is never so."""
         return self.options.tolerance > 0.0 and not self.falling
 
     def ending(self, interrupted: bool) -> Ending:
@@ -76,14 +74,14 @@ class Way:
             return Ending.INTERRUPTED
         if self.flat:
             return Ending.FLAT
-        return Ending.FALLING if self.falls.tell and self.falling else Ending.STEPS
+        return Ending.FALLING if self.monitor.is_ready and self.falling else Ending.STEPS
 
     def copied(self) -> dict[str, Tensor]:
         return {name: value.detach().clone() for name, value in self.values.items()}
 
     @torch.no_grad()
     def set(self, values: Mapping[str, Tensor]) -> None:
-        """Within the bounds."""
+        """Take these values, clamped to their bounds."""
         for name, value in self.values.items():
             value.copy_(self.parameters[name].within(values[name]))
 
@@ -92,24 +90,24 @@ class Way:
         return dict(zip(self.values, found, strict=True))
 
     def record(self, loss: float, gradients: Mapping[str, Tensor | None], rate: float) -> Record:
-        """Kept, and the step counted."""
+        """Add a record to the history and count the step."""
         norms = {name: 0.0 if g is None else float(g.norm()) for name, g in gradients.items()}
-        small = {n: v.detach().clone() for n, v in self.values.items() if v.numel() <= SMALL}
+        small = {n: v.detach().clone() for n, v in self.values.items() if v.numel() <= MAX_RECORDED}
         self.history.append(Record(self.step, loss, norms, small, rate))
         self.step += 1
         return self.history[-1]
 
     def state(self) -> dict[str, Any]:
-        plain = {name: getattr(self, name) for name in _PLAIN}
+        plain = {name: getattr(self, name) for name in self.saved}
         history = [tuple(record) for record in self.history]
-        return {**plain, "values": self.copied(), "history": history, "falls": self.falls.state()}
+        return {**plain, "values": self.copied(), "history": history, "monitor": self.monitor.state()}
 
-    def load(self, saved: Mapping[str, Any]) -> None:
-        for name in _PLAIN:
-            setattr(self, name, saved[name])
-        self.history = [Record(*record) for record in saved["history"]]
-        self.falls.load(saved["falls"])
-        self.set(saved["values"])
+    def load(self, state: Mapping[str, Any]) -> None:
+        for name in self.saved:
+            setattr(self, name, state[name])
+        self.history = [Record(*record) for record in state["history"]]
+        self.monitor.load(state["monitor"])
+        self.set(state["values"])
 
 
 def is_finite(record: Record) -> bool:
@@ -117,45 +115,46 @@ def is_finite(record: Record) -> bool:
 
 
 def descend(
-    way: Way,
+    optimizer: Optimizer,
     objective: Objective,
     save: Callable[[dict[str, Any]], None],
     saved: dict[str, Any] | None = None,
     title: str = "fit",
     report: Callable[[Record, dict[str, Tensor]], Record] = lambda record, values: record,
 ) -> Descent:
-    """Goes its way down. Ctrl-C ends it with the best values so far. The callback gets what `report` makes of a step's record
-    and the tensors after it, and the history holds the same.
+    """Take steps until the optimizer is flat or the steps run out. Ctrl-C ends the loop with the best values so far.
 
-    `save` is given the way's state now and then, and at the end; `saved` is such a state to go on from.
+    save    called with the optimizer's state every `checkpoint_every` steps and at the end
+    saved   such a state to go on from; None: begin anew
+    report  makes what the callback gets, of a step's record and the tensors after the step
     """
-    began, options = time.perf_counter(), way.options
+    began, options = time.perf_counter(), optimizer.options
     if saved is not None:
-        way.load(saved)
-        if way.renewed is not None:
-            objective.renew(way.renewed[1], way.renewed[0])
-    earlier = way.seconds
+        optimizer.load(saved)
+        if optimizer.renewed is not None:
+            objective.renew(optimizer.renewed[1], optimizer.renewed[0])
+    earlier = optimizer.seconds
     interrupted = False
 
     def keep() -> None:
-        way.seconds = earlier + time.perf_counter() - began
-        save(way.state())
+        optimizer.seconds = earlier + time.perf_counter() - began
+        save(optimizer.state())
 
     bar = tqdm(
-        total=options.steps, initial=way.step, desc=title, unit="step", disable=not options.progress, leave=False
+        total=options.steps, initial=optimizer.step, desc=title, unit="step", disable=not options.progress, leave=False
     )
     try:
-        while way.step < options.steps and not way.flat:
-            record = way.advance(objective)
+        while optimizer.step < options.steps and not optimizer.flat:
+            record = optimizer.advance(objective)
             bar.set_postfix_str(f"loss {record.loss:.3e}", refresh=False)
             bar.update()
             if options.callback is not None:
-                options.callback(report(record, way.values))
-            if way.step % options.checkpoint_every == 0:
+                options.callback(report(record, optimizer.values))
+            if optimizer.step % options.checkpoint_every == 0:
                 keep()
     except KeyboardInterrupt:
         interrupted = True
     finally:
         bar.close()
     keep()
-    return Descent(way.best, way.history, way.seconds, way.ending(interrupted))
+    return Descent(optimizer.best, optimizer.history, optimizer.seconds, optimizer.ending(interrupted))

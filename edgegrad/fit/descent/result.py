@@ -1,9 +1,8 @@
-"""What a fit by descent returns: the best values, what they make, and how well that explains the pictures."""
+"""The result of a fit by descent: the best values, the scene they make, and how well it shows what the pictures show."""
 
 from __future__ import annotations
 
 import io
-import json
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,31 +15,38 @@ from ...aovs import render_aovs
 from ...camera.camera import Camera
 from ...files.cameras import save_camera
 from ...files.image import write_image
-from ...files.paths import PathLike, replacing
+from ...files.paths import PathLike, replacing, write_figures, write_json
 from ...files.save import save_mesh
 from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..contour_colors import draw_contour
+from ..edge_support import MIN_EDGE_SUPPORT, edge_support
 from ..ending import Ending, reason_of
 from ..history import Record, number_or_none, plain_history
-from ..placement import Pose
-from ..sides import outlined
-from ..verdict import ENOUGH
-from ..views import View
+from ..measured import comparable
+from ..placement import Coordinates, Pose
+from ..views import Observation
+from .loop import Descent
+from .objective import Objective
+from .region_loss import FINAL_STEP
+from .scene_builder import build_detached
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+RESULT_SPP = 64  # samples per pixel at least, of the renders by which the result is judged
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a fit found.
+    """The result of fit_scene(), fit_shape() and fit_texture().
 
-    values     the parameters, by name; poses as matrices (4, 4) float64, mesh to world
-    poses      those of PoseParameters, by name
-    scene      with them, and cameras
-    loss       of all views, without the regularizer, at 64 samples a pixel or more
-    explained  the share of the render's edges that the pictures show too, 0 … 1
+    values     parameters by name; a PoseParameter as its matrix (4, 4) float64, mesh to world
+    poses      PoseParameters by name
+    scene      the scene with these values, and cameras
+    loss       mean over all views, without the regularizer, at 64 samples per pixel or more
+    explained  share of the render's edges that the pictures show too, 0 … 1
     ending     why the fit took no more steps
     """
 
@@ -52,9 +58,9 @@ class Fit:
     explained: float
     ending: Ending
     seconds: float
-    views: list[View] = field(repr=False)
+    views: list[Observation] = field(repr=False)
     history: list[Record] = field(repr=False)
-    start: Scene = field(repr=False)  # where the fit began
+    start: Scene = field(repr=False)
 
     @property
     def steps(self) -> int:
@@ -62,9 +68,8 @@ class Fit:
 
     @property
     def converged(self) -> bool:
-        """Further steps lead no further, and the pictures show what the fit has found: not a wrong place, nor a picture of
-        something else."""
-        return self.ending is Ending.FLAT and self.explained >= ENOUGH
+        """Whether further steps lead no further and the pictures show enough of the render's edges."""
+        return self.ending is Ending.FLAT and self.explained >= MIN_EDGE_SUPPORT
 
     @property
     def interrupted(self) -> bool:
@@ -77,17 +82,20 @@ class Fit:
 
     @property
     def reason(self) -> str:
-        """In words: "converged", or what kept the fit from that: "edges not explained: …", "loss still falling: …", "steps ran
-        out: …", "interrupted"."""
+        """The ending in words: "converged", "edges not explained: …", "loss still falling: …", "steps ran out: …" or
+        "interrupted"."""
         return reason_of(self.ending, self.explained)
 
     def render(self, index: int = 0, spp: int = 64, seed: int = 0) -> Tensor:
-        """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where there was a mask alone, or by regions; where
-        there was none, the depth, normal or position that was measured, as render_aovs() gives it."""
+        """Render the fit as (H, W, C) from the camera at `index`.
+
+        This is alpha (H, W, 1) if the view has a mask alone, or if the loss is "region". It is the depth, normal or position
+        that was measured, as render_aovs() gives it, if the view has neither image nor mask.
+        """
         return _render(self.scene, self.cameras[index], self.views[index], spp, seed)
 
     def plot(self, most: int = 4) -> Figure:
-        """target | start | fit | difference of up to so many views; by regions the contour of start and fit in the picture."""
+        """Draw target, start, fit and difference of at most `most` views; with the loss "region" contours in the picture."""
         n = len(self.views)
         chosen = sorted({round(k * (n - 1) / max(1, min(most, n) - 1)) for k in range(min(most, n))})
         rows = []
@@ -96,43 +104,33 @@ class Fit:
             start, end = _render(self.start, view.camera, view, 64, 0), self.render(i)
             if (measured := view.measured.get(view.aovs[0])) is not None:
                 start, end = measured.displayed(start), measured.displayed(end)
-            if view.outlined:
-                start, end = (outlined(view.shown, alpha) for alpha in (start, end))
+            if view.by_region:
+                start, end = (draw_contour(view.shown, alpha) for alpha in (start, end))
             rows.append((view.shown, start, end))
-        return require("edgegrad.fit.plots", *DRAWING).comparison(rows, not self.views[0].outlined)
+        return require("edgegrad.fit.plots", *DRAWING).comparison(rows, not self.views[0].by_region)
 
     def plot_history(self) -> Figure:
-        """The loss and the norm of each gradient, step by step."""
+        """Draw the loss and the norm of each gradient over the steps."""
         return require("edgegrad.fit.plots", *DRAWING).curves(self.history)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """Writes all of it to a folder, which is made where it is missing, and gives the files' names:
+        """Write the result to a folder, which is made if missing, and return the names of the files.
 
-        fit.json      loss, reason, cameras, and values of up to 64 numbers
-        values.pt     all values, for torch.load
-        history.json  loss, gradient norms and small values of each step
-        mesh*.ply     the shapes that moved
-        texture*.png  textures of 1 or 3 channels, as sRGB
-        mesh*.glb     the meshes with textures and materials, as save_mesh() writes them, where pillow is installed
-        camera*.json  the cameras, as load_camera reads them
-        fit.png       plot(), loss.png: plot_history(); not with figures=False
+        fit.json      loss, reason, cameras, and values of up to 64 numbers values.pt     all values, for torch.load
+        history.json  loss, gradient norms and small values of each step mesh*.ply     shapes that moved texture*.png  textures
+        of 1 or 3 channels, as sRGB mesh*.glb     meshes with textures and materials, as save_mesh() writes them, if pillow is
+        installed camera*.json  cameras, as load_camera reads them fit.png       plot(), loss.png: plot_history(); not with
+        figures=False
 
-        Each file is written whole or not at all. Raises OSError, or at last ImportError when matplotlib is missing.
+        Each file is written whole or not at all. Raises OSError, or at last ImportError if matplotlib is missing.
         """
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
-        written = []
-
-        def text(name: str, content: Any) -> None:
-            with replacing(out / name) as temporary:
-                temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-            written.append(name)
-
-        text("fit.json", self._summary())
+        written = ["fit.json", "values.pt", "history.json"]
+        write_json(out / "fit.json", self._summary())
         with replacing(out / "values.pt") as temporary:
             torch.save(self.values, temporary)
-        written.append("values.pt")
-        text("history.json", plain_history(self.history))
+        write_json(out / "history.json", plain_history(self.history))
         moved = any(n.endswith("verts") for n in self.values) or any(not n.startswith("cameras.") for n in self.poses)
         for i, mesh in enumerate(self.scene.meshes):
             number = "" if len(self.scene.meshes) == 1 else str(i)
@@ -142,8 +140,8 @@ class Fit:
             if mesh.texture is not None and mesh.texture.shape[-1] in (1, 3):
                 write_image(out / f"texture{number}.png", mesh.texture.clamp(0.0, 1.0))
                 written.append(f"texture{number}.png")
-            looks = mesh.texture is not None or mesh.material is not None
-            if looks and mesh.channels in (None, 1, 3) and (find_spec("PIL") or not mesh.has_textures):
+            textured = mesh.texture is not None or mesh.material is not None
+            if textured and mesh.channels in (None, 1, 3) and (find_spec("PIL") or not mesh.has_textures):
                 save_mesh(out / f"mesh{number}.glb", mesh)
                 written.append(f"mesh{number}.glb")
         for i, camera in enumerate(self.cameras):
@@ -151,11 +149,7 @@ class Fit:
             save_camera(out / name, camera)
             written.append(name)
         draw = {"fit.png": self.plot} | ({"loss.png": self.plot_history} if self.history else {})
-        for name in draw if figures else ():
-            with replacing(out / name) as temporary:
-                draw[name]().savefig(temporary)
-            written.append(name)
-        return written
+        return written + (write_figures(out, draw) if figures else [])
 
     def _summary(self) -> dict[str, Any]:
         small = {name: value.tolist() for name, value in self.values.items() if value.numel() <= 64}
@@ -165,12 +159,44 @@ class Fit:
         }  # fmt: skip
 
     def _repr_png_(self) -> bytes:
-        """In a notebook: the picture of plot()."""
+        """Show plot() in a notebook."""
         file = io.BytesIO()
         self.plot().savefig(file, format="png", dpi=100)
         return file.getvalue()
 
 
-def _render(scene: Scene, camera: Camera, view: View, spp: int, seed: int) -> Tensor:
+def _render(scene: Scene, camera: Camera, view: Observation, spp: int, seed: int) -> Tensor:
     with torch.no_grad():
         return render_aovs(scene, camera, view.aovs[:1], spp=spp, seed=seed)[view.aovs[0]]
+
+
+def make_fit(objective: Objective, descent: Descent, start: Scene, coordinates: Coordinates) -> Fit:
+    """Judge the best values of a descent over all views with many samples, and return the result."""
+    views, options = objective.views, objective.options
+    scene, cameras = build_detached(objective.build, descent.values)
+    loss, pairs = 0.0, []
+    spp = max(options.spp, RESULT_SPP)
+    objective.renew(descent.values, FINAL_STEP)
+    alphas: list[Tensor] = []
+    with torch.no_grad():
+        for i, view in enumerate(views):
+            renders = [next(objective.renders(scene, cameras, [i], spp, (options.seed + k) % 2**32))[1] for k in (1, 2)]
+            if objective.regions is not None:
+                alphas.append(0.5 * (renders[0]["alpha"][0] + renders[1]["alpha"][0]))
+                loss += float(objective.regions.loss([i], alphas[-1][None])) / len(views)
+            for name, target in view.wanted.items():
+                first, second = (found[name][0] for found in renders)
+                loss += float(objective.group_loss(name, [i], 0.5 * (first + second)[None])) / len(views)
+                pairs.append((first, second, target, view.weight))
+            for name, given in view.measured.items():
+                means = {key: 0.5 * (renders[0][key] + renders[1][key]) for key in (name, "alpha")}
+                loss += float(objective.measured_group_loss(name, [i], means)) / len(views)
+                target, weight = comparable(means[name][0], means["alpha"][0], given)
+                pairs.append((renders[0][name][0], renders[1][name][0], target, weight))
+    share = edge_support(pairs) if objective.regions is None else objective.regions.edge_support(alphas)
+    history = [coordinates.recorded(record) for record in descent.history]
+    return Fit(
+        values=coordinates.plain(descent.values), poses=coordinates.poses(descent.values), scene=scene, cameras=cameras,
+        views=views, loss=loss, explained=share, ending=descent.ending, history=history, seconds=descent.seconds,
+        start=start,
+    )  # fmt: skip

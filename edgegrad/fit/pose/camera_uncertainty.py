@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...camera.lens import MOST, bend
+from ...camera.lens import MOST_COEFFICIENTS, distort
 from .evidence import Source
 from .observed import motion
 from .pose import Pose
@@ -124,8 +124,8 @@ def reach(camera: Camera, entry: int) -> float:
         angle = n.norm(dim=1, keepdim=True)
         n, ahead = n / angle * torch.sin(angle), torch.cos(angle)
     q = torch.cat([n, ahead], 1)
-    count = MOST if camera.projection == "perspective" else 4
+    count = MOST_COEFFICIENTS if camera.projection == "perspective" else 4
     unit = torch.zeros(count, dtype=torch.float64)
     unit[entry - BEND] = 1e-3
-    moved = (bend(camera.projection, q, unit) - bend(camera.projection, q, 0.0 * unit)) / 1e-3
+    moved = (distort(camera.projection, q, unit) - distort(camera.projection, q, 0.0 * unit)) / 1e-3
     return float((focal_of(camera) * moved.norm(dim=1) / distance).max())

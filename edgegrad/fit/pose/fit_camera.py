@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...camera.lens import COUNTS
+from ...camera.lens import COEFFICIENT_COUNTS
 from ...check import check_flag, check_int
 from ...files.cameras import save_camera
 from ...files.paths import PathLike, replacing
@@ -281,7 +281,7 @@ def with_coefficients(name: str, camera: object, count: object) -> Camera:
     ValueError."""
     if not isinstance(camera, Camera):
         raise TypeError(f"{name}: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
-    counts = COUNTS[camera.projection]
+    counts = COEFFICIENT_COUNTS[camera.projection]
     number, most = check_int("distortion", count, 0, 2**31 - 1), max(counts, default=0)
     if number > most:
         raise ValueError(f"distortion: expected at most {most} for a camera that is {camera.projection}, got {number}")

@@ -26,7 +26,7 @@ from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
 from ..checkpoints import Checkpoint, traits
 from ..options import check_checkpoint
-from ..upside_down import BETTER, say_upside_down
+from ..row_order import MIN_IOU_GAIN, warn_of_flipped_rows
 from .given import Names, check_max_size, warn_of_scale
 from .journal import Journal
 from .photo.depth import warn_of_units
@@ -354,7 +354,7 @@ def _warn_if_upside_down(task: PoseTask, search: Search | PhotoSearch, place: bo
     else:
         again = Search(turned, turned.pyramid(start, max_size, spp), start, *way)
     found = again.first_end()
-    if found >= max(again.enough, search.explained + BETTER):
-        say_upside_down(
+    if found >= max(again.enough, search.explained + MIN_IOU_GAIN):
+        warn_of_flipped_rows(
             search.task.names.target, f"it shows {found:.0%} of the render's edges, as given {search.explained:.0%}"
         )

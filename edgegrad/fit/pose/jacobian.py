@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...aovs import IDS, aovs_request, by_name, check_aovs
 from ...camera.camera import Camera
-from ...camera.lens import MOST
+from ...camera.lens import MOST_COEFFICIENTS
 from ...kernel.operators import forward_kernel, jvp_kernel
 from ...scene.scene import Scene
 
@@ -108,13 +108,13 @@ class Rendered:
 
     def _tangents(self, motion: Motion | Motions) -> dict[str, Tensor]:
         """Of what the kernel is given."""
-        flat, camera, beside = self._request.scene, self._request.camera, self._request.beside
+        flat, camera, beside = self._request.scene, self._request.camera, self._request.auxiliary
         points = motion.of_points(flat.verts)
         tangents = {"verts": points}
         if motion.K is not None:
             tangents["K"] = motion.K[:, None]
         if motion.distortion is not None:
-            unsought = MOST - motion.distortion.shape[1]
+            unsought = MOST_COEFFICIENTS - motion.distortion.shape[1]
             tangents["distortion"] = torch.nn.functional.pad(motion.distortion, (0, unsought))[:, None]
         if isinstance(motion, Motions):
             return tangents  # of silhouettes and colours alone

@@ -79,5 +79,6 @@ def _packed(way: Way) -> dict[str, Any]:
 
 
 def _unpacked(packed: dict[str, Any]) -> Way:
-    steps = tuple(Step(size, loss, Pose.of(pose), *rest) for size, loss, pose, *rest in packed["steps"])
-    return Way(**{**packed, "pose": Pose.of(packed["pose"]), "here": Pose.of(packed["here"]), "steps": steps})
+    steps = tuple(Step(size, loss, Pose.from_numbers(pose), *rest) for size, loss, pose, *rest in packed["steps"])
+    pose, here = (Pose.from_numbers(packed[name]) for name in ("pose", "here"))
+    return Way(**{**packed, "pose": pose, "here": here, "steps": steps})

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from ...files.paths import PathLike, replacing
-from ..plots import comparison, displayed, draw_gradients
+from ..plots import comparison, draw_gradients
+from ..views import displayed
 from .photo.shown import shown
 from .result import PoseFit, Step
 from .task import Level, PoseTask
@@ -85,11 +86,11 @@ def draw_animation(path: PathLike, fit: PoseFit) -> None:
     """
     task = _task(fit)
     level = _level(task, FRAME)
-    target = displayed(level.shots[0].target)
+    target = displayed(level.shots[0].target).numpy()
     font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
     frames = []
     for step in _frames(_way(fit)):
-        image = displayed(shown(task, level, step.pose)[0])
+        image = displayed(shown(task, level, step.pose)[0]).numpy()
         panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
         frame = Image.fromarray((panels * 255.0).round().astype(np.uint8))
         edge = round(0.03 * frame.height)

@@ -16,8 +16,8 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...files.paths import PathLike, replacing
 from ...optional import DRAWING, require
+from ..edge_support import MIN_EDGE_SUPPORT
 from ..ending import Ending, reason_of
-from ..verdict import ENOUGH
 from .pose import Pose, pose_from_matrix
 from .uncertainty import FOCAL, Uncertainty
 
@@ -72,7 +72,7 @@ class PoseFit:
     # Of a fit of several objects, how much of this one the others leave to be seen, 0 … 1. Not kept in JSON
     visible: float = 1.0
     conflict: str = ""  # in words, which other pose or object it cannot be told from; not kept in JSON
-    enough: float = ENOUGH  # of `explained`, for this mesh and picture; not kept in JSON
+    enough: float = MIN_EDGE_SUPPORT  # of `explained`, for this mesh and picture; not kept in JSON
 
     @property
     def matrix(self) -> Tensor:

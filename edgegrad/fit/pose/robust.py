@@ -23,7 +23,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..verdict import edge_strength
+from ..edge_support import edge_strength
 from .task import Level, PoseTask, Shot
 
 NARROWEST = 0.1  # c, as a part of the pictures' range

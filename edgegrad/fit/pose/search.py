@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..verdict import ENOUGH, coherent, edges_of, explained
+from ..edge_support import MIN_EDGE_SUPPORT, block_error, edge_amount, edge_support
 from .gauss_newton import FIRST_DAMPING, MEMORY, PROBES_MEMORY, GaussNewton
 from .journal import Journal, Way
 from .observed import Observed
@@ -48,7 +48,7 @@ class _Judged(NamedTuple):
 
     loss: float
     explained: float  # the share of the render's edges that the pictures show
-    apart: float  # the means of blocks, as coherent() has them
+    apart: float  # the means of blocks, as block_error() has them
     edges: float  # of the render, all together
 
     def beats(self, best: _Judged) -> bool:
@@ -69,7 +69,7 @@ class Search:
     """The state of a search. `best`, `loss` and `history` may be read after each step, and `journal` at any time: a
     search that is given it goes on from there."""
 
-    enough = ENOUGH
+    enough = MIN_EDGE_SUPPORT
     alike = ()  # what looks alike is not known
 
     def __init__(
@@ -107,10 +107,10 @@ class Search:
         start = self._judge(self.start, stays)
         best = found if found.judged.beats(start.judged) else start
         self._take(best)
-        if self.further and best.judged.explained < ENOUGH:
+        if self.further and best.judged.explained < MIN_EDGE_SUPPORT:
             best = self._from_afar(best, near)
         deep = self.further and self.steps > ASIDE_STEPS
-        if deep and ENOUGH <= best.judged.explained < CLEAR and best.judged.apart > APART:
+        if deep and MIN_EDGE_SUPPORT <= best.judged.explained < CLEAR and best.judged.apart > APART:
             begins = len(self.history)
             ends = self._ranked(finer[0], self._tilted(best.pose))
             self._better(best, self._judge(*self._down(ends[0], finer[1:])), begins)
@@ -127,7 +127,7 @@ class Search:
         if ends[0] is not near:
             best = self._on(best, self._ranked(second, ends[:1]), begins)
         for _ in range(ROUNDS if self.steps > ASIDE_STEPS else 0):
-            if best.judged.explained >= ENOUGH:
+            if best.judged.explained >= MIN_EDGE_SUPPORT:
                 break
             begins = len(self.history)
             ends = distinct(self._ranked(coarse, [*self._others(best.pose), *ends[1:]]), FOLLOWED)
@@ -172,7 +172,7 @@ class Search:
 
     def _take(self, end: _End) -> None:
         self.loss, self.explained, self.best, self._answered = end.judged.loss, end.judged.explained, end.pose, True
-        self.converged = end.short and end.judged.explained >= ENOUGH
+        self.converged = end.short and end.judged.explained >= MIN_EDGE_SUPPORT
 
     def _ranked(self, level: Level, starts: list[Pose], *ends: Pose) -> list[Pose]:
         """Where a few steps lead from each start, and ends of such, the best first."""
@@ -283,7 +283,7 @@ class Search:
                 a, b = a[..., :-1], b[..., :-1]
             pairs.append((a, b, shot.target, weight))
         loss = first.loss(NARROWEST * task.extent)[0]
-        return _Judged(loss, explained(pairs), coherent(pairs), edges_of(pairs))
+        return _Judged(loss, edge_support(pairs), block_error(pairs), edge_amount(pairs))
 
     def _others(self, best: Pose) -> list[Pose]:
         """The few best of many poses around the start and the best one, by their loss on the coarsest level."""

@@ -18,7 +18,7 @@ from ...check import as_tensor, check_finite, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..region import VISIBLE
-from ..views import area_mean, before_black, check_image, check_without_alpha, has_levels, warn_of_faint, white_of
+from ..views import area_mean, check_image, check_without_alpha, has_levels, over_black, warn_of_faint, white_level
 from .given import LEAST, Names, depth_of, shots_of
 from .pose import Pose
 
@@ -132,7 +132,7 @@ class PoseTask:
                 shape = check_image(f"{names.mask}{name}", shape, view.size)
                 check_shape(f"{names.mask}{name}", shape, (*view.size, 1))
                 masks.append(shape)
-                image = shape if plain else torch.cat([before_black(image, shape)[0], shape], -1)
+                image = shape if plain else torch.cat([over_black(image, shape)[0], shape], -1)
             else:
                 behind = background if background is not None else scene.background
                 clutter = clutter or plain  # colours that nobody knows cannot be compared
@@ -342,7 +342,7 @@ class PoseTask:
 def _in_units_of_white(shots: list[Shot], masked: bool) -> tuple[list[Shot], float]:
     """Pictures whose white is 1, and the radiance that it was. `masked`: the last channel is a mask."""
     pixels = torch.cat([shot.target.flatten(0, 1) for shot in shots])
-    white = white_of(pixels[pixels[:, -1] > 0.0, :-1] if masked else pixels)
+    white = white_level(pixels[pixels[:, -1] > 0.0, :-1] if masked else pixels)
     found = []
     for shot in shots:
         target = shot.target / white

@@ -14,7 +14,7 @@ from torch import Tensor
 from ...rig.joints import Joints
 from ...rig.rig import Rig
 from ...rig.rotations import roma
-from ...rig.skinned import Skinned
+from ...rig.skinned import SkinDeformer
 from .sought import Sought
 
 
@@ -38,7 +38,7 @@ class Alternatives:
     @property
     def joints(self) -> Joints | None:
         """None where a rig does not say how they hang."""
-        return self.rig.deformer.joints if isinstance(self.rig.deformer, Skinned) else None
+        return self.rig.deformer.joints if isinstance(self.rig.deformer, SkinDeformer) else None
 
     def exchanged(self, values: Mapping[str, Tensor], one: Sequence[int], other: Sequence[int]) -> Tensor:
         """Two groups of rows, each where the other one is. Without joints each row takes its counterpart's rotation vector."""
@@ -95,7 +95,7 @@ class Alternatives:
 
     def _middle(self, place: int) -> Tensor:
         """(3,) of the vertices that hang on a joint, by their weights, from it, along its own axes at rest."""
-        assert isinstance(self.rig.deformer, Skinned)
+        assert isinstance(self.rig.deformer, SkinDeformer)
         total, count = torch.zeros(3, dtype=torch.float64), 0.0
         for skin, mesh in zip(self.rig.deformer.skins, self.rig.meshes, strict=True):
             for k in (skin.joints == place).nonzero()[:, 0].tolist():

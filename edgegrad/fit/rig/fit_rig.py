@@ -16,7 +16,7 @@ from ..descent.fit_scene import options_of
 from ..losses import REGION
 from ..options import Parameter
 from ..priors import Prior, checked_priors, towards
-from ..views import Images, outlined_views, views_of
+from ..views import Images, region_views, views_of
 from .keypoints import keypoint_term
 from .levels import Levels
 from .result import RigFit
@@ -81,7 +81,7 @@ def fit_rig(
     opts = options_of({"method": "gauss-newton" if count <= FEW else "adam", "steps": STEPS, "spp": 8, **options})
     views = views_of(cameras, images, masks, weights)
     if opts.loss == REGION:
-        views = outlined_views(views)
+        views = region_views(views)
     rest = {name: control.rest for name, control in rig.controls.items()}
     terms = [towards(rest)] if priors is None else checked_priors(priors, sought.values(sought.start))
     points = (

@@ -11,26 +11,27 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...aovs import render_aovs
-from ...rig.function import OfFunction
+from ...rig.function import FunctionDeformer
 from ...rig.rig import Rig
 from ...rig.rotations import roma
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
-from ..descent.building import Built
-from ..descent.curvature import MOST
-from ..descent.fit_scene import reporter, way_of
-from ..descent.gauss_newton import GaussNewtonSteps
+from ..descent.curvature import MAX_NUMBERS
+from ..descent.fit_scene import make_optimizer, reporter
+from ..descent.gauss_newton import GaussNewtonOptimizer
 from ..descent.loop import Descent, descend
-from ..descent.objective import FINAL_SPP, Objective, judged
-from ..descent.regions import LAST
+from ..descent.objective import Objective
+from ..descent.region_loss import FINAL_STEP
+from ..descent.result import RESULT_SPP, make_fit
+from ..descent.scene_builder import Built
 from ..ending import Ending
 from ..history import Record
 from ..losses import REGION
 from ..options import Options, Parameter
 from ..placement import Coordinates
 from ..priors import Prior
-from ..views import View
+from ..views import Observation
 from .alternatives import Alternatives
 from .limbs import ByContour, ByLoss, Limb, Search, limbs
 from .result import RigFit
@@ -57,7 +58,7 @@ class Levels:
     """The levels of one fit."""
 
     def __init__(
-        self, rig: Rig, sought: Sought, views: list[View], options: Options, priors: Sequence[Prior], eased: bool,
+        self, rig: Rig, sought: Sought, views: list[Observation], options: Options, priors: Sequence[Prior], eased: bool,
         points: Prior | None, coarsest: int, tries: int, look: Callable[..., Scene | Mesh],
     ) -> None:  # fmt: skip
         self.rig, self.sought, self.views, self.options = rig, sought, views, options
@@ -80,7 +81,7 @@ class Levels:
         values = self.sought.start
         first = dict(values)
         given = {"start": self.sought.fixed, "parameters": parameters, "tries": self.tries, "factors": self.factors}
-        checkpoint = Checkpoint.of(self.options, self.views, given)
+        checkpoint = Checkpoint.from_fit(self.options, self.views, given)
         saved, level, history, seconds = checkpoint.read(), 0, [], 0.0
         if saved is not None:
             level, values, seconds = saved["level"], saved["values"], saved["seconds"]
@@ -98,10 +99,10 @@ class Levels:
             if found.ending is Ending.INTERRUPTED or level == len(self.factors) - 1:
                 break
             level += 1
-        objective = Objective(self.build(self.views), self.views, self.options, many=self.many(self.views))
+        objective = Objective(self.build(self.views), self.views, self.options, build_batch=self.many(self.views))
         with torch.no_grad():
             start, _ = objective.build(first)
-        fit = judged(objective, Descent(values, history, seconds, found.ending), start, Coordinates({}))
+        fit = make_fit(objective, Descent(values, history, seconds, found.ending), start, Coordinates({}))
         found_values = {name: value.detach() for name, value in self.sought.all(values).items()}
         with torch.no_grad():
             alphas = [render_aovs(fit.scene, view.camera, ["alpha"], spp=16)["alpha"] for view in self.views]
@@ -112,36 +113,36 @@ class Levels:
     ) -> tuple[dict[str, float], JointUncertainty | None]:
         """Of each joint, what the pictures show of it, and how exactly."""
         joints = self.sought.joints
-        if not joints or sum(value.numel() for value in values.values()) > MOST:
+        if not joints or sum(value.numel() for value in values.values()) > MAX_NUMBERS:
             return {}, None
         rates = {name: p.lr for name, p in self.sought.parameters.items()}
         # The noise of few samples would count as that of the pictures.
-        options = dataclasses.replace(self.options, spp=max(self.options.spp, FINAL_SPP))
-        objective = Objective(objective.build, self.views, options, many=objective.many)
+        options = dataclasses.replace(self.options, spp=max(self.options.spp, RESULT_SPP))
+        objective = Objective(objective.build, self.views, options, build_batch=objective.build_batch)
         if objective.regions is not None:
-            objective.renew(values, LAST)
+            objective.renew(values, FINAL_STEP)
         try:
             return explained_by_joint(objective, values, joints), uncertainty_of(objective, values, rates, joints)
         except TypeError:  # no forward mode
             return {}, None
 
-    def build(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], Built]:
+    def build(self, views: Sequence[Observation]) -> Callable[[Mapping[str, Tensor]], Built]:
         return lambda tensors: self._scene(self.rig.posed(**self.sought.all(tensors)), self.sought.look(tensors), views)
 
-    def many(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], list[Built]]:
+    def many(self, views: Sequence[Observation]) -> Callable[[Mapping[str, Tensor]], list[Built]]:
         """The same of a batch of values. Rotations become matrices first, for a batch of three rotation vectors of three joints
         has the shape of three matrices."""
 
         def built(tensors: Mapping[str, Tensor]) -> list[Built]:
             values = dict(self.sought.all(tensors))
-            if "rotations" in values and not isinstance(self.rig.deformer, OfFunction):
+            if "rotations" in values and not isinstance(self.rig.deformer, FunctionDeformer):
                 values["rotations"] = roma().rotvec_to_rotmat(values["rotations"])
             every = self.rig.posed(**values)
             return [self._scene(posed, self.sought.look(tensors, k), views) for k, posed in enumerate(every)]
 
         return built
 
-    def _scene(self, posed: Scene | Mesh, values: Mapping[str, Tensor], views: Sequence[View]) -> Built:
+    def _scene(self, posed: Scene | Mesh, values: Mapping[str, Tensor], views: Sequence[Observation]) -> Built:
         posed = self.look(posed, **values)
         if not isinstance(posed, Mesh | Scene):
             raise TypeError(f"look: expected it to return a Mesh or a Scene, got {type(posed).__name__}")
@@ -173,7 +174,7 @@ class Levels:
         fine = level == len(self.factors) - 1
         spp = FINER * spp if fine else spp
         options = dataclasses.replace(self.options, spp=spp, steps=steps)
-        objective = Objective(build, views, options, prior=prior, many=self.many(views))
+        objective = Objective(build, views, options, prior=prior, build_batch=self.many(views))
         if fresh and level == 0:
             objective.check(values)
         title = f"level {level + 1} of {len(self.factors)}"
@@ -199,7 +200,7 @@ class Levels:
         ):
             try:
                 search = self._search(objective, found.values, options, name, TWIST_STEPS)
-                near = objective.left(found.values) < NEAR
+                near = objective.residual(found.values) < NEAR
                 values = search.twisted(found.values) if near else found.values
                 values = untwisted(objective, search.alternatives, self.sought.parameters[name], values)
             except KeyboardInterrupt:
@@ -237,7 +238,7 @@ class Levels:
             groups = [Limb(list(range(k, len(values[name])))) for k in range(len(values[name]))]
 
         def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
-            found = descend(way_of(parameters, few), objective, lambda state: None)
+            found = descend(make_optimizer(parameters, few), objective, lambda state: None)
             if found.ending is Ending.INTERRUPTED:
                 raise KeyboardInterrupt
             return found.values
@@ -255,10 +256,10 @@ class Levels:
         parameters = {
             name: dataclasses.replace(p, value=p.within(values[name])) for name, p in self.sought.parameters.items()
         }
-        way = way_of(parameters, options)
-        near = objective.regions is None and fine and objective.left(values) < NEAR
-        if isinstance(way, GaussNewtonSteps) and near:
-            way.unseen, way.damping = HARDLY_SEEN, NEAR_DAMPING
+        way = make_optimizer(parameters, options)
+        near = objective.regions is None and fine and objective.residual(values) < NEAR
+        if isinstance(way, GaussNewtonOptimizer) and near:
+            way.unseen_damping, way.damping = HARDLY_SEEN, NEAR_DAMPING
         return descend(
             way, objective, save, saved, title,
             reporter(objective.build, objective.views, bones=self.bones),

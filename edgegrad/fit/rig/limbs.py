@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 
 from ...rig.rig import Rig
-from ..descent.curvature import left, misfit
+from ..descent.curvature import misfit, residuals
 from ..descent.objective import Objective
-from ..descent.regions import LAST
+from ..descent.region_loss import FINAL_STEP
+from ..edge_support import MIN_EDGE_SUPPORT
 from ..options import Parameter
-from ..verdict import ENOUGH
 from .alternatives import Alternatives
 from .shown import explained_by_joint
 
@@ -126,7 +126,7 @@ class ByLoss:
 
     def _left(self, values: Values) -> float:
         with torch.no_grad():
-            return self.objective.left(values)
+            return self.objective.residual(values)
 
     def off(self, values: Values) -> Tensor:
         return misfit(self.objective, values, 0)[self.name]
@@ -150,7 +150,7 @@ class ByContour:
         return float(self.off(values).mean())
 
     def explained(self, values: Values) -> bool:
-        return float(self.off(values).max()) < 1.0 - ENOUGH
+        return float(self.off(values).max()) < 1.0 - MIN_EDGE_SUPPORT
 
     def nearly(self, values: Values) -> bool:
         return False  # no finer level draws limbs anew
@@ -161,7 +161,7 @@ class ByContour:
         return torch.tensor([1.0 - found.get(joint, 1.0) for joint in self.joints], dtype=torch.float64)
 
     def renew(self, values: Values) -> None:
-        self.objective.renew(values, LAST)
+        self.objective.renew(values, FINAL_STEP)
 
 
 def loss_of(objective: Objective, values: Values, seeds: Sequence[int] = SEEDS) -> float:
@@ -222,7 +222,7 @@ class Search:
             return values
         best, least = values, self.judge.cost(values)
         for _ in range(SWEEPS):
-            remaining, before = left(self.objective, best, 0)[self.name].mean(1), least
+            remaining, before = residuals(self.objective, best, 0)[self.name].mean(1), least
             for twist in sorted(twists, key=lambda twist: -float(remaining[twist.row]))[:WORST]:
                 if self.judge.explained(best):
                     return best
@@ -291,7 +291,7 @@ class Search:
 
         low, high = (None if b is None else torch.as_tensor(b)[place] for b in (parameter.low, parameter.high))
         own = Parameter(parameter.lr, start[self.name][place], low, high)
-        return whole(self.steps(self.objective.of(whole), {self.name: own}))
+        return whole(self.steps(self.objective.reparametrized(whole), {self.name: own}))
 
     def within(self, value: Tensor) -> Tensor:
         return self.parameters[self.name].within(value)

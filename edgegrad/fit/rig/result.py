@@ -16,8 +16,8 @@ from ...rig.rig import Rig
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..descent.result import Fit
+from ..edge_support import MIN_EDGE_SUPPORT
 from ..history import Record
-from ..verdict import ENOUGH
 from .uncertainty import JointUncertainty
 
 REGION = 0.01  # of a mask's area: a region of it is a limb that is missed
@@ -87,7 +87,7 @@ class RigFit:
         """Joints of whose edges the pictures show too few: they lie in another place."""
         if not self.explained:
             return []
-        least = max(ENOUGH, BESIDE_OTHERS * statistics.median(self.explained.values()))
+        least = max(MIN_EDGE_SUPPORT, BESIDE_OTHERS * statistics.median(self.explained.values()))
         return [name for name, share in self.explained.items() if share < least]
 
     @property

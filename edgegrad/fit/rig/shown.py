@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ..descent.curvature import derivatives
 from ..descent.objective import Objective
-from ..verdict import edges_of, explained
-from ..views import View
+from ..edge_support import edge_amount, edge_support
+from ..views import Observation
 
 MOVED = 0.05  # of the largest derivative by a joint: pixels that it moves
 BESIDE = 2  # pixels around these
@@ -50,13 +50,13 @@ def explained_by_joint(
             # Of regions, whose pictures have other colours, the contour alone, to tell how long it is.
             picture = view.wanted.get(name, one)
             pairs.append((one, other, picture, area if view.weight is None else area * view.weight))
-        if edges_of(pairs) < FEWEST:
+        if edge_amount(pairs) < FEWEST:
             continue
         if objective.regions is None:
-            found[joint] = explained(pairs)
+            found[joint] = edge_support(pairs)
         else:
             alphas = [0.5 * (first["alpha", i] + second["alpha", i]) for i in every]
-            found[joint] = objective.regions.explained(alphas, [areas["alpha", i][..., 0] for i in every])
+            found[joint] = objective.regions.edge_support(alphas, [areas["alpha", i][..., 0] for i in every])
     return found
 
 
@@ -90,7 +90,7 @@ def _areas(moved: Mapping[tuple[str, int], Tensor]) -> dict[tuple[str, int], Ten
     }
 
 
-def left_out(views: Sequence[View], renders: Sequence[Tensor]) -> float:
+def left_out(views: Sequence[Observation], renders: Sequence[Tensor]) -> float:
     """The largest share, over all views with a mask, of what it shows that lies in a region where the fit covers nothing, or that
     the fit covers beside it; of regions three pixels wide or more. `renders` are the fit's alphas (H, W, 1)."""
     most = 0.0

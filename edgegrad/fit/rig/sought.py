@@ -12,7 +12,7 @@ from torch import Tensor
 from ...check import as_tensor, check_finite, check_shape
 from ...rig.control import Control
 from ...rig.rig import Rig
-from ...rig.skinned import Skinned
+from ...rig.skinned import SkinDeformer
 from ..options import Parameter
 
 F64 = torch.float64
@@ -43,7 +43,7 @@ class Sought:
             "scale": torch.ones((), dtype=F64),
         }
         known = {**{name: control.rest for name, control in rig.controls.items()}, **place}
-        skinned = isinstance(rig.deformer, Skinned)
+        skinned = isinstance(rig.deformer, SkinDeformer)
         if seek is None:
             seek = [name for name in rig.controls if not skinned or name not in ("joint_translations", "joint_scales")]
             seek += ["translation"] if skinned else [] if "angles" in rig.controls else ["translation", "orientation"]
@@ -137,7 +137,7 @@ class Sought:
 def _free(rig: Rig, name: str, control: Control, joints: Sequence[str] | None) -> list[int] | None:
     if joints is not None:
         return sorted(control.row(name, joint) for joint in joints)
-    if isinstance(rig.deformer, Skinned):
+    if isinstance(rig.deformer, SkinDeformer):
         return sorted({int(j) for skin in rig.deformer.skins for j in skin.joints})
     return None
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ...sides import TOLERANCE, Sides
+from ...contour_colors import TOLERANCE, ContourColors
 from ..gauss_newton import Normal
 from .picture import Picture
 
 FEWEST = 20  # pixels on the contour
 
 
-def contour_loss(picture: Picture, sides: Sides) -> float:
+def contour_loss(picture: Picture, sides: ContourColors) -> float:
     """Of the contour's pixels, half the robust squares of the differences, in variances, less what noise alone leaves of them:
     poses whose contours are longer are no less likely for that."""
     squares = ((sides.mixed - picture.outlined).square() / sides.variance).sum(-1)
@@ -24,7 +24,7 @@ def contour_loss(picture: Picture, sides: Sides) -> float:
     return 0.5 * float((sides.band * picture.weight * excess).sum())
 
 
-def contour_term(picture: Picture, sides: Sides, tangents: Tensor) -> Normal | None:
+def contour_term(picture: Picture, sides: ContourColors, tangents: Tensor) -> Normal | None:
     """The equations of alpha's derivatives (n, h, w), blurred as alpha was; None where there is hardly any contour."""
     band = sides.band
     if int(band.sum()) < FEWEST:

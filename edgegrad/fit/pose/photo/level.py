@@ -15,11 +15,19 @@ from ....aovs import render_aovs
 from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ....scene.scene import Scene
-from ...region import RADIUS, Palette, Windows, around, likelihood, palette, posterior, smoothed, told
-from ...sides import ALONE_SHOWN, ALONE_TOLD, CONTRAST, PURE, REACH, Sides, blur_losses
-from ...sides import BLUR as CONTOUR_BLUR
-from ...sides import BLURS as CONTOUR_BLURS
-from ...verdict import explained
+from ...contour_colors import (
+    ALONE_INFORMATION,
+    ALONE_SHOWN,
+    COLOUR_WINDOW,
+    CONTOUR_BLUR,
+    CONTOUR_BLURS,
+    CONTRAST,
+    PURE,
+    ContourColors,
+    blur_losses,
+)
+from ...edge_support import edge_support
+from ...region import RADIUS, Palette, Windows, information, likelihood, palette, posterior, smoothed, surroundings
 from ..gauss_newton import Normal
 from ..given import bare
 from ..jacobian import Motion, Rendered
@@ -94,11 +102,11 @@ class Seen:
     surface: Surface | None  # in the box
     lit: Lit | None
 
-    def sides(self, blur: float = CONTOUR_BLUR) -> Sides:
+    def sides(self, blur: float = CONTOUR_BLUR) -> ContourColors:
         """Of the contour, in the box, when alpha is blurred by so many pixels."""
         contour = smoothed(self.alpha[self.box][None], blur)[0]
         part = self.part
-        return Sides.of(part.outlined, contour, self.near[self.box], part.mask is None, part.noise)
+        return ContourColors.from_image(part.outlined, contour, self.near[self.box], part.mask is None, part.noise)
 
 
 @dataclass(frozen=True)
@@ -147,7 +155,7 @@ class PhotoLevel:
                 channels = render_aovs(moved, cut, names, self.plain.spp, seed)
             surface = Surface.of(cut, channels, moves, alpha[box] if others else None)
         lit = Lit.of(part, surface, self.harmonics) if surface is not None and self.harmonics else None
-        near, extent = around(alpha)
+        near, extent = surroundings(alpha)
         return Seen(picture, box, part, alpha, tangents, near * picture.weight, extent, surface, lit)
 
     def equations(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> tuple[Normal, float]:
@@ -217,9 +225,9 @@ class PhotoLevel:
             length += float(on.sum())
             shown += float((on * (sides.contrast > CONTRAST) * sides.band).sum())
             if not self.harmonics:
-                soft = smoothed(seen.alpha[None], REACH)[0]
+                soft = smoothed(seen.alpha[None], COLOUR_WINDOW)[0]
                 beside = ((soft > PURE) & (soft < 1.0 - PURE)) * seen.near
-                bits += float((beside * told(self._posterior(k, seen), seen.alpha)).sum())
+                bits += float((beside * information(self._posterior(k, seen), seen.alpha)).sum())
                 pixels += float(beside.sum())
             band = sides.band.float() * picture.weight
             if seen.lit is None or picture.mask is not None:
@@ -233,12 +241,12 @@ class PhotoLevel:
                 pairs.append((expected, expected, picture.display, weight[..., None]))
         if length == 0.0:
             return 0.0
-        share = explained(pairs, softer=True) * min(1.0, extent / RESOLVED)
+        share = edge_support(pairs, softer=True) * min(1.0, extent / RESOLVED)
         if self.harmonics:
             return share * min(1.0, shown / length / SHOWN)
         # The colours that a contour divides are alike on both sides where it is not the object's, however strong the edges are
         # that it happens to follow.
-        sure = max(0.0, min(1.0, bits / max(pixels, 1e-30) / ALONE_TOLD))
+        sure = max(0.0, min(1.0, bits / max(pixels, 1e-30) / ALONE_INFORMATION))
         return share * min(1.0, shown / length / ALONE_SHOWN) * sure
 
     @cached_property

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
-from ...sides import NOISE, noise_of_mask
+from ...contour_colors import PIXEL_NOISE, mask_noise
 from ...views import area_mean
 from ..task import Shot
 
@@ -26,7 +26,7 @@ class Picture:
     mask: Tensor | None  # (h, w), 1 on the object
     weight: Tensor  # (h, w), how much a pixel counts
     depth: Tensor | None  # (h, w), NaN where it was not measured
-    noise: float = NOISE  # standard deviation of what `outlined` shows, where it is mixed
+    noise: float = PIXEL_NOISE  # standard deviation of what `outlined` shows, where it is mixed
 
     @staticmethod
     def of(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int]) -> Picture:
@@ -35,7 +35,7 @@ class Picture:
         if masked:
             radiance, mask = radiance[..., :-1], radiance[..., -1].clamp(0.0, 1.0)
         weight = torch.ones(size) if shot.weight is None else area_mean(shot.weight, size)[..., 0]
-        noise = NOISE if mask is None else noise_of_mask(shot.target[..., -1], size[0] / shot.target.shape[0])
+        noise = PIXEL_NOISE if mask is None else mask_noise(shot.target[..., -1], size[0] / shot.target.shape[0])
         nearest = None if depth is None else F.interpolate(depth[None, None], size, mode="nearest-exact")[0, 0]
         return Picture(
             shot.camera.resized(size), radiance, linear_to_srgb(radiance.clamp(0.0, 1.0)), mask, weight, nearest, noise

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ...region import LEAST, OUTLIERS, Windows, smoothed
+from ...region import MIN_FREQUENCY, OUTLIERS, Windows, smoothed
 from ..gauss_newton import Normal
 
 
@@ -21,7 +21,7 @@ def posteriors(windows: Sequence[Windows], alphas: Tensor, near: Tensor) -> Tens
     """(N + 1, h, w) of N objects with the silhouettes alphas (N, h, w), and last of what lies behind them, in windows of each."""
     shares = torch.cat([alphas, (1.0 - alphas.sum(0, keepdim=True)).clamp(min=0.0)]) * near
     counted = [one.frequencies(share) * one.present(share) for one, share in zip(windows, shares, strict=True)]
-    likely = torch.stack(counted) + LEAST
+    likely = torch.stack(counted) + MIN_FREQUENCY
     return likely / likely.sum(0)
 
 

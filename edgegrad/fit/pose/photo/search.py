@@ -281,7 +281,7 @@ class PhotoSearch(Ways):
         def starts() -> Iterator[tuple[Pose, list[Tensor]]]:
             flat = self.journal.numbers(compared)
             for at in range(0, len(flat), size + 1):
-                pose, side = Pose.of(flat[at : at + size]), int(flat[at + size])
+                pose, side = Pose.from_numbers(flat[at : at + size]), int(flat[at + size])
                 yield pose, [at_one_side(seen.alpha, side) for seen in first.see(pose, self.seed)]
 
         return self._of_covered(best, starts(), begins, answered)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ....aovs import render_aovs
-from ...sides import outlined
+from ...contour_colors import draw_contour
 from ..observed import motion
 from ..pose import Pose
 from ..robust import Comparison
@@ -30,7 +30,7 @@ def shown(task: PoseTask, level: Level, pose: Pose) -> list[Tensor]:
             alpha = channels["alpha"].float()
             image = shot.target * alpha if task.colourless else _lit(task, level, pose, channels, len(found))
         image = image + (1.0 - alpha) * FADED * shot.target
-        found.append(outlined(image, alpha))
+        found.append(draw_contour(image, alpha))
     return found
 
 

@@ -99,7 +99,7 @@ class Starts:
         """Starts after a few steps, those that the pictures show most of first. They are what a journal has of this."""
         flat = self.journal.numbers(self._compared)
         size = len(self.start.numbers)
-        return [Pose.of(flat[k : k + size]) for k in range(0, len(flat), size)]
+        return [Pose.from_numbers(flat[k : k + size]) for k in range(0, len(flat), size)]
 
     def _compared(self) -> list[float]:
         found = []

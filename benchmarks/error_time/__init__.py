@@ -1,0 +1,1 @@
+"""The error of the gradient against the time it takes, beside other renderers."""

@@ -1,0 +1,229 @@
+// Lines past edges and alpha edges, and what lies at both of their ends.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "boundary/curve.h"
+#include "estimator/view.h"
+#include "rays/alpha_mask.h"
+#include "rays/meeting.h"
+#include "scene/contact.h"
+#include "secondary/edge_line_source.h"
+#include "secondary/lune.h"
+#include "secondary/occluder.h"
+
+namespace edgegrad {
+
+// Lines in batches. `casters`: the scene as light meets it.
+template <class T>
+class TracedEdgeLines {
+   public:
+    TracedEdgeLines(const BackwardView<T>& view, const SceneView<T>& casters, const std::vector<AlphaEdge>& alpha_edges)
+        : view_(view), casters_(casters), alpha_edges_(alpha_edges), caster_(view.geometry.caster()) {
+        // So far before the edge a ray begins that floats find what touches it there.
+        const RayFrame& frame = caster_.frame();
+        constexpr double floats = 0x1p-18;
+        size_ = frame.radius * frame.unit, before_ = floats * size_;
+    }
+
+    // The place t of an edge, or, numbered after all edges, of an alpha edge, and the unit direction w of a line past
+    // it, either way, for whoever knows the segment by this number.
+    void add(int64_t piece, double t, Vec3 w, int64_t segment, double weight) {
+        Pending& o = pending_[count_];
+        const int64_t edges = view_.geometry.topology().n_edges();
+        o.line = EdgeLine();
+        o.edge = piece < edges ? piece : -1, o.weight = weight, o.line.w = w, o.line.segment = segment;
+        if (!(o.edge < 0 ? set_alpha_edge(alpha_edges_[piece - edges], t, o) : set_edge(t, o))) return;
+        const Occluder& occluder = o.line.occluder;
+        o.tangent = occluder.sum(occluder.tangent, vertices());
+        const auto adjacent = adjacent_faces(o);
+        without_[count_].assign(adjacent.begin(), adjacent.end());
+        std::sort(without_[count_].begin(), without_[count_].end());
+        ++count_;
+    }
+
+    bool is_full() const { return count_ == RayBatch::size; }
+
+    // Calls body(line, weight) for both ways along each line, if there is something at both of its ends.
+    template <class Body>
+    void cast(Body body) {
+        for (int side = 0; side < 2; ++side) {
+            find_ends(side);
+            int kept = 0;
+            for (int i = 0; i < count_; ++i)
+                if (pending_[i].end[side].face >= 0) pending_[kept++] = pending_[i];
+            count_ = kept;
+        }
+        for (int i = 0; i < count_; ++i)
+            for (int receiver = 0; receiver < 2; ++receiver)
+                if (set(pending_[i], receiver)) body(pending_[i].line, pending_[i].weight);
+        count_ = 0;
+    }
+
+   private:
+    // What the line meets beyond the edge, against its direction or along it.
+    struct End {
+        int32_t face = -1;
+        Barycentrics at;
+        double distance;  // from the edge; 0: it lies on that face
+    };
+    struct Pending {
+        EdgeLine line;
+        double weight;
+        int64_t edge;     // −1: an alpha edge
+        int32_t face;     // of an alpha edge
+        Vec3 p, tangent;  // world coordinates
+        End end[2];
+
+        Vec3 direction(int side) const { return side ? line.w : -line.w; }
+    };
+
+    auto vertices() const {
+        return [&](int32_t i) { return vec(view_.scene.verts + 3 * int64_t(i)); };
+    }
+    // Of the edge, or that of the alpha edge.
+    std::span<const int32_t> adjacent_faces(const Pending& o) const {
+        return o.edge < 0 ? std::span<const int32_t>(&o.face, 1) : view_.geometry.topology().faces(o.edge);
+    }
+
+    // Where some of its faces may be alpha-tested, lines are drawn as if all passed; those past the others are kept.
+    bool set_edge(double t, Pending& o) {
+        const auto halves = view_.geometry.topology().half_edges(o.edge);
+        const HalfEdge& own = halves[0];
+        o.line.occluder = occluder_of(view_.scene, own, t);
+        o.p = o.line.occluder.sum(o.line.occluder.weight, vertices());
+        if (!casters_.alpha_masks.face) return true;
+        opposite_.clear();
+        for (const HalfEdge& h : halves)
+            if (is_there(casters_, h, t)) opposite_.push_back(corner(view_.scene, h.face, (h.corner + 2) % 3));
+        if (opposite_.size() == halves.size() && !alpha_masks_jump(casters_, view_.geometry.topology(), o.edge))
+            return true;
+        const Lune lune(corner(view_.scene, own.face, own.first()), corner(view_.scene, own.face, own.second()),
+                        opposite_);
+        const Lune::Place place = lune.locate(o.line.w);
+        o.line.w = place.w;
+        return place.is_there();
+    }
+    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, Pending& o) const {
+        AlphaEdgePoint place{};
+        if (!AlphaEdgeFinder<T>(casters_).place(alpha_edge, t, place)) return false;
+        o.line.occluder = occluder_of(casters_, alpha_edge, place);
+        const double turned = o.line.occluder.turned(o.line.w, vertices());
+        if (!(std::fabs(turned) > 0)) return false;
+        if (turned > 0) o.line.w = -o.line.w;  // the face is there where κ D F > 0
+        o.p = next_to_alpha_edge(casters_, alpha_edge, place), o.face = alpha_edge.face;
+        return true;
+    }
+
+    void find_ends(int side) {
+        int32_t face[RayBatch::size];
+        cast_each(
+            caster_, count_, face, without_,
+            [&](int i) {
+                const Vec3 d = pending_[i].direction(side);
+                return Ray{pending_[i].p - before_ * d, d};
+            },
+            [&](int i, int32_t f) { return accept(pending_[i], side, f, pending_[i].end[side]); });
+        for (int i = 0; i < count_; ++i) pending_[i].end[side].face = face[i];
+    }
+
+    // Whether the line ends on a face.
+    bool accept(const Pending& o, int side, int32_t face, End& end) const {
+        const SceneView<T>& scene = view_.scene;
+        const Vec3 d = o.direction(side), q = corner(scene, face, 0);
+        const Vec3 m = cross(corner(scene, face, 1) - q, corner(scene, face, 2) - q);
+        const Meeting met = meet(scene, face, {o.p, d});
+        if (!met.exists()) return false;
+        const bool outside = met.margin() < -Meeting::rounding;
+        end.at = inside({met.u, met.v}), end.distance = met.t;
+        if (!shows(casters_, face, end.at)) return false;
+        // Near a border of faces floats and doubles may differ. Far away floats decide, for a line that passed a face
+        // might pass its neighbour too.
+        constexpr double near = 4;  // sizes of the face
+        const bool meets = !outside || met.t * met.t > near * near * length(m);
+        // How faces that share a vertex with those of the edge lie to it is exact, however near they are.
+        const auto own = adjacent_faces(o);
+        if (std::any_of(own.begin(), own.end(), [&](int32_t f) { return share_vertex(scene, face, f); }))
+            return meets && met.t > Meeting::rounding * size_;
+        const double touching = distance_in_contact(o, face, length(m) / std::fabs(dot(m, d)));
+        if (std::fabs(met.t) > touching) return meets && met.t > 0;
+        // The edge lies on this face: lines into it, on the side on which the edge's faces stand, end there.
+        end.distance = 0;
+        return !outside && rise(face, m, own) * dot(m, d) < 0;
+    }
+
+    // Along the line, up to the rounding of the input.
+    double distance_in_contact(const Pending& o, int32_t face, double slant) const {
+        const double size = extent(face);
+        return contact(spacing_at(o, face), size, size) * slant;
+    }
+    // The largest coordinate of a face, and the relative spacing of such numbers.
+    double extent(int32_t face) const {
+        double size = 0;
+        for (int i = 0; i < 3; ++i) {
+            const Vec3 v = corner(view_.scene, face, i);
+            size = std::max({size, std::fabs(v.x), std::fabs(v.y), std::fabs(v.z)});
+        }
+        return size;
+    }
+    double spacing_at(const Pending& o, int32_t face) const {
+        const Spacing& spacing = *view_.scene.spacing;
+        return std::max(spacing.of(view_.scene.faces[3 * int64_t(face)]), spacing.of(o.line.occluder.vertex[0]));
+    }
+
+    // How high faces stand over the plane of another, on the side where they do most; 0: they lie in it.
+    double rise(int32_t face, Vec3 m, std::span<const int32_t> others) const {
+        const Vec3 q = corner(view_.scene, face, 0);
+        double most = 0;
+        for (const int32_t other : others)
+            for (int i = 0; i < 3; ++i) {
+                const double height = dot(m, corner(view_.scene, other, i) - q);
+                if (std::fabs(height) > std::fabs(most)) most = height;
+            }
+        return std::fabs(most) > flat * dot(m, m) / std::sqrt(length(m)) ? most : 0;
+    }
+
+    // With one of the ends as the receiver; false where the edge lies on it: there the camera sees the border as an
+    // edge.
+    bool set(Pending& o, int receiver) const {
+        const End &near = o.end[receiver], &far = o.end[1 - receiver];
+        if (near.distance == 0) return false;
+        EdgeLine& line = o.line;
+        line.receiver = near.face, line.reflector = far.face, line.at = near.at, line.from = line.asked = far.at;
+        line.distance = near.distance + far.distance, line.share = far.distance / line.distance;
+        const Vec3 q = corner(view_.scene, near.face, 0);
+        const Vec3 m = cross(corner(view_.scene, near.face, 1) - q, corner(view_.scene, near.face, 2) - q);
+        line.facing = -dot(m, o.direction(receiver));
+        if (far.distance == 0) line.asked = adjacent(o, far.face);
+        return true;
+    }
+
+    // On a face on which the edge lies, a little to the side where light passes.
+    Barycentrics adjacent(const Pending& o, int32_t face) const {
+        const SceneView<T>& scene = view_.scene;
+        const Vec3 q = corner(scene, face, 0), e1 = corner(scene, face, 1) - q, e2 = corner(scene, face, 2) - q;
+        const Vec3 m = cross(e1, e2), across = unit(cross(m, o.tangent));
+        const double side = dot(cross(o.tangent, o.line.w), across) > 0 ? 1 : -1;
+        constexpr double little = 1e-5, roundings = 64;  // of the edge; of the input, for rays to lights
+        const double aside = little * length(o.tangent) + roundings * spacing_at(o, face) * extent(face);
+        const Vec3 there = o.p + (side * aside) * across - q;
+        const double scale = 1 / dot(m, m);
+        return inside({dot(cross(there, e2), m) * scale, dot(cross(e1, there), m) * scale});
+    }
+
+    static constexpr double flat = 1e-9;  // of the size of a face
+
+    const BackwardView<T>& view_;
+    const SceneView<T>& casters_;
+    const std::vector<AlphaEdge>& alpha_edges_;
+    const RayCaster& caster_;
+    double size_, before_;
+    Pending pending_[RayBatch::size];
+    std::vector<int32_t> without_[RayBatch::size];
+    std::vector<Vec3> opposite_;
+    int count_ = 0;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,71 @@
+"""edgegrad fit-camera."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from .arguments import CHECKPOINT, add_live, add_mesh, add_resume, add_view, count, number
+from .inputs import read_background, read_picture, read_scene, read_view, seen_by
+from .outputs import linger, live, make_folder, write_outputs
+
+
+def add(commands: Any) -> None:
+    parser = commands.add_parser("fit-camera", help="find the camera of a picture", description=run.__doc__)
+    add_mesh(parser)
+    parser.add_argument("image", type=Path, metavar="IMAGE", help="the picture; an alpha channel is taken as the mask")
+    add_view(parser)
+    parser.add_argument("--no-focal", action="store_true", help="keep the focal length")
+    parser.add_argument("--principal", action="store_true", help="also find the principal point")
+    parser.add_argument(
+        "--distortion",
+        type=number,
+        default=0,
+        metavar="N",
+        help="also find so many coefficients, up to 8 (a fisheye: 4)",
+    )
+    parser.add_argument(
+        "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
+    )
+    parser.add_argument("--steps", type=count, default=60, help="most steps on each level of resolution (%(default)s)")
+    parser.add_argument("--seed", type=number, default=0)
+    add_resume(parser)
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR",
+        help=f"for camera.json, history.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}",
+    )  # fmt: skip
+    add_live(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Finds pose and focal length of the camera that took a picture of a mesh, from a start within about 30° and 15 % of the
+    mesh's size. Ctrl-C keeps the best so far, and --resume goes on from there."""
+    from .. import save_camera
+    from ..fit import fit_camera
+    from . import INTERRUPTED
+
+    scene = read_scene(args)
+    args.image = seen_by(args.camera, args.image)
+    picture, mask = read_picture(args.image)
+    if mask is not None and args.background is not None:
+        raise ValueError("--background: expected none with an image that has alpha, got both; leave one out")
+    start = read_view(args, scene, (picture.shape[0], picture.shape[1]), None)
+    make_folder(args.out)
+    with live(args) as view:
+        fit = fit_camera(
+            scene, picture, start, mask=mask, background=read_background(args.background, picture), focal=not args.no_focal,
+            principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed, callback=view,
+            checkpoint=args.out / CHECKPOINT, resume=args.resume,
+        )  # fmt: skip
+        print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}")
+        K = fit.camera.K.tolist()
+        print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
+        if fit.uncertainty is not None:
+            print(f"standard deviation: {fit.uncertainty.words}", flush=True)
+        save_camera(args.out / "camera.json", fit.camera)
+        names = ["camera.json", fit.write_history(args.out), *write_outputs(args.out, fit.search), CHECKPOINT]
+        print(f"wrote {', '.join(names)} in {args.out}")
+        linger(view, fit)
+    return INTERRUPTED if fit.interrupted else 0

@@ -1,0 +1,160 @@
+"""edgegrad fit-pose."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from . import outputs
+from .arguments import (
+    CHECKPOINT,
+    add_depth,
+    add_label,
+    add_live,
+    add_mesh,
+    add_resume,
+    add_view,
+    count,
+    longer_side,
+    number,
+)
+from .inputs import (
+    assume_fov,
+    check_not_black,
+    check_size,
+    read_background,
+    read_coverage,
+    read_depth,
+    read_picture,
+    read_pose,
+    read_scene,
+    read_view,
+    read_weight,
+    seen_by,
+)
+
+if TYPE_CHECKING:
+    from ..fit import PoseFit
+
+
+def add(commands: Any) -> None:
+    parser = commands.add_parser("fit-pose", help="find a mesh in a picture", description=run.__doc__)
+    add_mesh(parser)
+    parser.add_argument("image", type=Path, metavar="IMAGE", help="the picture; an alpha channel is taken as the mask")
+    parser.add_argument("--mask", type=Path, help="image of the picture's size, white on the object, or of labels")
+    add_label(parser)
+    add_view(parser)
+    parser.add_argument(
+        "--init",
+        type=Path,
+        metavar="POSE",
+        help="pose to start from: a pose.json, or mesh to world 4 × 4 by rows as JSON, text or .npy; as in the mesh file when "
+        "left out",
+    )
+    parser.add_argument(
+        "--starts", type=_starts, default=1, metavar="N|global",
+        help="so many starts, around --init or turned in all ways; global looks in the whole picture (%(default)s)",
+    )  # fmt: skip
+    add_resume(parser)
+    parser.add_argument(
+        "--weight", type=Path, help="image of the picture's size: how much a pixel counts, black not at all"
+    )
+    add_depth(parser)
+    parser.add_argument("--fit-scale", action="store_true", help="also find the scale; the distance then stays")
+    parser.add_argument("--fit-focal", action="store_true", help="also find the focal length")
+    parser.add_argument(
+        "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
+    )
+    parser.add_argument(
+        "--size",
+        type=longer_side,
+        default=256,
+        help="most pixels on the longer side (%(default)s)",
+    )
+    parser.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
+    parser.add_argument("--seed", type=number, default=0)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help=f"for pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}",
+    )
+    add_live(parser)
+    parser.set_defaults(run=run)
+
+
+def _starts(text: str) -> int | str:
+    if text == "global" or (text.isdecimal() and int(text) >= 1):
+        return text if text == "global" else int(text)
+    raise argparse.ArgumentTypeError(f"expected a whole number from 1 up, or global, got {text!r}")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Finds rotation and translation of a mesh in a picture, from a start within about 30° and 15 % of the mesh's size.
+    Ctrl-C keeps the best pose so far, and --resume goes on from there."""
+    from ..fit import fit_pose
+    from . import INTERRUPTED
+
+    if args.label is not None and args.mask is None:
+        raise ValueError("--label: expected --mask with it, an image that has labels, got none; name it")
+    scene = read_scene(args)
+    args.image = seen_by(args.camera, args.image)
+    picture, mask = read_picture(args.image)
+    if args.mask is not None:
+        mask = read_coverage(args.mask, args.label)
+        check_size(mask, picture, args.mask, args.image)
+    if mask is not None:
+        check_not_black(mask, args.mask or args.image)
+    weight = None
+    if args.weight is not None:
+        weight = read_weight(args.weight)
+        check_size(weight, picture, args.weight, args.image)
+    if mask is not None and args.background is not None:
+        raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")
+    depth = read_depth(args, picture)
+    background = read_background(args.background, picture)
+    init = None if args.init is None else read_pose(args.init)
+    assumed = assume_fov(args, args.image, (picture.shape[0], picture.shape[1]), args.init)
+    camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
+    outputs.make_folder(args.out)
+    outputs.say(assumed)
+
+    with outputs.live(args) as view:
+
+        def after_step(fit: PoseFit) -> None:
+            # A step takes far longer than this: whatever ends the process, the best pose so far is on disk.
+            with suppress(OSError):  # the last copy will say what is wrong
+                outputs.write_pose(args.out, fit)
+            if view is not None:
+                view(fit)
+
+        fit = fit_pose(
+            scene, picture, camera, mask, None if init is None else init.matrix,
+            fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=background,
+            weight=weight, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed, starts=args.starts,
+            callback=after_step, checkpoint=args.out / CHECKPOINT, resume=args.resume,
+        )  # fmt: skip
+        # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
+        # are written also when printing failed.
+        try:
+            _print_fit(fit, args.fit_focal)
+        finally:
+            written = [*outputs.write_outputs(args.out, fit), CHECKPOINT]
+        print(f"wrote {', '.join(written)} in {args.out}")
+        outputs.linger(view, fit)
+    return INTERRUPTED if fit.interrupted else 0
+
+
+def _print_fit(fit: PoseFit, focal: bool) -> None:
+    lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", "mesh to world:"]
+    lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
+    if fit.uncertainty is not None:
+        lines.append(f"standard deviation: {fit.uncertainty.words}")
+    if fit.scale != 1.0:
+        lines.append(f"scale: {fit.scale:.6g}")
+    if focal:
+        lines.append(f"focal length: {float(fit.camera.K[0, 0]):.6g} px")
+    print("\n".join(lines), flush=True)

@@ -1,0 +1,48 @@
+"""edgegrad fit-rig."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from .arguments import add_descent, add_label, add_live, add_views, count, number
+from .inputs import descent, read_coverage, read_views
+from .outputs import finish, linger, live, make_folder
+
+
+def add(commands: Any) -> None:
+    parser = commands.add_parser("fit-rig", help="find the pose of what bends from masks", description=run.__doc__)
+    parser.add_argument(
+        "rig", type=Path, metavar="RIG", help="glTF or GLB with a skin or morph targets, or a robot's URDF"
+    )
+    add_views(parser, "masks, white on the object, or pictures whose alpha is one")
+    add_label(parser)
+    parser.add_argument("--joints", nargs="+", metavar="NAME", help="that turn (all that vertices hang on)")
+    parser.add_argument("--tries", type=number, default=40, help="limbs drawn anew; 0 for a start nearby (%(default)s)")
+    parser.add_argument("--coarsest", type=count, default=16, help="pixels of the first level (%(default)s)")
+    add_descent(parser, "pose.json, posed.glb")
+    parser.set_defaults(steps=15)
+    add_live(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Finds how a skinned mesh or a robot is posed from masks, from coarse to fine, beginning at rest. Ctrl-C keeps the best so
+    far, and --resume goes on from there."""
+    from .. import load_rig, load_robot
+    from ..fit import fit_rig
+
+    rig = load_robot(args.rig) if args.rig.suffix.lower() == ".urdf" else load_rig(args.rig, materials=False)
+    cameras, _, _ = read_views(args)
+    masks = [read_coverage(path, args.label) for path in args.images]
+    make_folder(args.out)
+    told = {"joints": args.joints, "tries": args.tries, "coarsest": args.coarsest, **descent(args)}
+    with live(args) as view:
+        found = fit_rig(rig, cameras, masks=masks, callback=view, **told)
+        code = finish(found.fit, args.out, found.save, found.reason)
+        unknown = "" if found.uncertainty is None else found.uncertainty.unknown
+        if unknown and unknown not in found.reason:
+            print(f"not determined by the masks: {unknown}", flush=True)
+        linger(view, found.fit)
+    return code

@@ -1,0 +1,281 @@
+"""What commands read: pictures, masks, backgrounds, poses and views."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .arguments import CHECKPOINT
+
+FOV = 40.0  # degrees, the vertical field of view where nothing is said of it
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from .. import Camera, Mesh, Scene
+    from ..fit import Pose
+
+
+def read_scene(args: argparse.Namespace) -> Scene:
+    """The mesh file, with --texture and --no-materials. Raises what load_scene raises, in words of the command line."""
+    from .. import Scene, load_scene
+
+    if args.texture is not None:
+        return Scene([read_mesh(args)])
+    with _in_words_of_the_shell():
+        return load_scene(args.mesh, materials=not args.no_materials)
+
+
+def read_mesh(args: argparse.Namespace) -> Mesh:
+    """The mesh file as one mesh; see read_scene."""
+    from .. import load_mesh
+
+    with _in_words_of_the_shell():
+        return load_mesh(args.mesh, args.texture, materials=not args.no_materials)
+
+
+@contextmanager
+def _in_words_of_the_shell() -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, FileNotFoundError) as error:
+        text = str(error)
+        for ours, theirs in (("pass materials=False", "pass --no-materials"), ("with label=", "with --label")):
+            text = text.replace(ours, theirs)
+        raise type(error)(text) from error
+
+
+def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
+    """(H, W, 3), and (H, W) from its alpha where that says anything."""
+    from .. import read_image
+
+    image = read_image(path, channels=4)
+    alpha = image[..., 3]
+    return image[..., :3].contiguous(), alpha if bool((alpha < 1.0).any()) else None
+
+
+def seen_by(camera: Path | None, image: Path) -> Path:
+    """The image as the camera of a file speaks of it: upright, for so commands read pictures whose cameras they write; or as it
+    is stored, where that alone is in proportion to the camera. Tells which, where the EXIF orientation leaves it open."""
+    from .. import load_camera
+    from ..files.formats.views import resized
+    from ..files.image import read_orientation, read_size
+    from ..files.paths import StoredPath
+
+    if camera is None or camera.suffix.lower() != ".json" or (orientation := read_orientation(image)) == 1:
+        return image
+    known, stored = load_camera(camera), StoredPath(image)
+    upright, sideways = (resized(known, read_size(path)) is not None for path in (image, stored))
+    if upright and sideways:
+        print(
+            f"edgegrad: {image}: read upright, as its EXIF orientation {orientation} says; if {camera} speaks of the pixels as "
+            "they are stored, as COLMAP's cameras do, remove the orientation from a copy of the image",
+            file=sys.stderr,
+        )
+    return stored if sideways and not upright else image
+
+
+def read_coverage(path: Path, label: int | None = None) -> Tensor:
+    """(H, W) as edgegrad.read_mask reads it. Raises what that raises, in words of the command line."""
+    from .. import read_mask
+
+    with _in_words_of_the_shell():
+        return read_mask(path, label)
+
+
+def read_labels(path: Path, count: int) -> list[Tensor]:
+    """Of each of so many meshes (H, W), where an image of labels has its number, from 1. Raises what read_mask raises."""
+    from .. import read_mask
+
+    found = []
+    for number in range(1, count + 1):
+        try:
+            found.append(read_mask(path, number))
+        except ValueError as error:
+            fix = "number the meshes in the order of --mesh, from 1, and leave out those that are not seen"
+            raise ValueError(str(error).replace("choose one with label=", fix).replace(" for label=", "")) from error
+    return found
+
+
+def read_weight(path: Path) -> Tensor:
+    """(H, W), how much a pixel counts. Raises what edgegrad.read_mask raises."""
+    from ..files.mask import read_weight
+
+    return read_weight(path)
+
+
+def read_depth(args: argparse.Namespace, picture: Tensor) -> Tensor | None:
+    """(H, W) of --depth and --depth-scale, for a picture (H, W, 3). Raises what edgegrad.read_depth raises, in words of the
+    command line."""
+    from .. import read_depth
+
+    if args.depth is None:
+        if args.depth_scale is not None:
+            raise ValueError("--depth-scale: expected --depth with it, an image of distances, got none; name it")
+        return None
+    try:
+        depth = read_depth(args.depth, args.depth_scale)
+    except ValueError as error:
+        raise ValueError(f"--depth-{error}" if str(error).startswith("scale:") else str(error)) from error
+    check_size(depth, picture, args.depth, args.image)
+    if not bool((depth > 0.0).any()):
+        raise ValueError(
+            f"{args.depth}: expected distances somewhere, got 0 in all pixels, which says that there is none"
+        )
+    return depth
+
+
+def check_size(image: Tensor, picture: Tensor, path: Path, like: Path) -> None:
+    """Raises ValueError."""
+    if image.shape[:2] != picture.shape[:2]:
+        raise ValueError(f"{path}: expected {_size(picture)} pixels like {like}, got {_size(image)}")
+
+
+def _size(image: Tensor) -> str:
+    return f"{image.shape[1]} × {image.shape[0]}"
+
+
+def read_background(text: str | None, picture: Tensor) -> Tensor | None:
+    """A colour (3,) from #rrggbb, or an image (H, W, 3)."""
+    import torch
+
+    from ..files.image import read_image, srgb_to_linear
+
+    if text is None:
+        return None
+    if text.startswith("#") or not Path(text).suffix:
+        try:
+            return srgb_to_linear(
+                torch.tensor(list(bytes.fromhex(text.removeprefix("#"))), dtype=torch.float32).reshape(3) / 255.0
+            )
+        except (ValueError, RuntimeError):
+            raise ValueError(f"--background: expected #rrggbb or an image file, got {text!r}") from None
+    image = read_image(text, channels=3)
+    if image.shape != picture.shape:
+        raise ValueError(f"{text}: expected {_size(picture)} pixels like the picture, got {_size(image)}; resize it")
+    return image
+
+
+def check_not_black(mask: Tensor, path: Path) -> None:
+    """Raises ValueError."""
+    if not bool((mask > 0.0).any()):
+        raise ValueError(
+            f"{path}: expected a mask, white on the object, got one that is black; is it the object's mask?"
+        )
+
+
+def read_pose(path: Path) -> Pose:
+    """From what fit-pose or track writes, or mesh to world 4 × 4 by rows: JSON, text or .npy. Raises ValueError or OSError."""
+    import numpy as np
+
+    from ..files.paths import check_readable
+    from ..fit.pose.pose import pose_from_matrix
+    from ..fit.pose.result import pose_from_json
+
+    try:
+        file = check_readable(path, (".json", ".txt", ".npy"))
+        if file.suffix.lower() == ".npy":
+            return pose_from_matrix("mesh_to_world", np.load(file, allow_pickle=False))
+        text = file.read_text(encoding="utf-8")
+        if file.suffix.lower() == ".txt":
+            return pose_from_matrix("mesh_to_world", np.loadtxt(text.replace(",", " ").splitlines(), ndmin=2))
+        return pose_from_json(text)
+    except ValueError as error:
+        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | None, pose_file: Path | None) -> Camera:
+    """From --camera; else from the pose file, unless a view is described; else one that frames the mesh."""
+    import torch
+
+    from .. import load_camera
+    from ..fit import PoseFit
+    from ..preview import framing
+
+    described = any(value is not None for value in (args.fov, args.eye, args.target, args.up))
+    camera, source = None, args.camera
+    if args.camera is not None:
+        if described:
+            raise ValueError(
+                "--camera: expected none of --fov, --eye, --target, --up beside it, got both; leave one out"
+            )
+        by_size = args.camera.suffix.lower() in (".gltf", ".glb")  # which have none of their own
+        camera = load_camera(args.camera, torch.float64, (size or (512, 512)) if by_size else None)
+    elif pose_file is not None and not described:
+        source = pose_file
+        if _has_camera(pose_file):  # else a pose alone, written by hand
+            camera = PoseFit.from_json(pose_file.read_text(encoding="utf-8")).camera
+    if camera is None:
+        fov, up = FOV if args.fov is None else args.fov, args.up or (0.0, 1.0, 0.0)
+        return framing(scene, size or (512, 512), fov, args.eye, args.target, up)
+    if size is None:
+        return camera
+    return fitting(camera, size, source)
+
+
+def assume_fov(args: argparse.Namespace, photo: Path, size: tuple[int, int], pose_file: Path | None) -> str:
+    """Where neither --camera nor --fov nor the pose file has a focal length, take --fov from the photograph's EXIF data, or else
+    40°. In words, what is assumed; empty where nothing is."""
+    import math
+
+    from ..files.focal import read_focal
+
+    placed = any(value is not None for value in (args.eye, args.target, args.up))
+    if (
+        args.camera is not None
+        or args.fov is not None
+        or (pose_file is not None and not placed and _has_camera(pose_file))
+    ):
+        return ""
+    focal = read_focal(photo) if photo.is_file() else None
+    if focal is None:
+        args.fov = FOV
+        said = f"{FOV:g}° assumed, for {photo} does not say its focal length; distances follow from it"
+    else:
+        args.fov = 2.0 * math.degrees(math.atan(0.5 * size[0] / focal.pixels))
+        said = f"{args.fov:.1f}° taken from the EXIF data of {photo} ({focal.words}), as if it were not cropped"
+    return f"edgegrad: --fov: {said}; give --camera or --fov where it is known"
+
+
+def _has_camera(pose_file: Path) -> bool:
+    return pose_file.suffix.lower() == ".json" and '"camera"' in pose_file.read_text(encoding="utf-8")
+
+
+def fitting(camera: Camera, size: tuple[int, int], source: Path) -> Camera:
+    """The camera for a picture of that size. Raises ValueError that names its file, unless they are in proportion."""
+    from ..files.formats.views import resized
+
+    found = resized(camera, size)
+    if found is None:
+        (H, W), (h, w) = size, camera.size
+        raise ValueError(
+            f"{source}: expected a camera for {W} × {H} pixels or in proportion, got {w} × {h}; crop alike"
+        )
+    return found
+
+
+def read_views(args: argparse.Namespace) -> tuple[list[Camera], list[Tensor], list[Tensor | None]]:
+    """Cameras of the images' sizes, images (H, W, 3), and alphas (H, W). Raises ValueError."""
+    from .. import load_camera
+
+    if len(args.camera) != len(args.images):
+        raise ValueError(f"--camera: expected {len(args.images)}, one for each image, got {len(args.camera)}")
+    args.images = [seen_by(path, image) for path, image in zip(args.camera, args.images, strict=True)]
+    cameras, pictures, alphas = [], [], []
+    for path, image in zip(args.camera, args.images, strict=True):
+        picture, alpha = read_picture(image)
+        cameras.append(fitting(load_camera(path), (picture.shape[0], picture.shape[1]), path))
+        pictures.append(picture)
+        alphas.append(alpha)
+    return cameras, pictures, alphas
+
+
+def descent(args: argparse.Namespace) -> dict[str, Any]:
+    """What arguments.add_descent asked for, as options of a fit."""
+    return {
+        "steps": args.steps, "spp": args.spp, "seed": args.seed, "checkpoint": args.out / CHECKPOINT, "resume": args.resume,
+    }  # fmt: skip

@@ -1,0 +1,109 @@
+"""What commands write."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..fit import CameraFit, Fit, PoseFit
+    from ..live import Viewer
+
+
+def make_folder(folder: Path) -> None:
+    """Before the work rather than after it. Raises OSError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise OSError(
+            f"--out: expected a folder to write to, got {folder} ({error.strerror}); choose another"
+        ) from error
+
+
+def say(text: str) -> None:
+    """On standard error, where there is anything to say."""
+    if text:
+        print(text, file=sys.stderr)
+
+
+@contextmanager
+def live(args: argparse.Namespace) -> Iterator[Viewer | None]:
+    """The live view that --view asks for. Whoever ends the block has saved the result. Raises ImportError without viser."""
+    if not args.view:
+        yield None
+        return
+    from .. import viewer
+
+    with viewer(args.port, server=True) as view:
+        print(f"live view: {view.url}", flush=True)
+        yield view
+
+
+def linger(view: Viewer | None, fit: Fit | PoseFit | CameraFit) -> None:
+    """Shows the result until the user has seen it, unless they ended the fit."""
+    if view is not None and not fit.interrupted:
+        view.show(fit)
+        print(f"live view: {view.url} until Ctrl-C or Close", flush=True)
+        view.wait()
+
+
+def write_pose(folder: Path, fit: PoseFit) -> None:
+    from ..files.paths import replacing
+
+    with replacing(folder / "pose.json") as temporary:
+        temporary.write_text(fit.to_json() + "\n", encoding="utf-8")
+
+
+def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
+    """The names of what was written; without the libraries of figures the pose alone. Raises OSError that names what was not."""
+    names = ["pose.json"] + ["fit.png", "loss.png", "fit.webp"] * bool(fit.history and _can_draw())
+    for name in names:
+        try:
+            if name == "pose.json":
+                write_pose(folder, fit)
+            else:
+                from ..fit.pose import pictures  # matplotlib takes a while to import
+
+                draw = {
+                    "fit.png": pictures.draw_fit,
+                    "loss.png": pictures.draw_loss,
+                    "fit.webp": pictures.draw_animation,
+                }
+                draw[name](folder / name, fit)
+        except OSError as error:
+            raise OSError(
+                f"{folder / name}: expected to write it, got: {error.strerror or error}; make room or rights"
+            ) from error
+    return names
+
+
+def finish(fit: Fit, folder: Path, save: Callable[..., list[str]] | None = None, reason: str | None = None) -> int:
+    """Says how a fit by descent ended and writes it all, by its own reason and save() unless others are given; the exit code.
+    Raises OSError."""
+    from . import INTERRUPTED
+    from .arguments import CHECKPOINT
+
+    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {reason or fit.reason}", flush=True)
+    written = [*(save or fit.save)(folder, figures=_can_draw()), CHECKPOINT]
+    print(f"wrote {', '.join(written)} in {folder}")
+    return INTERRUPTED if fit.interrupted else 0
+
+
+def _can_draw() -> bool:
+    from ..optional import require
+
+    try:
+        for module in ("matplotlib", "PIL"):
+            require(module, "edgegrad[figures]", "drawing a fit")
+    except ImportError as error:
+        print(f"edgegrad: no pictures: {error}", file=sys.stderr)
+        return False
+    return True

@@ -1,0 +1,149 @@
+"""edgegrad track."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from . import outputs
+from .arguments import add_mesh, add_view, count, longer_side, number
+from .films import MOST_FPS, USUAL_FPS, read_film, write_film
+from .inputs import assume_fov, read_pose, read_scene, read_view
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from .. import Camera
+    from ..fit import TrackedPose
+    from ..scene.scene import Scene
+
+EVERY = 10  # frames from one poses.json to the next
+FOUND, LOST = (60, 230, 90), (230, 60, 60)  # colours of contours
+
+
+def add(commands: Any) -> None:
+    parser = commands.add_parser("track", help="follow a mesh through a video", description=run.__doc__)
+    add_mesh(parser)
+    parser.add_argument("film", type=Path, metavar="VIDEO_OR_FOLDER", help="a video, or a folder of images, by name")
+    add_view(parser)
+    parser.add_argument(
+        "--init",
+        type=Path,
+        metavar="POSE.json",
+        required=True,
+        help="pose in the first frame, as fit-pose writes it; or the poses.json of a film that this one goes on from: the last "
+        "pose that is not lost",
+    )
+    parser.add_argument("--size", type=longer_side, default=256, help="most pixels on the longer side (%(default)s)")
+    parser.add_argument("--spp", type=count, default=8, help="samples a pixel (%(default)s)")
+    parser.add_argument("--seed", type=number, default=0)
+    parser.add_argument(
+        "--fps", type=_rate, help=f"frames a second of the film that is written (the video's; of a folder {USUAL_FPS})"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="for poses.json, frames with contours, and film.mp4 or .webp",
+    )
+    parser.set_defaults(run=run)
+
+
+def _rate(text: str) -> int:
+    if (found := count(text)) > MOST_FPS:
+        raise argparse.ArgumentTypeError(f"expected 1 to {MOST_FPS} frames a second, got {text!r}")
+    return found
+
+
+def run(args: argparse.Namespace) -> int:
+    """Follows a mesh through the frames of a video, from its pose in the first one. poses.json is written every few frames;
+    Ctrl-C and broken frames keep the poses so far."""
+    from ..fit import track
+    from . import INTERRUPTED
+
+    scene, init = read_scene(args), read_pose(args.init)
+    frames, fps = read_film(args.film, args.camera)
+    first = next(frames)
+    assumed = assume_fov(args, args.film, (first.shape[0], first.shape[1]), args.init)
+    camera = read_view(args, scene, (first.shape[0], first.shape[1]), args.init)
+    outputs.make_folder(args.out)
+    outputs.say(assumed)
+    overlays = args.out / "frames"
+    overlays.mkdir(exist_ok=True)
+    shown: list[Tensor] = []
+
+    def watched() -> Iterator[Tensor]:
+        for frame in chain([first], frames):
+            shown[:] = [frame]
+            yield frame
+
+    poses: list[TrackedPose] = []
+    written: list[Path] = []
+    interrupted = False
+    try:
+        for pose in track(scene, watched(), camera, init.matrix, max_size=args.size, spp=args.spp, seed=args.seed):
+            poses.append(pose)
+            if pose.index % EVERY == 0:
+                with suppress(OSError):  # the last copy will say what is wrong
+                    _write_poses(args.out, poses)
+            state = "lost" if pose.lost else f"{pose.explained:.0%} of the edges"
+            print(f"frame {pose.index}: {state}", file=sys.stderr)
+            path = overlays / f"{pose.index:05d}.png"
+            _write_overlay(path, shown[0], scene, camera, pose)
+            written.append(path)
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        names = ["frames"]
+        if poses:
+            _write_poses(args.out, poses)
+            names.insert(0, "poses.json")
+        if film := write_film(args.out, written, Fraction(args.fps or fps or USUAL_FPS)):
+            names.append(film)
+    lost = sum(pose.lost for pose in poses)
+    print(
+        f"{len(poses)} {'frame' if len(poses) == 1 else 'frames'}, lost in {lost}\nwrote {', '.join(names)} in {args.out}"
+    )
+    return INTERRUPTED if interrupted else 0
+
+
+def _write_poses(folder: Path, poses: list[TrackedPose]) -> None:
+    from ..files.paths import replacing
+
+    rows = [
+        {
+            "frame": pose.index, "mesh_to_world": pose.matrix.tolist(),
+            "explained": pose.explained if math.isfinite(pose.explained) else None, "lost": pose.lost,
+            "covered": pose.covered, "reason": pose.reason,
+        }
+        for pose in poses
+    ]  # fmt: skip
+    with replacing(folder / "poses.json") as temporary:
+        temporary.write_text(json.dumps({"poses": rows}, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_overlay(path: Path, frame: Tensor, scene: Scene, camera: Camera, pose: TrackedPose) -> None:
+    """The frame with the contour of the mesh."""
+    import torch
+
+    from .. import render_aovs, write_image
+    from ..files.image import srgb_to_linear
+
+    with torch.no_grad():
+        moved = scene.transformed(pose.R, pose.t, pose.scale)
+        alpha = render_aovs(moved, camera, ["alpha"], 4)["alpha"][..., 0]
+    inside = (alpha > 0.5).float()[None, None]
+    pool = torch.nn.functional.max_pool2d
+    contour = (pool(inside, 3, 1, 1) + pool(-inside, 3, 1, 1))[0, 0] > 0.5
+    picture = frame.clone()
+    picture[contour] = srgb_to_linear(torch.tensor(LOST if pose.lost else FOUND) / 255.0)
+    write_image(path, picture)

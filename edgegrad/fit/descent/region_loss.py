@@ -1,0 +1,176 @@
+"""The loss of regions and contours of pictures, a mean over the pixels near the object.
+
+The region term is −log(αP + (1 − α)(1 − P)), with the posterior P of the colours as a silhouette divides them (region.py). Its
+minimum is where P has its border, and that is where the silhouette was, so errors of P preserve themselves. The contour term is
+half the robust squared difference of the picture from a mixture of the colours on both sides (contour_colors.py). It says where
+between these colours a border lies. P and the colours are held fixed between renewals, so that the loss is a function of each
+pixel's alpha, which a descent can compare from step to step.
+
+Alpha is blurred, widely at first, so that a step reaches far. The contour term joins when alpha is as sharp as the pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ...files.image import linear_to_srgb
+from ..contour_colors import CONTOUR_BLUR, CONTOUR_BLURS, PURE, TOLERANCE, ContourColors, blur_losses, contour_support
+from ..edge_support import MIN_EDGE_SUPPORT
+from ..region import RADIUS, Windows, likelihood, palette, posterior, slope, smoothed, surroundings
+from ..views import Observation, has_levels, white_level
+
+FINAL_STEP = 2**20  # a step at which alpha is as sharp as pictures are
+RENEWAL_STEPS = 3  # from one renewal to the next
+LEAST_BLUR = 0.7  # pixels, of alpha, until the pictures show their own blur
+START_BLUR, NARROWING = 3.0, 0.6  # pixels at the start, and the factor from one renewal to the next
+SURENESS_BLUR = 2.5  # pixels, of the band in which colours next to the contour are judged
+MIN_SURENESS = (
+    0.695  # of colours next to right contours; wrong ones on edges of clutter reach 0.69, right ones 0.70 … 0.81
+)
+MIN_COLOUR_RANGE = 1.5 / 255.0  # sRGB values: pixels that differ by no more are of one colour in eight bits
+MIN_BACKGROUND = 0.02  # share of background among the pixels near the object
+
+
+class RegionLoss:
+    """The colours of some views' pictures, and the loss of silhouettes by them."""
+
+    def __init__(self, views: Sequence[Observation], seed: int) -> None:
+        pictures = [view.image for view in views if view.image is not None]
+        whites = [1.0 if has_levels(picture) else white_level(picture.flatten(0, 1)) for picture in pictures]
+        shown = [picture / white for picture, white in zip(pictures, whites, strict=True)]
+        self.displays = [linear_to_srgb(picture.clamp(0.0, 1.0)) for picture in shown]
+        self.palettes = [palette(display, seed) for display in self.displays]
+        self.labels = [own.labels(display) for display, own in zip(self.displays, self.palettes, strict=True)]
+        most = max((float(view.weight.max()) for view in views if view.weight is not None), default=1.0)
+        self.weights = [None if view.weight is None else view.weight[..., 0] / most for view in views]
+        self.near = [torch.zeros(view.camera.size) for view in views]
+        self.posteriors = [torch.full(view.camera.size, 0.5) for view in views]
+        self.sides: list[ContourColors | None] = [None for _ in views]
+        self.blur = LEAST_BLUR
+        self.narrows = False  # whether alpha is blurred more than at later steps
+        self._losses = [
+            torch.zeros(len(CONTOUR_BLURS)) for _ in views
+        ]  # of each view's contour, for each of CONTOUR_BLURS
+
+    def renew(self, index: int, alpha: Tensor, step: int = FINAL_STEP) -> None:
+        """Take posterior and colours from a view's silhouette alpha (H, W, 1) at a step; keep the last ones if it is empty."""
+        wide = START_BLUR * NARROWING ** (step // RENEWAL_STEPS)
+        self.narrows = wide > LEAST_BLUR
+        share = alpha[..., 0].detach().float()
+        near, extent = self.around(index, share)
+        if extent > 0.0 and bool((near > 0.0).any()):
+            windows = Windows(
+                (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index].colours, RADIUS * extent
+            )
+            self.near[index], self.posteriors[index] = near, posterior(windows, share, near)
+            sides = ContourColors.from_image(self.displays[index], smoothed(share[None], CONTOUR_BLUR)[0], near)
+            self.sides[index] = sides
+            self._losses[index] = blur_losses(sides, self.displays[index], near, share)
+        known = torch.stack(self._losses).sum(0)
+        self.blur = wide if self.narrows else CONTOUR_BLURS[int(known.argmin())] if bool(known.any()) else LEAST_BLUR
+
+    def around(self, index: int, alpha: Tensor) -> tuple[Tensor, float]:
+        """Return weights (H, W) of the pixels near the object, and its extent in pixels, 0 if it is not seen."""
+        near, extent = surroundings(alpha)
+        weight = self.weights[index]
+        return near if weight is None else near * weight, extent
+
+    def loss(self, group: Sequence[int], alpha: Tensor) -> Tensor:
+        """Return the sum of these views' losses at their alpha (B, H, W, 1)."""
+        P, near = self._of(group)
+        soft = self.blurred(alpha)
+        found = -likelihood(P, soft).double().log()
+        if (sides := self._sides(group)) is not None:
+            squares = self._squares(group, sides, soft)
+            found = found + 0.5 * sides.band * (squares / (1.0 + squares / TOLERANCE)).double()
+        return (near * found).sum()
+
+    def curvature(self, group: Sequence[int], alpha: Tensor) -> Tensor:
+        """Return the curvature (B, H, W) of loss() by each pixel's blurred alpha: Fisher's information of the region term, and
+        the squared slopes of the mixture in the contour term."""
+        P, near = self._of(group)
+        soft = self.blurred(alpha)
+        found = slope(P, soft).square()
+        if (sides := self._sides(group)) is not None:
+            robust = (1.0 + self._squares(group, sides, soft) / TOLERANCE).pow(-2)
+            slopes = (sides.slope_by(soft).square() / sides.variance).sum(-1)
+            found = found + sides.band * robust * slopes
+        return near * found
+
+    def blurred(self, images: Tensor) -> Tensor:
+        """Blur alpha or its derivatives (n, H, W, 1) as the loss does; return (n, H, W)."""
+        return smoothed(images[..., 0].float(), self.blur)
+
+    def shares(self, group: Sequence[int]) -> Tensor:
+        """Return the weights (B, H, W) of the pixels, which sum to 1 in each view."""
+        return self._of(group)[1]
+
+    def edge_support(self, alphas: Sequence[Tensor], within: Sequence[Tensor] | None = None) -> float:
+        """Return how much of the contour the pictures show, 0 … 1, from the alphas (H, W, 1) of the last renewal. It is the
+        smaller of two shares: that of the contour's edges, and how surely colours separate its two sides. The latter is the
+        mean of 2P − 1 inside and 1 − 2P outside, scaled so that MIN_SURENESS is just enough. `within` (H, W) masks pixels."""
+        parts, sureness, length = [], 0.0, 0.0
+        for k, alpha in enumerate(alphas):
+            share = alpha[..., 0].float()
+            near = self.around(k, share)[0]
+            near = near if within is None else near * within[k]
+            parts.append((self.displays[k], share, near))
+            soft = smoothed(share[None], SURENESS_BLUR)[0]
+            band = ((soft > PURE) & (soft < 1.0 - PURE)) * near
+            sure = 2.0 * self.posteriors[k] - 1.0
+            sureness += float((band * torch.where(share > 0.5, sure, -sure)).sum())
+            length += float(band.sum())
+        return max(0.0, min(MIN_EDGE_SUPPORT / MIN_SURENESS * sureness / max(length, 1e-30), contour_support(parts)))
+
+    def check(self, alphas: Sequence[Tensor]) -> None:
+        """Check that the silhouettes of the start leave pixels of the pictures around them, of more than one colour. Raises
+        ValueError."""
+        seen = coloured = 0
+        for k, alpha in enumerate(alphas):
+            share = alpha[..., 0].float()
+            near, extent = self.around(k, share)
+            seen += extent > 0.0
+            colours = self.displays[k][near > 0.0]
+            coloured += len(colours) > 0 and float((colours.amax(0) - colours.amin(0)).max()) > MIN_COLOUR_RANGE
+            if extent > 0.0 and float((near * (1.0 - share)).sum()) <= MIN_BACKGROUND * float(near.sum()):
+                raise ValueError(
+                    f'scene: expected meshes with some of the picture around them, as loss="region" needs, got a scene that '
+                    f"fills picture {k} at the start; leave out ground and walls, for all meshes of the scene are the object"
+                )
+        if not seen:
+            raise ValueError(
+                'scene: expected an object that the pictures show at the start, as loss="region" needs, got one out of view of '
+                "all cameras; start nearer"
+            )
+        if not coloured:
+            raise ValueError(
+                'images: expected the object before something of another colour, as loss="region" needs, got one colour alone '
+                "where it is at the start and around it; start nearer, or look for what made the pictures black or white"
+            )
+
+    def _of(self, group: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Return posteriors (B, H, W), and weights that sum to 1 in each view."""
+        near = torch.stack([self.near[i] for i in group])
+        return torch.stack([self.posteriors[i] for i in group]), near / near.sum((1, 2), keepdim=True).clamp(min=1e-30)
+
+    def _sides(self, group: Sequence[int]) -> ContourColors | None:
+        """Stack the contour colours of these views; None while alpha is blurred widely, or if some view has not shown the
+        object."""
+        found = [self.sides[i] for i in group]
+        if self.narrows or any(sides is None for sides in found):
+            return None
+        columns = zip(*(_tensors(sides) for sides in found if sides), strict=True)
+        alpha, inside, outside, variance, band = (torch.stack(list(column)) for column in columns)
+        return ContourColors(alpha, inside, outside, variance, band)
+
+    def _squares(self, group: Sequence[int], sides: ContourColors, alpha: Tensor) -> Tensor:
+        """Return squared differences (B, H, W) of the pictures from the mixture by alpha (B, H, W), over their variance."""
+        off = sides.mixed_by(alpha) - torch.stack([self.displays[i] for i in group])
+        return (off.square() / sides.variance).sum(-1)
+
+
+def _tensors(sides: ContourColors) -> tuple[Tensor, ...]:
+    return sides.alpha, sides.inside, sides.outside, sides.variance, sides.band
