@@ -10,7 +10,7 @@ namespace edgegrad {
 
 // Runs `work` unless the call is failing already. An exception must not leave a thread, for the process would end: the
 // first one is kept, and items that did not begin are left out.
-void Team::guard(const std::function<void()>& work) noexcept {
+void ThreadTeam::guard(const std::function<void()>& work) noexcept {
     if (failed_.load(std::memory_order_relaxed)) return;
     try {
         work();
@@ -19,7 +19,7 @@ void Team::guard(const std::function<void()>& work) noexcept {
     }
 }
 
-void Team::check() {
+void ThreadTeam::check() {
     if (failed_.load(std::memory_order_relaxed)) throw Interrupted();
     if (!interrupted_ || omp_get_thread_num() != 0) return;
     const auto now = std::chrono::steady_clock::now();
@@ -28,7 +28,7 @@ void Team::check() {
     if (interrupted_()) throw Interrupted();
 }
 
-void Team::run(const std::function<void()>& work) {
+void ThreadTeam::run(const std::function<void()>& work) {
 #if _OPENMP >= 200805  // MSVC's, which is older, has no tasks, so each loop is a region
 #pragma omp parallel num_threads(threads_) if (threads_ > 1)
 #pragma omp master
@@ -37,11 +37,10 @@ void Team::run(const std::function<void()>& work) {
     if (failed_) std::rethrow_exception(failure_);
 }
 
-EDGEGRAD_UNSEEN void Team::each_on_thread(int64_t n, const std::function<void(int, int64_t)>& item) {
-    const int threads = threads_for(n);
+EDGEGRAD_UNSEEN void ThreadTeam::parallel_for_items(int64_t n, const std::function<void(int, int64_t)>& item) {
     check();
 #if _OPENMP >= 200805
-    if (threads > 1 && omp_get_level() == 0) return run([&] { each_on_thread(n, item); });
+    if (threads_for(n) > 1 && omp_get_level() == 0) return run([&] { parallel_for_items(n, item); });
     std::atomic<int64_t> next{0};
     std::atomic<int> at_work{0};
     const auto take_items = [&](int thread) {
@@ -53,7 +52,7 @@ EDGEGRAD_UNSEEN void Team::each_on_thread(int64_t n, const std::function<void(in
         __tsan_release(&next);
     };
     __tsan_release(&next);
-    for (int thread = 1; thread < threads; ++thread) {
+    for (int thread = 1; thread < threads_for(n); ++thread) {
 #pragma omp task firstprivate(thread)
         take_items(thread);
     }
@@ -63,7 +62,7 @@ EDGEGRAD_UNSEEN void Team::each_on_thread(int64_t n, const std::function<void(in
 #pragma omp taskwait
     __tsan_acquire(&next);
 #else
-#pragma omp parallel for schedule(dynamic) num_threads(threads)
+#pragma omp parallel for schedule(dynamic) num_threads(threads_for(n))
     for (int64_t i = 0; i < n; ++i) guard([&] { check(), item(omp_get_thread_num(), i); });
 #endif
     if (failed_) std::rethrow_exception(failure_);

@@ -17,10 +17,10 @@ namespace edgegrad {
 struct Interrupted : std::exception {};
 
 // The threads of one call of the kernel.
-class Team {
+class ThreadTeam {
    public:
     // The calling thread alone asks `interrupted`, at most 20 times a second; null means never.
-    explicit Team(int threads, bool (*interrupted)() = nullptr)
+    explicit ThreadTeam(int threads, bool (*interrupted)() = nullptr)
         : threads_(std::max(1, threads)), interrupted_(interrupted) {}
 
     int threads() const { return threads_; }
@@ -34,17 +34,17 @@ class Team {
 
     // Calls item(thread, i) for i = 0 … n − 1, in no order, where thread < threads_for(n). It is compiled once: what a
     // loop does besides its items would otherwise be a large part of all code.
-    void each_on_thread(int64_t n, const std::function<void(int, int64_t)>& item);
+    void parallel_for_items(int64_t n, const std::function<void(int, int64_t)>& item);
     // Calls body(i) for i = 0 … n − 1, in no order.
     template <class Body>
-    void each(int64_t n, Body body) {
-        each_on_thread(n, [&](int, int64_t i) { body(i); });
+    void parallel_for(int64_t n, Body body) {
+        parallel_for_items(n, [&](int, int64_t i) { body(i); });
     }
     // Calls body(state, i) for i = 0 … n − 1, in no order, with a state for each thread. make() gives a pointer to it.
     template <class Make, class Body>
-    void each_with(int64_t n, Make make, Body body) {
+    void parallel_for_with_state(int64_t n, Make make, Body body) {
         std::vector<decltype(make())> states(threads_for(n));
-        each_on_thread(n, [&](int thread, int64_t i) {
+        parallel_for_items(n, [&](int thread, int64_t i) {
             if (!states[thread]) states[thread] = make();
             body(*states[thread], i);
         });
@@ -54,15 +54,15 @@ class Team {
     static constexpr int64_t block = 4096;
     static int64_t blocks(int64_t n) { return (n + block - 1) / block; }
     template <class Body>
-    void each_block(int64_t n, Body body) {
-        each(blocks(n), [&](int64_t k) { body(k, k * block, std::min(n, (k + 1) * block)); });
+    void parallel_for_blocks(int64_t n, Body body) {
+        parallel_for(blocks(n), [&](int64_t k) { body(k, k * block, std::min(n, (k + 1) * block)); });
     }
     // Returns what body(first, last) returns for each block, in their order. Each value is made on the thread's own
     // stack: threads that write next to one another in an array wait for each other's caches.
     template <class Body>
-    auto of_blocks(int64_t n, Body body) {
+    auto map_blocks(int64_t n, Body body) {
         std::vector<decltype(body(n, n))> out(blocks(n));
-        each_block(n, [&](int64_t k, int64_t first, int64_t last) { out[k] = body(first, last); });
+        parallel_for_blocks(n, [&](int64_t k, int64_t first, int64_t last) { out[k] = body(first, last); });
         return out;
     }
 

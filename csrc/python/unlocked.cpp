@@ -67,11 +67,11 @@ Unlocked::~Unlocked() {
     }
 }
 
-void run_unlocked(int threads, const std::function<void(Team&)>& f) {
+void run_unlocked(int threads, const std::function<void(ThreadTeam&)>& f) {
     const auto ask = in_main_thread() ? interrupted : nullptr;
     try {
         const Unlocked release;
-        Team team(threads, ask);
+        ThreadTeam team(threads, ask);
         team.run([&] { f(team); });
     } catch (const Interrupted&) {
         throw nb::python_error();  // that of the handler

@@ -32,7 +32,7 @@ class KeptGeometry {
     KeptGeometry(const int32_t* faces, int64_t n_faces, const double* verts, int64_t n_verts, const Spacing& spacing)
         : faces_(faces), verts_(verts), n_faces_(n_faces), n_verts_(n_verts), spacing_(spacing) {}
 
-    std::shared_ptr<const Geometry> acquire(GeometryWanted wanted, Team& team, GeometryWork& work) {
+    std::shared_ptr<const Geometry> acquire(GeometryWanted wanted, ThreadTeam& team, GeometryWork& work) {
         const bool moved = !find(wanted);
         if (moved) {
             work.rays = true;
@@ -115,7 +115,7 @@ class KeptGeometry {
 
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
                                                  int64_t n_verts, const Spacing& spacing, GeometryWanted wanted,
-                                                 Team& team, GeometryWork& work) {
+                                                 ThreadTeam& team, GeometryWork& work) {
     return KeptGeometry(faces, n_faces, verts, n_verts, spacing).acquire(wanted, team, work);
 }
 
