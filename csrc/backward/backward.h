@@ -26,18 +26,15 @@ template <class T>
 void render_tangents(const BackwardInput<T>& input, GradientOptions options, ThreadTeam& team,
                      const std::vector<Tangents>& tangents, double* image_dot);
 
-// Adds the screen-space gradient to `gradient` (H, W, 2): the change of the loss per px that the content of a pixel
-// moves right and down.
+// Adds the screen-space gradient to `gradient` (H, W, 2): loss change per px that a pixel's content moves right, down.
 template <class T>
 void render_screen_gradient(const BackwardInput<T>& input, GradientOptions options, ThreadTeam& team, double* gradient);
 
-// Returns the samples of both terms, for shaders written in PyTorch. Creases are the edges at which the scene's colours
-// jump.
+// Returns the samples of both terms, for PyTorch shaders. Creases are edges at which the scene's colours jump.
 template <class T>
 RecordList record_samples(const BackwardInput<T>& input, GradientOptions options, ThreadTeam& team);
 
-// Returns samples on shadow boundaries. `casters` is the scene as light meets it. `samples` is their number; −1 selects
-// the default.
+// Returns samples on shadow boundaries. `casters` is the scene as light meets it. `samples` = −1 is the default.
 template <class T>
 std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
                                          const GradientOptions& options, const LightParts& light, int64_t samples,

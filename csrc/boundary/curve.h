@@ -2,8 +2,7 @@
 // have any number of faces.
 //
 // On each side of the edge in the image one surface is visible next to it. It is the front-most incident face on that
-// side, or, if there is none, what lies behind. If both sides have the same radiance by construction, there is no
-// curve.
+// side, or, if there is none, what lies behind. If both have the same radiance by construction, there is no curve.
 #pragma once
 
 #include <algorithm>
@@ -38,22 +37,19 @@ struct Curve {
 
     Vec2 tangent() const { return x1 - x0; }  // dx/ds, a constant: a pinhole sees a straight line
 
-    // position() returns the pixel position at the fraction s of the curve in the image. parameter() returns t on the
-    // edge (1 − t) a + t b.
+    // At the fraction s in the image, position() returns px and parameter() returns t on the edge (1 − t) a + t b.
     Vec2 position(double s) const { return x0 + s * (x1 - x0); }
     double parameter(double s) const { return t0 + (t1 - t0) * (s * w0 / ((1 - s) * w1 + s * w0)); }
 };
 
-// Returns the barycentrics, in a face, of the point t of an edge of that face. They are exact: the face is known,
-// nothing is intersected.
+// Returns the barycentrics, in a face, of the point t of its edge. They are exact, since nothing is intersected.
 inline Barycentrics at_edge(const HalfEdge& h, double t) {
     double b[3] = {0, 0, 0};
     b[h.first()] = 1 - t, b[h.second()] = t;
     return {b[1], b[2]};
 }
 
-// Returns the barycentrics slightly inside the face, where this matters. On the border itself the nearest texel may be
-// a neighbour's.
+// Returns at_edge(), moved slightly inwards if the nearest texel counts: on the border it may be a neighbour's.
 template <class T>
 Barycentrics next_to_edge(const SceneView<T>& scene, const HalfEdge& h, double t) {
     const Barycentrics b = at_edge(h, t);
@@ -103,8 +99,7 @@ bool attributes_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdg
            rows_differ(a.vertex, a.vertex_width, vertex(scene, m, m.second()), vertex(scene, p, p.second()));
 }
 
-// Returns whether an edge runs exactly along a border of nearest texels. Other borders are discontinuities within a
-// face.
+// Returns whether an edge runs exactly along a border of nearest texels. Other borders are discontinuities.
 template <class T>
 bool lies_between_texels(const SceneView<T>& scene, const HalfEdge& h) {
     if (!takes_nearest(scene, h.face)) return false;
@@ -339,8 +334,7 @@ class CurveFinder {
 
     // Returns the rounding of pixel positions, px. Coordinates are at most p in size, axis by axis; depth weights are
     // at least w; the positions add up to `pixels`. A sum q = R p + t is rounded by its largest terms, so a distant
-    // orthographic camera loses depth, not position. In perspective, X / Z is rounded with X, and with Z in proportion
-    // to its terms.
+    // orthographic camera loses depth, not position. In perspective, X / Z is rounded with X, and with Z by its terms.
     double rounding(const double (&p)[3], double w, double pixels) const {
         const Camera& camera = view_.camera;
         const auto terms = [&](int row, double t) {

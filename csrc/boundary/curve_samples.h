@@ -11,8 +11,7 @@
 
 namespace edgegrad {
 
-// CurveSamples traces samples in batches of rays. The accumulation is a CurveAccumulation, or offers the same
-// functions.
+// CurveSamples traces samples in batches of rays. The accumulation has the functions of CurveAccumulation.
 template <class Accumulation, class T, CurveSource Source>
 class CurveSamples {
    public:

@@ -30,8 +30,7 @@ struct StepCrossing {
     Footprint alpha = {};  // texels and weights of F, where it is bilinear
 };
 
-// Calls visit(i, j, from, to) for the cells of a unit grid that a + τ d passes, from τ = first to last. It visits at
-// most `most` cells.
+// Calls visit(i, j, from, to) for up to `most` cells of a unit grid that a + τ d passes, τ = first to last.
 template <class Visit>
 void each_cell(Vec2 a, Vec2 d, double first, double last, int most, Visit visit) {
     double i = std::floor(a.x + first * d.x), j = std::floor(a.y + first * d.y);
@@ -94,8 +93,8 @@ class StepFinder {
     }
 
     // Calls visit(crossing, weight) for the discontinuities on the segment from a to b of a line of the undistorted
-    // image, where it lies on the face. If the segment passes more than `most` texture cells, `random` draws that many,
-    // which stand for all.
+    // image, where it lies on the face. If it passes more than `most` texture cells, `random` draws that many to stand
+    // for all.
     template <class Visit>
     void find(Vec2 a, Vec2 b, bool vertical, int most, uint64_t random, Visit visit) const {
         Segment s;

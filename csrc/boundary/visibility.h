@@ -21,8 +21,7 @@ class Visibility {
    public:
     explicit Visibility(const BackwardView<T>& view) : view_(view) {}
 
-    // Returns false if a face that the ray meets occludes the point. Otherwise the face lies behind, and is stored if
-    // it is the nearest so far.
+    // Returns false if a face that the ray meets occludes the point. Otherwise stores it if it is the nearest behind.
     bool lies_behind(int64_t face, const CurveFaces& own, CurveSample& sample) const {
         const auto corner = corners_of(view_, face);
         if (lies_far_before(view_, face, sample.point.z) || hides(face, corner.data(), sample.point, own)) return false;
@@ -87,8 +86,7 @@ class Visibility {
         return std::any_of(others.begin(), others.end(), [&](int32_t f) { return share_vertex(view_.scene, face, f); });
     }
 
-    // Returns the vector from n, outside a face, away across the nearest side of the face. It is as long as the error
-    // of floats.
+    // Returns the vector from n, outside a face, away from it across the nearest side, as long as the error of floats.
     Vec2 out_of(int64_t face, Vec2 n) const {
         const FaceMap m = face_map(view_.camera, corners_of(view_, face).data());
         const Vec3 p = m.times(n);

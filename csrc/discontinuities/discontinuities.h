@@ -1,5 +1,5 @@
-// This file declares the boundary term of discontinuities within faces: alpha edges (rays/alpha_mask.h), and borders
-// between nearest texels.
+// This file declares the boundary term of discontinuities within faces: alpha edges (rays/alpha_mask.h), and borders of
+// nearest texels.
 #pragma once
 
 #include "accumulate/accumulation.h"

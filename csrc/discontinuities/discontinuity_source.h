@@ -61,8 +61,7 @@ class StepSource {
             sample.side[k] = {sample.b.u + moved * slope.u, sample.b.v + moved * slope.v};
         }
         if (curve.is_alpha_edge) {
-            // The ray passes on the masked side. A neighbour that shares the alpha edge along a common edge is masked
-            // there too.
+            // The ray passes on the masked side. A neighbour with the same alpha edge on a common edge is masked, too.
             constexpr double aside = 1e-6;  // px
             sample.sight = normalised(view_.camera, curve.u + (-aside / std::sqrt(squared)) * gradient);
         } else {

@@ -40,8 +40,7 @@ class ImageHits {
             }
         };
         team.parallel_for_blocks(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-            // Neighbours mostly add to the same counter, and threads that add to one counter wait for each other. Sums
-            // are therefore local.
+            // Neighbours mostly add to the same counter. Sums are local, as threads on one counter wait for each other.
             int64_t counter = 0;
             int32_t n = 0;
             const auto count = [&] {

@@ -47,8 +47,7 @@ class OcclusionHint {
     }
 
     // Returns the number of pixels in and around a box if its content, no nearer than `nearest`, is behind all hits in
-    // each; else 0. One pixel around is included, because on a steep surface the samples of one pixel miss its farthest
-    // part.
+    // each; else 0. One pixel around is included, as on a steep surface one pixel's samples miss its farthest part.
     int64_t hiding_pixels(Vec2 low, Vec2 high, double nearest) const {
         if (levels_.empty()) return 0;
         const int i0 = pixel(low.x - 1, width_), i1 = pixel(high.x + 1, width_);

@@ -10,8 +10,7 @@
 
 namespace edgegrad {
 
-// Replaces n points of the unit square by normalised image coordinates of samples of pixel (x, y), drawn in proportion
-// to the filter.
+// Replaces n points of the unit square by normalised image coordinates of samples of pixel (x, y), drawn by the filter.
 void place_in_pixel(const Camera& camera, const Filter& filter, int x, int y, int n, double* n_x, double* n_y);
 
 // PixelRays makes the primary rays of the forward pass.

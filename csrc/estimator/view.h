@@ -68,8 +68,7 @@ uint8_t side_of(const BackwardView<T>& view, int64_t face) {
     return view.camera.side(q[0], q[1], q[2]);
 }
 
-// Returns the cell of a vertex among 256 × 256 cells of the image on the Z-order curve; the last one if it is out of
-// view.
+// Returns the cell of a vertex among 256 × 256 cells of the image on the Z-order curve; the last one if out of view.
 template <class T>
 uint16_t cell_of(const BackwardView<T>& view, int32_t vertex) {
     if (view.vertices.outcode[vertex]) return UINT16_MAX;
@@ -89,8 +88,7 @@ double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
 }
 
 // Maximum error of rays in px: beyond it the image shows rounding, not faces. Curves so near to a silhouette are
-// decided with it in double precision (coincident_segments.h). Samples keep this far from the end of a crease at a
-// silhouette.
+// decided with it in double precision (coincident_segments.h). Samples keep so far from a crease's end at one.
 constexpr double float_reach = 0.01;
 
 // px of the undistorted image by which the surfaces on either side of a curve are evaluated off it.

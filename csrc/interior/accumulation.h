@@ -1,6 +1,5 @@
 // This file declares what becomes of a sample inside a face. In reverse mode it adds a cotangent of the face's data
-// (face_grad.h), in forward mode a derivative of the pixels around it. In screen space it adds the gradient by the
-// image position.
+// (face_grad.h), in forward mode a derivative of the pixels around it. In screen space it adds that by image position.
 #pragma once
 
 #include <cstdint>
@@ -22,8 +21,7 @@ struct SurfaceSample {
     Vec2 across = {};  // px across a narrow face, as long as the error of rays; 0: the face is wide
 };
 
-// SurfaceAccumulation is compiled once per type of image and number of channels; the sampler is compiled without
-// either.
+// SurfaceAccumulation is compiled once per type of image and number of channels; samplers depend on neither.
 class SurfaceAccumulation {
    public:
     virtual ~SurfaceAccumulation() = default;

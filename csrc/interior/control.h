@@ -10,8 +10,7 @@
 // the interior term would be T_i for the colour c_i, and −∇L · T_i for the position x_i, with ∇L constant. The control
 // is the integrand at a sample, λ_i(x) Ã(x). The integral plus the sum over samples of (integrand − control) has the
 // same mean as the sum of the integrand, however good the control is. It is good where a face is small and visible, and
-// its adjoint nearly affine: few samples suffice there. A hidden face that is taken for a visible one adds noise of
-// mean zero.
+// its adjoint nearly affine: few samples suffice there. A face wrongly taken for visible adds noise of mean zero.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,4 @@
-// This file processes several faces of the scene at once. Arrays have one number per lane, so that loops over lanes are
-// vectorised.
+// This file processes several faces of the scene at once. Arrays have one number per lane, to vectorise loops.
 #pragma once
 
 #include <cstdint>
@@ -36,7 +35,7 @@ struct FaceLanes {
 
     // integrate() sets the members below. `T` is divided by the area, (C, 3, lanes). `x_bar` and `y_bar` are the
     // cotangents of the corners' positions. The others sum absolute values over channels: of the adjoint at the
-    // corners, of its differences from the first corner, and of the inner pixels' differences from the corners' mean.
+    // corners, of its differences from the first, and of the inner pixels' from the corners' mean.
     std::vector<double> T;
     double x_bar[3][size], y_bar[3][size], sum[size], change[size], apart[size];
     void integrate();

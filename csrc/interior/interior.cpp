@@ -3,8 +3,7 @@
 //
 // Triangles lie end to end by a measure m that contains area + longest side · 1 px (surface_measure.h). A point uniform
 // in the image of its triangle has the weight area · M / (n m). At a grazing angle the integrand grows as 1 / area, and
-// the product stays bounded. Where a triangle has a control (control.h), samples find only what differs from it, and
-// fewer suffice.
+// the product stays bounded. Where a triangle has a control (control.h), fewer samples find the difference only.
 
 #include "interior/interior.h"
 
@@ -184,8 +183,7 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
     const auto& [pixels, spp, seed, faces, share, beyond, by_importance] = samples;
     const int margin = beyond.value_or(0), stride = view.camera.width + 2 * margin;
     const Filter filter = beyond ? Filter(FilterKind::box) : view.image.filter;
-    // A pixel gets one sample more for each quarter of the mean by which it exceeds the mean. What is bright varies
-    // within a pixel as well.
+    // A pixel gets one round more for each quarter of the mean above it, as bright content varies in a pixel too.
     constexpr int most_times = 64;
     const int width = view.camera.width, height = view.camera.height;
     const double usual = view.importance.mean(0, width, 0, height);

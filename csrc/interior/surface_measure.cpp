@@ -22,8 +22,8 @@ constexpr OcclusionHint::Few occluded{.rays = 2, .share = 1.0 / 64, .least = 1.0
 constexpr double occluded_near_hits = 1.0 / 8;
 
 // Default samples per unit of (area + longest side · 1 px): for interpolated colours, and for textures that may vary
-// from pixel to pixel. They are balanced with the edge samples, so that a smaller error of either would cost the same
-// time (docs/tried.md).
+// from pixel to pixel. They are chosen with those at edges: a smaller error of either would cost the same time
+// (docs/tried.md).
 constexpr double colored = 0.5, textured = 4;
 
 // A lit sample costs several times as much, so textures get no more lit samples than colours. On faces that are no
@@ -40,8 +40,7 @@ double more_if_rough(double rough, double longest) {
 }
 
 // From this area in the image on, px², a triangle with a texture, or under a rough adjoint, is left to pixel samples.
-// Each triangle's integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays
-// unbiased.
+// Each triangle's integral is estimated in exactly one way, chosen before any sample, so the sum is unbiased.
 constexpr double large = 256;
 
 // A face with a control gets fewer samples where the control is likely good: the adjoint changes little, and the face
@@ -356,9 +355,8 @@ class MeasuredChunk {
         }
     }
 
-    // Returns the relative change of the adjoint over a face. It compares corners with each other, with the pixels at
-    // the middles of sides and face, and with the mean of its box. Corners alone may agree by chance, as the signs of
-    // an L1 loss do.
+    // Returns the relative change of the adjoint over a face. It compares corners with each other, with pixels at the
+    // middles of sides and face, and with its box's mean. Corners may agree by chance, as signs of an L1 loss do.
     double variation(int i) const {
         const FaceLanes& l = *lanes_;
         if (!(l.sum[i] > 0)) return 1;

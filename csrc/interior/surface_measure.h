@@ -1,5 +1,4 @@
-// This file declares the sampling density of each face for the interior term, and what the term knows of faces without
-// a sample.
+// This file declares each face's sampling density in the interior term, and what it knows without a sample.
 #pragma once
 
 #include <algorithm>
@@ -25,8 +24,7 @@ struct SurfaceMeasure {
     int beyond = 0;                   // number of pixels beyond each side of the image that count, see PixelSamples
     double total = 0, of_pixels = 0;  // default samples: of the faces laid end to end, of those left to the pixels
 
-    // Returns the factor on the default samples that gives the number `given`, or 1. A sub-camera of a panorama may see
-    // no face at all.
+    // Returns the factor on the default samples that gives `given`, or 1. A panorama's sub-camera may see no face.
     double scale(int64_t given) const {
         const double all = total + of_pixels;
         return given >= 0 && all > 0 ? double(given) / all : 1;

@@ -8,8 +8,7 @@ namespace edgegrad {
 
 namespace {
 
-// Occupancy stores for each of many buckets whether one or several segments were put there. Two buckets may share a
-// place.
+// Occupancy stores for each of many buckets whether it got one or several segments. Two buckets may share a place.
 class Occupancy {
    public:
     explicit Occupancy(int64_t segments) : words_(std::bit_ceil(2 * uint64_t(segments))), mask_(words_.size() - 1) {}

@@ -33,8 +33,7 @@ struct ImageSegment {
 // lines side by side in a cell lie within half a bucket of each other.
 class LineBuckets {
    public:
-    // A Line in a cell is measured in buckets. Its direction is modulo `directions`, at which the distance changes
-    // sign.
+    // A Line in a cell is measured in buckets. Directions are modulo `directions`, where distances change sign.
     struct Line {
         uint64_t cell;
         double direction, distance;
@@ -79,8 +78,7 @@ class LineBuckets {
     static bool runs_along_x(const Line& l) { return std::fabs(l.direction - directions / 2.0) > directions / 4.0; }
 
    private:
-    // Directions are measured by 1 − x / (|x| + y), y ≥ 0, in place of an angle. It runs from 0 to 2 and grows by ½ to
-    // 1 per radian.
+    // Directions are measured by 1 − x / (|x| + y), y ≥ 0, which grows from 0 to 2, by ½ to 1 per radian.
     static constexpr int64_t directions = 400;
     static constexpr double distance_step = 0.05;  // px
     struct Direction {
@@ -128,13 +126,11 @@ class CoincidentCurves {
     // Returns the segment of an edge that has samples; null if no other segment lies on it anywhere.
     const ImageSegment* find(int64_t edge) const;
 
-    // Meeting tells how two segments meet that come closer in the image than the error of rays. `along` segments are so
-    // close wherever both exist. `across` segments meet at a small angle, where more than a point of one is close, as
-    // at a common end.
+    // Meeting tells how two segments meet that come closer in the image than the error of rays. `along` ones are so
+    // close wherever both exist. `across` ones meet at a small angle, where more than a point of one is close.
     enum class Meeting { none, across, along };
 
-    // Calls found(other, meeting) for the segments that pass so close to the point x of a segment from find(), until it
-    // returns false.
+    // Calls found(other, meeting) for segments that pass so close to the point x of `own`, until it returns false.
     template <class Found>
     void at(const ImageSegment& own, Vec2 x, Found found) const {
         const LineBuckets::Line line = lines_.line_at(own, x);

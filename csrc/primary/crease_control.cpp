@@ -118,8 +118,7 @@ class ControlOfChannels final : public CreaseControl {
     }
 
    private:
-    // A Piece is Ã · ΔL between two lines of the filter. Ã is the quadratic through its ends and middle, or a constant
-    // for a box.
+    // A Piece is Ã · ΔL between two lines of the filter. Ã is quadratic through ends and middle, or constant (box).
     class Piece {
        public:
         Piece(ControlOfChannels& control, double begin, double end)
@@ -144,8 +143,7 @@ class ControlOfChannels final : public CreaseControl {
         double middle_, half_, a_[3] = {}, b_[3] = {};  // Ã times the jump at either end of the curve
     };
 
-    // Passed walks the pixels that a curve passes along one axis. The curve leaves the current pixel at `next`, and one
-    // more after every `step`.
+    // Passed walks the pixels that a curve passes along one axis. It leaves a pixel at `next`, then every `step`.
     struct Passed {
         int64_t pixel;
         int by;
@@ -161,8 +159,7 @@ class ControlOfChannels final : public CreaseControl {
         }
     };
 
-    // Adds Σ over the pixels passed of ∫ φ_k (φ_a a + φ_b b) ds. In each pixel Ã is constant, and a and b are Ã times
-    // the jump at either end.
+    // Adds ∫ φ_k (φ_a a + φ_b b) ds over each pixel passed, where Ã is constant. a, b are Ã times the jump at the ends.
     void add_integral_of_box() {
         const int width = view_.camera.width, height = view_.camera.height;
         Passed columns(curve_->x0.x, tangent_.x, per_[0]), rows(curve_->x0.y, tangent_.y, per_[1]);
@@ -204,8 +201,7 @@ class ControlOfChannels final : public CreaseControl {
         double end = 1;
         const auto meet = [&](double origin, double along, double per) {
             if (along == 0) return;
-            // The next line lies at least a millionth of the curve ahead, because s may be rounded to before the last
-            // one.
+            // The next line lies at least a millionth of the curve ahead, as s may be rounded to before the last one.
             const double here = origin + (s + 1e-6) * along - shift;
             const double line = along > 0 ? std::floor(here) + 1 : std::ceil(here) - 1;
             end = std::min(end, (line + shift - origin) * per);

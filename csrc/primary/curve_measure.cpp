@@ -17,8 +17,7 @@ namespace edgegrad {
 namespace {
 
 // Default number of samples per pixel of curve; see surface_measure.cpp. In lit scenes a sample costs three times as
-// much, and most of the error is that of faces. A quarter of the samples raises the error by a tenth at most
-// (docs/tried.md).
+// much, and most of the error is that of faces. A quarter of the samples adds a tenth at most (docs/tried.md).
 double samples_per_pixel(bool lit) { return lit ? 6 : 24; }
 
 // An error counts relative to the whole gradient. Controls have none, so the more they cover, the fewer samples the
@@ -150,8 +149,7 @@ class MeasuredEdges {
         return c.length * (apart ? CreaseSamples::turned_away : ImageHits::turned_away);
     }
 
-    // Adds a crease between wholly visible faces, one of them hit, or between hidden faces. Returns false for any
-    // other.
+    // Adds a crease between wholly visible faces, one of them hit, or between hidden faces. Else returns false.
     bool add_clear(int64_t e) {
         const Topology& topology = view_.geometry.topology();
         if (!faces_ || !topology.joins_two(e)) return false;

@@ -64,8 +64,7 @@ struct Curves : CurvesFound {
     // Returns the number of samples: the one in `o`, if not −1, or the default.
     int64_t wanted(const GradientOptions& o) const;
 
-    // Adds the segments of clear creases that share pixels with another curve, where either has samples. `all` adds
-    // those of all creases.
+    // Adds the segments of clear creases that share pixels with another curve, if either has samples. `all` adds all.
     void add_segments(const BackwardView<T>& view, const Systematic& samples, bool all);
 };
 

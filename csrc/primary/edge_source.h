@@ -43,8 +43,7 @@ class EdgeSource {
 
     bool place(const Curve& curve, double s, Sample& sample) {
         if (places_ == 0 || place_[places_ - 1].own.curve.edge != curve.edge) {
-            // A place is free again if none of its samples waits, because all were hidden. There are therefore never
-            // more places than lanes.
+            // A place is free again if all of its samples were hidden, so there are never more places than lanes.
             if (places_ > 0 && pending_ != places_ - 1) --places_;
             start(place_[places_++], curve);
         }
@@ -179,8 +178,7 @@ class EdgeSource {
         other_edges_.clear();
     }
 
-    // Sets the opaque faces on either side at the point t, where faces may be alpha-tested. Returns false if there are
-    // none.
+    // Sets the opaque faces on either side of the point t, if any may be alpha-tested. Returns false if there are none.
     bool show(const Curve& curve, double t, CoincidentShare& share) const {
         share.side[0].face = share.side[1].face = -1;
         for (const HalfEdge& h : view_.geometry.topology().half_edges(curve.edge)) {
@@ -208,8 +206,7 @@ class EdgeSource {
         return distort_jvp(view_.camera, sample.n, place_[sample.place].own.curve.tangent());
     }
 
-    // Computes the part of a sample that coincident curves leave to it, and gathers their faces. Returns false if
-    // nothing is left.
+    // Computes what coincident curves leave to a sample, and gathers their faces. Returns false if it is nothing.
     bool share(Place& place, Sample& sample) {
         const Curve curve = place.own.curve;
         const Topology& topology = view_.geometry.topology();

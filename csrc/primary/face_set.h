@@ -1,5 +1,4 @@
-// FaceSet is a set of faces that is cleared in constant time: slots of its hash table store the round in which they
-// were filled.
+// FaceSet is a set of faces that is cleared in constant time: hash slots store the round that filled them.
 #pragma once
 
 #include <cstddef>

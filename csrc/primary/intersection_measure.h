@@ -33,8 +33,7 @@ class IntersectionSize {
     }
 
    private:
-    // Clamps a factor. The lower bound keeps a sample's weight small, because the ends do not show what lies between
-    // them.
+    // Clamps a factor. The lower bound limits a sample's weight, because ends do not show what lies between them.
     static double within(double x, double most) { return x > 1.0 / 64 ? std::min(x, most) : 1.0 / 64; }
 
     // Returns the jump, or the mean where textures would have to be evaluated.

@@ -81,8 +81,7 @@ class LensBoundarySource {
 };
 static_assert(MovingCurve<LensBoundarySource>);
 
-// LensBoundarySamples traces samples in batches. Rays ignore no face, because nothing occludes a point of the lens
-// boundary.
+// LensBoundarySamples traces samples in batches. Rays ignore no face, because nothing occludes the lens boundary.
 template <class T>
 class LensBoundarySamples {
    public:
@@ -93,8 +92,7 @@ class LensBoundarySamples {
           accumulation_(accumulation),
           rays_(view.frame) {}
 
-    // Adds the point at the fraction s of an arc. Its x is a position that shows the inside, for accumulations that
-    // cast a ray there.
+    // Adds the point at the fraction s of an arc. Its x shows the inside, for accumulations that cast a ray there.
     void add(LensBoundary::Arc arc, double s, double weight) {
         const int i = rays_.count;
         const std::optional<LensBoundary::Point> point = lens_boundary_.at(arc.from + s * (arc.to - arc.from));

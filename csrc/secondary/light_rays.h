@@ -25,8 +25,7 @@ class LightRays {
               const std::vector<AlphaEdge>& alpha_edges)
         : view_(view), casters_(casters), light_(light), alpha_edges_(alpha_edges) {}
 
-    // Adds the ray from a point of the light past the place t of an edge or an alpha edge. `segment` is the caller's
-    // number for it.
+    // Adds the ray from a point of the light past the place t of an edge or an alpha edge. `segment` identifies it.
     void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
         Pending& w = pending_[count_];
         w.point = {.caster = {},

@@ -38,8 +38,7 @@ class Ends {
         face_[receiver_or_reflector].push_back(face), append(b_[receiver_or_reflector], {1 - u - v, u, v});
     }
 
-    // Returns (N, channels): the light that passes between each pair (transfer.h). Random numbers are numbered from
-    // `first` on.
+    // Returns (N, channels): the light that passes between each pair (transfer.h). Seeds count from `first` on.
     template <class T>
     std::vector<double> sent(const LineLight<T>& scene, uint64_t stream, int64_t first, Paths& paths) const {
         const int C = scene.lit.lit.channels;
@@ -83,9 +82,8 @@ class Ends {
     std::vector<double> b_[2];
 };
 
-// Evaluates the samples of records from `begin` on. Their first two surfaces are a receiver and a reflector; their
-// first factor is the sample's weight. Writes how much the image jumps, or the light that reaches the receiver and its
-// direction.
+// Evaluates the samples of records from `begin` on. Their first two surfaces are receiver and reflector; their first
+// factor is the weight. Writes how much the image jumps, or the light that reaches the receiver and its direction.
 template <class T>
 void light_reflectors(const LineLight<T>& light, const std::vector<CurveRecords>& records, size_t begin,
                       uint64_t stream, SecondaryEdgeSamples& out) {

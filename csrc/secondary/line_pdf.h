@@ -19,8 +19,7 @@
 
 namespace edgegrad {
 
-// DirectionCells divides the directions of unoriented lines by where they pass through three sides of a cube around the
-// origin.
+// DirectionCells divides unoriented directions by where they pass three sides of a cube around the origin.
 struct DirectionCells {
     static constexpr int across = 6, count = 3 * across * across;
 

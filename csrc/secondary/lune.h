@@ -19,8 +19,7 @@ class Lune {
    public:
     Lune() = default;
 
-    // Builds the lune of the edge from a to b. `opposite` holds the third corners of its faces; faces without area are
-    // ignored.
+    // Builds the lune of the edge from a to b. `opposite` has its faces' third corners; flat faces are ignored.
     Lune(Vec3 a, Vec3 b, std::span<const Vec3> opposite) {
         length_ = length(b - a);
         if (!(length_ > 0)) return;

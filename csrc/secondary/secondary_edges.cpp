@@ -145,7 +145,7 @@ Vec3 normal_of(const BackwardView<T>& view, const EdgeLine& line) {
     return cross(line.occluder.sum(line.occluder.tangent, places_of(view)), line.w);
 }
 
-// Appends a line with ends that need not be seen: F is by world coordinates, and y₁ stays at its barycentrics
+// Appends a line with ends that need not be seen: F is by world coordinates, with y₁ at fixed barycentrics
 // (edge_line_source.h).
 template <class T>
 void append_indirect(const BackwardView<T>& view, const EdgeLine& line, double weight, CurveRecords& records) {

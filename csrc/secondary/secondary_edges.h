@@ -1,5 +1,4 @@
-// This file declares the term of secondary edges: the curves at which visibility changes between the surfaces of a
-// light path.
+// This file declares the term of secondary edges: the curves at which visibility between surfaces changes.
 #pragma once
 
 #include <vector>

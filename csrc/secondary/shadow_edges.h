@@ -16,8 +16,7 @@
 
 namespace edgegrad {
 
-// A ShadowPiece is a part of an edge or an alpha edge, before those points of a light's part from which it casts a
-// shadow.
+// A ShadowPiece is a part of an edge or an alpha edge, before the points of a light for which it casts a shadow.
 struct ShadowPiece {
     int64_t edge;  // edge; if negative, an alpha edge
     int32_t part;

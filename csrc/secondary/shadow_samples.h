@@ -24,8 +24,7 @@ constexpr int64_t pair_tests = 1 << 22;  // number of tested pairs of edges and 
 constexpr int64_t fewest_intervals = 1 << 10, most_intervals = 1 << 15, samples_of_interval = 16;
 constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 
-// Cuts edges with a large part of the measure, because samples run along the light's wedges and their place on the edge
-// is drawn.
+// Cuts edges with much of the measure, because samples run along the light's wedges, at drawn places of the edge.
 inline std::vector<ShadowPiece> cut(const std::vector<ShadowPiece>& pieces, double intervals) {
     double total = 0;
     for (const ShadowPiece& p : pieces) total += p.measure;
@@ -90,8 +89,7 @@ struct ShadowStatistics {
 // vertices. The estimate is unbiased given any number of places.
 class Places {
    public:
-    // `density` has one number per interval and becomes its running sum. `whole` tells whether pieces get whole numbers
-    // of places.
+    // `density` has one number per interval and becomes its running sum. `whole` gives pieces whole numbers of places.
     Places(const Pieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed, ThreadTeam& team)
         : pieces_(pieces), intervals_(density.size()), whole_(whole), seed_(seed), systematic_(density, team) {
         systematic_.draw(n, to_unit(seed));
@@ -159,8 +157,7 @@ struct ShadowScene {
     const Pieces& pieces;
 };
 
-// ShadowChunk traces a chunk of light rays past edges to what lies behind. It calls body(ShadowPoint, weight) for each
-// shadow boundary there.
+// ShadowChunk traces light rays past edges, and calls body(ShadowPoint, weight) for each shadow boundary behind.
 template <class T, class Body>
 class ShadowChunk {
    public:
@@ -216,8 +213,7 @@ class ShadowCasters {
     const ShadowScene<T>& scene() const { return scene_; }
     int64_t intervals() const { return intervals_; }
 
-    // Draws pilots in each interval. body(ask) is called for a block of intervals, and must call ask(chunk) with a
-    // ShadowChunk.
+    // Draws pilots in each interval. Calls body(ask) per block, which must call ask(chunk) with a ShadowChunk.
     template <class Body>
     void draw_pilots(uint64_t seed, Body body) const {
         scene_.view.team.parallel_for((intervals_ + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {

@@ -185,8 +185,7 @@ class TracedEdgeLines {
         return std::fabs(most) > flat * dot(m, m) / std::sqrt(length(m)) ? most : 0;
     }
 
-    // Sets the line with one of its ends as the receiver. Returns false where the edge lies on that end: there the
-    // camera sees an edge.
+    // Sets one end of the line as the receiver. Returns false where the edge lies on it: there the camera sees an edge.
     bool set(Pending& o, int receiver) const {
         const End &near = o.end[receiver], &far = o.end[1 - receiver];
         if (near.distance == 0) return false;
