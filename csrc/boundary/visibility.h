@@ -46,7 +46,7 @@ class Visibility {
         int32_t nearest = -1;
         double depth = std::numeric_limits<double>::infinity();
         for (int refused = 0; face >= 0 && !decide(face); ++refused) {
-            // Where floats see hundreds of faces in one place, one ray decides on all of them.
+            // One ray decides on all faces where floats see hundreds of them in one place.
             if (refused == most_refused) {
                 face = view_.frame.beyond_float(n, face, ignored, decide);
                 break;

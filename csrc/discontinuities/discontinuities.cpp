@@ -19,7 +19,7 @@ namespace edgegrad {
 
 namespace {
 
-// Fraction of lines of a face behind the hits; see curve_measure.cpp.
+// A face behind the hits gets this fraction of its lines; see curve_measure.cpp.
 constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
 
 // A Family is the lines at (k + shift) · spacing, k = first … end − 1.
@@ -45,8 +45,8 @@ struct LinedFace {
 
 static_assert(sizeof(LinedFace) * 3 <= lined_face_bytes);
 
-// Bounds of the texture cells visited along a line: a minimum, and a number per spacing of its length. Where texels are
-// much smaller than pixels some stand for all, so the size of the image bounds the time.
+// A line may visit this minimum of texture cells, and this number per spacing of its length. Where texels are much
+// smaller than pixels some stand for all, so the size of the image bounds the time.
 constexpr int fewest_cells = 32, cells_a_spacing = 2;
 
 template <class T>

@@ -7,7 +7,7 @@
 
 namespace edgegrad {
 
-// Upper bound of the bytes per face that may have discontinuities; the list of them doubles as it grows.
+// A face that may have discontinuities takes at most these bytes; the list of them doubles as it grows.
 constexpr int64_t lined_face_bytes = 3 * 104;
 
 // Adds the samples of lines on the faces in view, GradientOptions::step_spacing apart; see add_boundary.

@@ -116,8 +116,8 @@ class ImageHits {
     void prefetch(int32_t vertex) const { edgegrad::prefetch(&at_[vertex]); }
 
    private:
-    // Bits of a vertex: `hit`: it belongs to a hit face. `border`: it belongs to a face with such vertices and others.
-    // `behind`: it lies behind all hits around it.
+    // A `hit` vertex belongs to a hit face. A `border` vertex belongs to a face with such vertices and others. A
+    // `behind` vertex lies behind all hits around it.
     static constexpr uint8_t hit = 1, border = 2, behind = 4;
     static constexpr double some = 1.0 / 16;
     static constexpr int enough = 64;  // number of hit faces that tells which sides of a part are visible

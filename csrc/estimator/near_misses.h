@@ -11,7 +11,7 @@
 
 namespace edgegrad {
 
-// Distances in units of the error of floats. Several are needed, because the face may be narrower than the largest.
+// The rays pass at these multiples of the floats' error: the face may be narrower than the largest.
 constexpr double passed_by[] = {2, 0.5, 1.0 / 8, 1.0 / 32};
 
 // Calls found(face) for each face that these rays meet. Returns the face that the ray at n itself meets; −1: none.

@@ -87,11 +87,11 @@ double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
     return view.seen[face] || view.transparent ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
 }
 
-// Maximum error of rays in px: beyond it the image shows rounding, not faces. Curves so near to a silhouette are
+// Rays err by at most this, px: beyond it the image shows rounding, not faces. Curves so near to a silhouette are
 // decided with it in double precision (coincident_segments.h). Samples keep so far from a crease's end at one.
 constexpr double float_reach = 0.01;
 
-// px of the undistorted image by which the surfaces on either side of a curve are evaluated off it.
+// curve_offset_of() returns how far off a curve the surfaces on either side are evaluated, px of the undistorted image.
 //
 // The light may be at the eye, or in a plane through the eye and an edge. The edge's shadow boundary then lies on its
 // silhouette in the image. Two estimators must then agree on what lies between the two curves. The silhouette tests

@@ -65,7 +65,7 @@ class Control {
         const double half = wedge(e1, e2) < 0 ? -0.5 : 0.5;
         const auto add = [&](int c, double c0, double c1, double c2) {
             const double d1 = half * (c1 - c0), d2 = half * (c2 - c0);
-            const Vec2 gradient{d1 * e2.y - d2 * e1.y, d2 * e1.x - d1 * e2.x};  // times the area
+            const Vec2 gradient{d1 * e2.y - d2 * e1.y, d2 * e1.x - d1 * e2.x};  // ∇L times the area
             for (int i = 0; i < 3; ++i) x_bar[i] += -T_[i * C + c] * gradient;
         };
         each_corner_value<N>(scene_, face_, add);

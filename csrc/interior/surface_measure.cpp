@@ -16,14 +16,13 @@ namespace edgegrad {
 
 namespace {
 
-// Factors on the density of a triangle behind the hits (occlusion.h): without hit neighbours, and next to a hit face.
-// They are never zero, because the triangle may still be visible.
+// These factors apply to the density of a triangle behind the hits (occlusion.h): without hit neighbours, and next to a
+// hit face. They are never zero, because the triangle may still be visible.
 constexpr OcclusionHint::Few occluded{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
 constexpr double occluded_near_hits = 1.0 / 8;
 
-// Default samples per unit of (area + longest side · 1 px): for interpolated colours, and for textures that may vary
-// from pixel to pixel. They are chosen with those at edges: a smaller error of either would cost the same time
-// (docs/tried.md).
+// Default samples are per unit of (area + longest side · 1 px), for interpolated colours and for textures. They are
+// chosen with those at edges: a smaller error of either would cost the same time (docs/tried.md).
 constexpr double colored = 0.5, textured = 4;
 
 // A lit sample costs several times as much, so textures get no more lit samples than colours. On faces that are no

@@ -56,7 +56,7 @@ class CreaseJumps {
         });
     }
 
-    const SceneView<T> scene_;  // with the channels that may jump
+    const SceneView<T> scene_;  // the scene with only the channels that may jump
     const int first_, C_;       // first of these channels, and their number
     std::conditional_t<N == 0, std::vector<double>, std::array<double, 2 * all_channels<N>>> value_{};
 };

@@ -103,7 +103,7 @@ class CreaseVisibility {
     static constexpr int most_points = int(std::size(asked_at));
     static int points(const Curve& c) { return c.length < 4 ? few_points : most_points; }
 
-    // Least fractions of samples: where nothing may divide a crease, and where something may but rays do not show it.
+    // These least fractions of samples hold where nothing may divide a crease, or something may but rays miss it.
     static constexpr double few = CreaseSamples::visible, near_silhouettes = 1.0 / 128, near_other_parts = 1.0 / 32,
                             near_missed =
                                 1.0 /

@@ -16,8 +16,8 @@ namespace edgegrad {
 
 namespace {
 
-// Default number of samples per pixel of curve; see surface_measure.cpp. In lit scenes a sample costs three times as
-// much, and most of the error is that of faces. A quarter of the samples adds a tenth at most (docs/tried.md).
+// Returns the default samples per pixel of curve; see surface_measure.cpp. A lit sample costs three times as much, and
+// most of the error is that of faces. A quarter of the samples adds a tenth at most (docs/tried.md).
 double samples_per_pixel(bool lit) { return lit ? 6 : 24; }
 
 // An error counts relative to the whole gradient. Controls have none, so the more they cover, the fewer samples the
@@ -241,8 +241,8 @@ class MeasuredEdges {
     }
 
     static constexpr double largest = 2;  // keeps a bright face among dark ones from taking all samples
-    // Lower bound where samples alone find the jump. They look slightly aside of the curve (accumulation.cpp), where a
-    // texture may differ across a nearly coplanar crease. Such a sample must not have a large weight.
+    // This bound holds where samples alone find the jump. They look slightly aside of the curve (accumulation.cpp),
+    // where a texture may differ across a nearly coplanar crease. Such a sample must not have a large weight.
     static constexpr double least = 1.0 / 1024;
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;

@@ -139,7 +139,7 @@ class EdgeLines {
     int64_t cell(Vec3 w) const { return pooled_.cell(vertex_, w); }
 
    private:
-    // Where alpha masks may differ between its faces, lines may pass in all directions (TracedEdgeLines).
+    // Lines may pass in all directions where alpha masks may differ between its faces (TracedEdgeLines).
     void set_edge(int64_t edge) {
         const auto halves = topology_.half_edges(edge);
         const HalfEdge& h = halves[0];

@@ -81,7 +81,7 @@ class FacesBeforeLight {
         return {{side, side, side}, true};
     }
 
-    // Returns the side from which the whole light sees a face; 0: it sees both.
+    // Returns the side from which the whole light sees a face; 0: neither is certain.
     int side(int64_t face) const {
         const Plane& p = plane_[face];
         const double s = dot(p.normal, light_.infinite ? ball_.centre : ball_.centre - p.corner);
@@ -89,7 +89,7 @@ class FacesBeforeLight {
         return s > reach ? 1 : s < -reach ? -1 : 0;
     }
 
-    // Direction in which lights are taken to have moved; it lies along no axis and no diagonal.
+    // Lights are taken to have moved in this direction, which lies along no axis and no diagonal.
     static constexpr Vec3 aside{0.5257, 0.6731, -0.5203};
 
    private:

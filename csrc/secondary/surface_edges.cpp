@@ -206,7 +206,7 @@ class LeavingRays {
         for (const Part& part : place_.parts) {
             const Vec3 asked = place_.p + pieces_.aside(piece, part.face) * part.across;
             const Barycentrics b = pieces_.barycentrics(part.face, asked);
-            // Where the face ends at the curve, a neighbour goes on.
+            // A neighbour continues the surface where the face ends at the curve.
             if (std::min({b.u, b.v, 1 - b.u - b.v}) < 0 || !light_.lit.lit.mesh_of(part.face).has_material) continue;
             const Vec3 n = unit(pieces_.normal(part.face));
             for (const double side : {1.0, -1.0}) {
