@@ -1,4 +1,4 @@
-// The backward pass: the two terms, and what they found turned into the gradients of the user's arrays.
+// This file combines the terms of the backward pass into the gradients of the user's arrays.
 
 #include <algorithm>
 #include <functional>
@@ -25,7 +25,7 @@ namespace edgegrad {
 
 namespace {
 
-// δI = (1 − coverage) δbackground, pixel by pixel: exact for the image that the forward pass made.
+// Adds δI = (1 − coverage) δbackground, pixel by pixel. It is exact for the image of the forward pass.
 template <class T>
 void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint, const T* coverage, ThreadTeam& team,
                     double* grad) {
@@ -47,13 +47,13 @@ void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint,
         for (int c = 0; c < C; ++c) grad[c] += sum[c];
 }
 
-// Which terms are asked for.
+// Terms tells which terms are wanted.
 struct Terms {
-    bool motion;      // inside faces, of what moves them
-    bool appearance;  // inside faces, of colours and textures
+    bool motion;      // interior term of motion
+    bool appearance;  // interior term of colours and textures
     bool boundary;
-    bool lens_boundary;  // of the lens, besides the other curves
-    bool steps;          // within faces
+    bool lens_boundary;  // lens boundary, in addition to other curves
+    bool steps;          // discontinuities within faces
 
     bool interior() const { return motion || appearance; }
     bool any() const { return interior() || boundary || steps; }
@@ -69,7 +69,7 @@ Terms terms_of(const Slots<Number>& slots, const GradientOptions& o) {
             .steps = slots.steps() && o.steps};
 }
 
-// Of what anything may move.
+// Returns the terms of everything that may move.
 Terms all_motion(const GradientOptions& o) {
     return {.motion = o.interior_geometry,
             .appearance = false,
@@ -78,7 +78,7 @@ Terms all_motion(const GradientOptions& o) {
             .steps = o.steps};
 }
 
-// What the image and its adjoint say, through whichever sub-camera.
+// InImage holds what all sub-cameras share of the image and its adjoint.
 template <class T>
 struct InImage {
     FilteredAdjoint<T> filtered;
@@ -92,14 +92,14 @@ struct InImage {
                      !input.importance_map),
           occlusion(input.transparent ? nullptr : input.hits.depth, input.camera.width, input.camera.height, team) {}
 
-    // By which the pixel filter reaches beyond the image.
+    // Returns how far the pixel filter reaches beyond the image, px.
     static double margin_of(const ImageOptions& image) { return image.filter.radius() - 0.5; }
 };
 
 template <class T>
 using ViewBody = std::function<void(const BackwardView<T>&)>;
 
-// Calls body(view) with what all terms look at through one sub-camera.
+// Calls body(view) with what all terms share for one sub-camera.
 template <class T>
 void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
                const GradientOptions& o, const Terms& terms, ThreadTeam& team, const ViewBody<T>& body) {
@@ -112,7 +112,7 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
     const AlphaTest* through = alpha_masks ? &*alpha_masks : nullptr;
     const CameraFrame frame(geometry.caster(), camera, through);
     Scatter scatter(team, {scene.radiance, scene.attributes.vertex_width, scene.attributes.face_width});
-    // What the controls need, of faces and of creases.
+    // Controls of faces and creases need these hits.
     const bool creases = terms.boundary && may_jump(scene, geometry.topology());
     std::optional<ImageHits> hits;
     if (!o.pixel_spp && (terms.interior() || creases))
@@ -143,7 +143,7 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
                          .curve_offset = curve_offset_of(camera, frame, vertices, team)});
 }
 
-// Where the terms are to sample, and how often.
+// Measured holds where the terms sample, and how often.
 template <class T>
 struct Measured {
     std::optional<SurfaceMeasure<T>> surface;
@@ -174,7 +174,7 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Gradi
     return out;
 }
 
-// At most so many samples as the budget of the image allows, but for those that the user asks for.
+// Limits the samples to the budget of the image, except numbers that the user sets.
 template <class T>
 SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted,
                            ThreadTeam& team) {
@@ -186,7 +186,7 @@ SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions&
     return n;
 }
 
-// Measures what the terms sample, draws the samples and contracts them.
+// Measures what the terms sample, draws the samples and accumulates them.
 template <class T>
 void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const Terms& terms,
                const Accumulation& accumulation, GradientSink& to, BackwardProfile& profile) {
@@ -208,8 +208,8 @@ void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const
     if (terms.steps) add_steps(view, accumulation, to, profile);
 }
 
-// The options for each of several sub-cameras: samples in proportion to what each wants, as many as one image would
-// get. Where one wants any it gets some, for it alone shows what it shows.
+// Returns the options of each sub-camera. The samples of one image are divided in proportion to what each wants. A
+// sub-camera that wants any gets some, because it alone shows its part.
 template <class T>
 std::vector<GradientOptions> options_of_sub_cameras(const BackwardInput<T>& input,
                                                     const std::vector<Camera>& sub_cameras, const InImage<T>& in_image,
@@ -253,7 +253,7 @@ void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Te
         with_view(input, sub_cameras[k], in_image, options[k], terms, team, body);
 }
 
-// The same for one sub-camera, where none shows more of what is looked for than another.
+// Calls body(view) for one sub-camera, where the result does not depend on which.
 template <class T>
 void with_any_sub_camera(const BackwardInput<T>& input, const GradientOptions& o, ThreadTeam& team,
                          const std::type_identity_t<ViewBody<T>>& body) {
@@ -261,7 +261,7 @@ void with_any_sub_camera(const BackwardInput<T>& input, const GradientOptions& o
     with_view<T>(input, sub_camera, InImage<T>(input, team), o, Terms{}, team, body);
 }
 
-// δI = (1 − coverage) δbackground of direction d, for pixels (H, W, D, C).
+// Adds δI = (1 − coverage) δbackground of direction d, for pixels (H, W, D, C).
 template <class T>
 void add_background_tangent(const BackwardInput<T>& input, const std::vector<Tangents>& directions, ThreadTeam& team,
                             double* image_dot) {

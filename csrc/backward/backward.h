@@ -1,4 +1,4 @@
-// The gradient of a loss of the image.
+// This file declares the gradient of a loss of the image, and the recorders of its samples.
 #pragma once
 
 #include <cstdint>
@@ -15,51 +15,50 @@ struct LitPaths;  // secondary/secondary_edges.h
 struct SecondaryEdgeSamples;
 struct MovingEdges;
 
-// Adds the gradient to what `grad` points to.
+// Adds the gradient to the arrays of `grad`.
 template <class T>
 BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& options, ThreadTeam& team,
                                 const Gradients& grad);
 
-// Derivatives of the image in several directions, forward mode: adds to `image_dot` (H, W, D, C). `adjoint` says how
-// much each pixel matters for where samples go; ones, if all do.
+// Adds derivatives of the image in several directions, forward mode, to `image_dot` (H, W, D, C). `adjoint` is the
+// importance of each pixel for the placement of samples; ones, if all count alike.
 template <class T>
 void render_tangents(const BackwardInput<T>& input, GradientOptions options, ThreadTeam& team,
                      const std::vector<Tangents>& tangents, double* image_dot);
 
-// The gradient by places in the image: adds to `gradient` (H, W, 2) how the loss changes as what is seen in a pixel
-// moves right and down, per pixel that it moves.
+// Adds the screen-space gradient to `gradient` (H, W, 2): loss change per px that a pixel's content moves right, down.
 template <class T>
 void render_screen_gradient(const BackwardInput<T>& input, GradientOptions options, ThreadTeam& team, double* gradient);
 
-// The samples of both terms, for shaders written in PyTorch. Creases are the edges at which the scene's colours jump.
+// Returns the samples of both terms, for PyTorch shaders. Creases are edges at which the scene's colours jump.
 template <class T>
 RecordList record_samples(const BackwardInput<T>& input, GradientOptions options, ThreadTeam& team);
 
-// The samples on the borders of the shadows of `casters`, the scene as light meets it; so many or, if −1, by default.
+// Returns samples on shadow boundaries. `casters` is the scene as light meets it. `samples` = −1 is the default.
 template <class T>
 std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
                                          const GradientOptions& options, const LightParts& light, int64_t samples,
                                          ThreadTeam& team);
-// So many on those that lie on surfaces, seen or not (secondary/indirect_shadows.h).
+// Returns `samples` samples on indirect shadow boundaries (secondary/indirect_shadows.h).
 template <class T>
 std::vector<CurveRecords> record_indirect_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
                                                   const GradientOptions& options, const LightParts& light,
                                                   int64_t samples, ThreadTeam& team);
 
-// The samples on the borders of what surfaces of paths of light see of one another (secondary/secondary_edges.h).
+// Returns the samples on secondary edges (secondary/secondary_edges.h).
 template <class T>
 std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
                                                  const GradientOptions& options, const LitPaths& paths, int64_t samples,
                                                  ThreadTeam& team, SecondaryEdgeSamples& out);
-// Those on curves at which surfaces begin to send light (secondary/surface_edges.h).
+// Returns the samples on curves at which the light that surfaces send jumps (secondary/surface_edges.h).
 template <class T>
 std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
                                                const GradientOptions& options, const LitPaths& paths,
                                                MovingEdges moving, int64_t samples, ThreadTeam& team,
                                                SecondaryEdgeSamples& out);
 
-// q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a
-// sub-camera.
+// Adds the adjoint of q = T (R p + t), with the rotation T of a sub-camera: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ
+// q̄, for q_bar (V, 3).
 void add_world(const Camera& sub_camera, const double* verts, const Array<double>& q_bar, ThreadTeam& team,
                const Gradients& grad);
 

@@ -12,7 +12,7 @@ namespace edgegrad {
 
 namespace {
 
-// With Ã · L in place of radiance: one number a surface.
+// AdjointRadiance evaluates Ã · L in place of the radiance: one number per surface.
 template <int N, class T>
 class AdjointRadiance {
    public:
@@ -30,7 +30,7 @@ class AdjointRadiance {
         return sum;
     }
 
-    // The jumps of the loss at a sample.
+    // Returns the jumps of the loss at a sample.
     CurveJumps jumps(int i, MovingSample& sample) {
         const SampleSurfaces surfaces = sample.surfaces();
         const Vec2 x = sample.x();
@@ -82,7 +82,7 @@ class ForwardBoundary final : public CurveAccumulation {
         velocity_.resize(directions_.size());
         for (size_t d = 0; d < directions_.size(); ++d) velocity_[d] = sample.velocities(directions_[d]);
         pixels_.around(sample.x(), [&](int64_t pixel, double weight) {
-            // Each pixel has a background of its own.
+            // Each pixel has its own background.
             const T* background = view_.scene.background_at(pixel);
             for (int c = 0; c < C_; ++c) {
                 double radiance[SampleSurfaces::most];
@@ -102,7 +102,7 @@ class ForwardBoundary final : public CurveAccumulation {
     const int C_;
     const FilteredPixels pixels_;
     LocalGradients& grad_;
-    std::vector<double> radiance_;  // (3, C) of the surfaces
+    std::vector<double> radiance_;  // (3, C), one row per surface
     std::vector<CurveJumps> velocity_;
     std::vector<double> values_;  // (D, C)
 };
@@ -152,7 +152,7 @@ class BoundaryRecorder final : public CurveAccumulation {
         add(sample, surfaces, {1, 0}, first), add(sample, surfaces, {0, 1}, second);
     }
 
-    // One of the curves. Its velocity is what its motion is the adjoint of.
+    // Appends one of the two curves. Its velocity is the map of which add_motion() is the adjoint.
     void add(MovingSample& sample, const SampleSurfaces& surfaces, CurveJumps curve, const double* factor) {
         if (std::all_of(factor, factor + CurveRecords::surfaces, [](double f) { return f == 0; })) return;
         form_.q.clear(), form_.uvs.clear(), form_.alphas.clear();
@@ -176,7 +176,7 @@ class BoundaryRecorder final : public CurveAccumulation {
             if (by_q[0] == 0 && by_q[1] == 0 && by_q[2] == 0) return;
             records_.row_of.push_back(sample_index);
             records_.vertex.push_back(int32_t(vertex));
-            // From the frame of the sub-camera to that of the camera.
+            // by_q is rotated from the frame of the sub-camera to that of the camera.
             const Vec3 q = transposed_times(camera_.turn, {by_q[0], by_q[1], by_q[2]});
             append(records_.by_q, {q.x, q.y, q.z});
         });
@@ -201,7 +201,7 @@ class BoundaryRecorder final : public CurveAccumulation {
         }
     }
 
-    // (∂x/∂u)ᵀ x̄.
+    // Returns (∂x/∂u)ᵀ x̄.
     Vec2 in_undistorted_image(Vec2 x_bar, Vec2 n) const {
         const auto along = [&](Vec2 u) {
             const Vec2 x = distort_jvp(camera_, n, u);
@@ -210,10 +210,10 @@ class BoundaryRecorder final : public CurveAccumulation {
         return {along({1, 0}), along({0, 1})};
     }
 
-    // A point of a surface moved a little off the curve to the side where it is visible: there alone is it known what
-    // lies between it and a light, where the curve is one of contact, and which of two steps along it was taken.
+    // Returns a point of a surface moved slightly off the curve, to its visible side. Only there is it known what lies
+    // between the point and a light at a contact curve, and which side of a discontinuity applies.
     Barycentrics aside(const SurfacePoint& p, const CurveSample& sample, Vec2 normal, double side) const {
-        constexpr double most = 1e-2;  // of the face
+        constexpr double most = 1e-2;  // maximum motion in barycentrics
         const double size = length(normal);
         if (!(size > 0 && std::isfinite(size))) return p.b;
         const auto corner = corners_of(view_, p.face);

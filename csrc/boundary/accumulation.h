@@ -1,8 +1,9 @@
-// What becomes of a sample on a curve, given the surfaces on its sides: in reverse mode cotangents of what the curve
-// moves with, in forward mode a derivative of the pixels around it, or the gradient by its place in the image.
+// This file declares what becomes of a sample on a curve, given the surfaces on its sides. In reverse mode it adds
+// cotangents of what the curve moves with, in forward mode a derivative of the pixels around it. In screen space it
+// adds the gradient by the image position.
 //
-// Accumulations are compiled once for each type of image and number of channels, sources of curves without either: a
-// sample is handed over through an interface.
+// Accumulations are compiled once per type of image and number of channels, and curve sources without either. A sample
+// is therefore passed through an interface.
 #pragma once
 
 #include <concepts>
@@ -14,11 +15,11 @@
 
 namespace edgegrad {
 
-// A sample and its curve: what MovingCurve offers, of whichever source.
+// MovingSample is a sample with its curve. It offers what MovingCurve requires, for any source.
 class MovingSample {
    public:
     virtual Vec2 x() const = 0;
-    virtual const CurveSample* on_surfaces() const = 0;  // null along the border of a lens, where there is one side
+    virtual const CurveSample* on_surfaces() const = 0;  // null on the lens boundary, which has one side
     virtual SampleSurfaces surfaces() = 0;
     virtual CurveJumps jumps(const double* radiance) const = 0;
     virtual CurveJumps velocities(const Direction& direction) const = 0;
@@ -56,10 +57,10 @@ class CurveAccumulation {
    public:
     virtual ~CurveAccumulation() = default;
 
-    // False if nothing could come of a sample at the pixel position x; i tells the samples of a batch apart.
+    // Returns false if a sample at the pixel position x cannot contribute. i identifies the sample in its batch.
     virtual bool wants(int i, Vec2 x) = 0;
 
-    // One that it wanted, and that is visible.
+    // Adds a visible sample for which wants() returned true.
     template <MovingCurve Source>
     void add(int i, Source& source, typename Source::Sample& sample) {
         SampleOf<Source> moving(source, sample);
@@ -70,7 +71,7 @@ class CurveAccumulation {
     virtual void contract(int i, MovingSample& sample) = 0;
 };
 
-// Of the samples of one chunk.
+// Makes the accumulation of one chunk of samples.
 template <class T>
 std::unique_ptr<CurveAccumulation> accumulate_curves(const BackwardView<T>& view, const Accumulation& accumulation,
                                                      LocalGradients& grad);

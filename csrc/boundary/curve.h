@@ -1,8 +1,8 @@
-// Where the image jumps along an edge: silhouettes, open borders and creases, for any number of faces on the edge.
+// This file finds the curves along edges at which the image jumps: silhouettes, open borders and creases. An edge may
+// have any number of faces.
 //
-// On each side of the edge in the image one surface is visible next to it: of the incident faces on that side the one
-// in front, or, if there is none, what lies behind. If both sides have the same radiance by construction, there is no
-// curve.
+// On each side of the edge in the image one surface is visible next to it. It is the front-most incident face on that
+// side, or, if there is none, what lies behind. If both have the same radiance by construction, there is no curve.
 #pragma once
 
 #include <algorithm>
@@ -19,36 +19,37 @@ namespace edgegrad {
 
 struct Curve {
     int64_t edge = -1;
-    HalfEdge minus, plus;   // the faces next to the curve; face −1: none, what lies behind is visible
+    HalfEdge minus, plus;   // faces next to the curve; face −1: none, what lies behind is visible
     Vec3 a, b;              // ends of the edge, camera coordinates
-    double t0 = 0, t1 = 0;  // its part within the view
-    double w0 = 1, w1 = 1;  // denominators of the projection at t0 and t1
-    Vec2 x0, x1;            // their pixel positions
+    double t0 = 0, t1 = 0;  // interval of the edge within the view
+    double w0 = 1, w1 = 1;  // depth weights at t0 and t1
+    Vec2 x0, x1;            // pixel positions at t0 and t1
     double length = 0;      // px
-    double rounding = 0;    // px, of the positions
+    double rounding = 0;    // px, rounding of the positions
 
     bool is_crease() const { return minus.face >= 0 && plus.face >= 0; }
 
-    Vec2 low() const { return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)}; }  // of its box
+    Vec2 low() const {
+        return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)};
+    }  // low() and high() are corners of its box.
     Vec2 high() const { return {std::max(x0.x, x1.x), std::max(x0.y, x1.y)}; }
     double nearest_depth() const { return std::min((1 - t0) * a.z + t0 * b.z, (1 - t1) * a.z + t1 * b.z); }
 
-    Vec2 tangent() const { return x1 - x0; }  // dx/ds, the same everywhere: a pinhole sees a straight line
+    Vec2 tangent() const { return x1 - x0; }  // dx/ds, a constant: a pinhole sees a straight line
 
-    // At the fraction s of the curve in the image: the pixel position, and t on the edge (1 − t) a + t b.
+    // At the fraction s in the image, position() returns px and parameter() returns t on the edge (1 − t) a + t b.
     Vec2 position(double s) const { return x0 + s * (x1 - x0); }
     double parameter(double s) const { return t0 + (t1 - t0) * (s * w0 / ((1 - s) * w1 + s * w0)); }
 };
 
-// Barycentrics, in a face, of the point t of an edge of that face. Exact: the face is known, nothing is intersected.
+// Returns the barycentrics, in a face, of the point t of its edge. They are exact, since nothing is intersected.
 inline Barycentrics at_edge(const HalfEdge& h, double t) {
     double b[3] = {0, 0, 0};
     b[h.first()] = 1 - t, b[h.second()] = t;
     return {b[1], b[2]};
 }
 
-// The same a little within the face, where it matters: on the border itself the nearest texel may be that of a
-// neighbour.
+// Returns at_edge(), moved slightly inwards if the nearest texel counts: on the border it may be a neighbour's.
 template <class T>
 Barycentrics next_to_edge(const SceneView<T>& scene, const HalfEdge& h, double t) {
     const Barycentrics b = at_edge(h, t);
@@ -62,7 +63,7 @@ int32_t vertex(const SceneView<T>& scene, const HalfEdge& h, int corner) {
     return scene.faces[3 * int64_t(h.face) + corner];
 }
 
-// Whether, of two faces on the same side of the edge (a, b) in the image, the first lies in front. Then its plane
+// Returns whether the first of two faces on the same side of the edge (a, b) in the image lies in front. Then its plane
 // separates the other one from the viewer.
 template <class T>
 bool in_front(const BackwardView<T>& view, const HalfEdge& first, const HalfEdge& second, Vec3 a, Vec3 b) {
@@ -72,7 +73,7 @@ bool in_front(const BackwardView<T>& view, const HalfEdge& first, const HalfEdge
     return other == 0 || (viewer > 0) != (other > 0);
 }
 
-// Whether two rows of an array differ.
+// Returns whether two rows of an array differ.
 template <class Number>
 bool rows_differ(const Number* values, int width, int64_t i, int64_t j) {
     if (i == j) return false;
@@ -81,7 +82,7 @@ bool rows_differ(const Number* values, int width, int64_t i, int64_t j) {
     return false;
 }
 
-// Whether two faces differ in texture coordinates along the edge they share.
+// Returns whether two faces differ in texture coordinates along the edge they share.
 template <class T>
 bool uvs_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
     const auto row = [&](const HalfEdge& h, int corner) { return scene.uv_corners[3 * int64_t(h.face) + corner]; };
@@ -89,7 +90,7 @@ bool uvs_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
            rows_differ(scene.uvs, 2, row(m, m.second()), row(p, p.second()));
 }
 
-// Whether two faces may differ in attributes along the edge they share: barycentrics are of each face alone.
+// Returns whether two faces may differ in attributes along the edge they share. Barycentrics belong to one face alone.
 template <class T>
 bool attributes_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
     const Attributes& a = scene.attributes;
@@ -98,7 +99,7 @@ bool attributes_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdg
            rows_differ(a.vertex, a.vertex_width, vertex(scene, m, m.second()), vertex(scene, p, p.second()));
 }
 
-// Whether an edge runs exactly along a border of nearest texels. Another border is a step within a face.
+// Returns whether an edge runs exactly along a border of nearest texels. Other borders are discontinuities.
 template <class T>
 bool lies_between_texels(const SceneView<T>& scene, const HalfEdge& h) {
     if (!takes_nearest(scene, h.face)) return false;
@@ -114,7 +115,7 @@ bool lies_between_texels(const SceneView<T>& scene, const HalfEdge& h) {
            (scene.alpha_masks.on(h.face) && along(alpha_of(scene, h.face)));
 }
 
-// Whether one of two faces may be there and the other cut out along the edge they share.
+// Returns whether alpha masks may differ between two faces along the edge they share.
 template <class T>
 bool alpha_masks_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
     const AlphaMaskArrays<T>& c = scene.alpha_masks;
@@ -122,7 +123,7 @@ bool alpha_masks_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEd
     return c.face[m.face] != c.face[p.face] || lies_between_texels(scene, m) || uvs_jump(scene, m, p);
 }
 
-// Whether two faces may differ along the edge they share: their values at its ends are compared.
+// Returns whether two faces may differ along the edge they share, by their values at its ends.
 template <class T>
 bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
     const bool textured = is_textured(scene, m.face);
@@ -137,8 +138,8 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
            (scene.channels > scene.radiance && attributes_jump(scene, m, p)) || alpha_masks_jump(scene, m, p);
 }
 
-// Whether neighbouring faces may differ at their common edge. Attributes that are indexed like the vertices
-// are the same on both sides of an edge, unless it joins copies.
+// Returns whether neighbouring faces may differ at their common edge. Attributes indexed like the vertices agree on
+// both sides of an edge, unless it joins copies.
 template <class T>
 bool may_jump(const SceneView<T>& scene, const Topology& topology) {
     const Attributes& a = scene.attributes;
@@ -146,8 +147,8 @@ bool may_jump(const SceneView<T>& scene, const Topology& topology) {
            scene.alpha_masks.face;
 }
 
-// The scene without the first of its channels if these are the same on both sides of an edge: what is interpolated from
-// vertices, unless copies are joined, and alpha where nothing is alpha-tested.
+// Returns the scene without its first channels if these are the same on both sides of any edge. They are what is
+// interpolated from vertices, unless copies are joined, and alpha where nothing is alpha-tested.
 template <class T>
 SceneView<T> without_continuous(SceneView<T> scene, const Topology& topology) {
     if (scene.corners != scene.faces || topology.welds() || scene.face_texture || scene.alpha_masks.face) return scene;
@@ -157,14 +158,15 @@ SceneView<T> without_continuous(SceneView<T> scene, const Topology& topology) {
     return scene;
 }
 
-// A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
-// (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing. > 0: the side of minus, < 0: of plus.
+// Returns the side of an edge on which a face lies: > 0: minus, < 0: plus, 0: it is seen edge-on and covers nothing. A
+// face that turns clockwise in the image (x right, y down) lies to the right of its sides. The normal (τ_y, −τ_x)
+// points to the left.
 inline int side_of(const HalfEdge& h, const Array<int8_t>& facing) {
     return h.backwards ? -facing[h.face] : facing[h.face];
 }
 
-// The orientation of each face in the image, Camera::facing (F,): that of its corners in the image, where they lie
-// inside the view, unless its rounding decides.
+// Returns the orientation of each face in the image, Camera::facing (F,). It is that of the corners in the image, if
+// these lie inside the view and rounding does not decide.
 template <class T>
 Array<int8_t> facing_of_faces(const BackwardView<T>& view) {
     Array<int8_t> facing(view.scene.n_faces);
@@ -192,7 +194,7 @@ Array<int8_t> facing_of_faces(const BackwardView<T>& view) {
     return facing;
 }
 
-// Finds the curves of one view.
+// CurveFinder finds the curves of one view.
 template <class T>
 class CurveFinder {
    public:
@@ -203,21 +205,21 @@ class CurveFinder {
     bool finds_creases() const { return jumps_; }
     const Array<int8_t>& facing() const { return facing_; }
 
-    // On which side of its edge a face lies in the image; see side_of.
+    // Returns the side of its edge on which a face lies in the image; see side_of.
     int turn_of(const HalfEdge& h) const { return side_of(h, facing_); }
 
-    // What is known of an edge at which a surface goes on: that there is no curve, or nothing more to do; that the
-    // faces differ along it; nothing.
+    // EarlyOut tells what is known of an edge between two faces. `done`: there is no curve, or nothing more to do.
+    // `differs`: the faces differ along it. `unknown`: nothing.
     enum class EarlyOut { done, differs, unknown };
 
-    // Calls body(edge) for those of the edges first … last − 1 that may have a curve. Most have one face on each side:
-    // there glance(edge, face, face) tells whether to look any further, so that little of memory is read for them.
+    // Calls body(edge) for those of the edges first … last − 1 that may have a curve. Most have one face on each side.
+    // There early_out(edge, face, face) tells whether to look further, so little memory is read for them.
     template <class See, class Body>
     void each(int64_t first, int64_t last, See early_out, Body body) const {
         const Topology& topology = view_.geometry.topology();
         const int8_t* const facing = facing_.data();
         const int32_t* face = topology.faces(first).data();
-        std::vector<int64_t> edges, joins;  // those with a curve, as far as is known; those that need a jump
+        std::vector<int64_t> edges, joins;  // edges that may have a curve; those that need a jump
         const int32_t* const end =
             last < topology.n_edges() ? topology.faces(last).data() : topology.faces(last - 1).data();
         for (int64_t e = first; e < last; ++e) {
@@ -259,16 +261,16 @@ class CurveFinder {
         }
     }
 
-    // Where edges between two faces are seen only if they are silhouettes.
+    // NoCreases makes edges between two faces count only if they are silhouettes.
     struct NoCreases {
         EarlyOut operator()(int64_t, int32_t, int32_t) const { return EarlyOut::done; }
         void prefetch(int32_t) const {}
     };
 
-    // The curve of an edge; false when there is none.
+    // Sets the curve of an edge. Returns false if there is none.
     bool find(int64_t edge, Curve& c) const {
         const auto halves = view_.geometry.topology().half_edges(edge);
-        // As in each().
+        // This repeats the test of each().
         if (!jumps_ && halves.size() == 2 && side_of(halves[0], facing_) * side_of(halves[1], facing_) < 0)
             return false;
         const int32_t va = vertex(view_.scene, halves[0], halves[0].first()),
@@ -299,7 +301,7 @@ class CurveFinder {
             if (!view_.volume.clip_segment(c.a, c.b, c.t0, c.t1)) return false;
             const Vec3 q0 = (1 - c.t0) * c.a + c.t0 * c.b, q1 = (1 - c.t1) * c.a + c.t1 * c.b;
             c.w0 = camera.depth_weight(q0), c.w1 = camera.depth_weight(q1);
-            if (!(c.w0 > 0 && c.w1 > 0)) return false;  // ends in the eye itself
+            if (!(c.w0 > 0 && c.w1 > 0)) return false;  // The edge ends in the eye itself.
             c.x0 = view_.volume.inside(project(camera, q0)), c.x1 = view_.volume.inside(project(camera, q1));
         }
         c.edge = edge, c.minus = side[0], c.plus = side[1];
@@ -308,8 +310,8 @@ class CurveFinder {
         return c.length > 0 && c.rounding < most_rounding;
     }
 
-    // The crease of an edge of which is known that it joins two faces, one on either side of it in the image, that both
-    // lie in the view, and that its rounding does not matter.
+    // Sets the crease of an edge between two faces, one on either side of it in the image. Both must lie in the view,
+    // and the edge's rounding must not matter.
     bool find_between(int64_t edge, Curve& c) const {
         const auto halves = view_.geometry.topology().half_edges(edge);
         const int minus = side_of(halves[0], facing_) > 0 ? 0 : 1;
@@ -324,16 +326,15 @@ class CurveFinder {
         return c.length > 0;
     }
 
-    // Of the curve of an edge that lies in the view.
+    // Returns the rounding of the curve of an edge inside the view.
     double rounding(const Curve& c) const {
         const HalfEdge& h = c.minus.face >= 0 ? c.minus : c.plus;
         return rounding(c, vertex(view_.scene, h, h.first()), vertex(view_.scene, h, h.second()));
     }
 
-    // Of pixel positions, px: of points whose coordinates are at most p in size, axis by axis, and whose denominators
-    // are at least w; the positions add up to `pixels`. A sum q = R p + t is rounded as its terms are large: an
-    // orthographic camera far away loses depth, not place. In perspective, X / Z is rounded with X, and with Z as large
-    // as it is itself.
+    // Returns the rounding of pixel positions, px. Coordinates are at most p in size, axis by axis; depth weights are
+    // at least w; the positions add up to `pixels`. A sum q = R p + t is rounded by its largest terms, so a distant
+    // orthographic camera loses depth, not position. In perspective, X / Z is rounded with X, and with Z by its terms.
     double rounding(const double (&p)[3], double w, double pixels) const {
         const Camera& camera = view_.camera;
         const auto terms = [&](int row, double t) {
@@ -348,8 +349,7 @@ class CurveFinder {
     }
 
    private:
-    // What is asked of memory so many edges ahead is there when it is wanted: where little is done for each edge, and
-    // where more is.
+    // Memory is prefetched this many edges ahead: `far` where little is done for each edge, `near` where more is.
     static constexpr size_t far = 24, near = 4;
 
     void prefetch_corners(int64_t edge) const {
@@ -397,11 +397,10 @@ class CurveFinder {
         return edgegrad::carries_jump(view_.scene, halves[0], halves[1]);
     }
 
-    // Of the pixel positions, px: an edge that is so long, or so far away, that doubles do not say where it runs in the
-    // image has no curve there. The bound is a generous one.
+    // px. An edge so long or so far away that doubles do not determine its image has no curve. The bound is generous.
     static constexpr double most_rounding = 16;
 
-    // Of a curve that ends at these vertices.
+    // Returns the rounding of a curve that ends at these vertices.
     double rounding(const Curve& c, int32_t va, int32_t vb) const {
         double p[3] = {};
         for (const int32_t v : {va, vb})
@@ -412,7 +411,7 @@ class CurveFinder {
 
     const BackwardView<T>& view_;
     Array<int8_t> facing_;  // orientation of each face in the image
-    const bool jumps_;      // false: neighbouring faces are known to carry the same radiance at their edge
+    const bool jumps_;      // false: neighbouring faces carry the same radiance at their edge
 };
 
 }  // namespace edgegrad

@@ -1,4 +1,4 @@
-// Samples of one source of curves: one ray each, and what is found contracted.
+// This file traces the samples of one curve source, one ray each, and accumulates the results.
 #pragma once
 
 #include <algorithm>
@@ -11,14 +11,14 @@
 
 namespace edgegrad {
 
-// Samples of one source, in batches of rays. The accumulation is a CurveAccumulation, or offers the same.
+// CurveSamples traces samples in batches of rays. The accumulation has the functions of CurveAccumulation.
 template <class Accumulation, class T, CurveSource Source>
 class CurveSamples {
    public:
     CurveSamples(const BackwardView<T>& view, Source& source, Accumulation& accumulation)
         : view_(view), visibility_(view), source_(source), accumulation_(accumulation), rays_(view.frame) {}
 
-    // The point at the fraction s of the curve.
+    // Adds the point at the fraction s of the curve.
     void add(const typename Source::Curve& curve, double s, double weight) {
         const int i = rays_.count;
         const Vec2 u = source_.position(curve, s);
@@ -52,15 +52,16 @@ class CurveSamples {
     }
 
    private:
-    // The face that hides the point; −1: none. `face`: what the cast found.
+    // Returns the face that occludes the point; −1: none. `face` is what the cast found.
     int32_t hiding(typename Source::Sample& sample, int32_t face) const {
         const int32_t hit = visibility_.beyond_float(sample, face);
         return hit < 0 || visibility_.lies_behind(hit, source_.faces_of(sample), sample) ? -1 : hit;
     }
 
-    // Whether nothing hides the point but faces that one sees through: `hit` and others behind it.
+    // Returns whether only transparent faces occlude the point: `hit` and others behind it.
     bool is_seen_through(int32_t hit, typename Source::Sample& sample) const {
-        constexpr size_t most = 7;  // that an image composes before another surface (edgegrad/points/blend.py)
+        constexpr size_t most =
+            7;  // transparent layers that an image composes before another surface (edgegrad/points/blend.py)
         const auto own = sample.ignored;
         std::vector<int32_t> ignored(own.begin(), own.end());
         std::sort(ignored.begin(), ignored.end());

@@ -1,8 +1,8 @@
-// What the estimator (primary_curves.cpp) knows of a curve along which the image jumps.
+// This file declares the interface of curve sources for the boundary estimators. A curve is where the image jumps.
 //
-// A sample is a point of a curve. Its ray, from the camera to that point, ignores the faces that meet in the curve;
-// what it finds hides the point, or lies behind it. A source of curves says where the point is and which faces the ray
-// ignores, then which surfaces the two sides show, and at last, given their radiance, adds the adjoint of the motion.
+// A sample is a point of a curve. Its primary ray ignores the faces that meet in the curve; what the ray hits occludes
+// the point, or lies behind it. A curve source first gives the point and the ignored faces, then the surfaces on both
+// sides. Given their radiance, it adds the adjoint of the motion.
 #pragma once
 
 #include <algorithm>
@@ -19,20 +19,20 @@
 
 namespace edgegrad {
 
-// A point of a face, or, with face −1, of the background.
+// A SurfacePoint is a point of a face, or, with face −1, of the background.
 struct SurfacePoint {
     int64_t face = -1;
     Barycentrics b;
     double depth = std::numeric_limits<double>::infinity();
 };
 
-// Faces that meet in a curve, and how exactly the input says where it lies: the largest coordinate of its ends in the
-// world, and the relative spacing of such numbers.
+// CurveFaces holds the faces that meet in a curve, and the precision of its position. These are the largest world
+// coordinate of its ends, and the relative spacing of such numbers.
 struct CurveFaces {
     std::span<const int32_t> faces;
     double coordinate = 0, spacing = 0;
 
-    // Of a curve on one face, which is kept where `face` lies.
+    // Returns the CurveFaces of a curve on one face. It refers to `face`, which must outlive it.
     template <class T>
     static CurveFaces on(const SceneView<T>& scene, const int32_t& face) {
         const int32_t* vertex = scene.faces + 3 * int64_t(face);
@@ -46,38 +46,37 @@ struct CurveFaces {
 };
 
 struct CurveSample {
-    Vec2 u, n;              // the place in the undistorted image, and its normalised coordinates
-    Vec2 sight;             // the normalised coordinates at which the camera's ray asks what hides the point
-    Vec2 x;                 // the pixel position
-    double area_scale = 1;  // how much larger an area is there than in the undistorted image
+    Vec2 u, n;              // position in the undistorted image, and its normalised coordinates
+    Vec2 sight;             // normalised coordinates of the ray that finds occluders
+    Vec2 x;                 // pixel position
+    double area_scale = 1;  // area scale from the undistorted image to the pixels
     Vec3 point;             // camera coordinates
-    double weight = 0;      // inverse of the density of samples along the curve's fraction s
+    double weight = 0;      // reciprocal density of samples along the curve's fraction s
     SurfacePoint behind = {};
 
-    // What the ray does not see; ascends if it is more than 16. `gathered` keeps them where they are not listed
-    // elsewhere.
+    // The ray ignores these faces; more than 16 must ascend. `gathered` stores them where no other list does.
     std::span<const int32_t> ignored;
     std::vector<int32_t> gathered;
-    std::vector<int32_t> transparent;  // before it, through which it is seen
+    std::vector<int32_t> transparent;  // transparent faces before the point, through which it is seen
 };
 
-// The surfaces of which a sample needs the radiance: minus, plus, and at most one more.
+// SampleSurfaces holds the surfaces of which a sample needs the radiance: minus, plus, and at most one more.
 struct SampleSurfaces {
     static constexpr int most = 3;
     SurfacePoint at[most];
     int count = 2;
 };
 
-// What a sample's weight times the jump of the radiance, L₋ − L₊, is for what the curve moves with; and, of another
-// curve that lies on it, for what that one moves with (coincidence.h). Or the velocities δx ∧ τ of both.
+// CurveJumps holds a sample's weight times the jump of the radiance, L₋ − L₊, for the curve's own motion. `second` is
+// that of another curve that coincides with it (coincidence.h). It also holds the velocities δx ∧ τ of both.
 struct CurveJumps {
     double first = 0, second = 0;
 };
 
-// What a accumulation asks of a curve on which a sample lies, at the pixel position `sample.x`. `jumps` takes one
-// number, linear in the radiance, of each of the surfaces. `add_motion` takes the jumps of the loss; `velocities` is
-// what it is the adjoint of, in one direction, and `normal` that of places x in the image. `finish` adds what was
-// summed for the latest curve.
+// MovingCurve is what an accumulation requires of a curve with a sample at the pixel position `sample.x`. `jumps` takes
+// one number per surface, linear in the radiance. `add_motion` takes the jumps of the loss. It is the adjoint of
+// `velocities`, which takes one direction. `normal` is the derivative of that velocity by the image position x.
+// `finish` adds the sums of the latest curve.
 template <class S>
 concept MovingCurve = requires(S& source, const S& known, typename S::Sample& sample, const double* radiance,
                                CurveJumps jumps, const Direction& direction, LocalGradients& grad) {
@@ -90,9 +89,9 @@ concept MovingCurve = requires(S& source, const S& known, typename S::Sample& sa
     source.finish(grad);
 };
 
-// `place` sets where the fraction s of a curve lies, of a sample that has its x, n and weight; false if no ray is
-// needed to know that nothing shows there. `faces_of` serves the test whether what the ray meets hides the point.
-// `cast` tells that no sample waits any more.
+// CurveSource adds what tracing requires. `place` sets the fraction s of a curve, for a sample with its x, n and
+// weight. It returns false if nothing shows there even without a ray. `faces_of` serves the occlusion test. `cast`
+// announces that no sample is pending any more.
 template <class S>
 concept CurveSource =
     MovingCurve<S> && std::derived_from<typename S::Sample, CurveSample> &&

@@ -1,10 +1,10 @@
-// Where lines across the image meet steps within a face: an alpha edge, or a border between texels where the
-// nearest one is taken.
+// This file finds where lines across the image meet discontinuities within a face: alpha edges, or borders between
+// nearest texels.
 //
-// Along a line in the image the barycentrics of a face are (P_a + t (P_b − P_a)) / w, with P and w affine (FaceMap), so
-// with τ = t w_b / ((1 − t) w_a + t w_b) they are affine in τ, and so are texture coordinates. A segment of the line
-// then runs through the cells of the texture as a straight line does (Amanatides and Woo 1987). In a cell of four
-// texels a bilinear α is a polynomial of degree 2 in τ: its zeros are known, and nothing is missed between points.
+// Along a line in the image the barycentrics of a face are (P_a + t (P_b − P_a)) / w, with P and w affine (FaceMap).
+// With τ = t w_b / ((1 − t) w_a + t w_b) they are affine in τ, and so are texture coordinates. A segment of the line
+// then runs straight through the cells of the texture (Amanatides and Woo 1987). In a cell of four texels a bilinear α
+// is a polynomial of degree 2 in τ. Its zeros are known in closed form, so none is missed.
 #pragma once
 
 #include <algorithm>
@@ -18,20 +18,19 @@
 
 namespace edgegrad {
 
-// A line across a face meets a step F = 0 at u in the undistorted image. F is affine in the texture coordinates near
-// there; an alpha-tested face is there where F > 0.
+// A StepCrossing is where a line across a face meets a discontinuity F = 0, at u in the undistorted image. F is affine
+// in the texture coordinates near there. An alpha-tested face is opaque where F > 0.
 struct StepCrossing {
     int32_t face = -1;
-    bool is_alpha_edge = false;  // of a alpha-tested face; else a border of texels
-    bool vertical = false;       // the line
+    bool is_alpha_edge = false;  // whether it is an alpha edge; else a border of texels
+    bool vertical = false;       // whether the line is vertical
     Vec2 u;
     Vec2 slope;            // ∂F/∂uv
-    double side = 0;       // F on the two sides of a border of texels, ±; 0: F is α less the cutoff
-    Footprint alpha = {};  // of which F is made, if it is
+    double side = 0;       // F on the two sides of a border of texels, ±; 0: F is α minus the cutoff
+    Footprint alpha = {};  // texels and weights of F, where it is bilinear
 };
 
-// Calls visit(i, j, from, to) for the cells of a unit grid that a + τ d, from τ = first to last, runs through; at most
-// `most` of them.
+// Calls visit(i, j, from, to) for up to `most` cells of a unit grid that a + τ d passes, τ = first to last.
 template <class Visit>
 void each_cell(Vec2 a, Vec2 d, double first, double last, int most, Visit visit) {
     double i = std::floor(a.x + first * d.x), j = std::floor(a.y + first * d.y);
@@ -50,9 +49,8 @@ void each_cell(Vec2 a, Vec2 d, double first, double last, int most, Visit visit)
     }
 }
 
-// Calls visit(t) for the t in [0, 1] where c0 + c1 t + c2 t² changes between < 0 and ≥ 0. What is no more than
-// `rounding` counts as zero: two faces, or two cells, then agree where a zero lies on their border, and one of them has
-// it.
+// Calls visit(t) for the t in [0, 1] where c0 + c1 t + c2 t² changes between < 0 and ≥ 0. Values up to `rounding` count
+// as zero. Two faces, or two cells, then agree on a zero on their common border, and one of them has it.
 template <class Visit>
 void each_sign_change(double c0, double c1, double c2, double rounding, Visit visit) {
     const auto at = [&](double t) {
@@ -64,7 +62,7 @@ void each_sign_change(double c0, double c1, double c2, double rounding, Visit vi
     for (const double to : {turn > 0 && turn < 1 ? turn : 0.0, 1.0}) {
         if (!(to > from)) continue;
         if ((at(from) >= 0) != (at(to) >= 0)) {
-            // Of both roots the one in between; the form that does not cancel.
+            // Takes the root in between, in the form that does not cancel.
             const double root = std::sqrt(std::max(0.0, c1 * c1 - 4 * c2 * c0));
             const double q = -0.5 * (c1 + (c1 > 0 ? root : -root));
             const double r0 = q != 0 ? c0 / q : from, r1 = c2 != 0 ? q / c2 : r0;
@@ -80,12 +78,12 @@ class StepFinder {
    public:
     explicit StepFinder(const BackwardView<T>& view) : view_(view) {}
 
-    // Whether there may be steps in a face.
+    // Returns whether there may be discontinuities in a face.
     static bool may_step(const SceneView<T>& scene, int64_t face) {
         return scene.alpha_masks.on(face) || takes_nearest(scene, face);
     }
 
-    // From now on.
+    // Selects the face for find().
     void set(int32_t face) {
         if (face == face_) return;
         face_ = face;
@@ -94,9 +92,9 @@ class StepFinder {
         front_ = side_of(view_, face) == 1 ? -1 : 1;
     }
 
-    // Calls visit(crossing, weight) for the steps on the segment from a to b, a line of the undistorted image, as far
-    // as it lies on the face. Of more than `most` cells of a texture so many are looked at, drawn by a random number;
-    // they then stand for all.
+    // Calls visit(crossing, weight) for the discontinuities on the segment from a to b of a line of the undistorted
+    // image, where it lies on the face. If it passes more than `most` texture cells, `random` draws that many to stand
+    // for all.
     template <class Visit>
     void find(Vec2 a, Vec2 b, bool vertical, int most, uint64_t random, Visit visit) const {
         Segment s;
@@ -141,7 +139,7 @@ class StepFinder {
             const auto texel = [&](int k) { return double(alpha.texels[f.texel[k]]) - cutoff; };
             const double t0 = texel(0), t1 = texel(1), t2 = texel(2), t3 = texel(3);
             if (std::min({t0, t1, t2, t3}) > 0 || std::max({t0, t1, t2, t3}) < 0) return;
-            // t0 + x by_x + y by_y + x y both, along x + t dx, y + t dy.
+            // Evaluates t0 + x by_x + y by_y + x y both along x + t dx, y + t dy.
             const double by_x = t1 - t0, by_y = t2 - t0, both = t0 - t1 - t2 + t3;
             const double dx = (to - from) * walk.d.x, dy = (to - from) * walk.d.y;
             const double rounding =
@@ -158,7 +156,7 @@ class StepFinder {
     }
 
    private:
-    // A part of a line that lies on the face: its ends, their places, texture coordinates and denominators w.
+    // A Segment is the part of a line on the face: positions, texture coordinates and depth weights w of its ends.
     struct Segment {
         Vec2 u[2], uv[2];
         double w[2];
@@ -166,7 +164,7 @@ class StepFinder {
     bool clip(Vec2 a, Vec2 b, Segment& s) const {
         const Vec3 p = map_.times(normalised(view_.camera, a)), q = map_.times(normalised(view_.camera, b));
         double first = 0, last = 1;
-        const auto keep = [&](double at_a, double at_b) {  // where this is not negative
+        const auto keep = [&](double at_a, double at_b) {  // keeps where the value is not negative
             at_a *= front_, at_b *= front_;
             if (at_a < 0 && at_b < 0) last = -1;
             else if (at_a < 0) first = std::max(first, at_a / (at_a - at_b));
@@ -184,7 +182,7 @@ class StepFinder {
         return true;
     }
 
-    // What of a segment is walked: a + τ d in cells.
+    // A Walk is the visited part of a segment: a + τ d in cells.
     struct Walk {
         Vec2 a, d;
         double first = 0, last = 1, weight = 1;
@@ -201,12 +199,12 @@ class StepFinder {
         return walk;
     }
 
-    // Where the segment crosses a border between texels.
+    // A Border is where the segment crosses a border between texels.
     struct Border {
         double tau, weight;
-        int64_t low, high;  // the texels on either side, by their coordinate
-        Vec2 slope;         // of that coordinate less the border's, by uv
-        double side;        // by how much it is moved to be well within a texel
+        int64_t low, high;  // texels on the side of the lower and higher coordinate
+        Vec2 slope;         // derivative of that coordinate minus the border's, by uv
+        double side;        // motion that is needed to be well within a texel
     };
     template <class Visit>
     void each_border(const Texture<T>& texture, const Segment& s, int most, uint64_t random, Visit visit) const {
@@ -214,8 +212,7 @@ class StepFinder {
         double last_i = 0, last_j = 0;
         bool begun = false;
         each_cell(walk.a, walk.d, walk.first, walk.last, walk.most, [&](double i, double j, double from, double) {
-            // A border along an edge of the face is a crease (lies_between_texels), and rounding must not find it
-            // again.
+            // A border along an edge of the face is a crease (lies_between_texels). Rounding must not find it again.
             constexpr double rounding = 1e-9;
             if (begun && from > rounding && from < 1 - rounding) {
                 const bool across = i != last_i, up = i + j > last_i + last_j;
@@ -236,7 +233,7 @@ class StepFinder {
     const BackwardView<T>& view_;
     int32_t face_ = -1;
     FaceMap map_;
-    double front_ = 1;  // the sign of w where the face is seen
+    double front_ = 1;  // sign of w where the face is seen
 };
 
 }  // namespace edgegrad

@@ -1,5 +1,5 @@
-// Whether a face hides a point of a curve, decided in double. Embree decides in float which faces a ray meets, and near
-// a curve that is not enough: the ray runs along the border of what it is to find.
+// This file decides in double precision whether a face occludes a point of a curve. Embree intersects in single
+// precision, which does not suffice near a curve: the ray runs along the borders of the faces that it must find.
 #pragma once
 
 #include <algorithm>
@@ -21,7 +21,7 @@ class Visibility {
    public:
     explicit Visibility(const BackwardView<T>& view) : view_(view) {}
 
-    // False if a face that the ray meets hides the point; else it lies behind, and is kept if it is the nearest so far.
+    // Returns false if a face that the ray meets occludes the point. Otherwise stores it if it is the nearest behind.
     bool lies_behind(int64_t face, const CurveFaces& own, CurveSample& sample) const {
         const auto corner = corners_of(view_, face);
         if (lies_far_before(view_, face, sample.point.z) || hides(face, corner.data(), sample.point, own)) return false;
@@ -31,11 +31,11 @@ class Visibility {
         return true;
     }
 
-    // The face that a ray truly meets, where `face` is what the cast found. Float and double may place the ray on
-    // different sides of an edge between two faces that it runs through, and where that edge lies on the curve in the
-    // image (the diagonal of a box's front, before an edge of its back) they do so again and again. Then float misses
-    // the neighbour that double would meet; so next to the ray that passes through the refused face go others that are
-    // moved off that face: by as much as floats may err, and by less, for the neighbour may be narrower than that.
+    // Returns the face that a ray truly meets, if the cast found `face`. Single and double precision may place the ray
+    // on different sides of an edge between two faces. Where that edge lies on the curve in the image, they do so
+    // repeatedly. An example is the diagonal of a box's front before an edge of its back. A ray that ignores the
+    // refused face then misses the neighbour in single precision. Further rays are therefore moved off that face, by
+    // the error of floats and by less, because the neighbour may be narrower than that.
     int32_t beyond_float(const CurveSample& sample, int32_t face) const {
         const Vec2 n = sample.sight;
         const auto decide = [&](int32_t f) {
@@ -46,7 +46,7 @@ class Visibility {
         int32_t nearest = -1;
         double depth = std::numeric_limits<double>::infinity();
         for (int refused = 0; face >= 0 && !decide(face); ++refused) {
-            // Where floats see hundreds of faces in one place, one ray decides on all of them.
+            // One ray decides on all faces where floats see hundreds of them in one place.
             if (refused == most_refused) {
                 face = view_.frame.beyond_float(n, face, ignored, decide);
                 break;
@@ -64,11 +64,11 @@ class Visibility {
    private:
     static constexpr int most_refused = 3;
 
-    // Whether a face that the ray meets lies before the point: its plane has the point on one side and the viewer on
-    // the other. Surfaces that touch at the curve (a cube on the ground) are not before it, however flat the view: the
-    // point may lie behind the plane by what the rounding of the input leaves, some spacings of the coordinates there,
-    // and by what doubles leave of a plane of that size, some of theirs. Faces that share vertices with those of the
-    // curve (the front of a thin plate, for its back) are no other surface that touches: the input says how they lie.
+    // Returns whether a face that the ray meets occludes the point: its plane separates the point from the viewer.
+    // Surfaces that touch at the curve (a cube on the ground) do not occlude it, however grazing the view. The point
+    // may lie behind the plane by some spacings of the input's coordinates, and by the rounding of doubles. Faces that
+    // share vertices with those of the curve are exempt from contact, because the input determines their position. An
+    // example is the front of a thin plate, for its back.
     bool hides(int64_t face, const Vec3 corner[3], Vec3 point, const CurveFaces& own) const {
         const Vec3 normal = cross(corner[1] - corner[0], corner[2] - corner[0]);
         const Vec3 to_viewer = view_.camera.to_viewer(corner[0]);
@@ -77,7 +77,7 @@ class Visibility {
         for (int i = 0; i < 3; ++i)
             size = std::max({size, std::fabs(corner[i].x), std::fabs(corner[i].y), std::fabs(corner[i].z)});
         const double apart = behind / length(normal), rounding = rounding_of_doubles * size;
-        // Of the two meshes, the coarser one's numbers count.
+        // The coarser mesh determines the spacing.
         const double coarser = std::max(own.spacing, view_.scene.spacing->of(view_.scene.faces[3 * face]));
         return apart > rounding && (apart > contact(coarser, own.coordinate, size) || shares_vertex(face, own.faces));
     }
@@ -86,12 +86,12 @@ class Visibility {
         return std::any_of(others.begin(), others.end(), [&](int32_t f) { return share_vertex(view_.scene, face, f); });
     }
 
-    // The way from n, which a face does not cover, across the side that it lies beyond: as long as floats may err.
+    // Returns the vector from n, outside a face, away from it across the nearest side, as long as the error of floats.
     Vec2 out_of(int64_t face, Vec2 n) const {
         const FaceMap m = face_map(view_.camera, corners_of(view_, face).data());
         const Vec3 p = m.times(n);
         const double sign = p.z < 0 ? -1 : 1;
-        // Barycentrics times p.z, as affine functions of n: value and slope.
+        // Barycentrics times p.z are affine functions of n, stored as slope and value.
         const auto row = [&](double Vec3::* r) { return Vec3{m.column[0].*r, m.column[1].*r, p.*r}; };
         const Vec3 u = row(&Vec3::x), v = row(&Vec3::y), w = row(&Vec3::z);
         Vec2 away;

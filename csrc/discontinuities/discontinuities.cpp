@@ -1,4 +1,4 @@
-// Lines across each face that may have steps, and the samples where they meet one.
+// This file draws lines across each face that may have discontinuities, and takes samples where they meet one.
 
 #include "discontinuities/discontinuities.h"
 
@@ -19,10 +19,10 @@ namespace edgegrad {
 
 namespace {
 
-// How few lines a face gets that lies behind what the image hit; see curve_measure.cpp.
+// A face behind the hits gets this fraction of its lines; see curve_measure.cpp.
 constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
 
-// The lines of a family at (k + shift) · spacing, k = first … end − 1.
+// A Family is the lines at (k + shift) · spacing, k = first … end − 1.
 struct Family {
     int64_t first = 0, end = 0;
 
@@ -32,21 +32,21 @@ struct Family {
     int64_t count() const { return end - first; }
 };
 
-// A face with the lines that cross it, where the adjoint is not zero.
+// A LinedFace is a face with the lines that cross it, where the adjoint is not zero.
 struct LinedFace {
     int32_t face;
     double spacing;  // px of the undistorted image
-    Vec2 low, high;  // the box of what is in view
+    Vec2 low, high;  // box of the part in view
     Family horizontal, vertical;
-    int64_t before = 0;  // lines of the faces before it
+    int64_t before = 0;  // number of lines of the faces before it
 
     int64_t count() const { return horizontal.count() + vertical.count(); }
 };
 
 static_assert(sizeof(LinedFace) * 3 <= lined_face_bytes);
 
-// So many cells of a texture are looked at along a line, for a piece of it of so many spacings: where texels are much
-// smaller than pixels some stand for all, and the time is bounded by the size of the image.
+// A line may visit this minimum of texture cells, and this number per spacing of its length. Where texels are much
+// smaller than pixels some stand for all, so the size of the image bounds the time.
 constexpr int fewest_cells = 32, cells_a_spacing = 2;
 
 template <class T>
@@ -110,7 +110,7 @@ class StepLines {
     }
 
     const BackwardView<T>& view_;
-    const double shift_[2];  // of the horizontal and of the vertical lines, in spacings
+    const double shift_[2];  // shifts of the horizontal and of the vertical lines, in spacings
     std::vector<LinedFace> faces_;
     int64_t count_ = 0;
 };

@@ -1,5 +1,5 @@
-// The boundary term of steps within faces: of what is alpha-tested (rays/alpha_mask.h), and of borders between texels
-// where the nearest one is taken.
+// This file declares the boundary term of discontinuities within faces: alpha edges (rays/alpha_mask.h), and borders of
+// nearest texels.
 #pragma once
 
 #include "accumulate/accumulation.h"
@@ -7,10 +7,10 @@
 
 namespace edgegrad {
 
-// Bytes of a face that may have steps, at most; the list of them doubles as it grows.
+// A face that may have discontinuities takes at most these bytes; the list of them doubles as it grows.
 constexpr int64_t lined_face_bytes = 3 * 104;
 
-// Adds what lines find on the faces in view, GradientOptions::step_spacing apart; see add_boundary.
+// Adds the samples of lines on the faces in view, GradientOptions::step_spacing apart; see add_boundary.
 template <class T>
 void add_steps(const BackwardView<T>& view, const Accumulation& accumulation, GradientSink& to,
                BackwardProfile& profile);

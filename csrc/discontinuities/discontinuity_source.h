@@ -1,12 +1,12 @@
-// Steps within faces as a source of curves: alpha edges, and borders of nearest texels.
+// This file holds the curve source of discontinuities within faces: alpha edges, and borders of nearest texels.
 //
-// Lines at a spacing Δ, horizontal and vertical, each family with one random shift, meet the curve F = 0 in points
-// (Crofton). With n = ∇F / |∇F|,
+// Lines at a spacing Δ, horizontal and vertical, meet the curve F = 0 in points (Crofton). Each family has one random
+// shift. With n = ∇F / |∇F|, the sum
 //
 //     Σ_vertical Δ |n_y| g + Σ_horizontal Δ |n_x| g,     g = Ã [L(F > 0) − L(F < 0)] δF / |∇F|,
 //
-// has the mean ∫ g dℓ, for a horizontal line meets a piece dℓ with the probability |n_x| dℓ / Δ. δF is taken at fixed
-// x:
+// has the mean ∫ g dℓ, because a horizontal line meets a piece dℓ with the probability |n_x| dℓ / Δ. δF is taken at
+// fixed x:
 //
 //     δF = ∂F/∂uv · (Σ b_i δuv_i + Σ δb_i uv_i) + Σ_k weight_k δα_k,
 //
@@ -30,10 +30,10 @@ class StepSource {
 
     struct Sample : CurveSample {
         StepCrossing crossing;
-        int32_t face;  // which the ray ignores
+        int32_t face;  // face that the ray ignores
         CurveFaces faces;
         FaceMap map;
-        Barycentrics b, side[2], slope;  // slope: ∂F/∂b
+        Barycentrics b, side[2], slope;  // `slope` is ∂F/∂b
         Vec2 by_n;                       // ∂F/∂n
         double scale;                    // |n_x| / |∇F| or |n_y| / |∇F|, in the undistorted image
     };
@@ -61,12 +61,11 @@ class StepSource {
             sample.side[k] = {sample.b.u + moved * slope.u, sample.b.v + moved * slope.v};
         }
         if (curve.is_alpha_edge) {
-            // The ray goes by on the side where the face is alpha-tested: a neighbour that has the alpha edge in
-            // common, where it runs along their edge, is alpha-tested there too.
+            // The ray passes on the masked side. A neighbour with the same alpha edge on a common edge is masked, too.
             constexpr double aside = 1e-6;  // px
             sample.sight = normalised(view_.camera, curve.u + (-aside / std::sqrt(squared)) * gradient);
         } else {
-            // Between texels there is a jump where the face is there on both sides.
+            // Texels cause a jump only where the face is opaque on both sides of their border.
             for (const Barycentrics& side : sample.side)
                 if (!shows(view_.scene, curve.face, side)) return false;
         }

@@ -1,5 +1,5 @@
-// At most so many default samples that the backward pass takes about as long as the image did, whatever the scene: in a
-// mesh that is tangled, or many layers deep, the curves and faces in view are many times what is visible.
+// This file limits the default samples, so that the backward pass takes about as long as the image for any scene. In a
+// tangled mesh, or one many layers deep, the curves and faces in view are many times what is visible.
 #pragma once
 
 #include <algorithm>
@@ -11,14 +11,14 @@
 
 namespace edgegrad {
 
-// Samples of the two terms.
+// SampleCounts holds the samples of the two terms.
 struct SampleCounts {
     int64_t surface = 0, edge = 0;
 };
 
 class SampleBudget {
    public:
-    // `coverage` (H · W): of the image, which cast `spp` rays in each pixel. Rays that hit nothing cost little.
+    // `coverage` (H · W) belongs to the image, which cast `spp` rays in each pixel. Rays that hit nothing cost little.
     template <class T>
     SampleBudget(const T* coverage, int64_t pixels, int spp, bool lit, ThreadTeam& team) : cost_(lit ? shaded : plain) {
         const auto covered = team.map_blocks(pixels, [&](int64_t first, int64_t last) {
@@ -27,9 +27,8 @@ class SampleBudget {
         for (const auto c : covered) rays_ += share_of_image * double(c) * spp;
     }
 
-    // As many as are wanted, if they cost no more than the rays of the image; else these are shared in proportion to
-    // the square roots of what the terms want: the one of which the scene has so much more is cut the most, but its
-    // errors are the larger, too.
+    // Returns the wanted samples, if they cost no more than the rays of the image. Otherwise the terms share the budget
+    // in proportion to the square roots of their wants. The larger one is cut the most, but its errors are larger, too.
     SampleCounts share(SampleCounts wanted) const {
         const double surface = cost_.surface * double(wanted.surface);
         const double edge = cost_.edge * double(wanted.edge);
@@ -42,15 +41,15 @@ class SampleBudget {
     }
 
    private:
-    // A sample of the gradient costs several rays of the image: it is placed by a search, traced among strangers,
-    // decided in double and scattered; and shaded by lights, each of which it asks whether it sees it, where there are
-    // any (docs/tried.md).
+    // Cost is in rays of the image. A sample of the gradient is placed by a search, traced incoherently, decided in
+    // double precision and scattered. With lights, it is also shaded by each light that it sees (docs/tried.md).
     struct Cost {
         double surface, edge;
     };
     static constexpr Cost plain{3.9, 7.0}, shaded{9, 18};
     static constexpr double share_of_image = 1;
-    static constexpr int64_t least = 1 << 14;  // some milliseconds, so that small images and few rays lose nothing
+    static constexpr int64_t least =
+        1 << 14;  // takes some milliseconds, so that small images and few rays lose nothing
     const Cost cost_;
     double rays_ = 0;
 };

@@ -1,4 +1,4 @@
-// Which faces the samples of the image hit, and what that says of their neighbours.
+// This file stores which faces the samples of the image hit, and what that implies for their neighbours.
 #pragma once
 
 #include <algorithm>
@@ -15,11 +15,12 @@
 
 namespace edgegrad {
 
-// By vertex: a face smaller than the distance of the samples is hit by chance, so it is asked together with its
-// neighbours. By part of the surface (faces connected by shared vertices) and side: a closed mesh shows one side alone.
+// ImageHits stores hits by vertex, because a face smaller than the sample spacing is hit by chance. Its neighbours are
+// therefore tested with it. It also stores hits by side and part of the surface (faces connected by shared vertices),
+// because a closed mesh shows one side only.
 class ImageHits {
    public:
-    // `seen` (F,): see HitBuffers.
+    // For `seen` (F,) see HitBuffers.
     template <class T>
     ImageHits(const SceneView<T>& scene, const Camera& camera, const VertexView& vertices,
               const OcclusionHint& occlusion, const Parts& parts, const uint8_t* seen, ThreadTeam& team)
@@ -31,7 +32,7 @@ class ImageHits {
                              ? behind
                              : 0;
         });
-        std::vector<int32_t> hits(2 * parts_.size(), 0);  // faces that were hit, by part and side
+        std::vector<int32_t> hits(2 * parts_.size(), 0);  // number of hit faces, by part and side
         const auto mark = [&](const int32_t* v, uint8_t bit) {
             for (int i = 0; i < 3; ++i) {
                 const std::atomic_ref at(at_[v[i]]);
@@ -39,7 +40,7 @@ class ImageHits {
             }
         };
         team.parallel_for_blocks(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-            // Neighbours mostly count for the same, and threads that all add to one number wait for each other.
+            // Neighbours mostly add to the same counter. Sums are local, as threads on one counter wait for each other.
             int64_t counter = 0;
             int32_t n = 0;
             const auto count = [&] {
@@ -56,7 +57,7 @@ class ImageHits {
             count();
         });
         team.parallel_for_blocks(scene.n_faces, [&](int64_t k, int64_t first, int64_t last) {
-            // Where no face of a part was hit there is no border.
+            // A part without hits has no border.
             if (const int64_t part = parts_.of_block(k); part >= 0 && hits[2 * part] + hits[2 * part + 1] == 0) return;
             for (int64_t f = first; f < last; ++f) {
                 const int32_t* v = scene.faces + 3 * f;
@@ -75,11 +76,11 @@ class ImageHits {
         });
     }
 
-    // Whether a face with this vertex was hit.
+    // Returns whether a face with this vertex was hit.
     bool at(int64_t vertex) const { return at_[vertex] & hit; }
 
-    // What the corners of a face say together: `missed`: none is of a face that was hit; `partly`: one is, or of a
-    // neighbour of such a face; `whole`: all are of faces that were hit; `clear`: and no face next to it has others.
+    // Face combines the corners of a face. `missed`: none belongs to a hit face. `partly`: one belongs to a hit face or
+    // to its neighbour. `whole`: all belong to hit faces. `clear`: no adjacent face has other corners.
     struct Face {
         bool missed, partly, whole, clear;
     };
@@ -89,39 +90,40 @@ class ImageHits {
                 !((a | b | c) & border)};
     }
 
-    // Whether the corners of a face lie inside the view, behind all that was hit around them (OcclusionHint), and it is
-    // no neighbour of a face that was hit.
+    // Returns whether a face's corners lie inside the view and behind all hits around them (OcclusionHint). The face
+    // must not neighbour a hit face.
     bool are_behind(const int32_t* v) const {
         return at_[v[0]] == behind && at_[v[1]] == behind && at_[v[2]] == behind;
     }
 
-    // What the density of samples is multiplied by on a face with this vertex that was not hit, nor a neighbour: by
-    // less if the image hit the part of the surface to which it belongs from the other side alone, as a closed mesh.
-    // `side`, 1 or 2, is that from which the face would be visible. Never zero, for it may be visible all the same. A
-    // side counts in full from a share of `some` of the hits on its part.
+    // where_missed() returns the factor on the sample density of a face with this vertex that was not hit, nor a
+    // neighbour. It is smaller if all hits on its part were from the other side, as on a closed mesh. `side`, 1 or 2,
+    // is that from which the face would be visible. It is never zero, because the face may still be visible. A side
+    // with the fraction `some` of the part's hits counts in full.
     static constexpr double missed = 1.0 / 8;
     double where_missed(int32_t vertex, int side) const {
         const int64_t part = parts_.size() > 1 ? parts_.of(vertex) : 0;
         return std::clamp(share_[2 * part + side - 1] / some * missed, turned_away, missed);
     }
 
-    // Whether that is as little as it ever is.
+    // Returns whether that factor is minimal.
     bool is_turned_away(int32_t vertex, int side) const { return where_missed(vertex, side) <= turned_away; }
     static constexpr double turned_away = 1.0 / 64;
 
-    // With those of Parts, of which there may be as many as vertices.
+    // This includes Parts, which may be as many as vertices.
     static constexpr int64_t bytes_per_vertex = sizeof(uint8_t) + 4 * sizeof(float);
 
     void prefetch(int32_t vertex) const { edgegrad::prefetch(&at_[vertex]); }
 
    private:
-    // Of a vertex: of a face that was hit; of a face that has such vertices and others; behind all around it.
+    // A `hit` vertex belongs to a hit face. A `border` vertex belongs to a face with such vertices and others. A
+    // `behind` vertex lies behind all hits around it.
     static constexpr uint8_t hit = 1, border = 2, behind = 4;
     static constexpr double some = 1.0 / 16;
-    static constexpr int enough = 64;  // faces that say which sides of a part are visible
+    static constexpr int enough = 64;  // number of hit faces that tells which sides of a part are visible
     const Parts& parts_;
     Array<uint8_t> at_;
-    std::vector<float> share_;  // by part and side: of the faces of the part that were hit; 1 where too few were
+    std::vector<float> share_;  // fraction of a part's hits, by part and side; 1 where too few were hit
 };
 
 }  // namespace edgegrad

@@ -1,5 +1,5 @@
-// Rays that pass a point of the image by less than they err: what floats cannot place there, one of them meets, and
-// double decides.
+// This file casts rays that pass a point of the image within the error of single precision. One of them meets the face
+// that floats misplace, and double precision decides.
 #pragma once
 
 #include <algorithm>
@@ -11,11 +11,11 @@
 
 namespace edgegrad {
 
-// Of the error of floats. Not at twice that alone, for what they look for may be narrower.
+// The rays pass at these multiples of the floats' error: the face may be narrower than the largest.
 constexpr double passed_by[] = {2, 0.5, 1.0 / 8, 1.0 / 32};
 
-// Calls found(face) for each face that they meet, and returns that of the ray at n itself; −1: none. `error` is the way
-// across a border of faces that runs by, as long as floats may err.
+// Calls found(face) for each face that these rays meet. Returns the face that the ray at n itself meets; −1: none.
+// `error` points across the nearby border of faces, and is as long as the error of floats.
 template <class T, class Found>
 int32_t each_near_miss(const BackwardView<T>& view, Vec2 n, Vec2 error, std::span<const int32_t> ignored, Found found) {
     constexpr int rays = 1 + int(std::size(passed_by));

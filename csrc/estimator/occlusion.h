@@ -1,5 +1,5 @@
-// What the image says of occlusion: a curve or a face that lies behind everything that was hit in the pixels it touches
-// is most likely occluded. It gets fewer samples, never none, so that nothing is biased.
+// This file predicts occlusion from the image. A curve or a face behind everything that was hit in the pixels it
+// touches is most likely occluded. It gets fewer samples, but never none, so the estimate is unbiased.
 #pragma once
 
 #include <algorithm>
@@ -13,11 +13,11 @@
 
 namespace edgegrad {
 
-// Maxima over squares of 1, 2, 4, … pixels of the depths that the image hit: any box is covered by four squares of one
-// level (cf. the hierarchical z-buffer of Greene et al. 1993).
+// OcclusionHint holds maxima of the hit depths over squares of 1, 2, 4, … pixels. Four squares of one level cover any
+// box (cf. the hierarchical z-buffer of Greene et al. 1993).
 class OcclusionHint {
    public:
-    // `depth` (H, W), see HitBuffers; null: nothing is known.
+    // For `depth` (H, W) see HitBuffers; null: nothing is known.
     OcclusionHint(const float* depth, int width, int height, ThreadTeam& team) : width_(width), height_(height) {
         if (!depth) return;
         levels_.push_back({depth, width, height});
@@ -46,15 +46,14 @@ class OcclusionHint {
         });
     }
 
-    // In how many pixels what lies in this box of the image, no nearer than `nearest`, is behind all that was hit:
-    // those of the box and around it; 0 unless in all of them. One pixel around: where a surface is steep, the samples
-    // of one pixel miss its farthest part.
+    // Returns the number of pixels in and around a box if its content, no nearer than `nearest`, is behind all hits in
+    // each; else 0. One pixel around is included, as on a steep surface one pixel's samples miss its farthest part.
     int64_t hiding_pixels(Vec2 low, Vec2 high, double nearest) const {
         if (levels_.empty()) return 0;
         const int i0 = pixel(low.x - 1, width_), i1 = pixel(high.x + 1, width_);
         const int j0 = pixel(low.y - 1, height_), j1 = pixel(high.y + 1, height_);
-        // A box no wider than a square of the level touches two of them at most. These reach beyond the box, so if they
-        // do not lie before `nearest`, smaller ones may.
+        // A box no wider than a square of the level touches at most two of them. These reach beyond the box, so smaller
+        // squares are tested if they do not decide.
         const int k = std::min(int(std::bit_width(unsigned(std::max(i1 - i0, j1 - j0)))), int(levels_.size()) - 1);
         const auto farthest = [&](int k) { return levels_[k].of_all(i0 >> k, i1 >> k, j0 >> k, j1 >> k); };
         const bool hidden = nearest > levels_[k].of_corners(i0 >> k, i1 >> k, j0 >> k, j1 >> k) ||
@@ -62,8 +61,8 @@ class OcclusionHint {
         return hidden ? int64_t(i1 - i0 + 1) * (j1 - j0 + 1) : 0;
     }
 
-    // Whether what lies within `reach` px of x, no nearer than `nearest`, is behind all that was hit in the tile of x
-    // and those around it: a coarse answer in one look.
+    // hides_around() returns whether what lies within `reach` px of x, no nearer than `nearest`, is behind all hits in
+    // the tile of x and its neighbours. This is a coarse answer from one look-up.
     static constexpr int tile = 8;  // px
     static constexpr double reach = tile - 1;
     static constexpr int64_t pixels_around = 9 * tile * tile;
@@ -76,16 +75,16 @@ class OcclusionHint {
     int rows() const { return (height_ + tile - 1) / tile; }
     int tile_of(Vec2 x) const { return pixel(x.y, height_) / tile * columns() + pixel(x.x, width_) / tile; }
 
-    // What the density of samples is multiplied by where something is hidden, by how many rays say so. Let gaps show V
-    // of the R px² in which it is hidden. All n = spp · R rays miss them with probability exp(−spp V). At 1/D of the
-    // density what shows has D V/R of the variance that it would have were all of it visible; in the mean over what
-    // rays find, D V/R exp(−spp V) ≤ D / (e n). So D may grow with n: with n / rays that is rays / e at most. One
-    // sample stands for no more than a share of the image; or, where that is less, as in a small image, D for no more
-    // than 1 / least.
+    // Few sets the factor on the density of samples where something is hidden, by the number of rays that say so. Let
+    // gaps show V of the R px² in which it is hidden. All n = spp · R rays miss them with probability exp(−spp V). At
+    // 1/D of the density, the visible part has D V/R of the variance that it would have were all of it visible. On
+    // average over what rays find, D V/R exp(−spp V) ≤ D / (e n). D may therefore grow with n; D = n / rays bounds this
+    // by 1 / (e rays). One sample stands for at most `share` of the image. In a small image, where that is less, D is
+    // at most 1 / least instead.
     struct Few {
         double rays, share, least;
     };
-    // The same where it is `least` with 16 samples a pixel: fewer miss more of what shows through a gap.
+    // factor() takes the value `least` at 16 samples per pixel. Fewer samples miss more of what shows through a gap.
     static double factor(double least, int spp) { return std::min(1.0, least * std::max(1.0, 16.0 / spp)); }
     double factor(Few few, double pixels, int spp) const {
         const double most = std::max(1 / few.least, few.share * width_ * height_);
@@ -97,7 +96,7 @@ class OcclusionHint {
         const float* depth;
         int width, height;
 
-        // The farthest of all squares of a box.
+        // Returns the largest depth of all squares of a box.
         float of_all(int i0, int i1, int j0, int j1) const {
             float out = -std::numeric_limits<float>::infinity();
             for (int j = j0; j <= j1; ++j)
@@ -105,7 +104,7 @@ class OcclusionHint {
             return out;
         }
 
-        // The farthest of the four squares at the corners of a box.
+        // Returns the largest depth of the four squares at the corners of a box.
         float of_corners(int i0, int i1, int j0, int j1) const {
             const auto at = [&](int i, int j) { return depth[size_t(j) * width + i]; };
             return std::max(std::max(at(i0, j0), at(i1, j0)), std::max(at(i0, j1), at(i1, j1)));
@@ -118,7 +117,7 @@ class OcclusionHint {
     int width_, height_;
     std::vector<std::vector<float>> storage_;
     std::vector<Level> levels_;
-    std::vector<float> around_tile_;  // the farthest of a tile and those around it
+    std::vector<float> around_tile_;  // largest depth of a tile and its neighbours
 };
 
 }  // namespace edgegrad

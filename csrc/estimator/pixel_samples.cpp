@@ -5,7 +5,7 @@ namespace edgegrad {
 EDGEGRAD_VECTORIZED void place_in_pixel(const Camera& camera, const Filter& filter, int x, int y, int n, double* n_x,
                                         double* n_y) {
     filter.sample(n, n_x), filter.sample(n, n_y);
-    // normalised(), with what the samples share in locals: the compiler cannot know that the arrays lie elsewhere.
+    // This is normalised() with shared values in locals, because the compiler cannot know that the arrays do not alias.
     const Vec2 n0 = normalised(camera, {x + 0.5, y + 0.5});
     const double a = camera.k_inverse[0], b = camera.k_inverse[1], c = camera.k_inverse[2], d = camera.k_inverse[3];
     for (int i = 0; i < n; ++i) {

@@ -1,4 +1,4 @@
-// Where the samples of a pixel lie, and their primary rays.
+// This file places the samples of a pixel, and makes their primary rays.
 #pragma once
 
 #include <cstdint>
@@ -10,11 +10,10 @@
 
 namespace edgegrad {
 
-// Replaces n points of the unit square by the normalised image coordinates of samples of pixel (x, y), which are drawn
-// in proportion to the filter.
+// Replaces n points of the unit square by normalised image coordinates of samples of pixel (x, y), drawn by the filter.
 void place_in_pixel(const Camera& camera, const Filter& filter, int x, int y, int n, double* n_x, double* n_y);
 
-// Makes the primary rays of the forward pass.
+// PixelRays makes the primary rays of the forward pass.
 class PixelRays {
    public:
     PixelRays(const Camera& camera, const ImageOptions& o)

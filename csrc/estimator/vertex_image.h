@@ -1,5 +1,5 @@
-// Vertices in the image: the filtered adjoint at their places, and the cotangents of these places. Controls (control.h,
-// crease_control.h) are made of both.
+// This file holds the filtered adjoint at the vertices' image positions, and the cotangents of these positions.
+// Controls (control.h, crease_control.h) use both.
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@
 
 namespace edgegrad {
 
-// Ã at the vertices of faces that the image hit, (V, C); elsewhere, and outside the view, not set.
+// Returns Ã (V, C) at the vertices of hit faces. Other rows, and those outside the view, are not set.
 template <class T>
 Array<T> adjoint_at_vertices(const FilteredAdjoint<T>& filtered, const VertexView& vertices, const ImageHits& hits,
                              int C, ThreadTeam& team) {
@@ -29,7 +29,7 @@ Array<T> adjoint_at_vertices(const FilteredAdjoint<T>& filtered, const VertexVie
     return adjoint;
 }
 
-// Adds cotangents of places in the image (V, 2) to those of camera coordinates and of K.
+// Adds cotangents of image positions (V, 2) to those of camera coordinates and of K.
 template <class T>
 void add_places(const BackwardView<T>& view, const Array<double>& x_bar, GradientSink& to) {
     const auto intrinsics = view.team.map_blocks(view.scene.n_verts, [&](int64_t first, int64_t last) {

@@ -1,4 +1,4 @@
-// What both terms of the backward pass look at, and what they ask of a face in double.
+// This file holds what all terms of the backward pass share, and the tests of faces in double precision.
 #pragma once
 
 #include <algorithm>
@@ -17,7 +17,7 @@
 
 namespace edgegrad {
 
-// What both terms of the backward pass look at.
+// BackwardView holds what all terms share for one sub-camera.
 template <class T>
 struct BackwardView {
     const SceneView<T>& scene;
@@ -27,22 +27,22 @@ struct BackwardView {
     const VertexView& vertices;
     const FilteredAdjoint<T>& adjoint;
     const Importance& importance;
-    const ImageOptions& image;  // of the image that was made
+    const ImageOptions& image;  // options of the forward image
     const GradientOptions& options;
     ThreadTeam& team;
     Scatter& scatter;
     const CameraFrame& frame;
-    const AlphaTest* alpha_masks;  // null: there are none
+    const AlphaTest* alpha_masks;  // null if no face is alpha-tested
     const uint8_t* transparent;    // BackwardInput::transparent faces
     const OcclusionHint& occlusion;
-    const ImageHits* hits;           // null where neither term asks
-    const uint8_t* detailed;         // (F,), null: see BackwardInput
+    const ImageHits* hits;           // null if no term needs them
+    const uint8_t* detailed;         // (F,), or null: see BackwardInput
     const uint8_t* seen;             // (F,): 0, or the side from which the forward pass hit the face
-    const int32_t* hit;              // (H, W, 2): the first and the last of the faces hit in each pixel
-    const Array<T>& vertex_adjoint;  // (V, C): Ã at the vertices of faces that were hit (vertex_image.h)
+    const int32_t* hit;              // (H, W, 2): first and last face hit in each pixel
+    const Array<T>& vertex_adjoint;  // (V, C): Ã at the vertices of hit faces (vertex_image.h)
     double curve_offset;             // px of the undistorted image, see curve_offset_of()
 
-    // That holds x.
+    // Returns the index of the pixel that contains x.
     int64_t pixel(Vec2 x) const {
         const auto index = [](double x, int size) { return int64_t(std::clamp(std::floor(x), 0.0, size - 1.0)); };
         return index(x.y, camera.height) * camera.width + index(x.x, camera.width);
@@ -56,7 +56,7 @@ std::array<Vec3, 3> corners_of(const BackwardView<T>& view, int64_t face) {
     return {q[v[0]], q[v[1]], q[v[2]]};
 }
 
-// Whether the filter of a pixel reaches y, in camera coordinates, and what is there belongs to this sub-camera.
+// Returns whether the filter of a pixel reaches y, in camera coordinates, and this sub-camera is responsible for it.
 template <class T>
 bool is_in_view(const BackwardView<T>& view, Vec3 y) {
     return view.camera.depth_weight(y) > 0 && view.volume.outcode(y) == 0;
@@ -68,8 +68,7 @@ uint8_t side_of(const BackwardView<T>& view, int64_t face) {
     return view.camera.side(q[0], q[1], q[2]);
 }
 
-// Of 256 × 256 cells of the image, on the Z-order curve, that in which a vertex lies; the last one of what is out of
-// view.
+// Returns the cell of a vertex among 256 × 256 cells of the image on the Z-order curve; the last one if out of view.
 template <class T>
 uint16_t cell_of(const BackwardView<T>& view, int32_t vertex) {
     if (view.vertices.outcode[vertex]) return UINT16_MAX;
@@ -79,35 +78,34 @@ uint16_t cell_of(const BackwardView<T>& view, int32_t vertex) {
     return uint16_t(z_order(index(x.x), index(x.y)));
 }
 
-// What the density of samples is multiplied by on a face, and on curves next to it, of which so many px² lie in view:
-// less where rays of the image should have hit it and none did, for it is most likely occluded. By no less than an
-// eighth: a strip of it may show, and along a curve, too narrow for rays to find.
+// Returns the factor on the sample density of a face with `area` px² in view, and of curves next to it. It is small
+// where rays of the image should have hit the face and none did, because it is most likely occluded. It is at least an
+// eighth: a visible strip may be too narrow for rays to find.
 template <class T>
 double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
     constexpr OcclusionHint::Few unhit{.rays = 16, .share = 0, .least = 1.0 / 8};
     return view.seen[face] || view.transparent ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
 }
 
-// px by which rays may miss a point, at most: by then the image shows floats, not faces. What runs along a silhouette
-// so near is decided with it in double (coincident_segments.h), and where a crease ends at one its samples keep so far
-// from the end.
+// Rays err by at most this, px: beyond it the image shows rounding, not faces. Curves so near to a silhouette are
+// decided with it in double precision (coincident_segments.h). Samples keep so far from a crease's end at one.
 constexpr double float_reach = 0.01;
 
-// px of the undistorted image by which the surfaces on either side of a curve are taken off it.
+// curve_offset_of() returns how far off a curve the surfaces on either side are evaluated, px of the undistorted image.
 //
-// Where the light stands at the eye, or in a plane through the eye and an edge, the boundary of the edge's shadow lies
-// on its silhouette in the image. Then two estimators must agree on what lies between the two curves. The silhouette
-// asks whether the surface behind it is lit, the shadow boundary asks whether the camera sees it, and the sum of both
-// is
+// The light may be at the eye, or in a plane through the eye and an edge. The edge's shadow boundary then lies on its
+// silhouette in the image. Two estimators must then agree on what lies between the two curves. The silhouette tests
+// whether the surface behind it is lit. The shadow boundary tests whether the camera sees it. Their sum is
 //
 //     [L_edge − L_lit] v_silhouette                                      if the shadow is hidden,
 //     [L_edge − L_dark] v_silhouette + [L_dark − L_lit] v_shadow         if it is visible,
 //
-// which are equal for what moves both curves together. So both ask at the same distance from their curve: a silhouette
-// on its outer side, a shadow boundary on its dark side. A shadow that shows less than that distance counts as hidden.
-// The distance exceeds what the rays of Embree err, for a ray along the border of a face may meet it in float or not.
+// which are equal for motions that both curves share. Both therefore evaluate at the same distance from their curve: a
+// silhouette on its outer side, a shadow boundary on its dark side. A shadow that shows less than that distance counts
+// as hidden. The distance exceeds the error of Embree's rays, because a ray along the border of a face may or may not
+// meet it in single precision.
 constexpr double least_curve_offset = 1e-5;   // px; coincident curves touch by less
-constexpr double curve_offset_in_errors = 4;  // of float rays at the vertex in view that they miss by most
+constexpr double curve_offset_in_errors = 4;  // in units of the largest error of float rays at a vertex in view
 inline double curve_offset_of(const Camera& camera, const CameraFrame& frame, const VertexView& vertices,
                               ThreadTeam& team) {
     const auto worst = team.map_blocks(vertices.q.size(), [&](int64_t first, int64_t last) {
@@ -122,13 +120,13 @@ inline double curve_offset_of(const Camera& camera, const CameraFrame& frame, co
     return std::clamp(curve_offset_in_errors * most, least_curve_offset, float_reach);
 }
 
-// Whether a face that the ray at n meets is there, not cut out.
+// Returns whether alpha masks leave the face opaque where the ray at n meets it.
 template <class T>
 bool is_there(const BackwardView<T>& view, int64_t face, Vec2 n) {
     return !view.alpha_masks || view.alpha_masks->shows(int32_t(face), n);
 }
 
-// Whether the ray at n meets a face, decided in double.
+// Returns whether the ray at n meets a face, decided in double precision.
 template <class T>
 bool meets(const BackwardView<T>& view, int64_t face, Vec2 n) {
     const auto corner = corners_of(view, face);
@@ -136,7 +134,7 @@ bool meets(const BackwardView<T>& view, int64_t face, Vec2 n) {
            is_there(view, face, n);
 }
 
-// The depth at which the ray at n meets a face.
+// Returns the depth at which the ray at n meets a face.
 template <class T>
 double depth_of(const BackwardView<T>& view, int64_t face, Vec2 n) {
     const auto corner = corners_of(view, face);
@@ -144,9 +142,9 @@ double depth_of(const BackwardView<T>& view, int64_t face, Vec2 n) {
     return b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
 }
 
-// Whether a face lies before a depth by several times its size. If a ray that float says to meet it misses it after
-// all, then mostly because it meets a neighbour, and one that passed through the face might slip past that neighbour
-// too; so there float decides, as it did for the image.
+// Returns whether a face lies before a depth by several times its size. If a ray misses such a face after all, single
+// precision has mostly confused it with a neighbour. A ray that ignores the face might miss that neighbour too. Single
+// precision therefore decides, as for the image.
 template <class T>
 bool lies_far_before(const BackwardView<T>& view, int64_t face, double depth) {
     const auto q = corners_of(view, face);

@@ -41,7 +41,7 @@ class ReverseInterior final : public SurfaceAccumulation {
         return std::any_of(A, A + C_, [](T a) { return a != 0; });
     }
 
-    // Faces in a pixel take turns and come again in the next one: some runs are kept open.
+    // Faces alternate in a pixel and recur in the next one, so some runs stay open.
     void add_in_pixel(int32_t face, Vec2 n, Vec2) override {
         if (open_.empty()) open_ = std::vector<FaceGrad<N, T>>(32, run_);
         FaceGrad<N, T>& run = open_[unsigned(face) % open_.size()];
@@ -121,7 +121,7 @@ class ForwardInterior final : public SurfaceAccumulation {
     double weight_ = 1;
 };
 
-// −Ã · ∂L/∂x: how the loss changes as what is seen at x moves in the image.
+// ScreenInterior adds −Ã · ∂L/∂x: the change of the loss as what is seen at x moves in the image.
 template <class T>
 class ScreenInterior final : public SurfaceAccumulation {
    public:
@@ -190,7 +190,7 @@ class InteriorRecorder final : public SurfaceAccumulation {
     }
     void add_in_pixel(int32_t face, Vec2 n, Vec2 x) override { in_pixels_.push_back({face, x, n, weight_}); }
 
-    // Face by face, for what samples of one face share is then read, and added to, once.
+    // Adds the samples face by face, so that data which samples of one face share is read and written once.
     void finish() override {
         std::stable_sort(in_pixels_.begin(), in_pixels_.end(),
                          [](const InPixel& a, const InPixel& b) { return a.face < b.face; });

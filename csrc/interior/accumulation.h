@@ -1,5 +1,5 @@
-// What becomes of a sample inside a face: in reverse mode a cotangent of what the face is made of (face_grad.h), in
-// forward mode a derivative of the pixels around it, or the gradient by its place in the image.
+// This file declares what becomes of a sample inside a face. In reverse mode it adds a cotangent of the face's data
+// (face_grad.h), in forward mode a derivative of the pixels around it. In screen space it adds that by image position.
 #pragma once
 
 #include <cstdint>
@@ -10,35 +10,35 @@
 
 namespace edgegrad {
 
-// A sample at u in the undistorted image, with barycentrics λ there, that stands for a share of the face's area; it is
-// seen at x, where `weight` px² are its own.
+// A SurfaceSample lies at u in the undistorted image, with barycentrics λ, and stands for a share of the face's area.
+// It is seen at x, where it stands for `weight` px².
 struct SurfaceSample {
     int32_t face;
     bool controlled;
     Vec2 u, x;
     Barycentrics lambda;
     double share, weight;
-    Vec2 across = {};  // a narrow face, by as much as rays err, px; 0: it is wide
+    Vec2 across = {};  // px across a narrow face, as long as the error of rays; 0: the face is wide
 };
 
-// Accumulations are compiled once for each type of image and number of channels, what draws the samples without either.
+// SurfaceAccumulation is compiled once per type of image and number of channels; samplers depend on neither.
 class SurfaceAccumulation {
    public:
     virtual ~SurfaceAccumulation() = default;
 
-    // False if nothing could come of a sample; i tells those of a batch apart.
+    // Returns false if a sample cannot contribute. i identifies it in its batch.
     virtual bool wants(int i, const SurfaceSample& sample) = 0;
-    // One that it wanted, seen at n.
+    // Adds a sample for which wants() returned true, seen at n.
     virtual void add(int i, const SurfaceSample& sample, Vec2 n, bool visible) = 0;
 
-    // Samples that were drawn in a pixel, with this weight each. False if nothing could come of them.
+    // Starts samples drawn in a pixel, with this weight each. Returns false if they cannot contribute.
     virtual bool begin_pixel(int64_t pixel, double weight) = 0;
     virtual void add_in_pixel(int32_t face, Vec2 n, Vec2 x) = 0;
 
     virtual void finish() = 0;
 };
 
-// Of the samples of one chunk.
+// Makes the accumulation of one chunk of samples.
 template <class T>
 std::unique_ptr<SurfaceAccumulation> accumulate_surfaces(const BackwardView<T>& view, const Accumulation& accumulation,
                                                          const GradientSink& to, LocalGradients& grad);

@@ -1,4 +1,4 @@
-// What a run of samples on one face adds to the gradient.
+// This file accumulates the gradient of a run of samples on one face.
 #pragma once
 
 #include "estimator/view.h"
@@ -7,8 +7,7 @@
 
 namespace edgegrad {
 
-// What a run of samples on one face finds. What they have in common is done once for the run: the face's map and its
-// derivative, and one row a corner for the scatter.
+// FaceGrad does common work once per run: the face's map and its derivative, and one row per corner for the scatter.
 template <int N, class T>
 class FaceGrad {
    public:
@@ -27,7 +26,7 @@ class FaceGrad {
         if (controlled) control_.start(face);
     }
 
-    // A sample seen at n, with the cotangent of its radiance.
+    // Adds a sample seen at n, with the cotangent of its radiance.
     void add(Vec2 n, const double* radiance_bar) {
         if (!seen_) {
             const int32_t* v = view_.scene.faces + 3 * int64_t(face_);

@@ -9,7 +9,7 @@ namespace {
 
 constexpr int lanes = FaceLanes::size;
 
-// The greatest whole number up to x, within 0 … most; 0 for NaN.
+// Returns the greatest whole number up to x, within 0 … most; 0 for NaN.
 inline int32_t whole(double x, double most) { return int32_t(std::min(std::max(0.0, x), most)); }
 
 EDGEGRAD_VECTORIZED void bound_lanes(FaceLanes& f, int width, int height, double radius) {
@@ -68,7 +68,7 @@ EDGEGRAD_VECTORIZED void bound_hidden(HiddenFaces& f, int width, int height, int
                     whole(f.x[0][i], width - 1) / OcclusionHint::tile;
 }
 
-// What one channel adds.
+// Adds the contribution of one channel.
 EDGEGRAD_VECTORIZED void integrate_channel(FaceLanes& f, const double* __restrict A, const double* __restrict color,
                                            double* __restrict T) {
     const double *A0 = A, *A1 = A + lanes, *A2 = A + 2 * lanes, *inside = A + 3 * lanes;
@@ -89,7 +89,7 @@ EDGEGRAD_VECTORIZED void integrate_channel(FaceLanes& f, const double* __restric
     }
     EDGEGRAD_ROLLED
     for (int i = 0; i < lanes; ++i) {
-        // ∇L times the area, as Control::add_to_places has it.
+        // This is ∇L times the area, as in Control::add_to_places.
         const double half = f.wedge[i] < 0 ? -0.5 : 0.5, d1 = half * color[i], d2 = half * color[lanes + i];
         const double x = d1 * (f.y[2][i] - f.y[0][i]) - d2 * (f.y[1][i] - f.y[0][i]);
         const double y = d2 * (f.x[1][i] - f.x[0][i]) - d1 * (f.x[2][i] - f.x[0][i]);

@@ -1,10 +1,9 @@
-// Surface samples: points on the triangles rather than pixels that happen to hit them; and, for large textured
-// triangles, samples of the pixels.
+// This file estimates the interior term from surface samples: points on the triangles rather than pixels that happen to
+// hit them. Large textured triangles get samples of the pixels instead.
 //
-// Triangles are laid end to end by a measure m of which area + longest side · 1 px is a part (surface_measure.h). A
-// point uniform in the image of its triangle then has the weight area · M / (n m). At a grazing angle the integrand
-// grows as 1 / area, and the product stays bounded. Where a triangle has a control (control.h), samples find only what
-// differs from it, and fewer do.
+// Triangles lie end to end by a measure m that contains area + longest side · 1 px (surface_measure.h). A point uniform
+// in the image of its triangle has the weight area · M / (n m). At a grazing angle the integrand grows as 1 / area, and
+// the product stays bounded. Where a triangle has a control (control.h), fewer samples find the difference only.
 
 #include "interior/interior.h"
 
@@ -29,7 +28,7 @@ namespace edgegrad {
 
 namespace {
 
-// The samples of one chunk.
+// InteriorChunk traces the samples of one chunk.
 template <class T>
 class InteriorChunk {
    public:
@@ -59,8 +58,8 @@ class InteriorChunk {
         rays_.count = 0;
     }
 
-    // Whether nothing lies before the sample. Its ray may miss its own face, when that is thinner than floats are
-    // apart; then what counts is whether what it met instead lies behind, by more than floats can decide.
+    // Returns whether nothing occludes the sample. Its ray may miss its own face, if that is thinner than the spacing
+    // of floats. The sample is then visible if what the ray met lies behind, by more than the error of floats.
     bool is_visible(int i) const {
         const int32_t own = sample_[i].face;
         const Vec2 n = rays_.n(i);
@@ -76,8 +75,8 @@ class InteriorChunk {
         return depth_of(view_, met, n) > depth + view_.frame.error({p[0], p[1], p[2]});
     }
 
-    // Whether something lies before the sample of a face that is narrower than rays err, though its ray found it: the
-    // border of what hides it runs so near that floats take the ray for one next to it.
+    // Returns whether a narrow face is occluded although its ray found it. The occluder's border runs so near that
+    // floats take the ray for one next to it.
     bool is_hidden_by_a_hair(int i) const {
         const SurfaceSample& sample = sample_[i];
         if (sample.across.x == 0 && sample.across.y == 0) return false;
@@ -101,7 +100,7 @@ class InteriorChunk {
     SurfaceSample sample_[RayBatch::size];
 };
 
-// Across a face that is narrower than some errors of rays, by as much as one errs, px; 0: it is wide.
+// Returns the vector across a face narrower than some errors of rays, as long as that error, px; 0: the face is wide.
 template <class T>
 Vec2 across_narrow(const BackwardView<T>& view, int64_t face, const VisiblePolygon& polygon) {
     constexpr double narrow = 4;
@@ -121,7 +120,7 @@ Vec2 across_narrow(const BackwardView<T>& view, int64_t face, const VisiblePolyg
     return (error / length(along)) * Vec2{along.y, -along.x};
 }
 
-// What the gradient of a face will ask for once its rays are cast.
+// Prefetches what the gradient of a face needs once its rays are cast.
 template <class T>
 void prefetch_face(const BackwardView<T>& view, int64_t face) {
     const int32_t *v = view.scene.faces + 3 * face, *row = view.scene.corners + 3 * face;
@@ -131,7 +130,7 @@ void prefetch_face(const BackwardView<T>& view, int64_t face) {
     }
 }
 
-// Adds what n samples find on the faces, which are laid end to end.
+// Adds the contribution of n samples on the faces, which lie end to end.
 template <class T>
 void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systematic& systematic,
                          const SurfaceMeasure<T>& surface, const Accumulation& accumulation, GradientSink& to,
@@ -173,18 +172,18 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
 
 }  // namespace
 
-// Samples of the pixels: rays through them, and the radiance where they hit differentiated with the weight A / spp.
+// Casts rays through pixels, and differentiates the radiance of their hits with the weight A / spp.
 //
-// For a large triangle with a texture this beats surface samples: its rays are the most coherent there are, and those
-// of a pixel and of its neighbours are spread evenly over it (sobol.h). For others it is poor: a triangle that is seen
-// at a grazing angle, or is smaller than a pixel, is hit by chance.
+// For a large textured triangle this beats surface samples. Its rays are the most coherent ones, and those of
+// neighbouring pixels are evenly spread over it (sobol.h). For others it is poor: a triangle at a grazing angle, or
+// smaller than a pixel, is hit by chance.
 template <class T>
 void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Accumulation& accumulation,
                        GradientSink& to, double (&seconds)[2]) {
     const auto& [pixels, spp, seed, faces, share, beyond, by_importance] = samples;
     const int margin = beyond.value_or(0), stride = view.camera.width + 2 * margin;
     const Filter filter = beyond ? Filter(FilterKind::box) : view.image.filter;
-    // One sample more for each quarter of the mean that a pixel counts more: what is bright varies within it as well.
+    // A pixel gets one round more for each quarter of the mean above it, as bright content varies in a pixel too.
     constexpr int most_times = 64;
     const int width = view.camera.width, height = view.camera.height;
     const double usual = view.importance.mean(0, width, 0, height);
@@ -201,7 +200,7 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
         struct {
             int64_t pixel;
             double weight;
-            Vec2 x;  // of the plane
+            Vec2 x;  // position in the plane of pixels
         } drawn[RayBatch::size];
         const auto cast = [&] {
             view.team.check();
@@ -224,7 +223,7 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
             if (!chunk->begin_pixel(pixel, weight)) continue;
             const uint64_t place = z_order(column, row) * spp;
             for (int done = 0; done < all;) {
-                // Each time with a sequence of its own, for neighbours that go fewer times complement one another too.
+                // Each round has its own sequence, so that neighbours with fewer rounds complement one another too.
                 const int in_turn = done % spp, n = std::min(spp - in_turn, RayBatch::size - rays.count);
                 double *n_x = rays.n_x + rays.count, *n_y = rays.n_y + rays.count;
                 sobol[done / spp].fill(place + in_turn, n, n_x, n_y);

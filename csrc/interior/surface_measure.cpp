@@ -16,51 +16,49 @@ namespace edgegrad {
 
 namespace {
 
-// What the density of a triangle is multiplied by if it lies behind what the image hit (occlusion.h): one of which no
-// neighbour was hit either, and one next to a face that was hit. Never zero, for the triangle may be visible all the
-// same.
+// These factors apply to the density of a triangle behind the hits (occlusion.h): without hit neighbours, and next to a
+// hit face. They are never zero, because the triangle may still be visible.
 constexpr OcclusionHint::Few occluded{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
 constexpr double occluded_near_hits = 1.0 / 8;
 
-// Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
-// from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
-// (docs/tried.md).
+// Default samples are per unit of (area + longest side · 1 px), for interpolated colours and for textures. They are
+// chosen with those at edges: a smaller error of either would cost the same time (docs/tried.md).
 constexpr double colored = 0.5, textured = 4;
 
-// Shaded by lights a sample costs several times as much, so textures get no more samples there than colours do; but of
-// faces that are no slivers they are better placed in the image's pixels, one in each, for neighbours' samples
-// complement one another (sobol.h). A sliver is hit there by chance, and weighs the more.
-constexpr double lit_pixel = 1, least_lit_area = 2, sliver = 0.1;  // samples, px², of the longest side's square
+// A lit sample costs several times as much, so textures get no more lit samples than colours. On faces that are no
+// slivers they are better placed in pixels, one in each, because neighbours' samples complement one another (sobol.h).
+// A sliver is hit there by chance, and its samples weigh more.
+constexpr double lit_pixel = 1, least_lit_area = 2,
+                 sliver = 0.1;  // samples; px²; fraction of the longest side's square
 
-// Where the adjoint is as rough as noise it changes from pixel to pixel within a face: up to so many times more samples
-// are taken, on faces that are several pixels long.
+// An adjoint as rough as noise changes from pixel to pixel within a face. Up to this factor more samples are taken, on
+// faces several pixels long.
 constexpr double most = 4;
 double more_if_rough(double rough, double longest) {
     return std::clamp(rough, 1.0, std::clamp(longest / 2, 1.0, most));
 }
 
-// From this area in the image on, px², a triangle with a texture, or under a rough adjoint, is left to samples of the
-// pixels. Each triangle's integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays
-// unbiased.
+// From this area in the image on, px², a triangle with a texture, or under a rough adjoint, is left to pixel samples.
+// Each triangle's integral is estimated in exactly one way, chosen before any sample, so the sum is unbiased.
 constexpr double large = 256;
 
-// A face with a control is sampled the less the better that is likely to be: the adjoint changes little, and the face
-// is not wide, px. From `widest` on its corners say little.
+// A face with a control gets fewer samples where the control is likely good: the adjoint changes little, and the face
+// is not wide, px. From `widest` on its corners predict little.
 constexpr double least = 1.0 / 16, wide = 32, widest = 64;
 
-// Neighbours that were hit say that a face is visible unless so many rays should have hit it and none did: samples
-// would have to take away all that the control of a hidden face adds.
+// Hit neighbours imply that a face is visible, unless this many rays should have hit it and none did. Samples would
+// have to cancel all that the control of a hidden face adds.
 constexpr double most_unhit = 4;
 
-// A face this long, px, has each of its points within OcclusionHint::reach of a corner: two thirds of the longest side
-// are the most that a point of a triangle is away from the nearest.
+// A face this long, px, has each of its points within OcclusionHint::reach of a corner. A point of a triangle is at
+// most two thirds of the longest side away from the nearest corner.
 constexpr double small = 1.5 * OcclusionHint::reach;
 static_assert(small < 2 * OcclusionHint::tile);
 
-// The pixels that large triangles may touch, by tiles.
+// PixelMask holds the pixels that large triangles may touch, by tiles.
 class PixelMask {
    public:
-    // Of the image and so many pixels beyond each of its sides.
+    // Covers the image and `beyond` pixels beyond each of its sides.
     PixelMask(const Camera& camera, double radius, int beyond)
         : width_(camera.width + 2 * beyond),
           height_(camera.height + 2 * beyond),
@@ -69,7 +67,7 @@ class PixelMask {
           columns_((width_ + tile - 1) / tile),
           marked_(size_t(columns_) * ((height_ + tile - 1) / tile), 0) {}
 
-    // A box in the image.
+    // Marks a box in the image.
     void mark(Vec2 low, Vec2 high) {
         low += Vec2{double(beyond_), double(beyond_)}, high += Vec2{double(beyond_), double(beyond_)};
         const auto index = [](double x, int most) {
@@ -82,7 +80,7 @@ class PixelMask {
                 std::atomic_ref(marked_[size_t(j) * columns_ + i]).store(1, std::memory_order_relaxed);
     }
 
-    // Square by square, for rays that are cast together are the faster the nearer they are.
+    // Returns the pixels square by square, because nearby rays are cast faster together.
     std::vector<int64_t> pixels() const {
         std::vector<int64_t> out;
         for (size_t t = 0; t < marked_.size(); ++t) {
@@ -106,7 +104,7 @@ class PixelMask {
     std::vector<uint8_t> marked_;
 };
 
-// Visits the faces of one chunk.
+// MeasuredChunk measures the faces of one chunk.
 template <class T>
 class MeasuredChunk {
    public:
@@ -141,8 +139,8 @@ class MeasuredChunk {
     }
 
    private:
-    // Lays out those of the faces that are small and lie behind all that was hit around their corners. Of these there
-    // may be many, and they get few samples, so little is asked of them. The others are listed.
+    // Lays out the small faces that lie behind all hits around their corners. They may be many and get few samples, so
+    // their measure is cheap. The others are listed.
     void add_hidden(int64_t first, int64_t last, int64_t end) {
         const VertexView& p = view_.vertices;
         const ImageHits& hits = *view_.hits;
@@ -189,7 +187,7 @@ class MeasuredChunk {
         }
     }
 
-    // Puts a face that lies inside the view of a pinhole into the lanes; any other is laid out here.
+    // Puts a face inside the view of a pinhole into the lanes, and lays out any other.
     void gather(int64_t f) {
         const int32_t* v = view_.scene.faces + 3 * f;
         const VertexView& p = view_.vertices;
@@ -212,7 +210,8 @@ class MeasuredChunk {
         }
     }
 
-    // By twice the signed area in the image, px², unless its rounding decides; `side`: about how long the face is, px.
+    // Sets the orientation by `twice` the signed area in the image, px², unless its rounding decides. `side` is the
+    // approximate length of the face, px.
     void set_facing(int64_t f, double twice, double side) {
         if (!want_facing_) return;
         if (std::fabs(twice) > rounding_ * side) [[likely]] {
@@ -223,22 +222,22 @@ class MeasuredChunk {
         facing_[f] = int8_t(view_.camera.facing(q[0], q[1], q[2]));
     }
 
-    // Samples a unit of a face.
+    // Returns the samples per unit of a face.
     double rate(int64_t f) const { return is_textured(view_.scene, f) ? textured : colored; }
-    // Whether lights shade it and it has a texture.
+    // Returns whether lights shade the face and it has a texture.
     bool is_detailed(int64_t f) const { return view_.detailed && view_.detailed[f]; }
 
-    // What the measure of a face is multiplied by if it lies behind what was hit in so many pixels.
+    // Returns the factor on the measure of a face that lies behind the hits in `pixels` pixels.
     double hidden(int64_t pixels) const { return view_.occlusion.factor(occluded, pixels, view_.image.spp); }
 
-    // What there is of a face in the image.
+    // Extent describes the image of a face.
     struct Extent {
         double area, longest;  // px², px
         Vec2 low, high;        // its box
         double nearest;        // depth
     };
 
-    // `side()` says from which side the face would be visible.
+    // Returns the default samples of a face. side() returns the side from which the face would be visible.
     template <class Side>
     double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
         const double m = (e.area + e.longest) * rate(f), unhit = where_unhit(view_, f, e.area);
@@ -249,9 +248,9 @@ class MeasuredChunk {
         return m * view_.hits->where_missed(view_.scene.faces[3 * f], side());
     }
 
-    // A face without a control.
+    // Lays out a face without a control.
     void lay_out(int64_t f, double m, double importance, const Extent& e) {
-        if (!std::isfinite(m)) return;  // coordinates beyond 1e150 cannot be sampled
+        if (!std::isfinite(m)) return;  // Coordinates beyond 1e150 cannot be sampled.
         const bool textured = is_textured(view_.scene, f);
         if (!textured) m *= more_if_rough(rough_, e.longest);
         const bool by_pixels = is_detailed(f) ? e.area >= least_lit_area && e.area >= sliver * e.longest * e.longest
@@ -286,8 +285,8 @@ class MeasuredChunk {
             const Extent extent{area, l.longest[i], {x0, y0}, {x1, y1}, std::min({l.z[0][i], l.z[1][i], l.z[2][i]})};
             samples_[i] =
                 default_samples(f, extent, seen, [&] { return (l.wedge[i] > 0) == (view_.camera.k_det > 0) ? 1 : 2; });
-            // One without texture and so small that its corners say what is between them. A face that comes near the
-            // eye is not affine in the image.
+            // The face gets a control if it has no texture and is so small that its corners predict its inside. A face
+            // near the eye is not affine in the image.
             const bool is_hit = view_.seen[f] || view_.image.spp * area < most_unhit;
             if (is_hit && seen.whole && l.longest[i] <= widest && view_.options.controls &&
                 !is_textured(view_.scene, f) && view_.camera.is_nearly_affine(l.depths[i])) {
@@ -355,9 +354,8 @@ class MeasuredChunk {
         }
     }
 
-    // How much the adjoint changes over a face relative to its size: from one corner to the others, to the pixels at
-    // the middles of the sides and of the face, and to the mean of its box. Corners alone may agree by chance, as the
-    // signs of an L1 loss do.
+    // Returns the relative change of the adjoint over a face. It compares corners with each other, with pixels at the
+    // middles of sides and face, and with its box's mean. Corners may agree by chance, as signs of an L1 loss do.
     double variation(int i) const {
         const FaceLanes& l = *lanes_;
         if (!(l.sum[i] > 0)) return 1;
@@ -365,10 +363,10 @@ class MeasuredChunk {
                          std::fabs(1 - view_.importance.of(l.sum[i] / 3) / importance_[i])});
     }
 
-    // What is asked of memory for a face so far ahead is there when it is wanted.
+    // Memory is prefetched this many faces ahead.
     static constexpr int ahead = 32;
     const BackwardView<T>& view_;
-    const std::vector<double>& importance_around_;  // of what lies within two tiles of a point, by its own
+    const std::vector<double>& importance_around_;  // importance within two tiles of a point, by its tile
     const bool want_places_;
     const GradientSink& to_;
     Array<int8_t>& facing_;
@@ -377,11 +375,11 @@ class MeasuredChunk {
     PixelMask& mask_;
     LocalGradients& grad_;
     const int C_;
-    const double rough_;                                                 // of faces without a control
-    const double rounding_ = 16 * view_.camera.rounding_of_positions();  // of a wedge, over the longer side
+    const double rough_;                                                 // for faces without a control
+    const double rounding_ = 16 * view_.camera.rounding_of_positions();  // rounding of a wedge, over the longer side
     double total_ = 0, of_pixels_ = 0;
     VisiblePolygon polygon_;
-    std::optional<FaceLanes> lanes_;  // none before there is a face for them
+    std::optional<FaceLanes> lanes_;  // empty until there is a face for them
     HiddenFaces hidden_;
     int64_t others_[FaceLanes::size];
     int n_others_ = 0;
@@ -396,7 +394,7 @@ class MeasuredChunk {
 
 namespace {
 
-// Keeps so many of the pixels, evenly spread: each as likely as any other.
+// Keeps the fraction `share` of the pixels, evenly spread, each with the same probability.
 void thin_out(std::vector<int64_t>& pixels, double share, double offset) {
     if (share >= 1) return;
     size_t kept = 0;
@@ -418,7 +416,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     const double margin = view.image.filter.radius() - 0.5;
     if (view.detailed) out.beyond = int(std::ceil(margin));
     PixelMask mask(view.camera, margin, out.beyond);
-    // What the controls are of all of their faces, summed by the places of vertices in the image.
+    // x_bar sums the controls of all faces, by image positions of vertices.
     Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
     GradientSink whole;
     whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors;

@@ -1,4 +1,4 @@
-// Where in the image something lies: cells of two pixels that segments pass.
+// CellMarks marks cells of two by two pixels that segments pass, so that a search can skip empty parts of the image.
 #pragma once
 
 #include <algorithm>
@@ -13,7 +13,7 @@ namespace edgegrad {
 
 class CellMarks {
    public:
-    // A box of cells.
+    // Cells is a box of cells, both corners included.
     struct Cells {
         uint16_t i0, j0, i1, j1;
     };
@@ -23,9 +23,9 @@ class CellMarks {
 
     static Cells around(Vec2 low, Vec2 high) { return {index(low.x), index(low.y), index(high.x), index(high.y)}; }
 
-    static constexpr int64_t bytes_per_pixel = sizeof(uint8_t);  // at most
+    static constexpr int64_t bytes_per_pixel = sizeof(uint8_t);  // upper bound
 
-    // Those that a segment comes nearer to than `margin`; by any thread.
+    // Marks the cells that a segment comes nearer to than `margin`. Any thread may call it.
     void mark(Vec2 a, Vec2 b, double margin) {
         const int parts = 1 + int(std::min(length(b - a) / cell, 0x1p16));
         for (int k = 0; k < parts; ++k) {
@@ -46,7 +46,7 @@ class CellMarks {
     static constexpr double cell = 2;  // px
     static uint16_t index(double x) { return uint16_t(std::clamp(x / cell, 0.0, 65535.0)); }
 
-    // What lies outside the image belongs to the cells at its border.
+    // Points outside the image belong to the cells at its border.
     template <class Body>
     void each(const Cells& c, Body body) {
         const int rows = int(marked_.size()) / columns_, i1 = std::min<int>(c.i1, columns_ - 1),

@@ -1,30 +1,30 @@
-// Where curves lie on one line in the image: which of them the gradient goes to, point by point.
+// This file decides, point by point, which of several curves on one line in the image gets the gradient.
 //
-// Of all faces that end at a point of the line, one lies in front; let it be on the minus side, and its curve be the
-// front one. L₋ is its radiance, L₊ what is seen on the other side: the front-most face that ends there, or what lies
-// behind. If the front curve moves alone, then towards plus its face grows over L₊, and towards minus it uncovers L₀,
-// what is next on its own side. Those are two derivatives, and its gradient is their mean,
+// Of all faces that end at a point of the line, one lies in front. Say it is on the minus side, and call its curve the
+// front curve. L₋ is its radiance. L₊ is what the other side shows: the front-most face that ends there, or the
+// background behind. If the front curve moves alone towards plus, its face grows over L₊. Towards minus it uncovers L₀,
+// what is next on its own side. These are two one-sided derivatives, and the gradient is their mean:
 //
 //     front: L₋ − (L₀ + L₊) / 2,   the curve of what it uncovers: (L₀ − L₊) / 2,   all others: 0.
 //
-// The sum is the jump L₋ − L₊, so that a motion that all share has its true derivative. Each share lies between the
-// derivatives of its curve for either direction: the second curve, drawn back, changes nothing, for the front face
-// covers it, and drawn forth shows L₀ over L₊; those farther behind change nothing when they are drawn back.
+// The sum is the jump L₋ − L₊, so a motion that all curves share has its true derivative. Each part lies between its
+// curve's one-sided derivatives. The second curve, drawn back, changes nothing, because the front face covers it; drawn
+// forward it shows L₀ over L₊. Curves farther behind change nothing when they are drawn back.
 //
-// Nothing but the front curve's samples is needed for all of it: those of the others stop here, before any ray is cast.
+// The front curve's samples suffice. Samples of the others stop here, before any ray is cast.
 //
-// What the front curve uncovers is, of its own faces, one that is seen edge-on (the side of a box seen straight on);
-// then the second curve is the side on which the ray leaves that face. Four cases are of their own:
+// The front curve may uncover one of its own faces, seen edge-on, as the side of a box. The second curve is then the
+// side on which the ray leaves that face. Four cases are special:
 //
-//  - Faces of the front curve end on both sides: it takes the whole jump, for nothing else shows when it moves.
-//  - The front faces of both sides touch, on curves of their own (two roofs, a T-junction): each is taken for the front
-//    one with the weight ½, as each covers half of the strip that both sweep, and the other is the second curve. With
-//    U what a curve uncovers, the one on minus then has (L₋ − U₋) / 2 + (L₋ − L₊) / 4, the mean of its own derivatives,
-//    plus (U₋ − U₊) / 4, and the one on plus the same, mirrored.
-//  - Before the uncovered face, another ends on the other side. No other curve may then have a share, and the front one
-//    takes the whole jump, its derivative where its face grows; unless the two curves are all there is, and each has
-//    the mean of its own.
-//  - The front curve is the far side of a face seen edge-on, which shows whichever side moves: half to each.
+//  - Faces of the front curve end on both sides: it takes the whole jump, because nothing else shows when it moves.
+//  - The front faces of both sides touch, on curves of their own (two roofs, a T-junction). Each covers half of the
+//    strip that both sweep, so each is the front one with weight ½ and the other is the second curve. Let U be what a
+//    curve uncovers. The one on minus then gets (L₋ − U₋) / 2 + (L₋ − L₊) / 4, the mean of its own derivatives, plus
+//    (U₋ − U₊) / 4. The one on plus gets the mirrored sum.
+//  - Another face ends on the other side, before the uncovered one. No other curve may then have a part, and the front
+//    one takes the whole jump, its derivative where its face grows. If the two curves are alone, each gets the mean of
+//    its own.
+//  - The front curve is the far side of a face seen edge-on, which shows whichever side moves: each gets half.
 #pragma once
 
 #include <algorithm>
@@ -39,7 +39,7 @@
 
 namespace edgegrad {
 
-// The largest coordinate of the ends of an edge, in the world.
+// Returns the largest world coordinate of the ends of an edge.
 template <class T>
 double largest_coordinate(const SceneView<T>& scene, const HalfEdge& h) {
     double largest = 0;
@@ -49,32 +49,32 @@ double largest_coordinate(const SceneView<T>& scene, const HalfEdge& h) {
     return largest;
 }
 
-// A side of a face at a point of the image: its vertices, and the point between them.
+// An EdgePoint is a point on a side of a face: the side's vertices, and the position between them.
 struct EdgePoint {
     int32_t vertex[2] = {-1, -1};
     double t = 0;
     Vec3 point;  // camera coordinates
 };
 
-// A curve, and its faces next to the line of another curve.
+// A CoincidentCurve is a curve with its faces next to the line of another curve.
 struct CoincidentCurve {
     Curve curve;
-    HalfEdge side[2] = {};               // those that end on minus and plus of the line; face −1: none
-    std::vector<HalfEdge> edge_on = {};  // those that lie on the line
-    double coordinate = 0, spacing = 0;  // of its ends: the largest, and that of the input's numbers
+    HalfEdge side[2] = {};               // faces that end on the minus and plus side of the line; face −1: none
+    std::vector<HalfEdge> edge_on = {};  // faces that lie on the line
+    double coordinate = 0, spacing = 0;  // largest coordinate of its ends, and the spacing of the input's numbers
 };
 
-// What a sample of a curve stands for.
+// CoincidentShare is what a sample of a curve stands for.
 struct CoincidentShare {
-    HalfEdge side[2] = {};  // what is seen on minus and plus; face −1: what lies behind
+    HalfEdge side[2] = {};  // faces seen on minus and plus; face −1: what lies behind
     double side_t[2] = {};
-    double far_depth = -std::numeric_limits<double>::infinity();  // of another curve's face, on the side opposite
+    double far_depth = -std::numeric_limits<double>::infinity();  // depth of another curve's face, on the opposite side
     double weight = 1;
-    int front = 0;  // the side on which the curve's own face ends
+    int front = 0;  // side on which the curve's own face ends
 
-    // The second curve, and what the front one uncovers: a face, or, with none, what lies behind.
-    EdgePoint second = {};  // without vertices: none
-    bool halves = false;    // it gets half of the jump
+    // The members below describe the second curve and what the front one uncovers: a face, or what lies behind.
+    EdgePoint second = {};  // no vertices: there is no second curve
+    bool halves = false;    // whether the second curve gets half of the jump
     int32_t uncovered = -1;
     Barycentrics uncovered_b = {};
     double uncovered_depth = std::numeric_limits<double>::infinity();
@@ -85,7 +85,7 @@ class Coincidence {
    public:
     Coincidence(const BackwardView<T>& view, const CurveFinder<T>& finder) : view_(view), finder_(finder) {}
 
-    // The faces of a curve next to the line of `line`.
+    // Returns `curve` with its faces next to the line of `line`.
     CoincidentCurve on_line(const Curve& curve, const Curve& line) const {
         CoincidentCurve c{.curve = curve};
         c.side[0].face = c.side[1].face = -1;
@@ -106,14 +106,14 @@ class Coincidence {
         return c;
     }
 
-    // Begins a sample of `own` at its point t, seen at x.
+    // Starts a sample of `own` at its point t, seen at x.
     void start(const CoincidentCurve& own, Vec2 x, double t) {
         own_ = {&own, t, (1 - t) * own.curve.a + t * own.curve.b};
         x_ = x;
         for (int k = 0; k < 2; ++k) first_[k] = {}, several_[k] = false, before_[k] = own_.side(k).face >= 0;
     }
 
-    // Another curve that passes through x. False once the gradient goes to others, whatever else passes.
+    // Adds another curve that passes through x. Returns false once the gradient goes to others, whatever follows.
     bool add(const CoincidentCurve& other, double t) {
         const Place place{&other, t, (1 - t) * other.curve.a + t * other.curve.b};
         for (int k = 0; k < 2; ++k) {
@@ -126,7 +126,7 @@ class Coincidence {
         return before_[0] || before_[1];
     }
 
-    // False where the gradient goes to others.
+    // Sets `share`. Returns false where the gradient goes to others.
     bool finish(CoincidentShare& share) const {
         if (!before_[0] && !before_[1]) return false;
         share = {};
@@ -157,7 +157,7 @@ class Coincidence {
             }
             if (recedes) continue;
             recedes = true;
-            // The middle of what the ray runs along.
+            // The uncovered point is the middle of the segment that the ray runs along.
             double b[3] = {0, 0, 0};
             b[h.first()] += (1 - own_.t) / 2, b[h.second()] += own_.t / 2;
             b[corner[0]] += (1 - end.t) / 2, b[corner[1]] += end.t / 2;
@@ -177,7 +177,7 @@ class Coincidence {
     }
 
    private:
-    // A curve where it passes through x.
+    // A Place is a curve at the point where it passes through x.
     struct Place {
         const CoincidentCurve* curve = nullptr;
         double t = 0;
@@ -190,13 +190,13 @@ class Coincidence {
         return view_.vertices.q[vertex(view_.scene, h, (h.corner + 2) % 3)];
     }
 
-    // The pixel position of q, times its weight.
+    // Returns the pixel position of q times its weight.
     Vec3 homogeneous(Vec3 q) const {
         const double *k = view_.camera.k, w = view_.camera.depth_weight(q);
         return {k[0] * q.x + k[1] * q.y + k[2] * w, k[3] * q.x + k[4] * q.y + k[5] * w, w};
     }
 
-    // Whether a face is no wider next to a curve than doubles say.
+    // Returns whether a face next to a curve is no wider in the image than the rounding of doubles.
     bool lies_on(const HalfEdge& h, const Curve& c) const {
         const Vec2 along = c.tangent();
         const Vec3 o = homogeneous(opposite_corner(h));
@@ -210,8 +210,8 @@ class Coincidence {
 
     bool touch(const Place& p, const Place& q) const { return std::fabs(p.point.z - q.point.z) <= tolerance(p, q); }
 
-    // Whether, of two faces that end on the same side, the first lies in front: a strict order, and the same for all
-    // who ask. Where they touch, the plane of the one in front separates the other from the viewer.
+    // Returns which of two faces that end on the same side lies in front. This is a strict order, the same for all
+    // callers. Where they touch, the plane of the one in front separates the other from the viewer.
     bool lies_before(const Place& p, const Place& q, int k) const {
         const double gap = q.point.z - p.point.z;
         if (!touch(p, q)) return gap > 0;
@@ -229,11 +229,11 @@ class Coincidence {
         return {{vertex(view_.scene, h, h.first()), vertex(view_.scene, h, h.second())}, p.t, p.point};
     }
 
-    // Where the ray through x leaves a face that it runs along from the curve itself on: the point of its other side,
-    // and the corners of that side.
+    // Finds where the ray through x leaves a face that it runs along, starting at the curve itself. Sets the point and
+    // the corners of the side on which it leaves.
     bool other_side(const HalfEdge& h, EdgePoint& end, int (&corner)[2]) const {
         const Vec2 along = own_.curve->curve.tangent();
-        const auto beyond = [&](Vec3 q) {  // x, along the line; affine in q
+        const auto beyond = [&](Vec3 q) {  // position along the line relative to x; affine in q
             const Vec3 o = homogeneous(q);
             return along.x * (o.x - o.z * x_.x) + along.y * (o.y - o.z * x_.y);
         };
@@ -254,7 +254,7 @@ class Coincidence {
 
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
-    Place own_, first_[2];  // of the others, the front-most on either side
+    Place own_, first_[2];  // front-most of the others, on either side
     bool several_[2] = {};
     bool before_[2] = {};  // whether the curve's own face lies before that one
     Vec2 x_;

@@ -8,12 +8,12 @@ namespace edgegrad {
 
 namespace {
 
-// For each of many buckets, whether one or several segments were put there. Two buckets may share a place.
+// Occupancy stores for each of many buckets whether it got one or several segments. Two buckets may share a place.
 class Occupancy {
    public:
     explicit Occupancy(int64_t segments) : words_(std::bit_ceil(2 * uint64_t(segments))), mask_(words_.size() - 1) {}
 
-    // By any thread, in any order.
+    // Any thread may add, in any order.
     void add(uint64_t key) {
         std::atomic<uint64_t>& w = word(key);
         const uint64_t one = bit(key), there = w.fetch_or(one, std::memory_order_relaxed);
@@ -31,20 +31,20 @@ class Occupancy {
     uint64_t mask_;
 };
 
-// Calls body(k, first, last) for parts of n segments, few enough for all threads to have some.
+// Calls body(k, first, last) for parts of n segments. Parts are small, so that all threads get some.
 constexpr int64_t few = 256;
 template <class Body>
 void each_few(int64_t n, ThreadTeam& team, Body body) {
     team.parallel_for((n + few - 1) / few, [&](int64_t k) { body(k, k * few, std::min(n, (k + 1) * few)); });
 }
 
-// How s meets o, over the part of s that lies next to o.
+// Returns how s meets o, over the part of s that lies next to o.
 CoincidentCurves::Meeting meeting_within(const ImageSegment& s, const ImageSegment& o) {
     const Vec2 along = s.b - s.a, other = o.b - o.a;
     const double squared = along.x * along.x + along.y * along.y;
     const auto parameter = [&](Vec2 x) { return ((x.x - s.a.x) * along.x + (x.y - s.a.y) * along.y) / squared; };
     const double t0 = parameter(o.a), t1 = parameter(o.b);
-    // Segments that merely touch end to end do not; a millionth of the length is no loss.
+    // Segments that merely touch end to end do not meet. Neglecting a millionth of the length loses nothing.
     const double first = std::max(0.0, std::min(t0, t1)), last = std::min(1.0, std::max(t0, t1));
     using Meeting = CoincidentCurves::Meeting;
     if (!(last - first > 1e-6)) return Meeting::none;
@@ -76,9 +76,9 @@ CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts,
     for (int64_t k = 0; k < n_parts; ++k)
         n += int64_t(parts[k].size()), total += length_of[k], margin_ = std::max(margin_, reach_of[k]);
     if (n == 0) return;
-    // Some segments wide, so that few share a cell where a mesh is fine and many where it is coarse; a millionth: so
-    // that cells can be counted; at most 16 px, so that distances in a cell say lines apart, unless many long segments
-    // would pass too many cells.
+    // Cells are some segments wide, so that few segments share a cell of a fine mesh and many one of a coarse mesh. At
+    // least 1e-6 px keeps the cells countable. At most 16 px lets distances in a cell separate lines, unless many long
+    // segments would pass too many cells.
     const double cell = std::min(std::max({4 * total / double(n), 8 * margin_, 1e-6}), 16.0);
     lines_ = LineBuckets(std::max(cell, total / (2.0 * double(n) + 0x1p16)), margin_);
     keep_those_not_alone(parts, samples, team);
@@ -104,7 +104,7 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
         sampled += std::count_if(parts[k].begin(), parts[k].end(),
                                  [&](const ImageSegment& s) { return samples.may_draw(s.curve); });
     });
-    // Of sampled ones all buckets that lines next to them may be in; the others then ask for their own alone.
+    // All buckets around a sampled line are marked. Other lines then test only their own bucket.
     Occupancy around_sampled(4 * sampled), of_sampled(sampled), of_others(sampled);
     team.parallel_for(n, [&](int64_t k) {
         for (const ImageSegment& s : parts[k])
@@ -179,7 +179,7 @@ void CoincidentCurves::fill(ThreadTeam& team) {
             .depth = float(s.depth),
             .segment = uint32_t(i)};
     });
-    // The threads put them there in any order.
+    // The threads filled the buckets in any order, so sort them.
     team.parallel_for_blocks(buckets, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t k = first; k < last; ++k)
             std::sort(entries_.begin() + begin_[k], entries_.begin() + begin_[k + 1],
@@ -189,7 +189,7 @@ void CoincidentCurves::fill(ThreadTeam& team) {
     });
 }
 
-// Buckets are shared by what follows end to end along a line, too. Where one holds many, all of them are kept unasked.
+// Buckets also hold segments that follow end to end along a line. In a bucket with many, all are kept untested.
 void CoincidentCurves::find_coincident(const Systematic& samples, ThreadTeam& team) {
     constexpr uint32_t many = 64;
     const auto any_adjacent = [&](const ImageSegment& s, const LineBuckets::Line& l) {
@@ -238,7 +238,7 @@ CoincidentCurves::Meeting CoincidentCurves::at_point(const ImageSegment& other, 
     const double t = from.x * along.x + from.y * along.y;
     if (!(t >= -reach * far && t <= (far + reach) * far)) return Meeting::none;
     const double aside = std::fabs(wedge(along, from));
-    if (!(aside <= 2 * reach * far)) return Meeting::none;  // spares most of what follows
+    if (!(aside <= 2 * reach * far)) return Meeting::none;  // This test spares most of what follows.
     const Meeting found = meeting(own, other);
     return found == Meeting::across && !(aside <= reach * far) ? Meeting::none : found;
 }

@@ -1,9 +1,9 @@
-// Curves that lie on one another in the image: the front and the back edge of a box that is seen straight on, meshes
-// in the same place, a long edge against two short ones; or nearly so, as what leaves one vertex at the limb of a
-// sphere.
+// This file finds curves that coincide, or nearly coincide, in the image. Examples are the front and back edge of a box
+// seen straight on, meshes in the same place, or a long edge against two short ones. At the limb of a sphere, edges of
+// one vertex nearly coincide.
 //
-// Pairs of them are not kept, for N curves on one line have N² / 2. Curves are sorted into buckets by direction,
-// distance and cell of the image, and who lies on a curve at one of its points is looked up there, from near to far.
+// Pairs are not stored, because N curves on one line have N² / 2. Curves are sorted into buckets by direction, distance
+// and cell of the image. A query at a point of a curve walks the bucket from near to far.
 #pragma once
 
 #include <algorithm>
@@ -20,20 +20,20 @@
 
 namespace edgegrad {
 
-// A curve in the image.
+// An ImageSegment is a curve in the image.
 struct ImageSegment {
-    int32_t edge, curve;  // the latter as samples count it
+    int32_t edge, curve;  // edge of the mesh; number of the curve for samples
     Vec2 a, b;
-    double reach;     // px by which the rays of Embree may miss it: its floats are no finer
-    double rounding;  // px, of its doubles
-    double depth;     // of its nearer end
+    double reach;     // px by which Embree's single-precision rays may miss it
+    double rounding;  // px, rounding of its doubles
+    double depth;     // depth of its nearer end
 };
 
-// Lines through the cells of the image: buckets of direction and of distance to the middle of a cell. Of what runs side
-// by side in a cell, each lies within half a bucket of the other.
+// LineBuckets hashes lines through the cells of the image by direction and by distance to the middle of a cell. Two
+// lines side by side in a cell lie within half a bucket of each other.
 class LineBuckets {
    public:
-    // A line in a cell, in buckets; its direction is found modulo `directions`, where the sign of the distance turns.
+    // A Line in a cell is measured in buckets. Directions are modulo `directions`, where distances change sign.
     struct Line {
         uint64_t cell;
         double direction, distance;
@@ -60,26 +60,25 @@ class LineBuckets {
         }
     }
 
-    // The line of a segment in the cell of its point x.
+    // Returns the line of a segment in the cell of its point x.
     Line line_at(const ImageSegment& s, Vec2 x) const {
         return line(Direction(s.b - s.a), s.a, index(x.x), index(x.y));
     }
 
-    // Random bits that stand for a line's own bucket.
+    // Returns random bits that stand for a line's own bucket.
     static uint64_t key(const Line& l) { return key(l, floor(l.direction), l.distance); }
 
-    // Those of the four buckets in which lines lie side by side with it, its own among them.
+    // Writes the keys of the four buckets that hold the lines next to it, its own bucket included.
     static void keys_around(const Line& l, uint64_t (&keys)[4]) {
         for (int k = 0; k < 4; ++k)
             keys[k] = key(l, floor(l.direction + (k & 1 ? 0.5 : -0.5)), l.distance + (k & 2 ? 0.5 : -0.5));
     }
 
-    // Whether lines of that direction run along x rather than y.
+    // Returns whether lines of that direction run along x rather than y.
     static bool runs_along_x(const Line& l) { return std::fabs(l.direction - directions / 2.0) > directions / 4.0; }
 
    private:
-    // In place of an angle: 1 − x / (|x| + y) of a direction with y ≥ 0, which is from 0 to 2 and grows by ½ to 1 a
-    // radian.
+    // Directions are measured by 1 − x / (|x| + y), y ≥ 0, which grows from 0 to 2, by ½ to 1 per radian.
     static constexpr int64_t directions = 400;
     static constexpr double distance_step = 0.05;  // px
     struct Direction {
@@ -114,24 +113,24 @@ class LineBuckets {
 
 class CoincidentCurves {
    public:
-    // Of the segments in all parts. Only what lies near those that have samples is kept.
+    // Takes the segments of all parts, and keeps those near segments that have samples.
     CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples, ThreadTeam& team);
 
-    // Of each curve, at most: its segment in a list that doubles as it grows, and again where others lie on its line;
-    // two tables; its entry in each of up to 7 cells; its companion, twice. Most pass one or two cells, and are alone.
+    // Returns an upper bound of the memory per curve. It counts the segment in a list that doubles, and again where
+    // others lie on its line. It adds two tables, up to 7 cell entries, and its CoincidentSegment, twice. Most curves
+    // pass one or two cells, and are alone.
     static constexpr int64_t bytes_per_curve() {
         return sizeof(ImageSegment) + 2 * 16 + 7 * sizeof(Entry) + 2 * sizeof(CoincidentSegment);
     }
 
-    // The segment of an edge that has samples; null if no other lies on it anywhere.
+    // Returns the segment of an edge that has samples; null if no other segment lies on it anywhere.
     const ImageSegment* find(int64_t edge) const;
 
-    // How two segments meet that come closer in the image than rays err: side by side wherever both are, or at an angle
-    // so small that more than a point of one is so near to the other, as where they share an end.
+    // Meeting tells how two segments meet that come closer in the image than the error of rays. `along` ones are so
+    // close wherever both exist. `across` ones meet at a small angle, where more than a point of one is close.
     enum class Meeting { none, across, along };
 
-    // Calls found(other, meeting) for the segments that pass the point x of one of find() so closely, until it returns
-    // false.
+    // Calls found(other, meeting) for segments that pass so close to the point x of `own`, until it returns false.
     template <class Found>
     void at(const ImageSegment& own, Vec2 x, Found found) const {
         const LineBuckets::Line line = lines_.line_at(own, x);
@@ -153,7 +152,7 @@ class CoincidentCurves {
     }
 
    private:
-    // A segment in a bucket, and from where to where it goes along x or y, whichever is more.
+    // An Entry is a segment in a bucket, with its interval along the longer of x and y.
     struct Entry {
         float low, high, depth;
         uint32_t segment;
@@ -167,16 +166,16 @@ class CoincidentCurves {
     static Meeting at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x);
 
     LineBuckets lines_;
-    // A segment that others lie on.
+    // A CoincidentSegment is a segment that others lie on.
     struct CoincidentSegment {
         int64_t edge;
         uint32_t segment;
     };
 
     Array<ImageSegment> segments_{0};
-    std::vector<CoincidentSegment> coincident_;  // by ascending edges
+    std::vector<CoincidentSegment> coincident_;  // in ascending order of edges
     uint64_t mask_ = 0;
-    std::vector<uint32_t> begin_;  // of each bucket, in entries_
+    std::vector<uint32_t> begin_;  // first index of each bucket in entries_
     Array<Entry> entries_{0};
     double margin_ = 0;  // px
 };

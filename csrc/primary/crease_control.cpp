@@ -12,8 +12,8 @@ namespace edgegrad {
 
 namespace {
 
-// What differs between the sides of a crease of faces without texture: all channels, at its ends. Where one face may be
-// there without the other, it is no such crease.
+// CreaseJumps holds the differences between the sides of an untextured crease, for all channels and both ends. Where
+// one face may be opaque without the other, it is no such crease.
 template <int N, class T>
 class CreaseJumps {
    public:
@@ -28,13 +28,13 @@ class CreaseJumps {
         std::fill(value_.begin(), value_.end(), 0.0);
         add(minus, 1), add(plus, -1);
     }
-    // Σ_c weight_c |jump_c|, the mean of both ends.
+    // Returns Σ_c weight_c |jump_c|, averaged over both ends.
     double size(const std::vector<double>& weights) const {
         double sum = 0;
         for (int c = 0; c < C_; ++c) sum += weights[first_ + c] * (std::fabs(value_[c]) + std::fabs(value_[C_ + c]));
         return 0.5 * sum;
     }
-    // Σ_c A_c jump_c at both ends, given A of all channels.
+    // Ends holds Σ_c A_c jump_c at both ends, given A of all channels.
     struct Ends {
         double a = 0, b = 0;
     };
@@ -56,8 +56,8 @@ class CreaseJumps {
         });
     }
 
-    const SceneView<T> scene_;  // of the channels that may jump
-    const int first_, C_;       // of them
+    const SceneView<T> scene_;  // the scene with only the channels that may jump
+    const int first_, C_;       // first of these channels, and their number
     std::conditional_t<N == 0, std::vector<double>, std::array<double, 2 * all_channels<N>>> value_{};
 };
 
@@ -69,7 +69,7 @@ class ControlOfChannels final : public CreaseControl {
     bool set(const Curve& curve) override {
         const SceneView<T>& scene = view_.scene;
         if (!joins_colors(scene, curve) || curve.t0 > 0 || curve.t1 < 1) return false;
-        // A crease that comes near the eye does not move in the image as its ends do.
+        // A crease near the eye moves in the image otherwise than its ends.
         distort_ = std::fabs(curve.w1 - curve.w0) / (curve.w0 + curve.w1);
         if (!(distort_ < 1.0 / 3)) return false;
         curve_ = &curve, tangent_ = curve.tangent();
@@ -118,7 +118,7 @@ class ControlOfChannels final : public CreaseControl {
     }
 
    private:
-    // Ã · ΔL between two lines of the filter: Ã by its values at the ends and in the middle, constant for a box.
+    // A Piece is Ã · ΔL between two lines of the filter. Ã is quadratic through ends and middle, or constant (box).
     class Piece {
        public:
         Piece(ControlOfChannels& control, double begin, double end)
@@ -143,8 +143,7 @@ class ControlOfChannels final : public CreaseControl {
         double middle_, half_, a_[3] = {}, b_[3] = {};  // Ã times the jump at either end of the curve
     };
 
-    // The pixels that a curve passes along one axis: the one it is in, and where it leaves that at `next`; from there
-    // on it leaves one after every `step`.
+    // Passed walks the pixels that a curve passes along one axis. It leaves a pixel at `next`, then every `step`.
     struct Passed {
         int64_t pixel;
         int by;
@@ -160,8 +159,7 @@ class ControlOfChannels final : public CreaseControl {
         }
     };
 
-    // Σ over the pixels passed, in each of which Ã is a constant, of ∫ φ_k (φ_a a + φ_b b) ds with a and b, Ã times the
-    // jump at either end.
+    // Adds ∫ φ_k (φ_a a + φ_b b) ds over each pixel passed, where Ã is constant. a, b are Ã times the jump at the ends.
     void add_integral_of_box() {
         const int width = view_.camera.width, height = view_.camera.height;
         Passed columns(curve_->x0.x, tangent_.x, per_[0]), rows(curve_->x0.y, tangent_.y, per_[1]);
@@ -185,7 +183,7 @@ class ControlOfChannels final : public CreaseControl {
         at_a_ += at_a, at_b_ += at_b;
     }
 
-    // The same on a piece where Ã is a quadratic: by Gauss's rule with three points, exact up to degree 5.
+    // Adds the integral over a piece where Ã is a quadratic, by Gauss's rule with three points, exact up to degree 5.
     void add_quadratic(const Piece& piece, double begin, double end) {
         constexpr double node[3] = {-0.7745966692414834, 0, 0.7745966692414834},
                          weight[3] = {5. / 18, 8. / 18, 5. / 18};
@@ -196,14 +194,14 @@ class ControlOfChannels final : public CreaseControl {
         }
     }
 
-    // Where the piece that begins at s ends: at the next line of the filter, the border of a pixel for a box, the
-    // middle of one else; or at 1.
+    // Returns where the piece that begins at s ends: at the next line of the filter, or at 1. Lines are pixel borders
+    // for a box, and pixel centres otherwise.
     double end_of_piece(double s) const {
         const double shift = view_.image.filter.is_box() ? 0 : 0.5;
         double end = 1;
         const auto meet = [&](double origin, double along, double per) {
             if (along == 0) return;
-            // The next line lies at least a millionth of the curve ahead, for s may be rounded to before the last one.
+            // The next line lies at least a millionth of the curve ahead, as s may be rounded to before the last one.
             const double here = origin + (s + 1e-6) * along - shift;
             const double line = along > 0 ? std::floor(here) + 1 : std::ceil(here) - 1;
             end = std::min(end, (line + shift - origin) * per);
@@ -212,14 +210,14 @@ class ControlOfChannels final : public CreaseControl {
         return std::max(end, s + 1e-6);
     }
 
-    static constexpr double wide = 1024;  // px, from which length on a crease gets all samples
+    static constexpr double wide = 1024;  // px, length from which a crease gets all samples
 
     const BackwardView<T>& view_;
     const Curve* curve_ = nullptr;
     Vec2 tangent_;
     double per_[2];  // 1 / tangent_
     double distort_ = 0;
-    int32_t vertex_[2][2];  // of minus and plus; a and b
+    int32_t vertex_[2][2];  // vertices of minus and plus, at a and b
     double at_a_ = 0, at_b_ = 0;
     CreaseJumps<N, T> jumps_;
 };

@@ -1,14 +1,15 @@
-// A control variate for creases, as control.h is one for faces: what a crease would give if all of it were visible.
+// This file declares the control variate of creases: the gradient of a crease if all of it were visible (control.h has
+// that of faces).
 //
-// Its radiance is known on both sides, so with τ = x_b − x_a, the jump ΔL = L₋ − L₊, affine between the ends, and φ_a =
-// 1 − s, φ_b = s the boundary term would be
+// The radiance on both sides is known. Let τ = x_b − x_a, φ_a = 1 − s, φ_b = s, and let the jump ΔL = L₋ − L₊ be affine
+// between the ends. The boundary term would then be
 //
 //     Σ_k δx_k ∧ τ ∫ Ã(x(s)) · ΔL(s) φ_k(s) ds,   k in {a, b}.
 //
-// Between the lines where the pixel filter begins and ends, Ã is a constant (box) or a quadratic of s (tent), so
-// Gauss's rule gives the integral exactly; of a Gaussian the quadratic through three points of each piece serves. That
-// is added for all such creases, and its integrand taken away at each sample, so that nothing is biased; samples find
-// only where the crease is occluded after all.
+// Between the lines at which the pixel filter begins and ends, Ã is a constant (box) or a quadratic of s (tent).
+// Gauss's rule then gives the exact integral. For a Gaussian, the quadratic through three points of each piece serves.
+// The integral is added for all such creases, and each sample subtracts its integrand, so the estimate is unbiased.
+// Samples then only find where the crease is occluded.
 #pragma once
 
 #include <memory>
@@ -27,24 +28,24 @@ bool joins_colors(const SceneView<T>& scene, const Curve& c) {
            !alpha_masks_jump(scene, c.minus, c.plus);
 }
 
-// Of one curve after the other.
+// CreaseControl evaluates the control of one curve at a time.
 class CreaseControl {
    public:
     virtual ~CreaseControl() = default;
 
-    // Begins with a curve; false where there is no control.
+    // Starts a curve. Returns false where it has no control.
     virtual bool set(const Curve& curve) = 0;
-    // How much the sides of that curve differ: Σ_c weight_c |jump_c|, the mean of both ends. Or of any two faces
-    // without texture, after which no curve has begun.
+    // jump() returns the difference between the sides of that curve: Σ_c weight_c |jump_c|, averaged over both ends.
+    // jump_between() takes any two faces without texture; no curve is started afterwards.
     virtual double jump(const std::vector<double>& weights) const = 0;
     virtual double jump_between(const HalfEdge& minus, const HalfEdge& plus, const std::vector<double>& weights) = 0;
-    // What its density is multiplied by, if a short crease gets `least`.
+    // Returns the factor on the curve's sample density, if a short crease gets `least`.
     virtual double density(double least) const = 0;
 
     virtual void add_integral() = 0;
-    // At the fraction s of the curve, of a sample with this weight.
+    // Subtracts the integrand at the fraction s of the curve, for a sample with this weight.
     virtual void subtract(double s, double weight) = 0;
-    // The cotangents of the places of the ends, half to each face's own vertices.
+    // Adds the cotangents of the end positions, half to each face's own vertices.
     virtual void flush(RowBuffer& x) = 0;
 };
 

@@ -1,5 +1,5 @@
-// What the image says of whole faces. Of a mesh with a colour for each face every edge is a crease, and nearly all of
-// them lie between two faces that are hidden, or visible, as a whole: of these nothing more is asked.
+// This file classifies whole faces by what the image shows of them. On a mesh with a colour per face every edge is a
+// crease. Nearly all of these lie between two faces that are wholly hidden or wholly visible, and need no further test.
 #pragma once
 
 #include <algorithm>
@@ -18,13 +18,13 @@
 namespace edgegrad {
 
 struct CreaseFace {
-    // `turned`: on the side of a closed mesh that is turned away, `hidden`: and no silhouette passes before it, or
-    // behind all that was hit around it; `clear`: in the middle of what was hit, and no silhouette passes before it,
-    // `seen`: and hit itself. `unknown` for all others.
+    // `turned`: the face is on the back of a closed mesh. `hidden`: in addition no silhouette passes before it, or it
+    // lies behind all hits around it. `clear`: it lies amid hits, and no silhouette passes before it. `seen`: in
+    // addition it was hit itself. `unknown`: none of these.
     enum State : uint8_t { unknown, turned, hidden, clear, seen };
-    float value;   // of two that differ the faces differ along their edge; not a number: of this one it does not say
-    float pixels;  // of one that is hidden or turned: the measure of a crease next to it, without the adjoint
-    float importance;  // and of the adjoint
+    float value;       // faces with different values differ along their common edge; NaN: unknown
+    float pixels;      // measure of a crease next to a hidden or turned face, without the adjoint
+    float importance;  // mean |Ã| in its box
     State state;
 
     bool is_hidden() const { return state == turned || state == hidden; }
@@ -81,7 +81,7 @@ class CreaseFaces {
             return out;
         }
         if (!hit.missed) return out;
-        // Each point of a side is as near to one of its ends as the hint reaches.
+        // Each point of a side is near enough to one of its ends for the hint to cover it.
         const auto squared = [](Vec2 side) { return side.x * side.x + side.y * side.y; };
         const double longest = std::sqrt(std::max({squared(b - a), squared(c - b), squared(a - c)}));
         double samples = 0;
@@ -98,7 +98,7 @@ class CreaseFaces {
         return out;
     }
 
-    // Of values at the corners only those of faces of one colour are compared.
+    // Values at the corners are compared only for faces of one colour.
     float value_of(int64_t f) const {
         const SceneView<T>& scene = view_.scene;
         const auto sum = [](const auto* values, int n) {
@@ -113,7 +113,7 @@ class CreaseFaces {
         return sum(scene.colors + scene.radiance * int64_t(row[0]), scene.radiance);
     }
 
-    // Bounds for all faces, of what else would be asked of each edge: how large coordinates and how coarse they are.
+    // Sets bounds for all faces of what each edge would need: the size of coordinates and their spacing.
     void set_bounds() {
         const auto parts = view_.team.map_blocks(view_.scene.n_verts, [&](int64_t first, int64_t last) {
             double most[3] = {};
@@ -146,8 +146,8 @@ class CreaseFaces {
     const MeetingParts& meeting_;
     Array<CreaseFace> faces_;
     double largest_ = 0, spacing_ = 0;
-    double least_weight_ = 1;  // to a power of two: from which denominator on the rounding of positions does not matter
-    const double density_of_hidden_;  // relative, on creases that lie behind all around them
+    double least_weight_ = 1;  // a power of two: depth weight from which the rounding of positions does not matter
+    const double density_of_hidden_;  // relative density, on creases that lie behind all hits around them
 };
 
 }  // namespace edgegrad

@@ -1,9 +1,9 @@
-// Whether a crease is visible, as far as that is known before any sample. It decides whether the control
-// (crease_control.h) is added, and how few samples will do; what it gets wrong they put right, so nothing is biased.
+// This file predicts whether a crease is visible, before any sample. The prediction selects the control
+// (crease_control.h) and the number of samples. Samples correct its errors, so the estimate is unbiased.
 //
-// Both sides of a crease are faces of its own, so its visibility changes only where a silhouette or border passes
-// before it, or where another part of the surface passes through it. Apart from these all of it is visible or none, and
-// one point tells which: a face of it that the image hit, if nothing divides that face, or a few rays.
+// Both sides of a crease are its own faces. Its visibility therefore changes only where a silhouette or border passes
+// before it, or another part of the surface intersects it. Otherwise all of it is visible or none, and one point
+// decides. That point is a hit on one of its faces, if nothing divides that face, or a few rays.
 #pragma once
 
 #include <cmath>
@@ -19,14 +19,15 @@
 
 namespace edgegrad {
 
-// What is expected of a crease, and the fraction of its samples that is drawn to make sure.
+// Expected is the predicted visibility of a crease, and the fraction of its samples drawn to verify it.
 struct Expected {
     bool visible;
     double samples;
 };
 
-// Such fractions: of creases behind what the image hit that nothing divides, or that a silhouette meets; on the side of
-// a closed mesh that is turned away; and of visible ones that nothing divides, with at least 16 rays a pixel.
+// CreaseSamples holds such fractions. `hidden` creases lie behind the hits and nothing divides them; a silhouette meets
+// `hidden_in_part` ones. `turned_away` creases are on the back of a closed mesh. `visible` ones have nothing that
+// divides them, and at least 16 rays per pixel.
 struct CreaseSamples {
     static constexpr OcclusionHint::Few hidden{.rays = 0.5, .share = 1.0 / 64, .least = 1.0 / 256},
         hidden_in_part{.rays = 2, .share = 1.0 / 128, .least = 1.0 / 256};
@@ -43,27 +44,27 @@ class CreaseVisibility {
 
     Relation relation(const Curve& c) const { return crossings_.relation(c, touching(c)); }
 
-    // Of a crease behind what the image hit in so many pixels (occlusion.h). If all of it is visible or none, a part
-    // that shows through a gap cannot be what rays missed.
+    // Predicts a crease that lies behind the hits in `pixels` pixels (occlusion.h). If all of it is visible or none,
+    // rays cannot have missed a part in a gap.
     Expected hidden(Relation relation, int64_t pixels) const {
         const bool whole = relation == Relation::apart;
         return {false, view_.occlusion.factor(whole ? CreaseSamples::hidden : CreaseSamples::hidden_in_part, pixels,
                                               view_.image.spp)};
     }
 
-    // Of any other; nothing where rays must say.
+    // Predicts any other crease; returns nothing where rays must decide.
     std::optional<Expected> without_rays(const Curve& c, Relation relation) const {
         const double missed = where_missed(c);
         if (relation == Relation::across) return Expected{hits(c.minus).whole && hits(c.plus).whole, missed};
-        // On the side of a closed mesh that is turned away.
+        // This crease is on the back of a closed mesh.
         if (missed < ImageHits::missed) return Expected{false, relation == Relation::apart ? missed / 16 : missed};
-        // Rays may slip past an own face that is seen edge-on, whose other sides are silhouettes then.
+        // Rays may slip past an own face seen edge-on, whose other sides are silhouettes then.
         if (is_thin(c, c.minus) || is_thin(c, c.plus)) return Expected{false, missed};
         if (fewest(c, relation) != few || !(view_.seen[c.minus.face] || view_.seen[c.plus.face])) return std::nullopt;
         return Expected{true, by_evidence(few)};
     }
 
-    // Adds rays to some points of a crease to the batch; returns its place there.
+    // Adds rays to some points of a crease to the batch. Returns its index there.
     int ask(const Curve& c, Relation relation) {
         const int n = points(c);
         asked_[size_] = {c, n, by_evidence(std::max(fewest(c, relation), near_silhouettes)), where_missed(c)};
@@ -75,7 +76,7 @@ class CreaseVisibility {
     }
     bool full() const { return size_ == most || rays_.count > RayBatch::size - most_points; }
 
-    // Casts them; body(k, curve, expected) gets the answers, k = 0, 1, … as they were asked.
+    // Casts the rays. Calls body(k, curve, expected) with the answers, k = 0, 1, … in the order of ask().
     template <class Body>
     void answer(Body body) {
         rays_.prepare();
@@ -87,39 +88,39 @@ class CreaseVisibility {
                 const Answer a = at(c, asked_at[i], ray++);
                 visible += a == Answer::visible, hidden += a == Answer::hidden;
             }
-            // Next to what the image hit, one that rays find hidden may be visible between them, as at a limb.
+            // Next to a hit, a crease that rays find hidden may be visible between them, as at a limb.
             const bool agreed = visible == points || (hidden == points && missed < 1);
             body(k, c, Expected{visible > hidden, agreed ? std::min(fewest, missed) : missed});
         }
         rays_.count = size_ = 0;
     }
 
-    static constexpr int few_points = 2, most = RayBatch::size / few_points;  // creases in a batch
+    static constexpr int few_points = 2, most = RayBatch::size / few_points;  // number of creases in a batch
 
    private:
-    // Where rays go: the ends of a crease that is no longer than some pixels, which has few samples itself; two points
-    // more of others.
+    // Rays go to the ends of a crease. One longer than some pixels has more samples itself, and gets two points more.
     static constexpr double asked_at[] = {0.05, 0.95, 0.35, 0.65};
     static constexpr int most_points = int(std::size(asked_at));
     static int points(const Curve& c) { return c.length < 4 ? few_points : most_points; }
 
-    // Least fractions of the samples: where nothing may divide a crease; and where it may, but rays find it undivided.
+    // These least fractions of samples hold where nothing may divide a crease, or something may but rays miss it.
     static constexpr double few = CreaseSamples::visible, near_silhouettes = 1.0 / 128, near_other_parts = 1.0 / 32,
-                            near_missed = 1.0 / 8;  // faces near which others were not hit: something may pass
-                                                    // through, or be alpha-tested
+                            near_missed =
+                                1.0 /
+                                8;  // faces near which rays missed: something may intersect there, or be alpha-tested
 
-    // Fewer than 16 rays a pixel miss more of where parts meet, and of which faces are divided.
+    // Fewer than 16 rays per pixel miss more of the places where parts meet and faces are divided.
     double by_evidence(double least) const { return OcclusionHint::factor(least, view_.image.spp); }
 
     double fewest(const Curve& c, Relation relation) const {
         if (view_.alpha_masks) return near_missed;
         if (relation != Relation::apart) return near_other_parts;
-        Vec2 low{INFINITY, INFINITY}, high{-INFINITY, -INFINITY};  // of both faces
+        Vec2 low{INFINITY, INFINITY}, high{-INFINITY, -INFINITY};  // image box of both faces
         double farthest = -INFINITY;
         for (const HalfEdge* h : {&c.minus, &c.plus})
             for (int i = 0; i < 3; ++i) {
                 const int32_t v = vertex(view_.scene, *h, i);
-                if (view_.vertices.outcode[v]) return near_other_parts;  // it is not known where all of the face is
+                if (view_.vertices.outcode[v]) return near_other_parts;  // The extent of the face is unknown.
                 const Vec2 x = view_.vertices.x[v];
                 low = {std::min(low.x, x.x), std::min(low.y, x.y)};
                 high = {std::max(high.x, x.x), std::max(high.y, x.y)};
@@ -129,8 +130,8 @@ class CreaseVisibility {
         return meeting_.in(low, high) ? near_other_parts : crossings_.in(low, high, farthest) ? near_silhouettes : few;
     }
 
-    // Whether an own face is no wider in the image than rays err: their places are rounded to floats of the image's
-    // size, and again as they are turned and cast.
+    // Returns whether an own face is no wider in the image than the error of rays. Their positions are rounded to
+    // floats of the image's size, and again by the rotation and the cast.
     bool is_thin(const Curve& c, const HalfEdge& h) const {
         const int32_t opposite = vertex(view_.scene, h, (h.corner + 2) % 3);
         if (view_.vertices.outcode[opposite]) return false;
@@ -139,9 +140,9 @@ class CreaseVisibility {
         return std::fabs(wedge(c.tangent(), view_.vertices.x[opposite] - c.x0)) < error * c.length;
     }
 
-    // What a ray says of the point s of a crease. Of what is nearer by less than a part of a pixel it does not say:
-    // where faces are seen nearly edge-on, it may be a neighbour that the ray should have missed, and what touches the
-    // crease is decided in double.
+    // Answer is what a ray says of the point s of a crease. It is `unknown` where the hit is nearer by less than a part
+    // of a pixel. On faces seen nearly edge-on it may be a neighbour that the ray should have missed. Contact with the
+    // crease is decided in double precision.
     enum class Answer { visible, hidden, unknown };
     Answer at(const Curve& c, double s, int ray) const {
         const int32_t hit = rays_.face[ray];
@@ -152,7 +153,7 @@ class CreaseVisibility {
         return behind > touching(c) ? Answer::visible : behind < -pixel / 4 ? Answer::hidden : Answer::unknown;
     }
 
-    // World units by which what touches a crease may lie behind it.
+    // Returns the world units by which a touching surface may lie behind a crease.
     double touching(const Curve& c) const {
         return contact(view_.scene.spacing->of(vertex(view_.scene, c.minus, c.minus.first())),
                        largest_coordinate(view_.scene, c.minus), std::max(std::fabs(c.a.z), std::fabs(c.b.z)));
@@ -160,7 +161,7 @@ class CreaseVisibility {
 
     ImageHits::Face hits(const HalfEdge& h) const { return view_.hits->of(view_.scene.faces + 3 * int64_t(h.face)); }
 
-    // Less than 1 where the image hit neither the crease nor its neighbours.
+    // Returns less than 1 where rays hit neither the crease nor its neighbours.
     double where_missed(const Curve& c) const {
         for (const int corner : {c.minus.first(), c.minus.second()})
             if (view_.hits->at(vertex(view_.scene, c.minus, corner))) return 1;

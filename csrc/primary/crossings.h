@@ -1,5 +1,5 @@
-// Where it may change along a crease whether it is visible: where silhouettes and open borders pass before it in the
-// image. Between them all of it is visible or none, but for meshes that pass through each other.
+// This file finds where silhouettes and open borders pass before a crease in the image. Between these places all of it
+// is visible or none, unless meshes intersect.
 #pragma once
 
 #include <algorithm>
@@ -17,10 +17,10 @@
 
 namespace edgegrad {
 
-// Segments in the cells of a grid over the image.
+// Crossings holds segments in the cells of a grid over the image.
 class Crossings {
    public:
-    // Of silhouettes and borders, in parts.
+    // Takes silhouettes and borders, in parts.
     Crossings(const std::vector<std::vector<ImageSegment>>& parts, int width, int height, ThreadTeam& team) {
         std::vector<int64_t> first(parts.size() + 1, 0);
         double total = 0;  // length
@@ -59,13 +59,13 @@ class Crossings {
                 entries_[end.fetch_add(1, std::memory_order_relaxed)] = segment;
             });
         });
-        // Each cell's begin has moved to its end, the begin of the next.
+        // Each cell's begin has moved to its end, which is the begin of the next.
         for (size_t cell = begin_.size() - 1; cell > 0; --cell) begin_[cell] = begin_[cell - 1];
         begin_[0] = 0;
     }
 
-    // How those that pass before a curve, or no farther behind it than `touching`, lie to it: none meets it between its
-    // ends; one runs along it, so near that floats do not show them apart; one crosses it, as far as is known.
+    // Relation describes the segments that pass before a curve, or at most `touching` behind it. `apart`: none meets it
+    // between its ends. `along`: one runs along it, closer than floats resolve. `across`: one may cross it.
     enum class Relation { apart, along, across };
     Relation relation(const Curve& c, double touching) const {
         const double farthest = std::max(c.a.z, c.b.z) + touching;
@@ -82,7 +82,7 @@ class Crossings {
         return found;
     }
 
-    // Whether one of them passes a box of the image, by less than rays may miss it, no farther away than a depth.
+    // Returns whether a segment no farther than `farthest` passes a box of the image, within the error of rays.
     bool in(Vec2 low, Vec2 high, double farthest) const {
         const int i0 = index(low.x, columns_), i1 = index(high.x, columns_);
         const int j0 = index(low.y, rows_), j1 = index(high.y, rows_);
@@ -98,13 +98,13 @@ class Crossings {
    private:
     struct Segment {
         Vec2 a, b;
-        double depth;  // of its nearer end
+        double depth;  // depth of its nearer end
         double rounding;
     };
 
     uint32_t size(size_t cell) const { return begin_[cell + 1] - begin_[cell]; }
 
-    // Calls body(segment) for those of a cell until it returns false; returns whether it never did.
+    // Calls body(segment) for the segments of a cell until it returns false. Returns whether it never did.
     template <class Body>
     bool each_in(size_t cell, Body body) const {
         for (uint32_t i = begin_[cell]; i < begin_[cell + 1]; ++i)
@@ -115,14 +115,14 @@ class Crossings {
     static bool passes(const Segment& s, Vec2 low, Vec2 high) {
         const double margin = float_reach + s.rounding;
         const Vec2 middle = 0.5 * (low + high), half = 0.5 * (high - low) + Vec2{margin, margin};
-        // Separated along x, along y or across the segment.
+        // A separating axis is x, y or the normal of the segment.
         const Vec2 to_a = s.a - middle, to_b = s.b - middle, along = s.b - s.a;
         return std::min(to_a.x, to_b.x) <= half.x && std::max(to_a.x, to_b.x) >= -half.x &&
                std::min(to_a.y, to_b.y) <= half.y && std::max(to_a.y, to_b.y) >= -half.y &&
                std::fabs(wedge(along, to_a)) <= std::fabs(along.x) * half.y + std::fabs(along.y) * half.x;
     }
 
-    // Those that meet the curve in an end are apart: silhouettes that go on from a vertex of a crease.
+    // Segments that meet the curve in an end are apart: they are silhouettes that continue from a vertex of a crease.
     static Relation relation(const Curve& c, const Segment& s) {
         const Vec2 along = s.b - s.a, own = c.tangent();
         const double error = 4 * (c.rounding + s.rounding), length = edgegrad::length(along);  // px
@@ -139,8 +139,8 @@ class Crossings {
         return (e0 > error && e1 > error) || (e0 < -error && e1 < -error) ? Relation::apart : Relation::across;
     }
 
-    // Calls body(cell) for every cell that a segment passes, give or take `margin`, until it returns false; returns
-    // whether it never did. What lies outside the image belongs to the cells at its border.
+    // Calls body(cell) for every cell within `margin` of a segment, until it returns false. Returns whether it never
+    // did. Points outside the image belong to the cells at its border.
     template <class Body>
     bool each_cell(Vec2 a, Vec2 b, double margin, Body body) const {
         const auto [left, right] = std::minmax(a.x, b.x);
@@ -161,14 +161,14 @@ class Crossings {
     }
     int index(double x, int count) const { return int(std::clamp(x * per_cell_, 0.0, double(count - 1))); }
 
-    // So many in a cell, of two pixels or so, and some of them cross.
+    // If a cell of about two pixels has more segments, some are assumed to cross.
     static constexpr uint32_t most_in_a_cell = 32;
     // Larger boxes are not searched.
     static constexpr int64_t most_cells = 64;
 
-    double cell_, per_cell_;  // px, and 1 over it
+    double cell_, per_cell_;  // px, and its reciprocal
     int columns_, rows_;
-    std::vector<uint32_t> begin_;  // of each cell, in entries_
+    std::vector<uint32_t> begin_;  // first index of each cell in entries_
     Array<Segment> segments_{0};
     Array<uint32_t> entries_{0};
 };

@@ -16,19 +16,18 @@ namespace edgegrad {
 
 namespace {
 
-// Default samples a pixel of curve; see surface_measure.cpp. Of lit scenes, where a sample costs three times as much
-// and most of the error is that of faces: with a quarter of the samples it grows by a tenth at most
-// (docs/tried.md).
+// Returns the default samples per pixel of curve; see surface_measure.cpp. A lit sample costs three times as much, and
+// most of the error is that of faces. A quarter of the samples adds a tenth at most (docs/tried.md).
 double samples_per_pixel(bool lit) { return lit ? 6 : 24; }
 
-// The error of a gradient is seen relative to all of it. What controls know has none, so the more of it that is, the
-// fewer samples do for the rest: their error falls as one over their number, and the rest of the gradient, a vector by
-// vertices, is about √(Σ measure² of the rest / Σ measure² of all) of the whole. No less than a fifth, for a motion
-// that all vertices share feels silhouettes more than creases, nor than takes a few milliseconds.
+// An error counts relative to the whole gradient. Controls have none, so the more they cover, the fewer samples the
+// rest needs. The rest's error falls as one over their number. Its part of the gradient, a vector by vertices, is about
+// √(Σ measure² of the rest / Σ measure² of all). The bound least_rest applies, because a motion that all vertices share
+// feels silhouettes more than creases. Drawing least_samples takes a few milliseconds.
 constexpr double least_rest = 1.0 / 5, least_samples = 1 << 12;
 
-// How far, in pixels, a ray may miss the points of a curve. A hundredth where it would be more: by then the image shows
-// floats, not faces.
+// Returns how far, in pixels, a ray may miss the points of a curve. It is limited to a hundredth: beyond that the image
+// shows rounding, not faces.
 template <class T>
 double reach_of_rays(const BackwardView<T>& view, const Curve& c) {
     double error = 0;
@@ -51,13 +50,13 @@ ImageSegment image_segment(const BackwardView<T>& view, const Curve& c, int64_t 
             .depth = c.nearest_depth()};
 }
 
-// What tells of creases without a sample.
+// CreaseHints holds what tells the visibility of creases without a sample.
 template <class T>
 struct CreaseHints {
     const Crossings crossings;
     const MeetingParts meeting;
     std::optional<CreaseFaces<T>>
-        faces;  // none where some are alpha-tested: their alpha edges are no silhouettes that they know
+        faces;  // none where faces are alpha-tested: it does not treat their alpha edges as silhouettes
 
     CreaseHints(const BackwardView<T>& view, const CurveFinder<T>& finder,
                 const std::vector<std::vector<ImageSegment>>& silhouettes)
@@ -67,13 +66,13 @@ struct CreaseHints {
     }
 };
 
-// The curves of one chunk of edges.
+// MeasuredEdges measures the curves of one chunk of edges.
 template <class T>
 class MeasuredEdges {
     using Relation = Crossings::Relation;
 
    public:
-    // `hints`, and `x`, where controls go: null if there are no controls.
+    // `hints`, and `x`, to which controls are added, are null if there are no controls.
     MeasuredEdges(const BackwardView<T>& view, const CurveFinder<T>& finder, const JumpScale& scale,
                   const CreaseHints<T>* hints, RowBuffer* x)
         : view_(view),
@@ -101,13 +100,13 @@ class MeasuredEdges {
     }
 
    private:
-    // What a curve's measure is made of besides its length: how large the jump and the adjoint are.
+    // A Jump holds the factors of a curve's measure besides its length: the sizes of the jump and of the adjoint.
     struct Jump {
-        int64_t curve;  // in `curves`
+        int64_t curve;  // index in `curves`
         double size, importance;
     };
 
-    // What is known of the faces on both sides of an edge.
+    // FaceEarlyOut skips edges by what is known of the faces on both sides.
     struct FaceEarlyOut {
         MeasuredEdges& edges;
         using EarlyOut = typename CurveFinder<T>::EarlyOut;
@@ -125,7 +124,7 @@ class MeasuredEdges {
         }
     };
 
-    // A crease between hidden faces gets so few samples that how large its jump is does not matter.
+    // Adds a crease between hidden faces. It gets so few samples that the size of its jump does not matter.
     void add_hidden(int64_t e, const CreaseFace& one, const CreaseFace& other) {
         const bool alone = one.state == CreaseFace::hidden && other.state == CreaseFace::hidden;
         ++found.creases;
@@ -139,8 +138,8 @@ class MeasuredEdges {
         curves.push_back(curve);
     }
 
-    // Adds the segment of the next curve, a crease that is turned away, before which a silhouette may pass; returns its
-    // measure without the adjoint.
+    // Adds the segment of the next curve, a crease on the back of a mesh, before which a silhouette may pass. Returns
+    // its measure without the adjoint.
     double add_turned(int64_t e) {
         Curve c;
         if (!finder_.find_between(e, c)) return 0;
@@ -150,8 +149,7 @@ class MeasuredEdges {
         return c.length * (apart ? CreaseSamples::turned_away : ImageHits::turned_away);
     }
 
-    // A crease between faces that are visible as a whole, of which one was hit; or hidden, as it turns out. False for
-    // any other.
+    // Adds a crease between wholly visible faces, one of them hit, or between hidden faces. Else returns false.
     bool add_clear(int64_t e) {
         const Topology& topology = view_.geometry.topology();
         if (!faces_ || !topology.joins_two(e)) return false;
@@ -232,7 +230,7 @@ class MeasuredEdges {
         measure(c, jump, control_->density(expected.samples));
     }
 
-    // Relative to a jump of the size of the mean, which is taken where nothing is known.
+    // Returns the jump relative to the mean, which stands in where nothing is known.
     double size_of_jump(const Curve& c) {
         if (!joins_colors(view_.scene, c)) return 1;
         return relative(control_->jump_between(c.minus, c.plus, scale_.weights));
@@ -242,9 +240,9 @@ class MeasuredEdges {
         return size > 0 && !visibility_ ? std::clamp(size, least, largest) : std::min(size, largest);
     }
 
-    static constexpr double largest = 2;  // so that a bright face among dark ones does not take all samples
-    // Where samples alone find the jump: they look a little aside of the curve (accumulation.cpp), and a texture may
-    // differ there where the faces of a crease are as good as coplanar. Such a sample must not stand for too much.
+    static constexpr double largest = 2;  // keeps a bright face among dark ones from taking all samples
+    // This bound holds where samples alone find the jump. They look slightly aside of the curve (accumulation.cpp),
+    // where a texture may differ across a nearly coplanar crease. Such a sample must not have a large weight.
     static constexpr double least = 1.0 / 1024;
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
@@ -256,7 +254,7 @@ class MeasuredEdges {
     Jump asked_[CreaseVisibility<T>::most];
 };
 
-// The lens boundary, where the adjoint is not zero. Nothing is known of the jump.
+// Measures the lens boundary, where the adjoint is not zero. The jump is unknown.
 template <class T>
 void measure_lens_boundary(const BackwardView<T>& view, Curves<T>& out) {
     if (!view.camera.lens_view.end) return;
@@ -266,7 +264,7 @@ void measure_lens_boundary(const BackwardView<T>& view, Curves<T>& out) {
     }
 }
 
-// Silhouettes and borders.
+// Returns the segments of silhouettes and borders.
 template <class T>
 std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, const CurveFinder<T>& finder) {
     return view.team.map_blocks(view.geometry.topology().n_edges(), [&](int64_t first, int64_t last) {
@@ -318,7 +316,7 @@ void Curves<T>::add_segments(const BackwardView<T>& view, const Systematic& samp
         segments.insert(segments.end(), std::make_move_iterator(hidden.begin()), std::make_move_iterator(hidden.end()));
     }
     if (std::all_of(clear.begin(), clear.end(), [](const auto& part) { return part.empty(); })) return;
-    // Two curves on one line matter if either is sampled, and two clear creases never do.
+    // Two curves on one line matter if either is sampled. Two clear creases never do.
     CellMarks marks(view.camera.width, view.camera.height), marks_of_sampled(view.camera.width, view.camera.height);
     if (!all)
         view.team.parallel_for(n, [&](int64_t part) {
@@ -372,7 +370,7 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
     for (const CurvesFound& f : found)
         out.pixels += f.pixels, out.silhouettes += f.silhouettes, out.creases += f.creases, out.squares += f.squares,
             out.unknown += f.unknown;
-    std::vector<int64_t> first{0};  // of each part, in all
+    std::vector<int64_t> first{0};  // index of the first curve of each part
     for (const auto& part : curves) first.push_back(first.back() + int64_t(part.size()));
     const int64_t n = first.back();
     measure_intersections(view, out);

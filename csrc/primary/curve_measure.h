@@ -1,4 +1,4 @@
-// How densely each curve is sampled, and what the boundary term knows of creases without a sample.
+// This file declares the sampling density of each curve, and what the boundary term knows of creases without a sample.
 #pragma once
 
 #include <cstdint>
@@ -13,30 +13,30 @@
 
 namespace edgegrad {
 
-// Curves are laid end to end by length · (mean |Ã| near them) · (how large the jump is, as far as it is known), less
-// where they are most likely occluded or where a control (crease_control.h) says nearly all.
+// Curves lie end to end by length · (mean |Ã| near them) · (estimated jump). The measure is reduced where they are most
+// likely occluded, or where a control (crease_control.h) covers nearly all.
 struct CurvesFound {
-    double pixels = 0;                // the measure without the adjoint, which default samples go by
-    double squares = 0, unknown = 0;  // Σ measure² of what is expected to be visible, and of what controls do not say
-    int64_t silhouettes = 0, creases = 0, intersections = 0;  // in view
-    double lens_boundary = 0;                                 // px of the lens boundary, in view
+    double pixels = 0;                // measure without the adjoint, which sets the default number of samples
+    double squares = 0, unknown = 0;  // Σ measure² of what is expected to be visible, and of what controls do not cover
+    int64_t silhouettes = 0, creases = 0, intersections = 0;  // number in view
+    double lens_boundary = 0;                                 // px of the lens boundary in view
 };
 struct MeasuredCurve {
     double measure = 0;
     int32_t edge;
     bool controlled = false;  // whether x_bar has the integral of a crease's control
-    bool hidden = false;      // a crease between hidden faces (crease_faces.h)
+    bool hidden = false;      // whether it is a crease between hidden faces (crease_faces.h)
 };
-// A crease between faces that are seen whole.
+// A ClearCrease is a crease between faces that are wholly visible.
 struct ClearCrease {
     int32_t curve;
     CellMarks::Cells cells;
 };
 struct MeasuredIntersection {
     double measure = 0;
-    int32_t index;  // of Curves::lines()
+    int32_t index;  // index in Curves::lines()
 };
-// Bytes of a curve in view, at most; the list of curves doubles as it grows.
+// Returns an upper bound of the bytes per curve in view; the list of curves doubles as it grows.
 constexpr int64_t bytes_per_curve() {
     return 3 * (sizeof(MeasuredCurve) + sizeof(ClearCrease)) + sizeof(double) + CoincidentCurves::bytes_per_curve();
 }
@@ -44,15 +44,15 @@ constexpr int64_t bytes_per_curve() {
 template <class T>
 struct Curves : CurvesFound {
     CurveFinder<T> finder;
-    Array<MeasuredCurve> curve{0};                         // those where the adjoint is not zero, by ascending edges
-    Array<Intersection> drawn{0};                          // of those of the geometry, if this view draws its own
-    std::vector<MeasuredIntersection> intersection;        // after them, those of faces that pass through each other
-    std::optional<LensBoundaryCurve> lens_boundary_curve;  // and after these the lens boundary, if it is asked for
-    Array<double> measure{0};                              // of all
-    std::vector<std::vector<ImageSegment>> segments;       // of those that others may lie on
-    std::vector<std::vector<ClearCrease>> clear;           // of which no segment was made
-    bool any_hidden = false;                               // or of creases between hidden faces, if there are any
-    Array<double> x_bar;  // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
+    Array<MeasuredCurve> curve{0};  // curves where the adjoint is not zero, by ascending edges
+    Array<Intersection> drawn{0};   // subset of the geometry's intersections, if this view draws its own
+    std::vector<MeasuredIntersection> intersection;        // intersections of faces, numbered after the curves
+    std::optional<LensBoundaryCurve> lens_boundary_curve;  // lens boundary, numbered last, if it is asked for
+    Array<double> measure{0};                              // measure of all curves, in that order
+    std::vector<std::vector<ImageSegment>> segments;       // segments of the curves that others may lie on
+    std::vector<std::vector<ClearCrease>> clear;           // creases without a segment
+    bool any_hidden = false;  // whether there are creases between hidden faces, which have no segment either
+    Array<double> x_bar;  // (V, 2) contribution of controls to the cotangents of image positions; empty: no controls
 
     Curves(const BackwardView<T>& view, Array<int8_t> facing);
 
@@ -61,16 +61,15 @@ struct Curves : CurvesFound {
     }
     int64_t arcs() const { return lens_boundary_curve ? int64_t(lens_boundary_curve->arcs.size()) : 0; }
 
-    // Samples: so many as are given, if not −1, or the defaults.
+    // Returns the number of samples: the one in `o`, if not −1, or the default.
     int64_t wanted(const GradientOptions& o) const;
 
-    // Adds the segments of those clear creases in whose pixels any other curve lies, where either has samples; or of
-    // all creases.
+    // Adds the segments of clear creases that share pixels with another curve, if either has samples. `all` adds all.
     void add_segments(const BackwardView<T>& view, const Systematic& samples, bool all);
 };
 
-// Finds and measures all curves, and begins x_bar with the integrals of the controls. `facing` (F,): Camera::facing.
-// `boundary`: whether that of a lens counts, which moves with its parameters alone.
+// Finds and measures all curves, and initialises x_bar with the integrals of the controls. `facing` (F,) is
+// Camera::facing. `lens_boundary` tells whether the lens boundary counts, which moves with the lens parameters alone.
 template <class T>
 Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool lens_boundary);
 

@@ -1,11 +1,11 @@
-// Silhouettes, open borders and creases as a source of curves. The radiance of an incident face is known exactly at the
-// edge, so the ray through the edge point, which ignores the faces of that edge, finds what lies behind, or that
-// something lies before.
+// This file holds the curve source of silhouettes, open borders and creases. The radiance of an incident face is known
+// exactly at the edge. The ray through the edge point ignores the faces of that edge, and finds what lies behind or
+// occludes it.
 //
-// Where other curves lie on this one in the image (coincident_segments.h), the ray runs along the borders of their
-// faces, and which of these it meets would be left to rounding. So they are asked in double. A face whose curve lies
-// apart by more than the rounding of doubles, or meets this one at an angle, covers the point or not, and the ray
-// ignores those that do; faces of curves on the same line it ignores too, and coincidence.h puts them in order.
+// Where other curves coincide with this one in the image (coincident_segments.h), the ray runs along the borders of
+// their faces. Rounding would decide which of these it meets, so they are tested in double precision. A face whose
+// curve is more than the rounding of doubles away, or meets this one at an angle, covers the point or not. The ray
+// ignores the faces that do. It also ignores faces of curves on the same line, which coincidence.h orders.
 #pragma once
 
 #include <algorithm>
@@ -29,7 +29,7 @@ class EdgeSource {
    public:
     using Curve = edgegrad::Curve;
 
-    // The point t of an edge.
+    // A Sample is the point t of an edge.
     struct Sample : CurveSample {
         int place = 0;
         double t = 0;
@@ -43,7 +43,7 @@ class EdgeSource {
 
     bool place(const Curve& curve, double s, Sample& sample) {
         if (places_ == 0 || place_[places_ - 1].own.curve.edge != curve.edge) {
-            // A place of which no sample waits, for all were hidden, is free again: so there are never more than lanes.
+            // A place is free again if all of its samples were hidden, so there are never more places than lanes.
             if (places_ > 0 && pending_ != places_ - 1) --places_;
             start(place_[places_++], curve);
         }
@@ -72,7 +72,7 @@ class EdgeSource {
     SampleSurfaces surfaces(Sample& sample) const {
         CoincidentShare& share = sample.share;
         const SurfacePoint& behind = sample.behind;
-        // What the ray meets may lie before the others.
+        // The surface that the ray meets may lie before the others.
         if (share.far_depth > behind.depth) share.side[1 - share.front].face = -1;
         SampleSurfaces surfaces;
         for (int k = 0; k < 2; ++k) {
@@ -101,7 +101,7 @@ class EdgeSource {
         return {tangent.y, -tangent.x};
     }
 
-    // δx ∧ τ of the point, with the vertices of the faces on either side in equal parts, as flush() has it.
+    // Returns δx ∧ τ of the point. The vertices of the faces on either side have equal parts, as in flush().
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
         if (!direction.moves()) return {};
         const Curve& curve = place_[sample.place].own.curve;
@@ -156,11 +156,11 @@ class EdgeSource {
     }
 
    private:
-    // A curve of which samples wait.
+    // A Place is a curve with pending samples.
     struct Place {
-        CoincidentCurve own;          // without its faces until they are asked for
-        const ImageSegment* segment;  // where others lie on it somewhere; else null
-        bool edge_on, with_faces;     // whether a face of it is seen edge-on; whether `own` has them
+        CoincidentCurve own;          // without its faces until they are needed
+        const ImageSegment* segment;  // segment, if others lie on it somewhere; else null
+        bool edge_on, with_faces;     // whether a face of it is seen edge-on; whether `own` has its faces
         CurveFaces faces;
     };
 
@@ -178,7 +178,7 @@ class EdgeSource {
         other_edges_.clear();
     }
 
-    // Sets what is there on either side at the point t, where faces may be alpha-tested; false if nothing is.
+    // Sets the opaque faces on either side of the point t, if any may be alpha-tested. Returns false if there are none.
     bool show(const Curve& curve, double t, CoincidentShare& share) const {
         share.side[0].face = share.side[1].face = -1;
         for (const HalfEdge& h : view_.geometry.topology().half_edges(curve.edge)) {
@@ -190,7 +190,7 @@ class EdgeSource {
         return share.side[0].face >= 0 || share.side[1].face >= 0;
     }
 
-    // Another curve on the line of the latest.
+    // Returns another curve on the line of the latest.
     const CoincidentCurve& other(int64_t edge, const Curve& line) {
         const size_t k = std::find(other_edges_.begin(), other_edges_.end(), edge) - other_edges_.begin();
         if (k < other_edges_.size()) return others_[k];
@@ -201,12 +201,12 @@ class EdgeSource {
         return others_[k] = coincidence_.on_line(c, line);
     }
 
-    // dx/ds at the pixel position.
+    // Returns dx/ds at the pixel position.
     Vec2 distorted_tangent(const Sample& sample) const {
         return distort_jvp(view_.camera, sample.n, place_[sample.place].own.curve.tangent());
     }
 
-    // What the curves that lie on this one leave to a sample of it; false if nothing. Gathers their faces.
+    // Computes what coincident curves leave to a sample, and gathers their faces. Returns false if it is nothing.
     bool share(Place& place, Sample& sample) {
         const Curve curve = place.own.curve;
         const Topology& topology = view_.geometry.topology();
@@ -233,8 +233,8 @@ class EdgeSource {
                 return visible = coincidence_.add(c, c.curve.parameter(s));
             }
             for (const int32_t f : faces) {
-                // One that the ray misses stays for it to find: where float takes it for a neighbour, that one is found
-                // as well (Visibility::beyond_float).
+                // A face that the ray misses is not ignored. If single precision confuses it with a neighbour, the ray
+                // finds that one as well (Visibility::beyond_float).
                 if (!asked_.insert(f) || !meets(view_, f, sample.n)) continue;
                 ignored.push_back(f);
                 if (!visibility_.lies_behind(f, place.faces, sample)) return visible = false;
@@ -252,15 +252,15 @@ class EdgeSource {
         return coincidence_.finish(sample.share);
     }
 
-    // Whether a second curve has a share of the jump that depends on what this one uncovers.
+    // Returns whether a second curve gets a part of the jump that depends on what this one uncovers.
     static bool uncovers(const Sample& sample) {
         const CoincidentShare& share = sample.share;
         return !share.halves && share.second.vertex[0] >= 0 &&
                !(share.uncovered_depth > sample.behind.depth && share.uncovered >= 0);
     }
 
-    // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to
-    // each, which matters only if they have copies of their own of the vertices.
+    // Adds the gradient to the vertices of the face that ends at the curve. Where a face lies on either side, each gets
+    // half. This matters only if they have copies of the vertices.
     void flush(LocalGradients& grad) {
         if (current_.edge < 0) return;
         const bool both = current_.is_crease();
@@ -285,13 +285,13 @@ class EdgeSource {
     const CoincidentCurves& coincident_;
     Coincidence<T> coincidence_;
 
-    Place place_[RayBatch::size];         // of the samples that wait
-    int places_ = 0, pending_ = -1;       // the place of the latest sample that waits
-    std::vector<int64_t> other_edges_;    // of the curves on the line of the latest
-    std::deque<CoincidentCurve> others_;  // theirs; those beyond wait to be used again
-    FaceSet asked_;                       // whether the latest sample's ray meets them
+    Place place_[RayBatch::size];         // places of the pending samples
+    int places_ = 0, pending_ = -1;       // number of places; place of the latest pending sample
+    std::vector<int64_t> other_edges_;    // edges of the curves on the line of the latest curve
+    std::deque<CoincidentCurve> others_;  // their curves; entries beyond are kept for reuse
+    FaceSet asked_;                       // faces that were tested against the latest sample's ray
 
-    // Sums for the latest curve, and for the latest second one.
+    // The members below sum over the latest curve, and over the latest second curve.
     Curve current_;
     Vec3 a_bar_, b_bar_;
     int32_t second_[2] = {-1, -1};  // vertices

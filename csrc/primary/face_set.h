@@ -1,4 +1,4 @@
-// A set of faces that is emptied at no cost: a hash table whose slots know in which round they were filled.
+// FaceSet is a set of faces that is cleared in constant time: hash slots store the round that filled them.
 #pragma once
 
 #include <cstddef>
@@ -13,7 +13,7 @@ class FaceSet {
    public:
     void clear() { ++round_, size_ = 0; }
 
-    // False if it is there already.
+    // Returns false if the face is in the set already.
     bool insert(int32_t face) {
         if (2 * size_ >= slots_.size()) grow();
         const bool inserted = insert_into(slots_, face);
@@ -24,7 +24,7 @@ class FaceSet {
    private:
     struct Slot {
         int32_t face = -1;
-        uint32_t round = 0;  // of an earlier one: the slot is free
+        uint32_t round = 0;  // the slot is free if the round is an earlier one
     };
 
     bool insert_into(std::vector<Slot>& slots, int32_t face) const {

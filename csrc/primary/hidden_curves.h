@@ -1,4 +1,4 @@
-// Curves that lie behind what the image hit, or next to faces that it did not hit.
+// This file reduces the samples of curves that lie behind the image's hits, or next to faces without a hit.
 #pragma once
 
 #include <algorithm>
@@ -11,13 +11,13 @@
 
 namespace edgegrad {
 
-// How few samples a silhouette gets if it lies behind what the image hit (occlusion.h). Never none, for it may be
-// visible all the same; a gap may run along it, so that fewer rays than elsewhere find it. What was merely not hit
-// counts in full: at the limb of a fine mesh the faces next to a silhouette are a hundredth of a pixel wide and hit by
-// chance. Of creases more is known: crease_visibility.h.
+// A silhouette behind the hits gets this fraction of its samples (occlusion.h). It is never zero, because the
+// silhouette may still be visible: a gap may run along it, which fewer rays than elsewhere find. A face that rays
+// merely missed counts in full. At the limb of a fine mesh the faces next to a silhouette are a hundredth of a pixel
+// wide and hit by chance. crease_visibility.h knows more of creases.
 constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
 
-// The same of a curve next to a face that shows along it wherever the curve does, if no ray hit that face.
+// Returns the fraction for a curve next to a face without a hit, if that face is visible wherever the curve is.
 template <class T>
 double next_to_unhit(const BackwardView<T>& view, int64_t face) {
     if (view.seen[face]) return 1;
@@ -29,7 +29,7 @@ double next_to_unhit(const BackwardView<T>& view, int64_t face) {
     return where_unhit(view, face, 0.5 * distorted * std::fabs(wedge(b - a, c - a)));
 }
 
-// In how many pixels a curve is behind all that was hit; 0: not in all of them.
+// Returns the number of pixels in which a curve lies behind all hits; 0: it does not in all of them.
 inline int64_t hiding_pixels(const OcclusionHint& occlusion, Vec2 low, Vec2 high, double nearest) {
     const bool small = std::max(high.x - low.x, high.y - low.y) <= 2 * OcclusionHint::reach;
     if (small && occlusion.hides_around(0.5 * (low + high), nearest)) return OcclusionHint::pixels_around;

@@ -1,4 +1,4 @@
-// How densely lines where faces pass through each other are sampled.
+// This file sets the sampling density of intersection lines of faces.
 #pragma once
 
 #include <algorithm>
@@ -14,14 +14,14 @@
 
 namespace edgegrad {
 
-// How much a line where faces pass through each other counts next to another one: by how the radiance differs at its
-// ends, which is known, and by how far it moves with the faces, which is far where their planes are nearly the same.
+// IntersectionSize weighs an intersection line against others. It uses the known difference of the radiance at its
+// ends, and how far it moves with the faces. The motion is large where their planes nearly coincide.
 template <class T>
 class IntersectionSize {
    public:
     IntersectionSize(const BackwardView<T>& view, const JumpScale& scale) : view_(view), scale_(scale) {}
 
-    // Per pixel of its length.
+    // Returns the weight per pixel of its length.
     double operator()(const IntersectionCurve& c) {
         planes_.set(view_, c);
         const Vec2 n0 = normalised(view_.camera, c.x0), n1 = normalised(view_.camera, c.x1);
@@ -33,10 +33,10 @@ class IntersectionSize {
     }
 
    private:
-    // Not so little that a sample stands for too much, where ends do not show of what lies between them.
+    // Clamps a factor. The lower bound limits a sample's weight, because ends do not show what lies between them.
     static double within(double x, double most) { return x > 1.0 / 64 ? std::min(x, most) : 1.0 / 64; }
 
-    // The size of the mean where textures would have to be asked.
+    // Returns the jump, or the mean where textures would have to be evaluated.
     double jump(const Intersection& i, Vec2 n0, Vec2 n1) {
         const SceneView<T>& scene = view_.scene;
         if (is_textured(scene, i.face[0]) || is_textured(scene, i.face[1])) return scale_.unknown;
@@ -58,10 +58,10 @@ class IntersectionSize {
     const BackwardView<T>& view_;
     const JumpScale& scale_;
     IntersectionPlanes planes_;
-    std::vector<double> jump_;  // of each channel, at either end
+    std::vector<double> jump_;  // jump of each channel, at either end
 };
 
-// Where there are too many for all to be found: of faces that are hidden, most likely, or out of view, fewer are drawn.
+// Draws a subset of too many intersections. Faces out of view, or most likely hidden, get fewer.
 template <class T>
 Array<Intersection> draw_intersections(const BackwardView<T>& view) {
     constexpr float hidden = 1.0f / 8;
@@ -82,9 +82,9 @@ Array<Intersection> draw_intersections(const BackwardView<T>& view) {
         hash(view.options.seed, 12, gradient_stream), view.team);
 }
 
-// Lines where faces pass through each other: those where the adjoint is not zero, appended to `out.intersection`. What
-// is known of their jumps tells how they compare with one another. Of silhouettes it is not known, so together they
-// count as half their length, for where they are many most join what is near in space too.
+// Appends the intersection lines where the adjoint is not zero to `out.intersection`. Their known jumps compare them
+// with one another. Jumps of silhouettes are unknown, so the lines together count as half their length. Where they are
+// many, most join surfaces that are near in space too.
 constexpr double share_of_length = 0.5;
 template <class T>
 void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {

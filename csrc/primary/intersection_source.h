@@ -1,16 +1,16 @@
-// Lines along which faces pass through each other, as a source of curves.
+// This file holds the curve source of lines along which faces intersect.
 //
-// Of two planes A and B let F be the difference of what is affine in the image: 1/z in perspective, −z in an
-// orthographic view,
+// For two planes A and B, let F be the difference of a quantity that is affine in the image: 1/z in perspective, −z in
+// an orthographic view.
 //
 //     F(x) = 1/z_A − 1/z_B   or   z_B − z_A,     A is in front where F > 0.
 //
-// The curve F = 0 is straight, and its share of ∂loss/∂Φ is ∫ Ã · [L_A − L_B] δF / |∇F| dℓ, where δF is taken at fixed
-// x: on the plane with the normal N, through q_i, along the ray q(z) at x,
+// The curve F = 0 is straight, and contributes ∫ Ã · [L_A − L_B] δF / |∇F| dℓ to ∂loss/∂Φ. δF is taken at fixed x, on
+// the plane with the normal N through q_i, along the ray q(z) at x:
 //
 //     (N · dq/dz) δz = N · (Σ b_i δq_i − δq(z)).
 //
-// Where a lens bends the image, dℓ / |∇F| is that of the undistorted image times the area scale.
+// Where a lens distorts the image, dℓ / |∇F| is that of the undistorted image times the area scale.
 #pragma once
 
 #include <algorithm>
@@ -25,21 +25,23 @@
 
 namespace edgegrad {
 
-// In the image.
+// An IntersectionCurve is an intersection line in the image.
 struct IntersectionCurve {
     const Intersection* faces = nullptr;
     Vec3 a, b;              // ends within the view, camera coordinates
-    double w0 = 1, w1 = 1;  // denominators of the projection there
-    Vec2 x0, x1;            // their pixel positions
+    double w0 = 1, w1 = 1;  // depth weights of the ends
+    Vec2 x0, x1;            // pixel positions of the ends
     double length = 0;      // px
 
-    Vec2 low() const { return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)}; }  // of its box
+    Vec2 low() const {
+        return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)};
+    }  // low() and high() are corners of its box.
     Vec2 high() const { return {std::max(x0.x, x1.x), std::max(x0.y, x1.y)}; }
     double nearest_depth() const { return std::min(a.z, b.z); }
 };
 
-// False where it is out of view, where a face is seen edge-on, or where it is an edge that is a silhouette: that is a
-// curve by itself, and stands for it. `facing` (F,): see facing_of_faces.
+// Sets the curve. Returns false if it is out of view or a face is seen edge-on. Returns false, too, for an edge that is
+// a silhouette, which is a curve by itself. For `facing` (F,) see facing_of_faces.
 template <class T>
 bool find_intersection(const BackwardView<T>& view, const Array<int8_t>& facing, const Intersection& i,
                        IntersectionCurve& c) {
@@ -52,13 +54,13 @@ bool find_intersection(const BackwardView<T>& view, const Array<int8_t>& facing,
     c.faces = &i;
     c.a = (1 - t0) * a + t0 * b, c.b = (1 - t1) * a + t1 * b;
     c.w0 = camera.depth_weight(c.a), c.w1 = camera.depth_weight(c.b);
-    if (!(c.w0 > 0 && c.w1 > 0)) return false;  // ends in the eye itself
+    if (!(c.w0 > 0 && c.w1 > 0)) return false;  // The line ends in the eye itself.
     c.x0 = view.volume.inside(project(camera, c.a)), c.x1 = view.volume.inside(project(camera, c.b));
     c.length = length(c.x1 - c.x0);
     return c.length > 0 && std::isfinite(c.length);
 }
 
-// Of the planes of both faces, what the points of a curve share.
+// IntersectionPlanes holds what the points of a curve share of the planes of both faces.
 struct IntersectionPlanes {
     FaceMap map[2];
     Vec3 normal[2];
@@ -79,7 +81,7 @@ struct IntersectionPlanes {
         return *this;
     }
 
-    // The length, px, of a silhouette whose motion would change the image as much, at a point of the curve.
+    // Returns the length, px, of a silhouette whose motion would change the image as much, at a point of the curve.
     double as_silhouette(const Camera& camera, double z, Vec2 n) const {
         double squares = 0;
         for (const Vec3 N : normal) squares += dot(N, N) / std::pow(camera.along_ray(N, n), 2);
@@ -169,7 +171,7 @@ class IntersectionSource {
 
     void cast() { places_ = 0; }
 
-    // Adds what was summed for the latest curve.
+    // Adds the sums of the latest curve.
     void finish(LocalGradients& grad) {
         if (!current_) return;
         for (int k = 0; k < 2; ++k)
@@ -181,7 +183,7 @@ class IntersectionSource {
     }
 
    private:
-    // A curve of which samples wait.
+    // A Place is a curve with pending samples.
     struct Place {
         Curve curve;
         IntersectionPlanes planes;
@@ -204,10 +206,10 @@ class IntersectionSource {
     }
 
     const BackwardView<T>& view_;
-    Place place_[RayBatch::size];  // of the samples that wait
+    Place place_[RayBatch::size];  // places of the pending samples
     int places_ = 0;
 
-    // Sums for the latest curve, of the corners of both faces.
+    // The members below sum over the latest curve, by the corners of both faces.
     const Intersection* current_ = nullptr;
     Vec3 q_bar_[2][3];
 };

@@ -1,4 +1,4 @@
-// What the sizes of jumps in all channels are compared by.
+// This file scales jumps, so that the sizes of different channels compare.
 #pragma once
 
 #include <algorithm>
@@ -11,11 +11,11 @@
 namespace edgegrad {
 
 struct JumpScale {
-    std::vector<double> weights;  // of the channels
-    double unknown = 0;           // the size of a jump of which nothing is known: Σ_c weight_c · (mean |L_c|)
+    std::vector<double> weights;  // weights of the channels
+    double unknown = 0;           // size of an unknown jump: Σ_c weight_c · (mean |L_c|)
 };
 
-// Mean of Σ_c weight_c |value_c| over all rows.
+// Returns the mean of Σ_c weight_c |value_c| over all rows.
 template <class Number>
 double mean_size(const Number* values, int64_t rows, const double* weights, int width, ThreadTeam& team) {
     if (rows == 0 || width == 0) return 0;
@@ -30,8 +30,8 @@ double mean_size(const Number* values, int64_t rows, const double* weights, int 
     return all / double(rows);
 }
 
-// The channels of radiance have one unit. Attributes have units of their own, so there a channel counts as much as the
-// loss depends on it.
+// Returns the scale of jumps. The channels of radiance have one unit. Attributes have different units, so a channel is
+// weighted by the loss's sensitivity to it.
 template <class T>
 JumpScale jump_scale(const BackwardView<T>& view) {
     const SceneView<T>& scene = view.scene;

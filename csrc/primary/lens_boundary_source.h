@@ -1,7 +1,8 @@
-// The lens boundary (camera/lens_boundary.h), along which the image jumps from the scene to the background.
+// This file holds the curve source of the lens boundary (camera/lens_boundary.h), along which the image jumps from the
+// scene to the background.
 //
-// Its share of ∂loss/∂Φ is ∫ Ã · [L_inside − L_background] (∂x/∂Φ · N) dθ, with N the normal that points outwards, as
-// long as dx/dθ. The ray of a sample is that of the lens boundary itself, the last that is seen.
+// It contributes ∫ Ã · [L_inside − L_background] (∂x/∂Φ · N) dθ to ∂loss/∂Φ. The normal N points outwards and is as
+// long as dx/dθ. The ray of a sample is that of the lens boundary itself, the last one in view.
 #pragma once
 
 #include <cmath>
@@ -19,10 +20,10 @@ namespace edgegrad {
 
 struct LensBoundaryArc {
     LensBoundary::Arc arc;
-    double length, measure;  // px; and with the mean |Ã| near it
+    double length, measure;  // px; and px times the mean |Ã| near it
 };
 
-// The lens boundary in arcs of a few pixels: those where the adjoint is not zero.
+// LensBoundaryCurve divides the lens boundary into arcs of a few pixels, where the adjoint is not zero.
 struct LensBoundaryCurve {
     const LensBoundary lens_boundary;
     std::vector<LensBoundaryArc> arcs;
@@ -47,13 +48,13 @@ struct LensBoundaryCurve {
     }
 };
 
-// What a accumulation asks of it.
+// LensBoundarySource answers what an accumulation asks of a curve source.
 class LensBoundarySource {
    public:
     struct Sample {
         Vec2 x, normal;  // px, and N
         LensBoundary::Point point;
-        double weight;  // inverse of the density of samples along the arc
+        double weight;  // reciprocal density of samples along the arc
         SurfacePoint inside;
     };
 
@@ -80,7 +81,7 @@ class LensBoundarySource {
 };
 static_assert(MovingCurve<LensBoundarySource>);
 
-// Samples in batches of rays, of which none ignores a face: nothing hides a point of the lens boundary.
+// LensBoundarySamples traces samples in batches. Rays ignore no face, because nothing occludes the lens boundary.
 template <class T>
 class LensBoundarySamples {
    public:
@@ -91,7 +92,7 @@ class LensBoundarySamples {
           accumulation_(accumulation),
           rays_(view.frame) {}
 
-    // The point at the fraction s of an arc; its x is a place that shows the inside, for who asks there for a ray.
+    // Adds the point at the fraction s of an arc. Its x shows the inside, for accumulations that cast a ray there.
     void add(LensBoundary::Arc arc, double s, double weight) {
         const int i = rays_.count;
         const std::optional<LensBoundary::Point> point = lens_boundary_.at(arc.from + s * (arc.to - arc.from));
@@ -101,7 +102,7 @@ class LensBoundarySamples {
                       .point = *point,
                       .weight = weight,
                       .inside = {}};
-        // Right behind a fisheye n is some 1e-16, and Embree may miss what a ray with so small components should meet.
+        // Right behind a fisheye n is about 1e-16. Embree may miss a face if a ray has so small components.
         const auto rounded = [](double x) { return std::fabs(x) < 1e-12 ? 0.0 : x; };
         rays_.n_x[i] = rounded(point->n.x), rays_.n_y[i] = rounded(point->n.y);
         if (++rays_.count == RayBatch::size) cast();
@@ -120,7 +121,7 @@ class LensBoundarySamples {
         view_.frame.cast(rays_);
         for (int i = 0; i < rays_.count; ++i) {
             const int32_t face = rays_.face[i];
-            if (face < 0) continue;  // the background on both sides
+            if (face < 0) continue;  // The background is on both sides.
             const Vec2 n = rays_.n(i);
             const FaceMap map = face_map(view_.camera, corners_of(view_, face).data());
             sample_[i].inside = {face, barycentrics_of_hit(map, n), depth_of(view_, face, n)};

@@ -1,5 +1,5 @@
-// Where parts of the surface that do not hang together (topology.h) meet in the image: one occludes the other there, or
-// passes through it, of which no curve of either tells.
+// This file finds where unconnected parts of the surface (topology.h) meet in the image. One occludes the other there,
+// or intersects it, and no curve of either tells.
 #pragma once
 
 #include <algorithm>
@@ -14,11 +14,11 @@ namespace edgegrad {
 
 class MeetingParts {
    public:
-    // `hit` (H, W, 2): the first and the last of the faces (F, 3) that were hit in each pixel; see HitBuffers.
+    // `hit` (H, W, 2) has the first and the last of the faces (F, 3) that were hit in each pixel; see HitBuffers.
     MeetingParts(const int32_t* hit, const int32_t* faces, const Parts& parts, int width, int height, ThreadTeam& team)
         : width_(width), height_(height) {
         if (parts.size() < 2) return;
-        std::vector<int32_t> part(size_t(width) * height);  // −1: none, −2: several
+        std::vector<int32_t> part(size_t(width) * height);  // −1: no part, −2: several
         const int rows = std::max(1, (1 << 14) / width), strips = (height + rows - 1) / rows;
         const auto each_row = [&](auto body) {
             team.parallel_for(strips, [&](int64_t k) {
@@ -51,7 +51,7 @@ class MeetingParts {
         });
     }
 
-    // Whether some may meet in a box of the image, or a pixel next to it.
+    // Returns whether parts may meet in a box of the image, or in a pixel next to it.
     bool in(Vec2 low, Vec2 high) const {
         if (meet_.empty()) return false;
         const int i0 = pixel(low.x, width_), i1 = pixel(high.x, width_);
@@ -69,7 +69,7 @@ class MeetingParts {
     static int pixel(double x, int count) { return int(std::clamp(x, 0.0, double(count - 1))); }
     static constexpr int64_t most_pixels = 64;  // larger boxes are not searched
     int width_, height_;
-    std::vector<uint8_t> meet_;  // (H, W): in a pixel or next to it; empty: there is one part
+    std::vector<uint8_t> meet_;  // (H, W): whether parts meet in a pixel or next to it; empty: there is one part
 };
 
 }  // namespace edgegrad

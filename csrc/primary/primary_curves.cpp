@@ -1,4 +1,4 @@
-// The estimator of the boundary term: samples over all curves, one ray each.
+// This file estimates the boundary term from samples over all curves, with one ray each.
 
 #include "primary/primary_curves.h"
 
@@ -22,7 +22,7 @@ namespace edgegrad {
 
 namespace {
 
-// Of a sample it only matters whether it is visible.
+// VisibilityQuery only tells whether a sample is visible.
 class VisibilityQuery final : public CurveAccumulation {
    public:
     bool visible = false;
@@ -33,7 +33,7 @@ class VisibilityQuery final : public CurveAccumulation {
     void contract(int, MovingSample&) override { visible = true; }
 };
 
-// Edges, lines where faces pass through each other, and the lens boundary, in their order as primitives.
+// Edges, intersections and the lens boundary are numbered as primitives in this order.
 enum Kind { on_edges, on_intersections, on_lens_boundary };
 
 template <class T>
@@ -51,12 +51,12 @@ OrderedDraws ordered(const BackwardView<T>& view, const Curves<T>& curves, const
     return {systematic, n, {edges, lines, lines + curves.arcs()}, cell, view.team};
 }
 
-// Some of the samples.
+// Drawn is a range of the samples.
 struct Drawn {
     const OrderedDraws& draws;
     int64_t first, last;
 
-    // Calls body(k, s, weight) for each: on the curve k, at its fraction s.
+    // Calls body(k, s, weight) for each sample, on the curve k at its fraction s.
     template <class Body>
     void each(Body body) const {
         const Systematic& systematic = draws.systematic();
@@ -66,13 +66,13 @@ struct Drawn {
     }
 };
 
-// Samples keep so far from the ends of a crease that what floats leave of a silhouette there does not matter.
+// Keeps samples off the ends of a crease, so far that rounding of a silhouette there does not matter.
 double kept_off_ends(const Curve& curve, double s) {
     const double end = curve.is_crease() ? std::min(float_reach / curve.length, 0.1) : 0;
     return std::clamp(s, end, 1 - end);
 }
 
-// Unless it is the same as before; false if it has no extent.
+// Finds the curve, unless it is the current one. Returns false if it has no extent.
 template <class T>
 bool find(const Curves<T>& curves, const MeasuredCurve& measured, Curve& curve) {
     if (curve.edge == measured.edge || curves.finder.find(measured.edge, curve)) return true;
@@ -80,8 +80,8 @@ bool find(const Curves<T>& curves, const MeasuredCurve& measured, Curve& curve) 
     return false;
 }
 
-// Whether any sample of a crease between hidden faces is visible, for once. No silhouette passes before these faces, so
-// that other curves on a crease (coincident_segments.h) have no part in whether something hides it.
+// Returns whether any sample of a crease between hidden faces is visible after all. No silhouette passes before these
+// faces. Other curves on a crease (coincident_segments.h) therefore cannot affect whether something hides it.
 template <class T>
 bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const OrderedDraws& draws) {
     if (!curves.any_hidden) return false;
@@ -169,7 +169,7 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
     const OrderedDraws draws = ordered(view, curves, systematic, n);
-    const bool hidden = any_visible(view, curves, draws);  // whether these count after all
+    const bool hidden = any_visible(view, curves, draws);  // whether creases between hidden faces count after all
     curves.add_segments(view, systematic, hidden);
     const CoincidentCurves coincident(std::move(curves.segments), systematic, view.team);
     profile.curves += watch.lap();

@@ -1,9 +1,9 @@
-// AlphaEdges of alpha-tested faces on faces, cut into pieces at the borders of cells between texels.
+// This file finds the alpha edges of alpha-tested faces and cuts them at the borders of texel cells.
 //
-// Between four texels a bilinear α is f + x f_x + y f_y + x y f_xy, so the alpha edge F = α − cutoff = 0 is a hyperbola
-// whose axes are the texture's. A branch is monotonous and convex, so a line across its chord meets it once, and before
-// the other branch: how far along the chord, t, says where on it a point lies. Where the nearest texel is taken, alpha
-// edges are borders of texels.
+// Between four texels a bilinear α is f + x f_x + y f_y + x y f_xy. The alpha edge F = α − cutoff = 0 is therefore a
+// hyperbola whose axes are the texture's. A branch is monotonous and convex, so a line across its chord meets it once,
+// and before the other branch. The position t along the chord therefore parametrises the branch. Where the filter is
+// nearest, alpha edges are borders of texels.
 #pragma once
 
 #include <algorithm>
@@ -20,28 +20,28 @@
 
 namespace edgegrad {
 
-// A piece of an alpha edge: within one cell, and on one face.
+// An AlphaEdge is a piece of an alpha edge within one texel cell and on one face.
 struct AlphaEdge {
     int32_t face;
-    // 0: of a bilinear α. Else between nearest texels: the coordinate that changes across it, 1 or 2, with the sign of
-    // the side on which the face is there.
+    // border is 0 on a bilinear α. Between nearest texels it is the coordinate that changes across the edge, 1 or 2.
+    // Its sign tells the side on which the face is opaque.
     int border;
-    double i, j;  // the cell
+    double i, j;  // position of the cell, in texels
     Barycentrics begin, end;
-    double share;  // how many it stands for
+    double share;  // number of pieces that this one stands for
 };
 
-// A place on an alpha edge. In barycentrics, with κ: dp/dt = κ (−∂F/∂v, ∂F/∂u).
+// An AlphaEdgePoint is a point of an alpha edge. In barycentrics, with κ: dp/dt = κ (−∂F/∂v, ∂F/∂u).
 struct AlphaEdgePoint {
     Barycentrics b;
     Barycentrics slope;  // ∂F/∂b
     Vec2 by_uv;          // ∂F/∂uv
     double kappa;
-    Footprint alpha;  // of which F is made, where it is bilinear
+    Footprint alpha;  // texels and weights of F, where it is bilinear
 };
 
-// A face in the cells of its alpha texture: the corners of cells are the centres of texels, or, where the nearest one
-// is taken, their corners.
+// FaceCells maps a face to the cells of its alpha texture. The corners of cells are the centres of texels, or, where
+// the filter is nearest, the corners of texels.
 template <class T>
 class FaceCells {
    public:
@@ -68,10 +68,10 @@ class FaceCells {
     const double cutoff;
     const bool linear;
     Vec2 corner[3], side[2];
-    double area;  // twice
+    double area;  // twice the signed area, texels²
 };
 
-// F in the cell from (i, j) on, of a bilinear α.
+// AlphaCell holds F of a bilinear α in the cell whose first corner is (i, j).
 struct AlphaCell {
     double i, j, f[4];
 
@@ -83,7 +83,7 @@ struct AlphaCell {
         return f[0] + x * (f[1] - f[0]) + y * (f[2] - f[0]) + x * y * both();
     }
     Vec2 gradient(Vec2 q) const { return {f[1] - f[0] + (q.y - j) * both(), f[2] - f[0] + (q.x - i) * both()}; }
-    // The nearest point of the alpha edge across a chord through q.
+    // Returns the nearest point of the alpha edge across a chord through q.
     Vec2 on_alpha_edge(Vec2 q, Vec2 chord) const {
         const Vec2 across{-chord.y, chord.x}, g = gradient(q);
         const double c0 = value(q), c1 = g.x * across.x + g.y * across.y, c2 = across.x * across.y * both();
@@ -97,7 +97,7 @@ class AlphaEdgeFinder {
    public:
     explicit AlphaEdgeFinder(const SceneView<T>& scene) : scene_(scene) {}
 
-    // All, but of very many cells or pieces those that a seed draws: these stand for all.
+    // Returns all pieces. If cells or pieces are too many, the seed draws a subset that stands for all.
     std::vector<AlphaEdge> find(uint64_t seed, ThreadTeam& team) const {
         std::vector<AlphaEdge> found;
         if (!scene_.alpha_masks.face) return found;
@@ -123,7 +123,7 @@ class AlphaEdgeFinder {
         return some;
     }
 
-    // At the fraction t along the chord. False where rounding leaves no direction.
+    // Sets `out` at the fraction t along the chord. Returns false where rounding leaves no direction.
     bool place(const AlphaEdge& alpha_edge, double t, AlphaEdgePoint& out) const {
         const FaceCells<T> cells(scene_, alpha_edge.face);
         const Vec2 a = cells.place(alpha_edge.begin), b = cells.place(alpha_edge.end), chord = b - a;
@@ -138,7 +138,7 @@ class AlphaEdgeFinder {
         out.b = cells.at(q);
         out.by_uv = {gradient.x * double(cells.texture.width), -gradient.y * double(cells.texture.height)};
         out.slope = {dot(gradient, cells.side[0]), dot(gradient, cells.side[1])};
-        // In cells dp/dt = κ area (−F_y, F_x), and its part along the chord is the chord.
+        // In cells dp/dt = κ area (−F_y, F_x). Its component along the chord equals the chord.
         out.kappa = dot(chord, chord) / (wedge(gradient, chord) * cells.area);
         return std::isfinite(out.kappa);
     }
@@ -152,20 +152,20 @@ class AlphaEdgeFinder {
         const double sign = border > 0 ? 1 : -1;
         return std::abs(border) == 1 ? Vec2{sign, 0} : Vec2{0, sign};
     }
-    // About how many cells a face runs through.
+    // Estimates the number of cells that a face covers.
     static double cells_of(const FaceCells<T>& cells) {
         const double n = 0.5 * std::fabs(cells.area) + 2 * (length(cells.side[0]) + length(cells.side[1])) + 1;
         return std::isfinite(n) ? n : 0;
     }
 
-    // Every so many rows of cells, from a random one on.
+    // Adds the pieces in every `every`-th row of cells, starting at a random one.
     void add(int32_t face, double every, double random, std::vector<AlphaEdge>& out) const {
         const FaceCells<T> cells(scene_, face);
         if (!(std::fabs(cells.area) > 0) || !std::isfinite(cells.area)) return;
         const Vec2* p = cells.corner;
         const double top = std::floor(std::min({p[0].y, p[1].y, p[2].y})), bottom = std::max({p[0].y, p[1].y, p[2].y});
         for (double j = top + std::floor(random * every); j <= bottom; j += every) {
-            // What of the face lies between two borders of rows.
+            // The interval [low, high] is what the face covers of this row.
             double low = std::numeric_limits<double>::infinity(), high = -low;
             const auto take = [&](double x) { low = std::min(low, x), high = std::max(high, x); };
             for (int k = 0; k < 3; ++k) {
@@ -192,7 +192,8 @@ class AlphaEdgeFinder {
     void add_cell(int32_t face, const FaceCells<T>& cells, const AlphaCell& c, double every,
                   std::vector<AlphaEdge>& out) const {
         if (!c.has_alpha_edge()) return;
-        // Where it meets the sides of the cell; of two branches one is on either side of the middle, across.
+        // These are the points at which the alpha edge meets the sides of the cell. One of two branches lies on either
+        // side of the cell's middle, across.
         const auto between = [&](int k, int m) { return c.f[k] / (c.f[k] - c.f[m]); };
         Vec2 left[2], right[2];
         int n_left = 0, n_right = 0;
@@ -219,14 +220,14 @@ class AlphaEdgeFinder {
         if ((cells.alpha(i, j - 1) >= 0) != here) clip(face, cells, nullptr, here ? 2 : -2, down, every, out);
     }
 
-    // Adds what of a piece of alpha edge lies on the face.
+    // Adds the parts of a piece that lie on the face.
     void clip(int32_t face, const FaceCells<T>& cells, const AlphaCell* cell, int border, const Vec2 (&end)[2],
               double every, std::vector<AlphaEdge>& out) const {
         const Vec2 chord = end[1] - end[0];
         const double squared = dot(chord, chord);
         if (!(squared > 0)) return;
-        // Where it meets the face's sides.
-        double part[8] = {0, 1};  // ascends
+        // Cuts are where the piece meets the sides of the face.
+        double part[8] = {0, 1};  // ascending fractions of the chord
         int n = 2;
         const auto cut = [&](double t) {
             if (!(t > 0 && t < 1)) return;
@@ -258,8 +259,8 @@ class AlphaEdgeFinder {
         }
     }
 
-    // Whether a point of the alpha edge lies on the face. An alpha edge along a side of it belongs to the face that is
-    // alpha-tested there; between nearest texels it is the edge that casts the shadow.
+    // Returns whether a point of the alpha edge lies on the face. An alpha edge along a side belongs to the face that
+    // is alpha-tested there. Between nearest texels that edge itself casts the shadow.
     static bool lies_on(const FaceCells<T>& cells, Vec2 q, Vec2 gradient) {
         const double turn = cells.area > 0 ? 1 : -1;
         for (int k = 0; k < 3; ++k) {

@@ -1,25 +1,26 @@
-// Borders of what surfaces see of one another, as a source of curves: an edge (a, b), or an alpha edge, on the
-// line between two points of a path of light, y₁ that is seen in the image and y₂ that sends light to it.
+// This file holds the curve source of secondary edges: edges (a, b) and alpha edges seen from a shading point. Each
+// lies on the line between two points of a light path. y₁ is the shading point, which the image shows. y₂ is the
+// reflector, which sends light to y₁.
 //
-// In place of a light there is a surface of the scene, so that one border in the image has no one place: for each point
-// of the edge and each line past it there is another. Lines are drawn by the point p = (1 − t) a + t b and the unit
-// direction w, in the wedge on which the faces of the edge lie where N · (y − p) < 0, N = (b − a) × w. A line that is
-// moved by h along N / |N| passes the faces if h > 0, and |N| dh dt dω is the measure of lines, cos θ₁ cos θ₂ / r² dA₁
-// dA₂ at its ends: so the border's share of ∂loss/∂Φ is
+// A surface takes the place of a light here, so one edge has no single image: each point of it and each line past it
+// gives another. Lines are drawn by the point p = (1 − t) a + t b and the unit direction w. w lies in the wedge in
+// which the faces of the edge have N · (y − p) < 0, with N = (b − a) × w. A line that moves by h along N / |N| passes
+// the faces if h > 0. The measure of lines is |N| dh dt dω; at its ends it is cos θ₁ cos θ₂ / r² dA₁ dA₂. The edge
+// therefore contributes to ∂loss/∂Φ
 //
 //     ∫∫ Ã |dx/dA₁| V f₁ L₂ δF dt dω,    F = N · (λ y₁ + (1 − λ) y₂ − p),    λ = |y₂ − p| / (|y₁ − p| + |y₂ − p|)
 //
-// with f₁ L₂ what y₁ scatters to the viewer of what y₂ sends, and V whether the viewer sees y₁. The place of y₁ in the
-// image is fixed, y₂ and p stay at their places on face and edge: along the ray r = dq/dz of the camera, with the
-// normal m of the face of y₁, c = N·r / m·r, and barycentrics β and γ of y₁ and y₂,
+// Here f₁ L₂ is what y₁ scatters to the viewer of the light from y₂, and V tells whether the viewer sees y₁. The
+// position of y₁ in the image is fixed; y₂ and p stay at their barycentrics on face and edge. The camera's ray is
+// r = dq/dz, m is the normal of the face of y₁, c = N·r / m·r, and β and γ are the barycentrics of y₁ and y₂. Then
 //
-//     δF = λ c m · Σ β_i δv_i + (1 − λ) N · Σ γ_i δv_i − N · ((1 − t) δa + t δb) + λ (N − c m) · δq(x),
+//     δF = λ c m · Σ β_i δv_i + (1 − λ) N · Σ γ_i δv_i − N · ((1 − t) δa + t δb) + λ (N − c m) · δq(x).
 //
-// of which λ (N − c m) · (δq(x) − Σ β_i δv_i) is that y₁ slides on its face. That part counts as far as light does not
-// come from nearby, times 1 − φ(|y₂ − y₁|): sliding before what is near is found otherwise (near_field.h).
+// The part λ (N − c m) · (δq(x) − Σ β_i δv_i) says that y₁ moves on its face. It is weighted by 1 − φ(|y₂ − y₁|),
+// because the near-field term covers light from nearby (near_field.h).
 //
-// δq(x) at a fixed depth, as for borders of shadows (shadow_source.h). On an alpha edge p = Σ b_i v_i moves with its
-// face and, as f grows by δf, gives way by −N·δp = κ D δf (occluder.h).
+// δq(x) is taken at a fixed depth, as for shadow boundaries (shadow_source.h). On an alpha edge p = Σ b_i v_i moves
+// with its face; as f grows by δf, the alpha edge recedes by −N·δp = κ D δf (occluder.h).
 #pragma once
 
 #include <algorithm>
@@ -33,17 +34,17 @@
 
 namespace edgegrad {
 
-// A line past an edge or an alpha edge, of which both ends lie on faces.
+// An EdgeLine is a line past an edge or an alpha edge, of which both ends lie on faces.
 struct EdgeLine {
     Occluder occluder = {};
-    Vec3 w = {};                            // unit, world coordinates; the faces lie where N · (y − p) < 0
-    int64_t segment = 0;                    // of the sampler (secondary_edges.cpp)
-    int32_t receiver = -1, reflector = -1;  // the faces of y₁ and y₂
-    Barycentrics at = {}, from = {};        // y₁ and y₂ on them
-    Barycentrics asked = {};  // where the reflector's radiance is asked: next to y₂, if the edge lies on that face
+    Vec3 w = {};                            // unit direction, world coordinates; the faces lie where N · (y − p) < 0
+    int64_t segment = 0;                    // number that identifies the sampler's segment (secondary_edges.cpp)
+    int32_t receiver = -1, reflector = -1;  // faces of y₁ and y₂
+    Barycentrics at = {}, from = {};        // barycentrics of y₁ and y₂
+    Barycentrics asked = {};  // where the reflector's radiance is evaluated: next to y₂, if the edge lies on that face
     double share = 0;         // λ
     double distance = 0;      // |y₂ − y₁|
-    double facing = 0;        // on which side of the receiver's plane the reflector is
+    double facing = 0;        // sign tells the side of the receiver's plane on which the reflector lies
 };
 
 template <class T>
@@ -53,20 +54,20 @@ class EdgeLineSource {
 
     struct Sample : CurveSample {
         EdgeLine line;
-        int32_t own;  // the receiver, which the ray ignores
+        int32_t own;  // the receiver, which the primary ray ignores
         CurveFaces faces;
         Vec3 N, m;             // ∂F/∂y₂ / (1 − λ), and ∂F/∂v_i / β_i of the receiver
         Vec2 by_n;             // ∂F/∂n
         double by_alpha_edge;  // ∂F/∂f
-        double scale;          // px² of the undistorted image for each unit of the receiver's area
+        double scale;          // px² of the undistorted image per unit of the receiver's area
     };
 
-    // near  the radius of what slides are found of otherwise, world units
+    // `near` is the radius of the near-field term, world units.
     EdgeLineSource(const BackwardView<T>& view, double near) : view_(view), near_(near) {}
 
     Vec2 position(const Curve& line, double) const { return project(view_.camera, place_of(line)); }
 
-    // In camera coordinates.
+    // Returns y₁ in camera coordinates.
     Vec3 place_of(const Curve& line) const {
         const auto v = corners_of(view_, line.receiver);
         return line.at[0] * v[0] + line.at[1] * v[1] + line.at[2] * v[2];
@@ -77,7 +78,7 @@ class EdgeLineSource {
         const auto v = corners_of(view_, line.receiver);
         const Array<Vec3>& q = view_.vertices.q;
         const Vec3 m = cross(v[1] - v[0], v[2] - v[0]), y = place_of(line);
-        // What the viewer sees from behind is dark on both sides of the border.
+        // A face that the viewer sees from behind is dark on both sides of the edge.
         if (!(line.facing * dot(m, camera.to_viewer(y)) > 0)) return false;
 
         sample.line = line, sample.own = line.receiver;
@@ -101,7 +102,7 @@ class EdgeLineSource {
 
     const CurveFaces& faces_of(const Sample& sample) const { return sample.faces; }
 
-    // The receiver, and, of which no radiance is wanted, the reflector.
+    // Returns the receiver and the reflector. The reflector's radiance is not wanted.
     SampleSurfaces surfaces(const Sample& sample) const {
         const EdgeLine& line = sample.line;
         return {{{line.receiver, line.at, sample.point.z}, {line.reflector, line.asked, sample.point.z}}};

@@ -1,15 +1,16 @@
-// Samples on the borders of shadows, by the area that these sweep on surfaces.
+// This file draws samples on indirect shadow boundaries, by the area that these sweep on surfaces.
 //
-// With F = N · (y − p) of shadow_source.h, and y at fixed barycentrics of the receiver, which has the unit normal g,
+// Let F = N · (y − p) as in shadow_source.h, with y at fixed barycentrics of the receiver, which has the unit normal g.
+// Then
 //
 //     δF = N · (Σ β_i δv_i − w_a δa − w_b δb − w_l δl).
 //
-// On the receiver |∇F| = |N × g|, and per unit of t on the edge the border has the length S |g × N| / |g·d|. So what
-// light the surface gets changes by
+// On the receiver |∇F| = |N × g|, and per unit of t on the edge the boundary has the length S |g × N| / |g·d|. The
+// light that the surface gets therefore changes by
 //
 //     ∫ [L(F > 0) − L(F < 0)] δF / |∇F| dℓ = ∫ [L(F > 0) − L(F < 0)] δF S / |g·d| dt.
 //
-// The samples are those of shadows.cpp, but that no camera has a say in where they lie.
+// Samples are drawn as in shadows.cpp, but without weights by the image: the camera need not see them.
 
 #include "secondary/indirect_shadows.h"
 
@@ -23,7 +24,7 @@ namespace edgegrad {
 
 namespace {
 
-// A border on a receiver, in world coordinates.
+// BorderOnFace is a shadow boundary on a receiver, in world coordinates.
 template <class T>
 struct BorderOnFace {
     const SceneView<T>& scene;
@@ -41,7 +42,7 @@ struct BorderOnFace {
         for (int i = 0; i < 3; ++i) v[i] = corner(scene, point.face, i), y += point.on[i] * v[i];
         g = unit(cross(v[1] - v[0], v[2] - v[0]));
     }
-    // Area for each unit of F and t.
+    // Returns the area per unit of F and t.
     double scale() const { return border.S / std::fabs(dot(g, border.d)); }
 
     void append_to(CurveRecords& records, double weight) const {

@@ -1,5 +1,5 @@
-// The curves along which shadows end on surfaces, whether the camera sees them there or not: these surfaces light
-// others, to which less or more of the light comes by way of them as the curves move.
+// This file declares the term of indirect shadow boundaries: the curves along which shadows end on surfaces, seen by
+// the camera or not. These surfaces light others, and the light that they pass on changes as the curves move.
 #pragma once
 
 #include "estimator/view.h"
@@ -7,8 +7,8 @@
 
 namespace edgegrad {
 
-// Records so many samples on the borders of a light's shadows, by area of the surface that they sweep. Their positions
-// in the image are not set, and velocities are by places of vertices and of the light in the world.
+// Records `samples` samples on a light's shadow boundaries, by the area of the surface that these sweep. The samples
+// have no position in the image. Their velocities are by world coordinates of the vertices and of the light.
 template <class T>
 void add_indirect_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
                           int64_t samples, GradientSink& to);

@@ -1,4 +1,4 @@
-// Where light goes on past the edges and alpha edges that cast shadows.
+// This file traces light past the edges and alpha edges that cast shadows, to the faces behind them.
 #pragma once
 
 #include <algorithm>
@@ -17,7 +17,7 @@
 
 namespace edgegrad {
 
-// Rays from points of a light past edges and alpha edges, in batches, and what they meet behind.
+// LightRays traces rays from points of a light past edges and alpha edges, in batches.
 template <class T>
 class LightRays {
    public:
@@ -25,8 +25,7 @@ class LightRays {
               const std::vector<AlphaEdge>& alpha_edges)
         : view_(view), casters_(casters), light_(light), alpha_edges_(alpha_edges) {}
 
-    // The place t of an edge or an alpha edge before a point of the light, for whoever knows the segment by this
-    // number.
+    // Adds the ray from a point of the light past the place t of an edge or an alpha edge. `segment` identifies it.
     void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
         Pending& w = pending_[count_];
         w.point = {.caster = {},
@@ -42,7 +41,7 @@ class LightRays {
             return;
         const Vec3 light = w.point.light;
         if (light_.infinite) {
-            // From outside of the scene.
+            // The ray starts outside of the scene.
             const RayFrame& frame = view_.geometry.caster().frame();
             w.before = (4 * frame.radius * frame.unit + length(w.p - frame.centre)) / length(light);
             w.ray = {w.p + w.before * light, -light};
@@ -60,8 +59,8 @@ class LightRays {
 
     bool is_full() const { return count_ == RayBatch::size; }
 
-    // Calls body(ShadowPoint, weight) for each face to which light goes on past them: the first that casts a shadow,
-    // and those before it that let light through.
+    // Calls body(ShadowPoint, weight) for each face that light reaches past the edges. These are the first face that
+    // casts a shadow, and the faces before it that transmit light.
     void cast(const std::function<void(const ShadowPoint&, double)>& body) {
         while (count_ > 0) {
             int32_t face[RayBatch::size];
@@ -75,8 +74,8 @@ class LightRays {
                 Pending& w = pending_[i];
                 w.point.face = face[i], w.point.on = inside({met[i].u, met[i].v});
                 w.point.along = light_.infinite ? met[i].t - w.before : met[i].t;
-                // What lies before the edge, or touches it, bears no border: the shadow begins there, along a curve
-                // that the camera sees as an edge.
+                // A face before the edge, or touching it, bears no shadow boundary. The shadow begins there, along a
+                // curve that the camera sees as an edge.
                 if (met[i].t > w.before + touching(w, face[i])) body(w.point, w.weight);
                 if (casters_.alpha_masks.on(face[i]) && !shows(casters_, face[i], w.point.on)) go_on(going_on++, i);
             }
@@ -89,13 +88,13 @@ class LightRays {
         ShadowPoint point;
         double weight;
         int64_t edge;
-        int32_t face;  // of an alpha edge
-        Vec3 p;        // of the edge, world coordinates
+        int32_t face;  // face of an alpha edge
+        Vec3 p;        // point of the edge, world coordinates
         Ray ray;
-        double before;  // where the edge lies on the ray, in lengths of its direction
+        double before;  // position of the edge on the ray, in lengths of its direction
     };
 
-    // The i-th ray goes on behind the face that it met, as the k-th.
+    // Continues the i-th ray, as the k-th, behind the face that it met.
     void go_on(int k, int i) {
         std::vector<int32_t>& without = without_[i];
         without.insert(std::upper_bound(without.begin(), without.end(), pending_[i].point.face),
@@ -129,13 +128,13 @@ class LightRays {
     auto vertices() const {
         return [&](int32_t i) { return vec(view_.scene.verts + 3 * int64_t(i)); };
     }
-    // Of the edge, or that of the alpha edge.
+    // Returns the faces of the edge, or the face of the alpha edge.
     std::span<const int32_t> adjacent_faces(const Pending& w) const {
         return w.edge < 0 ? std::span<const int32_t>(&w.face, 1) : view_.geometry.topology().faces(w.edge);
     }
 
-    // Whether a face next to the edge casts a shadow from that place of it: where none does, light passes on both
-    // sides. Where some are there and others cut out, those that are must lie on one side, which then is known.
+    // Returns whether a face next to the edge casts a shadow from that place. Light passes on both sides if no face is
+    // opaque there. If some faces are masked, the opaque ones must lie on one side, which sets `point.side`.
     bool casts(int64_t edge, double t, ShadowPoint& point) const {
         const auto halves = view_.geometry.topology().half_edges(edge);
         const auto there = [&](const HalfEdge& h) { return is_there(casters_, h, t); };
@@ -155,8 +154,8 @@ class LightRays {
     bool accept(const Pending& w, int32_t face, Meeting& m) const {
         m = meet(view_.scene, face, w.ray);
         if (!m.exists() || m.t <= 0 || m.margin() < -Meeting::rounding) return false;
-        // On the border of a face, as that of a box in whose side the light lies, it goes by or not as it would had the
-        // light moved a little (FacesBeforeLight).
+        // A ray through the border of a face hits or misses it as if the light had moved a little (FacesBeforeLight).
+        // An example is a light in the side of a box.
         if (m.margin() <= Meeting::rounding) {
             constexpr double little = 1e-7;
             const Vec3 moved = (little * length(w.ray.direction)) * FacesBeforeLight<T>::aside;
@@ -164,12 +163,12 @@ class LightRays {
             const Meeting adjacent = meet(view_.scene, face, {origin, w.p - origin});
             if (!adjacent.exists() || adjacent.margin() < 0) return false;
         }
-        // The light itself, of which the point lies on this face or one next to it.
+        // This is the light itself: its point lies on this face or on a neighbour.
         if (light_.face[w.point.part] >= 0 && m.t <= touching(w, face)) return false;
         return shows(view_.scene, face, inside({m.u, m.v}));
     }
 
-    // How far along its ray an edge may lie from a face that it touches, up to the rounding of the input.
+    // Returns how far along its ray an edge may lie from a face that it touches, up to the rounding of the input.
     double touching(const Pending& w, int32_t face) const {
         const SceneView<T>& scene = view_.scene;
         for (const int32_t adjacent : adjacent_faces(w))
@@ -182,7 +181,7 @@ class LightRays {
         const Vec3 q = corner(scene, face, 0);
         const Vec3 m = cross(corner(scene, face, 1) - q, corner(scene, face, 2) - q);
         const double spacing = std::max(scene.spacing->of(v[0]), scene.spacing->of(w.point.caster.vertex[0]));
-        // Across the face, so along the ray it is more the more this grazes it.
+        // The rounding is measured across the face, so it is longer along a ray that grazes it.
         return contact(spacing, size, size) * length(m) / std::fabs(dot(m, w.ray.direction));
     }
 

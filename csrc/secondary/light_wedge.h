@@ -1,8 +1,9 @@
-// The part of a light's triangle from which an edge is a silhouette: the wedges between the planes of its faces.
+// This file clips a light's triangle to the part from which an edge is a silhouette: the wedges between the planes of
+// its faces.
 //
-// All is done in the triangle's last two barycentrics, where a plane is a line and areas are fractions of twice the
-// unit triangle's. A face's height over a point of the light is affine, so its values at the corners say it. From
-// where all heights, taken as the faces run along the edge, have one sign, the edge is a silhouette.
+// Coordinates are the triangle's last two barycentrics. A plane is a line in them, and areas are fractions of twice the
+// unit triangle's. A face's height over a point of the light is affine, so its values at the corners determine it. The
+// edge is a silhouette from where all heights, signed as the faces run along the edge, agree in sign.
 #pragma once
 
 #include <algorithm>
@@ -17,11 +18,11 @@ namespace edgegrad {
 
 class LightWedge {
    public:
-    // By heights of the edge's faces at the corners of the triangle.
+    // Sets the wedges from the heights of the edge's faces at the corners of the triangle.
     void clip(std::span<const Vec3> heights) {
         along_ = {1, 0};
         for (const Vec3 h : heights) {
-            // Lengthwise, a wedge runs along the line of a face's plane.
+            // The long axis of a wedge is the line of a face's plane.
             const Vec2 across{h.y - h.x, h.z - h.x};
             const double size = length(across);
             if (!(size > 0)) continue;
@@ -45,17 +46,17 @@ class LightWedge {
         }
     }
 
-    // The whole triangle.
+    // Sets the wedge to the whole triangle.
     void all() {
         along_ = {1, 0};
         for (int k = 0; k < 2; ++k) polygon_[k].clear(), area_[k] = 0, sections_[k].clear();
         polygon_[0] = {{0, 0}, {1, 0}, {0, 1}}, area_[0] = 1;
     }
 
-    // Of the triangle's area.
+    // Returns the wedges' fraction of the triangle's area.
     double fraction() const { return area_[0] + area_[1]; }
 
-    // Somewhere in its middle; where it is not empty.
+    // Returns a point in the middle of the larger wedge, which must not be empty.
     Vec2 centre() const {
         const std::vector<Vec2>& polygon = polygon_[area_[1] > area_[0]];
         Vec2 sum;
@@ -65,9 +66,9 @@ class LightWedge {
 
     struct Point {
         Vec2 uv;
-        int side;  // of the edge on which its faces lie
+        int side;  // side of the edge on which its faces lie
     };
-    // Uniform for numbers in [0, 1): the first ascends along the wedge, as its area does.
+    // Maps numbers in [0, 1) to uniform points. The first number ascends along the wedge, in proportion to its area.
     Point at(double along, double across) {
         double area = along * fraction();
         const int k = area_[0] > 0 && (area < area_[0] || !(area_[1] > 0)) ? 0 : 1;
@@ -85,7 +86,7 @@ class LightWedge {
         double at = 0, low = 0, high = 0;
     };
 
-    // Keeps where a height is positive (Sutherland and Hodgman 1974).
+    // Keeps the part with a positive height (Sutherland and Hodgman 1974).
     void cut(std::vector<Vec2>& polygon, Vec3 h) {
         kept_.clear();
         const auto height = [&](Vec2 p) { return (1 - p.x - p.y) * h.x + p.x * h.y + p.y * h.z; };
@@ -98,7 +99,7 @@ class LightWedge {
         polygon.swap(kept_);
     }
 
-    // Across a convex polygon at its corners, ascending.
+    // Collects the sections across a convex polygon at its corners, in ascending order.
     void find_sections(const std::vector<Vec2>& polygon, std::vector<Section>& sections) const {
         const auto forward = [&](Vec2 p) { return p.x * along_.x + p.y * along_.y; };
         const auto aside = [&](Vec2 p) { return p.y * along_.x - p.x * along_.y; };
@@ -115,7 +116,7 @@ class LightWedge {
             }
     }
 
-    // With a part of the polygon's area before it.
+    // Returns the section that has the fraction `part` of the polygon's area before it.
     static Section section(const std::vector<Section>& sections, double part) {
         double total = 0;
         for (size_t j = 1; j < sections.size(); ++j) total += between(sections[j - 1], sections[j]);
@@ -125,7 +126,7 @@ class LightWedge {
             area -= between(sections[j - 1], sections[j]), ++j;
         const Section &a = sections[j - 1], &b = sections[j];
         const double whole = between(a, b), f = whole > 0 ? std::clamp(area / whole, 0.0, 1.0) : 0.5;
-        // Of a trapezoid with the widths w₀, w₁ the area up to x is w₀ x + (w₁ − w₀) x² / 2.
+        // In a trapezoid with the widths w₀, w₁ the area up to x is w₀ x + (w₁ − w₀) x² / 2.
         const double w0 = a.high - a.low, w1 = b.high - b.low,
                      root = std::sqrt(std::max(w0 * w0 + f * (w1 * w1 - w0 * w0), 0.0));
         const double x = w0 + root > 0 ? f * (w0 + w1) / (w0 + root) : f;
@@ -135,10 +136,10 @@ class LightWedge {
         return 0.5 * (a.high - a.low + b.high - b.low) * (b.at - a.at);
     }
 
-    std::vector<Vec2> polygon_[2], kept_;  // on either side of the edge
+    std::vector<Vec2> polygon_[2], kept_;  // one for either side of the edge
     double area_[2] = {0, 0};
     Vec2 along_;
-    std::vector<Section> sections_[2];  // once they were asked for
+    std::vector<Section> sections_[2];  // empty until `at` is called
 };
 
 }  // namespace edgegrad

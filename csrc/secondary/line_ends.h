@@ -1,4 +1,4 @@
-// The two ends of lines of light, and what passes between them.
+// This file holds the two ends of light's lines past secondary edges, and evaluates the light that passes between them.
 #pragma once
 
 #include <algorithm>
@@ -15,13 +15,13 @@
 
 namespace edgegrad {
 
-// What lights the reflectors of lines. `casters`: the scene as light meets it.
+// LineLight holds what lights the reflectors of lines. `casters` is the scene as light meets it.
 template <class T>
 struct LineLight {
     const BackwardView<T>& view;
     const SceneView<T>& casters;
     const LitPaths& lit;
-    LitOptions at_reflector;  // how often light may be scattered up to there
+    LitOptions at_reflector;  // allows the bounces that remain before the reflector
 
     LineLight(const BackwardView<T>& view_, const SceneView<T>& casters_, const LitPaths& lit_)
         : view(view_), casters(casters_), lit(lit_), at_reflector(lit_.options) {
@@ -30,7 +30,7 @@ struct LineLight {
     bool is_seen() const { return lit.seen; }
 };
 
-// Pairs of points, a receiver and a reflector of light each.
+// Ends holds pairs of points: a receiver and a reflector each.
 class Ends {
    public:
     int64_t size() const { return int64_t(face_[0].size()); }
@@ -38,7 +38,7 @@ class Ends {
         face_[receiver_or_reflector].push_back(face), append(b_[receiver_or_reflector], {1 - u - v, u, v});
     }
 
-    // (N, channels) what passes between them (transfer.h), with the numbers of so many pairs from `first` on.
+    // Returns (N, channels): the light that passes between each pair (transfer.h). Seeds count from `first` on.
     template <class T>
     std::vector<double> sent(const LineLight<T>& scene, uint64_t stream, int64_t first, Paths& paths) const {
         const int C = scene.lit.lit.channels;
@@ -59,7 +59,7 @@ class Ends {
         return out;
     }
 
-    // (N, 3) unit directions from receivers to reflectors.
+    // Returns (N, 3) unit directions from receivers to reflectors.
     template <class T>
     std::vector<double> directions(const LineLight<T>& scene) const {
         std::vector<double> out;
@@ -82,8 +82,8 @@ class Ends {
     std::vector<double> b_[2];
 };
 
-// For samples of records from `begin` on, whose first two surfaces are a receiver and a reflector, and whose first
-// factor is what is drawn: by how much the image jumps, or what comes to the receiver, and from where.
+// Evaluates the samples of records from `begin` on. Their first two surfaces are receiver and reflector; their first
+// factor is the weight. Writes how much the image jumps, or the light that reaches the receiver and its direction.
 template <class T>
 void light_reflectors(const LineLight<T>& light, const std::vector<CurveRecords>& records, size_t begin,
                       uint64_t stream, SecondaryEdgeSamples& out) {

@@ -1,10 +1,9 @@
-// How densely lines past edges and alpha edges are drawn: by how much light passes along them, as far as it is
-// known.
+// This file holds the pdf of lines past edges and alpha edges. It follows the light that passes along them, as far as
+// that is known.
 //
-// Edges of one connected part of a scene see almost the same along parallel lines, and each of many has few lines of
-// its own. So what is found of some lines is pooled: by their parts, and by cells of directions. Where there are glossy
-// faces, some lines are drawn by how these mirror (specular_lines.h); as all lines could come by either way, their
-// densities are mixed.
+// Edges of one connected part see almost the same light along parallel lines, and each of many edges has few lines.
+// Pilot results are therefore pooled by connected part and by cell of directions. Where faces are glossy, some lines
+// are drawn by their mirror lobes (specular_lines.h). Either strategy could draw any line, so their pdfs are mixed.
 #pragma once
 
 #include <algorithm>
@@ -20,8 +19,7 @@
 
 namespace edgegrad {
 
-// Cells of directions of lines, whichever way these run: where they pass through three sides of a cube around the
-// origin.
+// DirectionCells divides unoriented directions by where they pass three sides of a cube around the origin.
 struct DirectionCells {
     static constexpr int across = 6, count = 3 * across * across;
 
@@ -38,7 +36,7 @@ struct DirectionCells {
     }
 };
 
-// Root mean squares of what lines gave, by part and direction.
+// PooledLines holds root mean squares of the lines' contributions, by part and direction.
 class PooledLines {
    public:
     explicit PooledLines(const Parts& parts)
@@ -47,7 +45,7 @@ class PooledLines {
           squares_(tables_ * DirectionCells::count, 0.0),
           lines_(squares_.size(), 0) {}
 
-    // That of a line along w past an edge at a vertex.
+    // Returns the cell of a line along w past an edge at a vertex.
     int64_t cell(int32_t vertex, Vec3 w) const {
         return parts_.of(vertex) * tables_ / parts_.size() * DirectionCells::count + DirectionCells::of(w);
     }
@@ -55,7 +53,7 @@ class PooledLines {
     void add(int64_t cell, double value) {
         if (std::isfinite(value)) squares_[cell] += value * value;
     }
-    // Once all are there: the root mean squares, each raised by a share of that of all.
+    // Returns the root mean squares once all lines are added. Each is raised by a fraction of the overall one.
     std::vector<double> means() const {
         double squares = 0, lines = 0;
         for (size_t k = 0; k < squares_.size(); ++k) squares += squares_[k], lines += double(lines_[k]);
@@ -76,11 +74,11 @@ class PooledLines {
     std::vector<int64_t> lines_;
 };
 
-// The lines past one edge or alpha edge after another, cut into cells of even pdf.
+// EdgeLines draws the lines past one edge or alpha edge at a time, in cells of constant pdf.
 template <class T>
 class EdgeLines {
    public:
-    // `means`: of the cells of `pooled`; empty: all are equal.
+    // `means` belong to the cells of `pooled`. If it is empty, all cells count alike.
     EdgeLines(const SceneView<T>& casters, const Topology& topology, const std::vector<AlphaEdge>& alpha_edges,
               const PooledLines& pooled, const std::vector<double>& means, const Mirrors& mirrors)
         : scene_(casters),
@@ -90,7 +88,7 @@ class EdgeLines {
           means_(means),
           mirrors_(mirrors) {}
 
-    // How many lines of an edge, or, numbered after all edges, of an alpha edge are drawn, relative to others.
+    // Selects an edge, or an alpha edge, numbered after all edges. Returns its relative number of lines.
     double set(int64_t piece) {
         opposite_.clear(), stands_for_ = 1;
         if (piece < topology_.n_edges()) set_edge(piece);
@@ -110,11 +108,11 @@ class EdgeLines {
     }
 
     struct Line {
-        double t;     // on the edge
-        Vec3 w;       // unit
-        double area;  // ∫ dt dω over what it stands for, were one line drawn of this piece; 0: none is drawn
+        double t;     // position on the edge
+        Vec3 w;       // unit direction
+        double area;  // ∫ dt dω over what the line stands for, were it the only one of this piece; 0: no line is drawn
     };
-    // For numbers in [0, 1), of which the last chooses how it is drawn.
+    // Maps numbers in [0, 1) to a line. `choice` selects the strategy.
     Line at(double along_edge, Vec2 u, double choice) {
         double t = along_edge;
         Vec2 there = u;
@@ -141,7 +139,7 @@ class EdgeLines {
     int64_t cell(Vec3 w) const { return pooled_.cell(vertex_, w); }
 
    private:
-    // Where one of its faces may be there and others not, lines may pass in all directions (EdgeLines).
+    // Lines may pass in all directions where alpha masks may differ between its faces (TracedEdgeLines).
     void set_edge(int64_t edge) {
         const auto halves = topology_.half_edges(edge);
         const HalfEdge& h = halves[0];
@@ -151,7 +149,7 @@ class EdgeLines {
         vertex_ = vertex(scene_, h, h.first());
         a_ = corner(scene_, h.face, h.first()), b_ = corner(scene_, h.face, h.second());
     }
-    // Its chord: an alpha edge is passed in all directions, but for those in its plane.
+    // Uses the chord of the alpha edge, which lines pass in all directions except in the face's plane.
     void set_alpha_edge(const AlphaEdge& alpha_edge) {
         const Vec3 v[3] = {corner(scene_, alpha_edge.face, 0), corner(scene_, alpha_edge.face, 1),
                            corner(scene_, alpha_edge.face, 2)};
@@ -163,7 +161,7 @@ class EdgeLines {
     }
 
     static constexpr int along = 8;
-    static constexpr double widest = M_PI / 8, most_across = 8;  // azimuths of a cell
+    static constexpr double widest = M_PI / 8, most_across = 8;  // azimuths of a cell, radians and number
 
     static double angle_at_middle(int j) {
         static const std::vector<double> angles = [] {
@@ -174,7 +172,7 @@ class EdgeLines {
         return angles[j];
     }
     double before(int64_t k) const { return k ? sum_[k - 1] : 0; }
-    // One over the pdf of lines that cells draw.
+    // Returns the reciprocal pdf of the lines that cells draw.
     double area(const Lune::Place& place) const {
         const double all = lune_.weight(place.w);
         if (sum_.empty()) return all;
@@ -196,7 +194,7 @@ class EdgeLines {
     Lune lune_;
     SpecularLines mirrored_;
     int across_ = 1;
-    std::vector<double> sum_;  // of the means of its cells
+    std::vector<double> sum_;  // running sum of the cells' means
 };
 
 }  // namespace edgegrad

@@ -1,8 +1,9 @@
-// The lines past an edge on which all of its faces lie on one side: the wedge between the planes of the faces that
-// holds none of them. Along each of these lines what one end sees of the other begins or ends at the edge.
+// This file holds the lines past an edge that have all of its faces on one side. They fill the wedge (lune) between the
+// planes of the faces that contains none of them. Along each of these lines, visibility between the two ends changes at
+// the edge.
 //
-// With the unit direction e of the edge, θ the angle to it and φ an angle about it, they are the directions
-// e cos θ + sin θ (x cos φ + y sin φ) for φ in an interval; each line counts once, whichever way it runs.
+// Let e be the edge's unit direction, θ the angle to it and φ an angle about it. The lines have the directions e cos θ
+// + sin θ (x cos φ + y sin φ) for φ in an interval. Each line counts once, whichever way it runs.
 #pragma once
 
 #include <algorithm>
@@ -18,7 +19,7 @@ class Lune {
    public:
     Lune() = default;
 
-    // Of the edge from a to b, whose faces have these corners next to it. Faces without area are not there.
+    // Builds the lune of the edge from a to b. `opposite` has its faces' third corners; flat faces are ignored.
     Lune(Vec3 a, Vec3 b, std::span<const Vec3> opposite) {
         length_ = length(b - a);
         if (!(length_ > 0)) return;
@@ -41,20 +42,20 @@ class Lune {
         width_ = widest - M_PI > flat ? widest - M_PI : 0;
     }
 
-    // Its azimuths, radians; and times the length of the edge.
+    // width() is in radians of azimuth; measure() is the width times the length of the edge.
     double width() const { return width_; }
     double measure() const { return length_ * width_; }
     bool empty() const { return !(measure() > 0); }
 
-    // For numbers in [0, 1): with the pdf 2 sin θ / (π width) by solid angle. The faces lie where
-    // ((b − a) × w) · (corner − a) < 0.
+    // Maps numbers in [0, 1) to a direction with the pdf 2 sin θ / (π width) by solid angle. The faces lie where ((b −
+    // a) × w) · (corner − a) < 0.
     Vec3 direction(double u, double v) const { return at(polar_angle(u), v); }
     Vec3 at(double theta, double v) const {
         const double phi = low_ + width_ * v;
         return std::cos(theta) * e_ + std::sin(theta) * (std::cos(phi) * x_ + std::sin(phi) * y_);
     }
-    // The line along w, as at(θ, v) has it, and by which share of the polar angles' measure θ comes first; v < 0: it is
-    // none of these lines.
+    // A Place is the line along w, oriented as at(θ, v) returns it. u is the fraction of the polar measure below θ. v <
+    // 0 marks a line outside the lune.
     struct Place {
         Vec3 w;
         double u, v = -1;
@@ -73,10 +74,10 @@ class Lune {
         }
         return {};
     }
-    // One over that pdf.
+    // Returns the reciprocal of direction()'s pdf.
     double weight(Vec3 w) const { return M_PI / 2 * width_ / length(cross(e_, w)); }
 
-    // θ − sin θ cos θ = π u, by Newton's method where it stays between bounds.
+    // Solves θ − sin θ cos θ = π u by Newton's method, safeguarded by bisection.
     static double polar_angle(double u) {
         double low = 0, high = M_PI, theta = M_PI * u;
         for (int k = 0; k < 40; ++k) {
@@ -90,7 +91,7 @@ class Lune {
     }
 
    private:
-    static constexpr double flat = 1e-9;  // radians by which faces in one plane may seem to fold
+    static constexpr double flat = 1e-9;  // radians by which coplanar faces may seem to fold
 
     Vec3 e_, x_, y_;
     double length_ = 0, low_ = 0, width_ = 0;

@@ -1,9 +1,9 @@
-// Places of curves that hide what lies behind them: edges, and alpha edges.
+// This file holds points of the curves that occlude what lies behind them: edges and alpha edges.
 //
-// Seen along d, a curve p(t) hides what lies on one side of the plane through p that d and dp/dt span, F = N · (y − p)
-// with N = dp/dt × d. An alpha edge f(b; uv, α) = 0 on a face with the sides e₁, e₂ has ∂p/∂t = κ (−f_v e₁ + f_u e₂) as
-// it stands, N·e₁ = κ D f_u and N·e₂ = κ D f_v with D = d · (e₁ × e₂). So where f grows by δf, the alpha edge gives way
-// by N·δp = −κ D δf, next to the motion N · Σ b_i δv_i of the face; and the face is there where F has the sign of κ D.
+// Seen along d, a curve p(t) occludes one side of the plane through p spanned by d and dp/dt: F = N · (y − p) with
+// N = dp/dt × d. An alpha edge f(b; uv, α) = 0 on a face with the sides e₁, e₂ has ∂p/∂t = κ (−f_v e₁ + f_u e₂). Then
+// N·e₁ = κ D f_u and N·e₂ = κ D f_v with D = d · (e₁ × e₂). As f grows by δf, the alpha edge recedes by N·δp = −κ D δf,
+// in addition to the motion N · Σ b_i δv_i of the face. The face is opaque where F has the sign of κ D.
 #pragma once
 
 #include <algorithm>
@@ -19,35 +19,35 @@
 
 namespace edgegrad {
 
-// A place p of such a curve, and dp/dt along it, as sums of vertices: of the two of an edge, (1 − t) a + t b and b − a,
-// or of the three of a face with an alpha edge.
+// An Occluder is a point p of such a curve, with dp/dt, as weighted sums of vertices. An edge has the two vertices of
+// (1 − t) a + t b and b − a; an alpha edge has the three of its face.
 struct Occluder {
     int count = 2;
     int32_t vertex[3];
     double weight[3], tangent[3];
-    // Of an alpha edge.
+    // The members below are set on alpha edges only.
     int32_t uv_row[3];
     double kappa = 0;
     Vec2 by_uv;       // ∂f/∂uv
-    Footprint alpha;  // of which f is made, if it is
+    Footprint alpha;  // texels and weights of f, if `of_alpha`
     bool of_alpha = false;
 
     bool is_alpha_edge() const { return count == 3; }
-    // Of one vector a vertex.
+    // Returns the weighted sum of one vector per vertex.
     template <class Values>
     Vec3 sum(const double (&by)[3], Values values) const {
         Vec3 out = by[0] * values(vertex[0]) + by[1] * values(vertex[1]);
         if (count == 3) out += by[2] * values(vertex[2]);
         return out;
     }
-    // κ D, by the direction d; at(i): a vertex.
+    // Returns κ D for the direction d; at(i) returns a vertex.
     template <class At>
     double turned(Vec3 d, At at) const {
         const Vec3 a = at(vertex[0]);
         return kappa * dot(d, cross(at(vertex[1]) - a, at(vertex[2]) - a));
     }
 
-    // -- how f depends on texture coordinates and alpha texels ---------------------------------------------------
+    // -- dependence of f on texture coordinates and alpha texels -----------------------------------------------------
 
     double alpha_edge_jvp(const Tangents& tangents) const {
         double f_dot = 0;
@@ -72,7 +72,7 @@ struct Occluder {
                 grad.alphas.add<1>(alpha.texel[k], &alpha_bar);
             }
     }
-    // Rows of a sample whose border moves by `by_alpha_edge` times f.
+    // Appends the rows of a sample whose curve moves by `by_alpha_edge` times f.
     void append_alpha_edge(double by_alpha_edge, int64_t sample, CurveRecords& records) const {
         if (is_alpha_edge())
             for (int i = 0; i < 3; ++i) {
@@ -88,7 +88,7 @@ struct Occluder {
     }
 };
 
-// The place t of an edge.
+// Returns the occluder at the place t of an edge.
 template <class T>
 Occluder occluder_of(const SceneView<T>& scene, const HalfEdge& h, double t) {
     const int32_t* v = scene.faces + 3 * int64_t(h.face);
@@ -98,7 +98,7 @@ Occluder occluder_of(const SceneView<T>& scene, const HalfEdge& h, double t) {
     o.tangent[0] = -1, o.tangent[1] = 1, o.tangent[2] = 0;
     return o;
 }
-// The same of an alpha edge.
+// Returns the occluder at a point of an alpha edge.
 template <class T>
 Occluder occluder_of(const SceneView<T>& scene, const AlphaEdge& alpha_edge, const AlphaEdgePoint& place) {
     Occluder o;
@@ -113,8 +113,8 @@ Occluder occluder_of(const SceneView<T>& scene, const AlphaEdge& alpha_edge, con
     o.kappa = place.kappa, o.by_uv = place.by_uv, o.alpha = place.alpha, o.of_alpha = alpha_edge.border == 0;
     return o;
 }
-// Where rays past an alpha edge go by, world coordinates: a little to where the face is alpha-tested, for a neighbour
-// that has the alpha edge in common, where it runs along their edge, is alpha-tested there too, or not met.
+// Returns the point, in world coordinates, at which rays pass an alpha edge. It is moved slightly to the masked side. A
+// neighbour that shares the alpha edge along a common edge is then masked there too, or not met.
 template <class T>
 Vec3 next_to_alpha_edge(const SceneView<T>& scene, const AlphaEdge& alpha_edge, const AlphaEdgePoint& place) {
     constexpr double aside = 1e-7;
@@ -124,7 +124,7 @@ Vec3 next_to_alpha_edge(const SceneView<T>& scene, const AlphaEdge& alpha_edge, 
     return v + (place.b.u - step * place.slope.u) * e1 + (place.b.v - step * place.slope.v) * e2;
 }
 
-// Whether of two faces on an edge one may be there and the other cut out along it.
+// Returns whether alpha masks may differ between the faces of an edge.
 template <class T>
 bool alpha_masks_jump(const SceneView<T>& casters, const Topology& topology, int64_t edge) {
     if (!casters.alpha_masks.face) return false;
@@ -132,7 +132,7 @@ bool alpha_masks_jump(const SceneView<T>& casters, const Topology& topology, int
     return std::any_of(halves.begin() + 1, halves.end(),
                        [&](const HalfEdge& h) { return alpha_masks_jump(casters, halves[0], h); });
 }
-// Whether a face is there next to a place of its edge.
+// Returns whether a face is opaque next to a place of its edge.
 template <class T>
 bool is_there(const SceneView<T>& casters, const HalfEdge& h, double t) {
     return shows(casters, h.face, next_to_edge(casters, h, t));

@@ -1,8 +1,8 @@
-// Samples on the borders of what surfaces of a path see of one another.
+// This file draws samples on secondary edges.
 //
-// Edges and alpha edges are laid end to end by their length times the azimuths of lines past them (lune.h). Some
-// lines, pilots, say how much light passes by those of each connected part of the scene, direction by direction; the
-// samples go in proportion to that, with a lower bound (line_pdf.h).
+// Edges and alpha edges lie end to end by their length times the azimuths of lines past them (lune.h). Pilots measure
+// the light that passes the edges of each connected part of the scene, by direction. The density of samples follows it,
+// with a lower bound (line_pdf.h).
 
 #include "secondary/secondary_edges.h"
 
@@ -28,13 +28,13 @@ namespace {
 constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 constexpr int64_t fewest_pilots = 1 << 10, most_pilots = 1 << 14, samples_of_pilot = 4, pilots_of_block = 1 << 8;
 
-// What chunks of lines share.
+// LineScene holds what chunks of lines share.
 template <class T>
 struct LineScene : LineLight<T> {
     PooledLines& pooled;
     Mirrors mirrors;
     const std::vector<AlphaEdge> alpha_edges;
-    std::vector<double> means = {};  // of its cells; empty: not known yet
+    std::vector<double> means = {};  // means of the cells of `pooled`; empty until pilots are cast
 
     LineScene(const LineLight<T>& light, PooledLines& pooled_)
         : LineLight<T>(light),
@@ -46,7 +46,7 @@ struct LineScene : LineLight<T> {
         return {this->casters, this->view.geometry.topology(), alpha_edges, pooled, means, mirrors};
     }
 
-    // What is drawn of each edge and alpha edge, relative to others.
+    // Returns the relative number of lines of each edge and alpha edge.
     Array<double> measure() const {
         const int64_t n = this->view.geometry.topology().n_edges() + int64_t(alpha_edges.size());
         Array<double> out(n);
@@ -58,9 +58,9 @@ struct LineScene : LineLight<T> {
     }
 };
 
-// What pilots find.
+// Pilots holds the lines and contributions of pilots.
 struct Pilots {
-    std::vector<int64_t> cell;  // of PooledLines
+    std::vector<int64_t> cell;  // cells of PooledLines
     std::vector<double> value;
     Ends ends;
 
@@ -71,7 +71,7 @@ struct Pilots {
     }
 };
 
-// Their accumulation: which of them are seen, and how much the border of each moves, with its edge or the receiver.
+// SeenPilots accumulates pilots that the camera sees, by the motion of each edge's image with the edge or the receiver.
 template <class T>
 class SeenPilots {
    public:
@@ -88,7 +88,7 @@ class SeenPilots {
     Pilots& found_;
 };
 
-// Calls body(line, weight) for both ways along the lines of a chunk.
+// LineChunk calls body(line, weight) for both ways along the lines of a chunk.
 template <class T, class Body>
 class LineChunk {
    public:
@@ -100,7 +100,7 @@ class LineChunk {
           edge_lines_(scene.lines()),
           lines_(scene.view, scene.casters, scene.alpha_edges) {}
 
-    // The i-th line, at a position along the edges; these ascend. The cell that it is pooled in.
+    // Adds the i-th line, at an ascending position along the edges. Returns the cell in which it is pooled.
     int64_t add(int64_t i, double position) {
         const int64_t k = edge_ < 0 ? edges_.primitive(position) : edges_.primitive(position, edge_);
         if (k != edge_) edge_ = k, edge_lines_.set(k);
@@ -124,7 +124,7 @@ class LineChunk {
     TracedEdgeLines<T> lines_;
 };
 
-// Calls lines(body) with a body that gives the accumulation those of which the camera sees an end.
+// Calls lines(body). Its body passes on to the accumulation the lines with an end in view of the camera.
 template <class T, class Accumulation, class Lines>
 void each_seen(const BackwardView<T>& view, double near, Accumulation& accumulation, LocalGradients& grad,
                Lines lines) {
@@ -145,7 +145,8 @@ Vec3 normal_of(const BackwardView<T>& view, const EdgeLine& line) {
     return cross(line.occluder.sum(line.occluder.tangent, places_of(view)), line.w);
 }
 
-// A line of which no end need be seen: F by places in the world, y₁ stays at its barycentrics (edge_line_source.h).
+// Appends a line with ends that need not be seen: F is by world coordinates, with y₁ at fixed barycentrics
+// (edge_line_source.h).
 template <class T>
 void append_indirect(const BackwardView<T>& view, const EdgeLine& line, double weight, CurveRecords& records) {
     const int64_t sample = records.size();
@@ -169,7 +170,7 @@ void append_indirect(const BackwardView<T>& view, const EdgeLine& line, double w
     if (occluder.is_alpha_edge()) occluder.append_alpha_edge(occluder.turned(line.w, places_of(view)), sample, records);
 }
 
-// Fills what is pooled.
+// Fills scene.pooled from n pilots and sets its means.
 template <class T>
 void cast_pilots(LineScene<T>& scene, int64_t n) {
     const BackwardView<T>& view = scene.view;
@@ -178,7 +179,7 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
     if (!(edges.total() > 0)) return;
     edges.draw(n, to_unit(hash(view.options.seed, 17, gradient_stream)));
     struct PilotStatistics {
-        std::vector<int64_t> lines, cell;  // cells of all lines, and of those that give something
+        std::vector<int64_t> lines, cell;  // cells of all lines, and of those that contribute
         std::vector<double> value;
     };
     std::vector<PilotStatistics> found((n + pilots_of_block - 1) / pilots_of_block);

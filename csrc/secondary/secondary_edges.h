@@ -1,4 +1,4 @@
-// The curves along which what surfaces of a path of light see of one another ends.
+// This file declares the term of secondary edges: the curves at which visibility between surfaces changes.
 #pragma once
 
 #include <vector>
@@ -8,11 +8,11 @@
 
 namespace edgegrad {
 
-// By default, of an image of this size with so many samples a pixel.
+// Returns the default number of samples for an image of this size and samples per pixel.
 int64_t most_secondary_edge_samples(int64_t width, int64_t height, int spp);
 
-// What light is scattered by, and how often: `further` times of these after the end of a line that it comes to, which
-// the camera sees, or need not.
+// LitPaths holds what scatters light, and how often. After a line's end, light is scattered up to `further` more times.
+// `seen` tells whether the camera must see that end.
 struct LitPaths {
     const LitScene& lit;
     const LitOptions& options;
@@ -20,16 +20,16 @@ struct LitPaths {
     bool seen = true;
 };
 
-// Of each chunk of samples, an array each. (S, channels) by how much the image jumps at them, times what a sample
-// stands for; or, where the camera need not see the end of a line, what has come there, and (S, 3) from where, in unit
-// directions.
+// SecondaryEdgeSamples holds one array per chunk of samples. `jump` (S, channels) is the jump of the image times the
+// sample's weight. If the camera need not see the end, it is the light that arrives there. `origin` (S, 3) then holds
+// the unit directions to its source.
 struct SecondaryEdgeSamples {
     std::vector<std::vector<double>> jump, origin;
 };
 
-// Records samples on these borders: so many lines, or, if −1, by default. `casters`: the scene as light meets it, of
-// which less may be there than the camera sees. An end of a line that need not be seen has no position in the image,
-// and velocities are by places of vertices in the world.
+// Records `samples` samples on secondary edges; −1 selects the default. `casters` is the scene as light meets it, which
+// may lack faces that the camera sees. An end that need not be seen has no position in the image. Its velocities are by
+// world coordinates of the vertices.
 template <class T>
 void add_secondary_edges(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& paths,
                          int64_t samples, const Record& record, GradientSink& to, SecondaryEdgeSamples& out);

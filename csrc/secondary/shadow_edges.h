@@ -1,5 +1,5 @@
-// Edges that cast shadows: those at which all faces lie on one side, as seen from a point of a light. And alpha edges
-// of alpha-tested faces, which do before all points that do not lie in the plane of their face.
+// This file finds the edges that cast shadows: those with all faces on one side, as seen from a point of a light. Alpha
+// edges of alpha-tested faces cast shadows from all points outside the plane of their face.
 #pragma once
 
 #include <algorithm>
@@ -16,20 +16,20 @@
 
 namespace edgegrad {
 
-// A part of an edge or an alpha edge before those points of a part of a light from which it casts a shadow.
+// A ShadowPiece is a part of an edge or an alpha edge, before the points of a light for which it casts a shadow.
 struct ShadowPiece {
-    int64_t edge;  // or, where it is negative, an alpha edge
+    int64_t edge;  // edge; if negative, an alpha edge
     int32_t part;
-    float t0, t1;    // on it
-    double share;    // what it stands for: of all points of the light, and of the edge
-    double measure;  // of its shadows, as far as they are known without a ray
+    float t0, t1;    // interval on the edge
+    double share;    // fraction of the light's points times number of edges that it stands for
+    double measure;  // measure of its shadows, as far as it is known without a ray
 
     bool is_alpha_edge() const { return edge < 0; }
     int64_t alpha_edge() const { return -1 - edge; }
     static int64_t of_alpha_edge(int64_t alpha_edge) { return -1 - alpha_edge; }
 };
 
-// A light's parts as many edges ask for them.
+// PartsBall is a ball around all parts of a light.
 struct PartsBall {
     Vec3 centre;
     double radius = 0;
@@ -42,7 +42,7 @@ struct PartsBall {
     }
 };
 
-// The planes of faces, in world coordinates, and which way they are turned to points of a light.
+// FacesBeforeLight holds the planes of faces in world coordinates, and tells which side points of a light see.
 template <class T>
 class FacesBeforeLight {
    public:
@@ -56,9 +56,9 @@ class FacesBeforeLight {
         });
     }
 
-    // How high the corners of a part lie over a face's plane, times its size; zeros for a face without area. A face
-    // that is seen edge-on from all of the part is taken for what it is once the light has moved a little in a fixed
-    // direction, the same for all faces: then of two edges of such a face only one casts its shadow.
+    // Heights holds how high the corners of a part lie over a face's plane, times the face's size. It is zero for a
+    // face without area. A face seen edge-on from the whole part is evaluated as if the light had moved a little. The
+    // direction is the same for all faces, so only one of two edges of such a face casts its shadow.
     struct Heights {
         Vec3 at;
         bool edge_on;
@@ -71,7 +71,7 @@ class FacesBeforeLight {
         for (int i = 0; i < 3; ++i) {
             const Vec3 to = light_.infinite ? light_.at(part, i) : light_.at(part, i) - p.corner;
             h[i] = dot(p.normal, to);
-            constexpr double slack = 16;  // of how exactly a point of a light lies on its face
+            constexpr double slack = 16;  // factor on the rounding with which a light's point lies on its face
             edge_on = edge_on &&
                       std::fabs(h[i]) <= slack * p.rounding * (std::fabs(to.x) + std::fabs(to.y) + std::fabs(to.z));
         }
@@ -81,7 +81,7 @@ class FacesBeforeLight {
         return {{side, side, side}, true};
     }
 
-    // That from which all of the light sees a face; 0: not from one.
+    // Returns the side from which the whole light sees a face; 0: neither is certain.
     int side(int64_t face) const {
         const Plane& p = plane_[face];
         const double s = dot(p.normal, light_.infinite ? ball_.centre : ball_.centre - p.corner);
@@ -89,7 +89,7 @@ class FacesBeforeLight {
         return s > reach ? 1 : s < -reach ? -1 : 0;
     }
 
-    // In which direction lights are taken to have moved: along no axis nor diagonal.
+    // Lights are taken to have moved in this direction, which lies along no axis and no diagonal.
     static constexpr Vec3 aside{0.5257, 0.6731, -0.5203};
 
    private:
@@ -103,7 +103,7 @@ class FacesBeforeLight {
     Array<Plane> plane_;
 };
 
-// The wedges of edges and alpha edges before parts of a light, one after another; each thread has its own.
+// EdgeWedge holds the wedge of one edge or alpha edge before a part of a light; each thread has its own.
 template <class T>
 class EdgeWedge {
    public:
@@ -116,7 +116,7 @@ class EdgeWedge {
                                      : set(piece.edge, piece.part);
     }
 
-    // False where the light lies in the plane of the face.
+    // Returns false where the light lies in the plane of the face.
     bool set_alpha_edge(int64_t face, int64_t part) {
         const auto h = faces_.heights(face, part);
         if (h.flat() || h.edge_on) return false;
@@ -124,8 +124,8 @@ class EdgeWedge {
         return true;
     }
 
-    // False where the edge is a silhouette from nowhere, or only because faces that are seen edge-on are taken for
-    // turned. Where not all of its faces may be there, it depends on the place from where it is one (LightRays).
+    // Returns false where the edge is never a silhouette, or only by the perturbation of faces seen edge-on. Where its
+    // faces may be masked, the point on the edge decides whether it is one (LightRays).
     bool set(int64_t edge, int64_t part) {
         heights_.clear();
         bool known = false;
@@ -152,9 +152,9 @@ class EdgeWedge {
     LightWedge wedge_;
 };
 
-// The edges and alpha edges of a scene that cast shadows of a light. Each edge between whose faces some of the light
-// may lie is asked before as many of its parts, spread evenly over their order, as give about `tests` pairs in all;
-// alpha edges, a quarter as many.
+// ShadowEdgeFinder finds the edges and alpha edges that cast shadows of a light. An edge is tested if some of the light
+// may lie between its faces. The tested parts of the light are evenly spaced, so many that there are about `tests`
+// pairs in all. Alpha edges get a quarter as many.
 template <class T>
 class ShadowEdgeFinder {
    public:
@@ -184,8 +184,8 @@ class ShadowEdgeFinder {
         int64_t edges_found = 0;
         for (const auto& block : parts)
             for (size_t i = 0; i < block.size(); ++i) edges_found += i == 0 || block[i].edge != block[i - 1].edge;
-        // Neighbours see almost the same. Of many edges these are neighbours on the mesh before the same part of the
-        // light, so part after part; of few the parts of the light before the same edge.
+        // Neighbouring pieces see almost the same light. Many edges are sorted by part of the light, so that neighbours
+        // lie together on the mesh. Few edges are sorted by edge.
         if (edges_found <= light_.count) {
             std::vector<ShadowPiece> found;
             for (const auto& block : parts) found.insert(found.end(), block.begin(), block.end());
@@ -204,7 +204,7 @@ class ShadowEdgeFinder {
     }
 
    private:
-    // False where all of the light surely sees both faces of an edge from the same sides.
+    // Returns false where all of the light surely sees both faces of an edge from the same sides.
     bool may_cast(int64_t edge) const {
         if (!view_.geometry.topology().joins_two(edge)) return true;
         if (alpha_masks_jump(casters_, view_.geometry.topology(), edge)) return true;
@@ -213,7 +213,7 @@ class ShadowEdgeFinder {
         return one == 0 || other == 0 || one != other;
     }
 
-    // Whether an edge lies in the plane of a part, as those of a flat panel do: that part sends it no light.
+    // Returns whether an edge lies in the plane of a part, as on a flat panel. That part sends it no light.
     bool lies_in_plane(int64_t part, Vec3 a, Vec3 b) const {
         if (light_.infinite || !light_.extended) return false;
         const Vec3 c = light_.at(part, 0), n = cross(light_.at(part, 1) - c, light_.at(part, 2) - c);

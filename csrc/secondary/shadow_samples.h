@@ -1,5 +1,5 @@
-// Where samples on the borders of shadows lie: the pieces of edges before parts of a light (shadow_edges.h), end to end
-// by what is known of their shadows without a ray, and the density along them that pilots say.
+// This file places samples on shadow boundaries. Pieces of edges before parts of a light (shadow_edges.h) lie end to
+// end by an estimate of their shadows that needs no ray. Pilots set the density along them.
 #pragma once
 
 #include <algorithm>
@@ -13,19 +13,18 @@
 
 namespace edgegrad {
 
-constexpr double most_of_edge = 64;  // pieces
-constexpr int pilots = 4;            // places of an interval
+constexpr double most_of_edge = 64;  // maximum number of pieces of an edge
+constexpr int pilots = 4;            // number of pilots per interval
 constexpr int64_t intervals_of_block = 64;
-constexpr int64_t neighbours = 16;       // of an interval, on either side
-constexpr int64_t mirrored = 2;          // samples of a place before a light with an extent
-constexpr double own_share = 0.3;        // of the mean square that is the interval's own
-constexpr double floor_share = 0.1;      // of the density that pilots do not decide
-constexpr int64_t pair_tests = 1 << 22;  // of edges before parts of the light
+constexpr int64_t neighbours = 16;       // number of intervals on either side whose pilots are shared
+constexpr int64_t mirrored = 2;          // samples per place before a light with an extent
+constexpr double own_share = 0.3;        // fraction of the mean square that comes from the interval itself
+constexpr double floor_share = 0.1;      // fraction of the density that is independent of pilots
+constexpr int64_t pair_tests = 1 << 22;  // number of tested pairs of edges and light parts
 constexpr int64_t fewest_intervals = 1 << 10, most_intervals = 1 << 15, samples_of_interval = 16;
 constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 
-// Samples run along the light's wedges, and where on the edge is drawn: so edges that make up much of the measure are
-// cut.
+// Cuts edges with much of the measure, because samples run along the light's wedges, at drawn places of the edge.
 inline std::vector<ShadowPiece> cut(const std::vector<ShadowPiece>& pieces, double intervals) {
     double total = 0;
     for (const ShadowPiece& p : pieces) total += p.measure;
@@ -39,7 +38,7 @@ inline std::vector<ShadowPiece> cut(const std::vector<ShadowPiece>& pieces, doub
     return out;
 }
 
-// Pieces end to end: positions in [0, 1) along their measure.
+// Pieces maps positions in [0, 1) to pieces laid end to end by their measure.
 class Pieces {
    public:
     Pieces(std::vector<ShadowPiece> pieces, ThreadTeam& team)
@@ -49,10 +48,10 @@ class Pieces {
 
     struct Place {
         int64_t piece;
-        double fraction;  // of it
-        double weight;    // that it has, were places drawn evenly: one over its density
+        double fraction;  // position within the piece
+        double weight;    // reciprocal density of evenly drawn places
     };
-    // That at a position; `before`: the piece of one at a position before it, or −1.
+    // Returns the piece at a position. `before` is the piece of an earlier position, or −1.
     int64_t piece(double position, int64_t before) const {
         const double p = std::min(position * systematic_.total(), std::nextafter(systematic_.total(), 0.0));
         return before < 0 ? systematic_.primitive(p) : systematic_.primitive(p, before);
@@ -63,7 +62,7 @@ class Pieces {
         return {k, std::clamp((position * systematic_.total() - systematic_.begin_of(k)) / measure, 0.0, 1.0),
                 pieces_[k].share * double(pieces_[k].t1 - pieces_[k].t0) * systematic_.total() / measure};
     }
-    // Where a piece begins and ends.
+    // begin() and end() return the positions between which a piece lies.
     double begin(int64_t k) const { return systematic_.begin_of(k) / systematic_.total(); }
     double end(int64_t k) const { return begin(k) + systematic_.measure_of(k) / systematic_.total(); }
     const ShadowPiece& operator[](int64_t k) const { return pieces_[k]; }
@@ -78,20 +77,19 @@ class Pieces {
     Systematic systematic_;
 };
 
-// What pilots find of an interval: sums over them.
+// ShadowStatistics holds sums over the pilots of an interval.
 struct ShadowStatistics {
     double squares = 0;  // (swept area · light)²
     double length = 0;   // px
 };
 
-// Where the samples lie: n places in proportion to a density that is constant in equal intervals of the pieces'
-// positions. They are equally spaced; but those of a piece that is due at least one are then spread evenly from end to
-// end of it, each somewhere in its share. By how many places the piece has, more or less than it is due, vertices would
-// otherwise differ most. For each number of places the mean over where they lie is right.
+// Places draws n places from a density that is constant in equal intervals of the pieces' positions. Places are equally
+// spaced, except in a piece whose expected number is at least one. There they are spread evenly from end to end, each
+// jittered in its stratum. Otherwise rounding the number of places per piece would cause most of the variance between
+// vertices. The estimate is unbiased given any number of places.
 class Places {
    public:
-    // density  one number for each interval; becomes its running sum
-    // whole    whether pieces get whole numbers of places
+    // `density` has one number per interval and becomes its running sum. `whole` gives pieces whole numbers of places.
     Places(const Pieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed, ThreadTeam& team)
         : pieces_(pieces), intervals_(density.size()), whole_(whole), seed_(seed), systematic_(density, team) {
         systematic_.draw(n, to_unit(seed));
@@ -99,12 +97,12 @@ class Places {
     }
 
     struct Place {
-        double position;  // along the pieces
+        double position;  // position along the pieces
         int64_t interval;
-        double weight;  // one over its density
+        double weight;  // reciprocal density
     };
 
-    // The i-th; places are asked for in ascending order.
+    // Returns the i-th place; i must ascend between calls.
     Place operator()(int64_t i) {
         const double even = systematic_.position(i);
         interval_ = interval_ < 0 ? systematic_.primitive(even) : systematic_.primitive(even, interval_);
@@ -126,7 +124,7 @@ class Places {
     int64_t interval_at(double position) const {
         return std::min(int64_t(position * double(intervals_)), intervals_ - 1);
     }
-    // The density's sum up to a position, and the position from where it is that.
+    // sum_before returns the density's sum up to a position. position_of is its inverse.
     double sum_before(double position) const {
         const int64_t k = interval_at(position);
         return systematic_.begin_of(k) + (position * double(intervals_) - double(k)) * systematic_.measure_of(k);
@@ -135,7 +133,7 @@ class Places {
         const double fraction = (sum - systematic_.begin_of(k)) / systematic_.measure_of(k);
         return (double(k) + std::clamp(fraction, 0.0, 1.0)) / double(intervals_);
     }
-    // Of the first place that is no less than a sum.
+    // Returns the number of the first place at or after a sum.
     int64_t number_from(double sum) const { return int64_t(std::ceil((sum - systematic_.position(0)) / spacing_)); }
     double weight_of(int64_t interval) const { return systematic_.weight(interval) / double(intervals_); }
 
@@ -148,7 +146,7 @@ class Places {
     int64_t interval_ = -1, piece_ = -1;
 };
 
-// What chunks of samples share.
+// ShadowScene holds what chunks of samples share.
 template <class T>
 struct ShadowScene {
     const BackwardView<T>& view;
@@ -159,8 +157,7 @@ struct ShadowScene {
     const Pieces& pieces;
 };
 
-// Casts a chunk of points on edges from their lights, to whatever lies behind: body(ShadowPoint, weight) is called for
-// each border of a shadow there.
+// ShadowChunk traces light rays past edges, and calls body(ShadowPoint, weight) for each shadow boundary behind.
 template <class T, class Body>
 class ShadowChunk {
    public:
@@ -171,15 +168,15 @@ class ShadowChunk {
           light_rays_(scene.view, scene.casters, scene.light, scene.alpha_edges),
           body_(std::move(body)) {}
 
-    // The i-th of places that ascend, with so many samples: a second one mirrors the first on the edge. How samples
-    // fall to the two ends would make most of the noise where there are few on an edge.
+    // Adds the i-th of ascending places, with `samples` samples. A second sample mirrors the first on the edge: the
+    // split between the two ends would cause most of the noise where samples are few.
     void add(int64_t i, double position, int64_t interval, double weight, int64_t samples) {
         const auto place = scene_.pieces.at(position, piece_);
         const ShadowPiece& piece = scene_.pieces[place.piece];
         if (place.piece != piece_) casts_ = wedge_.set(piece), piece_ = place.piece;
         if (!casts_) return;
         const Vec2 other = sequence_(uint64_t(i));
-        // Along the edge before a point, else along the wedge.
+        // The place runs along the edge before a point light, and along the wedge otherwise.
         const double t = scene_.light.extended ? other.x : place.fraction;
         for (int64_t k = 0; k < samples; ++k) {
             const auto from = wedge_->at(place.fraction, k ? 1 - other.y : other.y);
@@ -194,17 +191,17 @@ class ShadowChunk {
     const ShadowScene<T> scene_;
     const ShiftedSequence sequence_;
     int64_t piece_ = -1;
-    bool casts_ = false;  // whether that one does
+    bool casts_ = false;  // whether that piece casts a shadow
     EdgeWedge<T> wedge_;
     LightRays<T> light_rays_;
     Body body_;
 };
 
-// The edges and alpha edges that cast shadows of a light.
+// ShadowCasters holds the edges and alpha edges that cast shadows of a light.
 template <class T>
 class ShadowCasters {
    public:
-    // expected  about how many samples there will be
+    // `expected` is the approximate number of samples.
     ShadowCasters(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t expected)
         : intervals_(std::clamp(expected / samples_of_interval, fewest_intervals, most_intervals)),
           faces_(view.scene, light, view.team),
@@ -216,7 +213,7 @@ class ShadowCasters {
     const ShadowScene<T>& scene() const { return scene_; }
     int64_t intervals() const { return intervals_; }
 
-    // Has places of each interval asked: body(ask) is called for some at a time, and calls ask(chunk) of a ShadowChunk.
+    // Draws pilots in each interval. Calls body(ask) per block, which must call ask(chunk) with a ShadowChunk.
     template <class Body>
     void draw_pilots(uint64_t seed, Body body) const {
         scene_.view.team.parallel_for((intervals_ + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
@@ -247,8 +244,8 @@ class ShadowCasters {
     const ShadowScene<T> scene_;
 };
 
-// The density of samples in each interval, from what pilots found: what those of one interval miss, those of its
-// neighbours may have met, so most of the mean square is theirs.
+// Returns the density of samples in each interval. Neighbouring pilots may have found what an interval's own missed, so
+// most of the mean square is theirs.
 inline Array<double> density_of(const std::vector<ShadowStatistics>& of_interval) {
     const auto count = int64_t(of_interval.size());
     Array<double> measure(count);

@@ -1,20 +1,20 @@
-// Borders of shadows as a source of curves.
+// This file holds the curve source of shadow boundaries.
 //
-// A point l of a light and an edge (a, b) span the shadow plane, with the normal N = (b − a) × d, where d = p − l runs
-// from the light to the point p of the edge (or, from a light at infinity, along its rays). Its border on a face, the
-// receiver, with the normal m through v_i, is where the two planes meet. With y(x) what is seen of the receiver at x,
+// A point l of a light and an edge (a, b) span the shadow plane. Its normal is N = (b − a) × d. d = p − l runs from the
+// light to the point p of the edge. For a light at infinity it runs along the rays. The boundary lies where this plane
+// meets a face, the receiver, with the normal m through v_i. Let y(x) be the point of the receiver seen at x. Then
 //
 //     F(x) = N · (y(x) − p)
 //
-// is zero there, and the border's share of ∂loss/∂Φ is ∫ Ã [L(F > 0) − L(F < 0)] δF / |∇F| dℓ. Along the ray r = dq/dz
-// of the camera, with c = N·r / m·r, barycentrics β of y, and y = w_a a + w_b b + w_l l on the shadow plane,
+// is zero there, and the boundary contributes ∫ Ã [L(F > 0) − L(F < 0)] δF / |∇F| dℓ to ∂loss/∂Φ. Let r = dq/dz be the
+// camera's ray, c = N·r / m·r, β the barycentrics of y, and y = w_a a + w_b b + w_l l on the shadow plane. Then
 //
 //     δF = c m · Σ β_i δv_i − N · (w_a δa + w_b δb + w_l δl) + (N − c m) · δq(x),
 //
-// δq(x) at a fixed depth. The last factor is also ∇F, by the place in the image. Per unit of t on the edge the border
-// has the length |y′| with y′ = S / (m·d) · m × N, S = |y − l| / |p − l|, or 1 if the light is at infinity: so all that
-// is asked of the place on the edge is that rays go there. A light at infinity moves by its direction towards it.
-// A alpha edges does the same by its tangent in place of b − a (occluder.h).
+// with δq(x) at a fixed depth. The last factor is also ∇F, by the position in the image. Per unit of t on the edge the
+// boundary has the length |y′| with y′ = S / (m·d) · m × N. S = |y − l| / |p − l|, or 1 if the light is at infinity.
+// The position on the edge therefore only decides where the ray goes. A light at infinity moves by the direction
+// towards it. An alpha edge uses its tangent in place of b − a (occluder.h).
 #pragma once
 
 #include <algorithm>
@@ -27,27 +27,27 @@
 
 namespace edgegrad {
 
-// Where the ray of a light past an edge or an alpha edge meets a face.
+// A ShadowPoint is where the ray of a light past an edge or an alpha edge meets a face.
 struct ShadowPoint {
     Occluder caster;
-    int32_t part;         // of the light
-    Vec2 uv;              // on it
-    Vec3 light;           // that place, world coordinates, or the direction towards it
-    int side;             // on which it is dark as seen from there: 1, that of dp/dt × (p − l), or −1
+    int32_t part;         // part of the light
+    Vec2 uv;              // position on that part
+    Vec3 light;           // point of the light, world coordinates, or the direction towards it
+    int side;             // dark side as seen from the light: 1: the side of dp/dt × (p − l), or −1
     int32_t face = -1;    // the receiver
-    int64_t segment = 0;  // of the sampler (shadows.cpp)
-    Barycentrics on{};    // the receiver
-    double along = 0;     // y = l + along · d, or p + along · d from a light at infinity
+    int64_t segment = 0;  // number that identifies the sampler's interval (shadows.cpp)
+    Barycentrics on{};    // barycentrics on the receiver
+    double along = 0;     // y = l + along · d; for a light at infinity, p + along · d
 };
 
-// How F depends on what the border is made of, in whichever coordinates vertices and the light are given.
+// ShadowBorder holds the derivatives of F, in the coordinate system of the given vertices and light.
 struct ShadowBorder {
     Vec3 N, d;
     double S;
-    double by_caster[3] = {}, by_light;  // by its vertices, and by the light
+    double by_caster[3] = {}, by_light;  // weights of its vertices, and of the light
     double by_alpha_edge = 0;            // ∂F/∂f
 
-    // at(i): a vertex; `light`: the point, or the direction towards it.
+    // Builds the border. at(i) returns a vertex; `light` is its point, or the direction towards it.
     template <class At>
     static ShadowBorder of(const ShadowPoint& point, bool infinite, Vec3 light, At at) {
         const Occluder& caster = point.caster;
@@ -59,7 +59,7 @@ struct ShadowBorder {
         if (caster.is_alpha_edge()) o.by_alpha_edge = o.S * caster.turned(o.d, at);
         return o;
     }
-    // What is swept where F may change by `most` times the length of how what casts the border moves along N.
+    // Returns the area swept as the occluder moves by a unit length along N. `most` is the area per unit of F.
     double swept(double most, const Occluder& caster) const {
         double sum = by_caster[0] + by_caster[1];
         if (caster.is_alpha_edge()) sum += by_caster[2];
@@ -74,13 +74,13 @@ class ShadowSource {
 
     struct Sample : CurveSample {
         ShadowPoint shadow;
-        int32_t receiver;  // which the ray ignores
+        int32_t receiver;  // face that the primary ray ignores
         CurveFaces faces;
         ShadowBorder border;
-        Vec3 m;          // times c
+        Vec3 m;          // normal of the receiver times c
         Vec2 by_n;       // ∂F/∂n
         double speed;    // |du/dt|, px of the undistorted image
-        double scale;    // that over |∇F|
+        double scale;    // `speed` over |∇F|
         bool lit_ahead;  // whether the lit side is where F > 0
     };
 
@@ -88,7 +88,7 @@ class ShadowSource {
 
     Vec2 position(const Curve& curve, double) const { return project(view_.camera, place_of(curve)); }
 
-    // In camera coordinates.
+    // Returns y in camera coordinates.
     Vec3 place_of(const Curve& curve) const {
         const auto v = corners_of(view_, curve.face);
         return curve.on[0] * v[0] + curve.on[1] * v[1] + curve.on[2] * v[2];
@@ -103,7 +103,7 @@ class ShadowSource {
         const auto v = corners_of(view_, curve.face);
         const ShadowBorder border = ShadowBorder::of(curve, infinite_, light_of(curve), vertices());
         const Vec3 m = cross(v[1] - v[0], v[2] - v[0]), y = place_of(curve), d = border.d, N = border.N;
-        // What is lit from behind is dark on both sides of the border.
+        // A face that is lit from behind is dark on both sides of the boundary.
         if (!(dot(m, d) * dot(m, camera.view_direction(y)) > 0)) return false;
 
         sample.shadow = curve, sample.receiver = curve.face;
@@ -119,7 +119,7 @@ class ShadowSource {
         sample.scale = sample.speed / length(place_vjp(camera, sample.by_n));
         sample.lit_ahead = curve.side < 0;
         if (!std::isfinite(sample.scale)) return false;
-        // On the dark side: see BackwardView::curve_offset.
+        // The ray is moved to the dark side: see BackwardView::curve_offset.
         const Vec2 by_u = place_vjp(camera, sample.by_n);
         const double moved_by = (sample.lit_ahead ? -1 : 1) * view_.curve_offset / length(by_u);
         sample.sight = normalised(camera, sample.u + moved_by * by_u);
@@ -131,7 +131,7 @@ class ShadowSource {
 
     const CurveFaces& faces_of(const Sample& sample) const { return sample.faces; }
 
-    // The receiver in the light, and in the shadow.
+    // Returns the receiver twice: lit, and in shadow.
     SampleSurfaces surfaces(const Sample& sample) const {
         const SurfacePoint there{sample.receiver, sample.shadow.on, sample.point.z};
         return {{there, there}};
@@ -181,7 +181,7 @@ class ShadowSource {
     void finish(LocalGradients&) {}
 
    private:
-    // In camera coordinates.
+    // Returns vertices in camera coordinates.
     auto vertices() const {
         return [&](int32_t i) { return view_.vertices.q[i]; };
     }

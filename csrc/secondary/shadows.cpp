@@ -1,10 +1,9 @@
-// Samples on the borders of shadows.
+// This file draws samples on shadow boundaries.
 //
-// Pieces of edges before parts of the light (shadow_edges.h) are laid end to end by what is known of their shadows
-// without a ray. Equal intervals of that measure take some rays each, pilots, from the light past the edge to whatever
-// they meet, and from the camera to there, which say how long the border's image is, how far it moves with the edge,
-// and how much light ends there. The samples go in proportion to the root mean square of that product over an interval,
-// with a lower bound.
+// Pieces of edges before parts of the light (shadow_edges.h) lie end to end by an estimate of their shadows that needs
+// no ray. Equal intervals of that measure get some pilots each: rays from the light past the edge to a face, and from
+// the camera to there. Pilots measure the length of the boundary's image, its motion with the edge, and the light that
+// ends there. The density of samples follows the root mean square of that product over an interval, with a lower bound.
 
 #include "secondary/shadows.h"
 
@@ -22,9 +21,9 @@ namespace edgegrad {
 
 namespace {
 
-constexpr double samples_a_pixel = 24;  // of the border of a point's shadow
+constexpr double samples_a_pixel = 24;  // samples per pixel of a point light's shadow boundary
 
-// The accumulation of pilots.
+// Pilots accumulates the results of pilots.
 template <class T>
 class Pilots {
    public:
@@ -42,7 +41,7 @@ class Pilots {
         for (int i = 0; i < 3; ++i) there += point.on[i] * corner(view_.scene, point.face, i);
         const double arriving = cosine * light_.towards(point.part, point.light, there);
         const double look = view_.importance.mean(sample.x, sample.x);
-        // The area that the border sweeps as the edge moves: where light grazes a face it is much for little length.
+        // The boundary sweeps this area as the edge moves. Where light grazes a face, it is large for little length.
         const double swept =
             sample.border.swept(std::fabs(sample.weight * sample.scale * sample.area_scale), point.caster);
         const double px = sample.weight * sample.speed * std::sqrt(std::fabs(sample.area_scale));
@@ -66,12 +65,12 @@ int64_t most_shadow_samples(int64_t width, int64_t height, int spp) {
 template <class T>
 void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t samples,
                  const Record& record, GradientSink& to, BackwardProfile& profile) {
-    // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
-    // where the light has an extent, for each of its points casts a shadow of its own.
+    // A sample casts an incoherent ray from the light and one from the camera, so rays are limited to an eighth of the
+    // image's. A light with an extent gets all of them, because each of its points casts its own shadow.
     const int64_t most = most_shadow_samples(view.camera.width, view.camera.height, view.image.spp);
     const ShadowCasters<T> edges(view, casters, light, samples >= 0 ? samples : light.extended ? most : 0);
     if (edges.empty()) return;
-    // Casts from the camera to what lights have met.
+    // Casts from the camera to the points that light has met.
     const auto chunk_of = [&](uint64_t seed, ShadowSource<T>& source, auto& samples_of_chunk) {
         return ShadowChunk(edges.scene(), seed, [&](const ShadowPoint& point, double weight) {
             if (is_in_view(view, source.place_of(point))) samples_of_chunk.add(point, 0, weight);
@@ -89,7 +88,7 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
         ask(chunk);
         samples_of_block.finish(unused);
     });
-    double length = 0;  // of the border, px, a mean over the light
+    double length = 0;  // length of the boundary, px, averaged over the light
     for (const ShadowStatistics& found : of_interval) length += found.length / double(pilots * edges.intervals());
     Array<double> density = density_of(of_interval);
     const int64_t wanted = light.extended ? most : int64_t(std::min(samples_a_pixel * length, 1e15));

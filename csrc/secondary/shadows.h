@@ -1,4 +1,4 @@
-// The curves along which shadows end.
+// This file declares the term of shadow boundaries that the camera sees.
 #pragma once
 
 #include "estimator/view.h"
@@ -6,11 +6,11 @@
 
 namespace edgegrad {
 
-// By default, of an image of this size with so many samples a pixel.
+// Returns the default maximum number of samples for an image of this size and samples per pixel.
 int64_t most_shadow_samples(int64_t width, int64_t height, int spp);
 
-// Records samples on the borders of a light's shadows: so many, or, if −1, by default some a pixel of border.
-// `casters`: the scene as light meets it, of which less may be there than the camera sees.
+// Records `samples` samples on a light's shadow boundaries; −1 selects a default number per pixel of boundary.
+// `casters` is the scene as light meets it, which may lack faces that the camera sees.
 template <class T>
 void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t samples,
                  const Record& record, GradientSink& to, BackwardProfile& profile);

@@ -1,14 +1,13 @@
-// Lines past a point of an edge along which glossy faces mirror the viewer, or a light, to it.
+// This file draws lines past a point of an edge along which glossy faces mirror the viewer, or a light, to that point.
 //
-// A face whose lobe is narrow sends light to the viewer, or takes it from a light, along few of the lines past an edge.
-// Were it a mirror, it would be the one line to the mirrored place e′ of the viewer or of the light: from the point p
-// of the edge along m = (e′ − p) / |e′ − p|, that meets the mirror's plane at y. So directions are drawn by the lobe
-// that the face has there. While e is at a finite distance, what is off by ε at p is off by ε (1 + |p − y| / |e − y|) /
-// 2 between the face's normal and the half vector at the place it then meets, where the lobe at y alone would have ε /
-// 2: so the lobe is that of a face smoother by the factor |e − y| / (|p − y| + |e − y|).
+// A face with a narrow lobe sends light to the viewer, or takes it from a light, along few of the lines past an edge. A
+// mirror would do so along one line, to the mirror image e′ of the viewer or light e. That line runs from the edge's
+// point p along m = (e′ − p) / |e′ − p| and meets the mirror's plane at y. Directions are therefore drawn by the face's
+// lobe there. If e is at a finite distance, a deviation ε at p changes the angle between normal and half vector by ε (1
+// + |p − y| / |e − y|) / 2. The lobe at y alone would give ε / 2. The lobe is therefore that of a face smoother by the
+// factor |e − y| / (|p − y| + |e − y|).
 //
-// All of it is a pdf of directions and no more: faces that bend, are textured or are hidden only make it a worse
-// one.
+// This only shapes a pdf of directions. Faces that are curved, textured or occluded make it less efficient, not biased.
 #pragma once
 
 #include <algorithm>
@@ -23,7 +22,7 @@
 
 namespace edgegrad {
 
-// What a scene's faces mirror, and which do.
+// Mirrors holds the glossy faces of a scene, and the targets that they mirror.
 class Mirrors {
    public:
     Mirrors(const LitScene& lit, bool viewer) {
@@ -45,12 +44,12 @@ class Mirrors {
 
    private:
     friend class SpecularLines;
-    static constexpr size_t most_pairs = 32;  // of faces, the largest ones, and what they mirror
+    static constexpr size_t most_pairs = 32;  // maximum number of pairs of a face, largest first, and a target
 
     struct Target {
-        Vec3 place;  // or the unit direction towards it
+        Vec3 place;  // position, or the unit direction towards it
         bool infinite;
-        double extent;  // of a ball around it
+        double extent;  // radius of a ball around it
     };
     struct Face {
         Vec3 corner[3], n;
@@ -77,7 +76,7 @@ class Mirrors {
                 return targets_.push_back({0.5 * (low + high), false, 0.5 * length(high - low)});
             }
             default:
-                return;  // from all around
+                return;  // Other kinds emit from all around.
         }
     }
 
@@ -98,10 +97,10 @@ class Mirrors {
     std::vector<Face> faces_;
 };
 
-// Those past one point, unit directions of lines whichever way they run: drawn, and their pdf by solid angle.
+// SpecularLines draws unit directions of unoriented lines past one point, and returns their pdf by solid angle.
 class SpecularLines {
    public:
-    // `lune`: of the edge on which the point p lies; lines that are not in it are drawn seldom.
+    // `lune` belongs to the edge on which the point p lies. Lines outside of it are drawn rarely.
     void set(const Mirrors& mirrors, Vec3 p, const Lune& lune) {
         lobes_.clear(), sum_.clear(), share_ = 0;
         double sum = 0;
@@ -111,10 +110,10 @@ class SpecularLines {
                     share_ = std::max(share_, most_share * weight), sum_.push_back(sum += weight);
     }
 
-    // Of lines, that are best drawn so.
+    // Returns the fraction of lines to draw by these lobes.
     double share() const { return share_; }
 
-    // From numbers in [0, 1), of which the first chooses; zero if there is none.
+    // Maps numbers in [0, 1) to a direction; `choice` selects the lobe. Returns zero if there is none.
     Vec3 draw(double choice, Vec2 u) const {
         const auto k = std::min<size_t>(std::upper_bound(sum_.begin(), sum_.end(), choice * sum_.back()) - sum_.begin(),
                                         sum_.size() - 1);
@@ -132,10 +131,11 @@ class SpecularLines {
 
    private:
     static constexpr double most_share = 0.5;
-    static constexpr double outside = 0.1;  // of the weight of a mirror in which e is seen, and off the lune
+    static constexpr double outside =
+        0.1;  // relative weight of a mirror that does not contain y, or of a line outside the lune
 
     struct Lobe {
-        Vec3 n;  // of the face, on the side of p
+        Vec3 n;  // normal of the face, on the side of p
         DrawnLobe by;
     };
 
@@ -155,7 +155,7 @@ class SpecularLines {
         const Vec3 l = -m, v = 2 * dot(n, l) * n - l;
         lobes_.push_back({n, DrawnLobe(n, v, std::clamp(alpha, least_alpha, 1.0))});
         double weight = 1;
-        // Where the mirror would be looked at: in the face, or about there.
+        // y is the reflection point: it should lie in the face or near it.
         const Vec3 e1 = face.corner[1] - face.corner[0], e2 = face.corner[2] - face.corner[0], M = cross(e1, e2),
                    y = p + (own / dot(n, l)) * m - face.corner[0];
         const double b1 = dot(cross(y, e2), M), b2 = dot(cross(e1, y), M), whole = dot(M, M);
@@ -163,10 +163,10 @@ class SpecularLines {
         if (!lune.locate(m).is_there()) weight *= outside;
         return weight;
     }
-    static constexpr double near = 0.1;  // in barycentrics
+    static constexpr double near = 0.1;  // tolerance in barycentrics
 
     std::vector<Lobe> lobes_;
-    std::vector<double> sum_;  // of their weights
+    std::vector<double> sum_;  // running sum of the lobes' weights
     double share_ = 0;
 };
 

@@ -1,20 +1,19 @@
-// Samples on the curves at which a surface begins to send light.
+// This file draws samples on the curves at which the light that a surface sends jumps.
 //
-// Points of paths stay at the barycentrics of their faces. So of a face A that a face B passes through, one part is
-// before B and the other behind it, and both change as B moves. With unit normals n, the plane of B through b,
-// barycentrics α and β of a point of the line on A and B, and Φ the light that paths by way of a point of A bring to
-// the image,
+// Points of paths stay at the barycentrics of their faces. Where a face B passes through a face A, one part of A is
+// before B and the other behind it. Both change as B moves. Let n be unit normals, b a point of B's plane, and α and β
+// the barycentrics of a point of the line on A and B. Φ is the light that paths through a point of A bring to the
+// image. Then
 //
 //     δI = ∫ [Φ(F > 0) − Φ(F < 0)] δF / sin θ dℓ,   F(y) = n_B · (y − b),   δF = n_B · (Σ α_i δv_i − Σ β_i δw_i)
 //
-// with θ the angle between the planes, for |∇F| on A is its sine; and the same of B. A face that is alpha-tested is
-// there where f > 0 (occluder.h): along its alpha edge dℓ / |∇f| = |κ M| dt with M the cross product of the sides of
-// the face, and f is moved by texture coordinates and alpha alone.
+// θ is the angle between the planes, because |∇F| on A is its sine. The same holds for B. An alpha-tested face is
+// opaque where f > 0 (occluder.h). Along its alpha edge dℓ / |∇f| = |κ M| dt, with M the cross product of the sides of
+// the face. Only texture coordinates and alpha move f.
 //
-// The camera sees some of these points, and for them there are curves in the image. Of Φ this is what goes on to other
-// surfaces: a direction is drawn by the cosine, what it meets gets light from a point that lies a little next to the
-// curve, and from there light goes to the camera (light_tracing.h). Each side of a face counts, and each of its two
-// parts.
+// For points that the camera sees there are curves in the image. Here Φ is the light that goes on to other surfaces. A
+// direction is drawn by the cosine, and the point that it meets is lit from a point slightly next to the curve. From
+// there light goes to the camera (light_tracing.h). Each side of a face counts, and each of its two parts.
 
 #include "secondary/surface_edges.h"
 
@@ -34,18 +33,18 @@ namespace edgegrad {
 namespace {
 
 constexpr int64_t fewest_places = 256, places_of_samples = 4;
-// How far next to the curve light is asked for, in lengths of its piece, and in roundings of the input.
+// Light is evaluated this far next to the curve, in lengths of its piece and in roundings of the input.
 constexpr double little = 1e-5, roundings = 64;
 
-// One part of a face next to a place of a curve.
+// A Part is one part of a face next to a place of a curve.
 struct Part {
     int32_t face;
-    int of;         // which of the faces that meet there
+    int of;         // index of the face among those that meet there
     Vec3 across;    // unit vector on the face, from the curve into the part
     double factor;  // dℓ / |∇F|, negative where F < 0
 };
 
-// A place of a curve, in the world, and the parts of faces that end there.
+// A Place is a point of a curve in the world, with the parts of faces that end there.
 struct Place {
     struct Row {
         int of;
@@ -54,8 +53,8 @@ struct Place {
     };
     Vec3 p;
     std::vector<Part> parts;
-    std::vector<Row> rows;  // how F moves with vertices, of each face
-    Occluder alpha_edge;    // and f with the texture
+    std::vector<Row> rows;  // derivatives of F by vertices, for each face
+    Occluder alpha_edge;    // derivatives of f by the texture
 
     void append_motion(const Part& part, int64_t sample, CurveRecords& records) const {
         for (const Row& row : rows) {
@@ -67,7 +66,7 @@ struct Place {
     }
 };
 
-// The curves laid end to end by their lengths.
+// BorderPieces holds the curves, laid end to end by their lengths.
 template <class T>
 class BorderPieces {
    public:
@@ -83,7 +82,7 @@ class BorderPieces {
             alpha_edges_ = AlphaEdgeFinder<T>(casters).find(hash(seed, 13, gradient_stream), view.team);
     }
 
-    // How many samples each piece gets, relative to others.
+    // Returns the relative number of samples of each piece.
     Array<double> measure() const {
         const auto n = int64_t(crossings_->size() + alpha_edges_.size());
         Array<double> out(n);
@@ -94,14 +93,14 @@ class BorderPieces {
         return out;
     }
 
-    // The place t of a piece. False where nothing ends.
+    // Sets the place t of a piece. Returns false where no surface ends.
     bool set(int64_t k, double t, Place& out) const {
         out.parts.clear(), out.alpha_edge = {};
         if (k < int64_t(crossings_->size())) return set_crossing((*crossings_)[k], t, out);
         return set_alpha_edge(alpha_edges_[k - int64_t(crossings_->size())], t, out);
     }
 
-    // Of a place in the plane of a face.
+    // Returns the barycentrics of a point in the plane of a face.
     Barycentrics barycentrics(int32_t face, Vec3 p) const {
         const Vec3 q = corner(view_.scene, face, 0), e1 = corner(view_.scene, face, 1) - q,
                    e2 = corner(view_.scene, face, 2) - q, m = cross(e1, e2), there = p - q;
@@ -112,7 +111,7 @@ class BorderPieces {
         const Vec3 q = corner(view_.scene, face, 0);
         return cross(corner(view_.scene, face, 1) - q, corner(view_.scene, face, 2) - q);
     }
-    // How far next to it light is asked for.
+    // Returns how far next to the curve light is evaluated.
     double aside(int64_t k, int32_t face) const {
         double size = 0;
         for (int i = 0; i < 3; ++i) {
@@ -175,7 +174,7 @@ class BorderPieces {
         if (!AlphaEdgeFinder<T>(casters_).place(alpha_edge, t, there)) return false;
         const Vec3 q = corner(view_.scene, alpha_edge.face, 0), e1 = corner(view_.scene, alpha_edge.face, 1) - q,
                    e2 = corner(view_.scene, alpha_edge.face, 2) - q, M = cross(e1, e2);
-        const Vec3 gradient = there.slope.u * cross(e2, M) + there.slope.v * cross(M, e1);  // of f, times |M|²
+        const Vec3 gradient = there.slope.u * cross(e2, M) + there.slope.v * cross(M, e1);  // gradient of f times |M|²
         out.p = place(alpha_edge.face, there.b), out.rows.clear(),
         out.alpha_edge = occluder_of(casters_, alpha_edge, there);
         out.parts.push_back(
@@ -183,7 +182,7 @@ class BorderPieces {
         return true;
     }
 
-    static constexpr double flat = 1e-9;  // radians between planes that are taken for one
+    static constexpr double flat = 1e-9;  // radians; planes at a smaller angle are taken for one
 
     const BackwardView<T>& view_;
     const SceneView<T>& casters_;
@@ -193,7 +192,7 @@ class BorderPieces {
     std::vector<AlphaEdge> alpha_edges_;
 };
 
-// Rays from both sides of all parts of faces next to a place, and what gets light along them.
+// LeavingRays traces rays from both sides of all parts of faces next to a place, to the points that they light.
 template <class T>
 class LeavingRays {
    public:
@@ -207,7 +206,7 @@ class LeavingRays {
         for (const Part& part : place_.parts) {
             const Vec3 asked = place_.p + pieces_.aside(piece, part.face) * part.across;
             const Barycentrics b = pieces_.barycentrics(part.face, asked);
-            // Where the face ends at the curve, another one goes on there.
+            // A neighbour continues the surface where the face ends at the curve.
             if (std::min({b.u, b.v, 1 - b.u - b.v}) < 0 || !light_.lit.lit.mesh_of(part.face).has_material) continue;
             const Vec3 n = unit(pieces_.normal(part.face));
             for (const double side : {1.0, -1.0}) {
@@ -232,7 +231,7 @@ class LeavingRays {
         append(records.x, {0.0, 0.0});
         append(records.face, {hit_[i], face_[i], -2});
         append(records.b, {hit_b_[2 * i], hit_b_[2 * i + 1], b_[2 * i], b_[2 * i + 1], 0.0, 0.0});
-        append(records.factor, {M_PI * weight * part.factor, 0.0, 0.0});  // the cosine over its density
+        append(records.factor, {M_PI * weight * part.factor, 0.0, 0.0});  // the cosine over its pdf
         place_.append_motion(part, sample, records);
     }
 

@@ -1,4 +1,4 @@
-// Lines past edges and alpha edges, and what lies at both of their ends.
+// This file traces lines past edges and alpha edges to what lies at both of their ends.
 #pragma once
 
 #include <algorithm>
@@ -16,20 +16,20 @@
 
 namespace edgegrad {
 
-// Lines in batches. `casters`: the scene as light meets it.
+// TracedEdgeLines traces lines in batches. `casters` is the scene as light meets it.
 template <class T>
 class TracedEdgeLines {
    public:
     TracedEdgeLines(const BackwardView<T>& view, const SceneView<T>& casters, const std::vector<AlphaEdge>& alpha_edges)
         : view_(view), casters_(casters), alpha_edges_(alpha_edges), caster_(view.geometry.caster()) {
-        // So far before the edge a ray begins that floats find what touches it there.
+        // A ray starts this far before the edge, so that single precision finds faces that touch the edge.
         const RayFrame& frame = caster_.frame();
         constexpr double floats = 0x1p-18;
         size_ = frame.radius * frame.unit, before_ = floats * size_;
     }
 
-    // The place t of an edge, or, numbered after all edges, of an alpha edge, and the unit direction w of a line past
-    // it, either way, for whoever knows the segment by this number.
+    // Adds a line along the unit direction w, of either sign, past the place t of an edge. Alpha edges are numbered
+    // after all edges. `segment` is the caller's number for it.
     void add(int64_t piece, double t, Vec3 w, int64_t segment, double weight) {
         Pending& o = pending_[count_];
         const int64_t edges = view_.geometry.topology().n_edges();
@@ -46,7 +46,7 @@ class TracedEdgeLines {
 
     bool is_full() const { return count_ == RayBatch::size; }
 
-    // Calls body(line, weight) for both ways along each line, if there is something at both of its ends.
+    // Calls body(line, weight) for both ways along each line, if there is a face at both of its ends.
     template <class Body>
     void cast(Body body) {
         for (int side = 0; side < 2; ++side) {
@@ -63,17 +63,17 @@ class TracedEdgeLines {
     }
 
    private:
-    // What the line meets beyond the edge, against its direction or along it.
+    // An End is what the line meets beyond the edge, against its direction or along it.
     struct End {
         int32_t face = -1;
         Barycentrics at;
-        double distance;  // from the edge; 0: it lies on that face
+        double distance;  // distance from the edge; 0: the edge lies on that face
     };
     struct Pending {
         EdgeLine line;
         double weight;
-        int64_t edge;     // −1: an alpha edge
-        int32_t face;     // of an alpha edge
+        int64_t edge;     // −1 for an alpha edge
+        int32_t face;     // face of an alpha edge
         Vec3 p, tangent;  // world coordinates
         End end[2];
 
@@ -83,12 +83,12 @@ class TracedEdgeLines {
     auto vertices() const {
         return [&](int32_t i) { return vec(view_.scene.verts + 3 * int64_t(i)); };
     }
-    // Of the edge, or that of the alpha edge.
+    // Returns the faces of the edge, or the face of the alpha edge.
     std::span<const int32_t> adjacent_faces(const Pending& o) const {
         return o.edge < 0 ? std::span<const int32_t>(&o.face, 1) : view_.geometry.topology().faces(o.edge);
     }
 
-    // Where some of its faces may be alpha-tested, lines are drawn as if all passed; those past the others are kept.
+    // Lines are drawn as if all passed where faces may be masked. Lines past the opaque faces are kept.
     bool set_edge(double t, Pending& o) {
         const auto halves = view_.geometry.topology().half_edges(o.edge);
         const HalfEdge& own = halves[0];
@@ -112,7 +112,7 @@ class TracedEdgeLines {
         o.line.occluder = occluder_of(casters_, alpha_edge, place);
         const double turned = o.line.occluder.turned(o.line.w, vertices());
         if (!(std::fabs(turned) > 0)) return false;
-        if (turned > 0) o.line.w = -o.line.w;  // the face is there where κ D F > 0
+        if (turned > 0) o.line.w = -o.line.w;  // The face is opaque where κ D F > 0.
         o.p = next_to_alpha_edge(casters_, alpha_edge, place), o.face = alpha_edge.face;
         return true;
     }
@@ -129,7 +129,7 @@ class TracedEdgeLines {
         for (int i = 0; i < count_; ++i) pending_[i].end[side].face = face[i];
     }
 
-    // Whether the line ends on a face.
+    // Returns whether the line ends on a face.
     bool accept(const Pending& o, int side, int32_t face, End& end) const {
         const SceneView<T>& scene = view_.scene;
         const Vec3 d = o.direction(side), q = corner(scene, face, 0);
@@ -139,27 +139,27 @@ class TracedEdgeLines {
         const bool outside = met.margin() < -Meeting::rounding;
         end.at = inside({met.u, met.v}), end.distance = met.t;
         if (!shows(casters_, face, end.at)) return false;
-        // Near a border of faces floats and doubles may differ. Far away floats decide, for a line that passed a face
-        // might pass its neighbour too.
-        constexpr double near = 4;  // sizes of the face
+        // Near a face's border single and double precision may differ. Far away single precision decides, because a
+        // line that passed a face might pass its neighbour too.
+        constexpr double near = 4;  // distance in sizes of the face
         const bool meets = !outside || met.t * met.t > near * near * length(m);
-        // How faces that share a vertex with those of the edge lie to it is exact, however near they are.
+        // The position of faces that share a vertex with the edge's faces is exact, however near they are.
         const auto own = adjacent_faces(o);
         if (std::any_of(own.begin(), own.end(), [&](int32_t f) { return share_vertex(scene, face, f); }))
             return meets && met.t > Meeting::rounding * size_;
         const double touching = distance_in_contact(o, face, length(m) / std::fabs(dot(m, d)));
         if (std::fabs(met.t) > touching) return meets && met.t > 0;
-        // The edge lies on this face: lines into it, on the side on which the edge's faces stand, end there.
+        // The edge lies on this face. Lines into it end there, on the side on which the edge's faces stand.
         end.distance = 0;
         return !outside && rise(face, m, own) * dot(m, d) < 0;
     }
 
-    // Along the line, up to the rounding of the input.
+    // Returns the distance along the line that counts as contact, from the rounding of the input.
     double distance_in_contact(const Pending& o, int32_t face, double slant) const {
         const double size = extent(face);
         return contact(spacing_at(o, face), size, size) * slant;
     }
-    // The largest coordinate of a face, and the relative spacing of such numbers.
+    // extent returns the largest coordinate of a face; spacing_at returns the relative spacing of such numbers.
     double extent(int32_t face) const {
         double size = 0;
         for (int i = 0; i < 3; ++i) {
@@ -173,7 +173,7 @@ class TracedEdgeLines {
         return std::max(spacing.of(view_.scene.faces[3 * int64_t(face)]), spacing.of(o.line.occluder.vertex[0]));
     }
 
-    // How high faces stand over the plane of another, on the side where they do most; 0: they lie in it.
+    // Returns the largest height of faces over another's plane; 0: they lie in it.
     double rise(int32_t face, Vec3 m, std::span<const int32_t> others) const {
         const Vec3 q = corner(view_.scene, face, 0);
         double most = 0;
@@ -185,8 +185,7 @@ class TracedEdgeLines {
         return std::fabs(most) > flat * dot(m, m) / std::sqrt(length(m)) ? most : 0;
     }
 
-    // With one of the ends as the receiver; false where the edge lies on it: there the camera sees the border as an
-    // edge.
+    // Sets one end of the line as the receiver. Returns false where the edge lies on it: there the camera sees an edge.
     bool set(Pending& o, int receiver) const {
         const End &near = o.end[receiver], &far = o.end[1 - receiver];
         if (near.distance == 0) return false;
@@ -200,20 +199,22 @@ class TracedEdgeLines {
         return true;
     }
 
-    // On a face on which the edge lies, a little to the side where light passes.
+    // Returns a point on a face that contains the edge, moved slightly to the side where light passes.
     Barycentrics adjacent(const Pending& o, int32_t face) const {
         const SceneView<T>& scene = view_.scene;
         const Vec3 q = corner(scene, face, 0), e1 = corner(scene, face, 1) - q, e2 = corner(scene, face, 2) - q;
         const Vec3 m = cross(e1, e2), across = unit(cross(m, o.tangent));
         const double side = dot(cross(o.tangent, o.line.w), across) > 0 ? 1 : -1;
-        constexpr double little = 1e-5, roundings = 64;  // of the edge; of the input, for rays to lights
+        constexpr double little = 1e-5,
+                         roundings =
+                             64;  // fraction of the edge's length; number of input roundings, for rays to lights
         const double aside = little * length(o.tangent) + roundings * spacing_at(o, face) * extent(face);
         const Vec3 there = o.p + (side * aside) * across - q;
         const double scale = 1 / dot(m, m);
         return inside({dot(cross(there, e2), m) * scale, dot(cross(e1, there), m) * scale});
     }
 
-    static constexpr double flat = 1e-9;  // of the size of a face
+    static constexpr double flat = 1e-9;  // relative to the size of a face
 
     const BackwardView<T>& view_;
     const SceneView<T>& casters_;
