@@ -139,7 +139,9 @@ def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch)
     task = PoseTask.from_arguments(
         case.mesh, case.picture, case.camera, None, None, None, Unknowns(), 1.0, ArgumentNames()
     )
-    start = pose_from_matrix("init", case.beside(case.truth, 15.0, 0.05 * case.size, np.random.default_rng(4)).matrix)
+    start = pose_from_matrix(
+        "init", case.perturbed(case.truth, 15.0, 0.05 * case.size, np.random.default_rng(4)).matrix
+    )
     assert comparable(task, start) and not comparable(task, start._replace(scale=2.0 * start.scale))
     R, t = case.truth.R, case.truth.t
     pose, side = nearby(task, start, 0)[0]
