@@ -12,7 +12,10 @@ import pytest
 import torch
 
 ROOT = Path(__file__).parents[1]
-sys.path += [str(ROOT), str(ROOT / "examples")]  # Tests use scenes and references of benchmarks/, and objects of examples/.
+sys.path += [
+    str(ROOT),
+    str(ROOT / "examples"),
+]  # Tests use scenes and references of benchmarks/, and objects of examples/.
 torch.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # what started the tests may have it ignored, as nohup does
 
