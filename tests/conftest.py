@@ -11,7 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
-sys.path.append(str(Path(__file__).parents[1]))  # for benchmarks/, some scenes and references of which are tested
+ROOT = Path(__file__).parents[1]
+sys.path += [
+    str(ROOT),
+    str(ROOT / "examples"),
+]  # Tests use scenes and references of benchmarks/, and objects of examples/.
 torch.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # what started the tests may have it ignored, as nohup does
 

@@ -22,7 +22,7 @@ from torch import Tensor
 FIRST_PROBES, PROBES = 24, 4  # images v at the first point, and at every later one
 MEMORY, PROBES_MEMORY = 0.0, 0.9  # weight of earlier JᵀJ when a new one comes, from J and from probes
 INITIAL_DAMPING, LOWEST_DAMPING = 0.1, 0.005  # relative to the diagonal of JᵀJ
-MAX_STEP = 0.07  # The largest entry of a step: JᵀJ says little about poses further away.
+MAX_STEP_ENTRY = 0.07  # The largest entry of a step: JᵀJ says little about poses further away.
 UNDAMPED_STEPS, DECAY = (
     4,
     0.5,
@@ -123,7 +123,7 @@ class GaussNewton:
         # Directions that the image does not show have noise alone: 1e-4 of the largest entry keeps them at rest.
         damped = self._curvature + torch.diag(self.damping * diagonal + 1e-4 * diagonal.max())
         step = -torch.linalg.solve(damped, self._gradient)
-        shrink = min(1.0, MAX_STEP / float(step.abs().max().clamp(min=1e-30)))
+        shrink = min(1.0, MAX_STEP_ENTRY / float(step.abs().max().clamp(min=1e-30)))
         return step * shrink / (1.0 + DECAY * max(0, self._settled - UNDAMPED_STEPS))
 
     def state(self) -> dict[str, Any]:

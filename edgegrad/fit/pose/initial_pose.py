@@ -7,7 +7,7 @@ from torch import Tensor
 
 from .inputs import depth_of
 from .pose import Pose
-from .task import PoseTask, Shot, focal_of
+from .task import PoseTask, TargetView, focal_of
 
 DEFAULT_FILL = 0.5  # Share of the picture's shorter side that an object fills when nothing else is known.
 MIN_OVERLAP = (
@@ -45,11 +45,11 @@ def initial_pose(task: PoseTask) -> Pose:
     return identity._replace(t=view[:3, :3].T @ (q - view[:3, 3]) - task.center)
 
 
-def _before(task: PoseTask, shot: Shot, pose: Pose) -> bool:
+def _before(task: PoseTask, shot: TargetView, pose: Pose) -> bool:
     return float(depth_of(shot.camera, pose, task.center)) > 0.5 * task.size
 
 
-def _box(task: PoseTask, shot: Shot, pose: Pose) -> tuple[Tensor, Tensor]:
+def _box(task: PoseTask, shot: TargetView, pose: Pose) -> tuple[Tensor, Tensor]:
     """Return opposite corners (2,) of the object's box in the image, in pixels, without distortion."""
     verts = torch.cat([mesh.verts for mesh in task.scene.meshes])
     view, K = shot.camera.world_to_camera, shot.camera.K
@@ -59,7 +59,7 @@ def _box(task: PoseTask, shot: Shot, pose: Pose) -> tuple[Tensor, Tensor]:
     return pixels.amin(0), pixels.amax(0)
 
 
-def _mask_box(shot: Shot) -> tuple[Tensor, Tensor] | None:
+def _mask_box(shot: TargetView) -> tuple[Tensor, Tensor] | None:
     rows, columns = torch.nonzero(shot.target[..., -1] > 0.5, as_tuple=True)
     if not len(rows):
         return None

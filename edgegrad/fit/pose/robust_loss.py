@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..edge_support import edge_strength
-from .task import PoseTask, PyramidLevel, Shot
+from .task import PoseTask, PyramidLevel, TargetView
 
 MIN_WIDTH = 0.1  # Least c, relative to the pictures' range.
 WIDTH_MEDIANS = 2.5  # c, in medians
@@ -97,7 +97,7 @@ class Comparison:
         if self._has_gains and c != self._width:
             self._fit_gains(c)
 
-    def _weights(self, shot: Shot, r: Tensor, c: float) -> Tensor:
+    def _weights(self, shot: TargetView, r: Tensor, c: float) -> Tensor:
         """Return the weights (…, 1) of differences r (…, C) of all pixels."""
         w = (1.0 + r.square().sum(-1, keepdim=True) / c**2).pow(-2)
         return w if shot.weight is None else w * shot.weight.reshape(w.shape)
@@ -208,7 +208,7 @@ class Comparison:
             count += C * float((edges.square() * self._weights(shot, self.differences[k].detach(), c)).sum())
         return total / max(count, 1e-30)
 
-    def _open(self, shot: Shot, c: float) -> Tensor:
+    def _open(self, shot: TargetView, c: float) -> Tensor:
         """Return the weight of uncovered shares in the residual of a picture."""
         count = torch.ones(()) if shot.weight is None else shot.weight
         return count.sqrt() * math.sqrt(COVERAGE_REWARD) * c

@@ -51,7 +51,7 @@ class Unknowns(NamedTuple):
     distortion: int = 0  # number of coefficients
 
 
-class Shot(NamedTuple):
+class TargetView(NamedTuple):
     """One picture at one resolution."""
 
     camera: Camera
@@ -63,7 +63,7 @@ class Shot(NamedTuple):
 class PyramidLevel(NamedTuple):
     """The task at one resolution."""
 
-    shots: list[Shot]
+    shots: list[TargetView]
     blur: float  # pixels
     coarseness: float  # size of a pixel, relative to the finest level's
     spp: int
@@ -82,7 +82,7 @@ class PoseTask:
 
     scene: Scene
     aovs: tuple[str, ...]  # what is compared, in order: "image", "alpha" or both
-    shots: list[Shot]  # whole pictures
+    shots: list[TargetView]  # whole pictures
     clutter: bool  # The background is unknown: where the object is not seen, nothing is compared.
     colourless: bool  # The meshes have no colours, and no mask shows them: pictures show them grey.
     extent: float  # norm over the channels of the pictures' range, of colours where there are any
@@ -141,7 +141,7 @@ class PoseTask:
                 if behind is None:
                     clutter = clutter or is_clutter(image)
                 behind = _background(behind, image)
-            shots.append(Shot(view.to("cpu", torch.float64, copy=True), image, behind, count))
+            shots.append(TargetView(view.to("cpu", torch.float64, copy=True), image, behind, count))
         warn_of_faint(names.mask, masks)
         if all(shot.weight is not None and not bool((shot.weight > 0).any()) for shot in shots):
             raise ValueError(
@@ -225,7 +225,7 @@ class PoseTask:
     def turned_over(self) -> PoseTask:
         """Return the task with the pictures upside down."""
         shots = [
-            Shot(
+            TargetView(
                 shot.camera, shot.target.flip(0),
                 shot.background.flip(0) if shot.background is not None and shot.background.dim() == 3 else shot.background,
                 None if shot.weight is None else shot.weight.flip(0),
@@ -242,7 +242,7 @@ class PoseTask:
             if behind is not None and behind.dim() == 3:
                 behind = area_mean(behind, size)
             weight = None if weight is None else area_mean(weight, size)
-            shots.append(Shot(camera.resized(size), blurred(area_mean(target, size), blur), behind, weight))
+            shots.append(TargetView(camera.resized(size), blurred(area_mean(target, size), blur), behind, weight))
         return PyramidLevel(shots, blur, coarseness, spp, dofs)
 
     def moved(self, pose: Pose, dofs: list[int], p: Tensor) -> Pose:
@@ -273,7 +273,7 @@ class PoseTask:
         coefficients = pose.distortion + step[DISTORTION:]
         return Pose(R, t, scale, pose.focal * zoom, pose.principal + step[PRINCIPAL:DISTORTION], coefficients)
 
-    def motion(self, level: PyramidLevel, shot: Shot, pose: Pose) -> Motion:
+    def motion(self, level: PyramidLevel, shot: TargetView, pose: Pose) -> Motion:
         """Return how each entry of a step that the level seeks moves what the shot sees. These are the derivatives of moved()
         and lens() at a zero step. The object's centre moves along the first camera's axes, and the object rotates and scales
         about it."""
@@ -356,7 +356,9 @@ class PoseTask:
         moved = self.scene.transformed(pose.R, pose.t, pose.scale)
         return [(moved, self.lens(shot.camera, pose), (seed + 977 * k) % 2**32) for k, shot in enumerate(level.shots)]
 
-    def layers(self, level: PyramidLevel, shot: Shot, channels: Mapping[str, Tensor], slopes: bool = False) -> Tensor:
+    def layers(
+        self, level: PyramidLevel, shot: TargetView, channels: Mapping[str, Tensor], slopes: bool = False
+    ) -> Tensor:
         """Return the summands (…, h, w, n) of a picture, blurred like the pictures. These are the object before black, the
         visible part of a known background, and alpha, if it is compared. `slopes`: the channels are derivatives."""
         parts = [channels["image"]] if "image" in self.aovs else []
@@ -376,7 +378,7 @@ class PoseTask:
         ]
 
 
-def _in_units_of_white(shots: list[Shot], masked: bool) -> tuple[list[Shot], float]:
+def _in_units_of_white(shots: list[TargetView], masked: bool) -> tuple[list[TargetView], float]:
     """Return pictures whose white is 1, and its radiance before. `masked`: the last channel is a mask."""
     pixels = torch.cat([shot.target.flatten(0, 1) for shot in shots])
     white = white_level(pixels[pixels[:, -1] > 0.0, :-1] if masked else pixels)

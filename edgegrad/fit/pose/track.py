@@ -81,7 +81,7 @@ class TrackedPose:
                 f"hardly seen: where its motion leads, for the picture shows {self.explained:.0%} of the render's edges"
             )
         if self.covered > MOSTLY:
-            return f"covered: {self.covered:.0%} of the object is not what it was before"
+            return f"covered: {self.covered:.0%} of the object is not what it looked like before"
         return "seen"
 
     @property

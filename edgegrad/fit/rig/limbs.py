@@ -91,12 +91,12 @@ class ByLoss:
         return loss_of(self.objective, values)
 
     def matches(self, values: Values) -> bool:
-        return self._left(values) < FITTED_LOSS
+        return self._residual(values) < FITTED_LOSS
 
     def nearly_matches(self, values: Values) -> bool:
-        return self._left(values) < NEARLY_FITTED_LOSS
+        return self._residual(values) < NEARLY_FITTED_LOSS
 
-    def _left(self, values: Values) -> float:
+    def _residual(self, values: Values) -> float:
         with torch.no_grad():
             return self.objective.residual(values)
 

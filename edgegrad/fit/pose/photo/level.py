@@ -32,7 +32,7 @@ from ..gauss_newton import NormalEquations
 from ..inputs import without_colors
 from ..jacobian import Motion, Rendered
 from ..pose import Pose
-from ..task import FOCAL_LENGTH, PoseTask, PyramidLevel, Shot, scaled
+from ..task import FOCAL_LENGTH, PoseTask, PyramidLevel, TargetView, scaled
 from .contour import contour_loss, contour_term
 from .depth import depth_term
 from .light import HARMONICS, FittedLight
@@ -43,7 +43,7 @@ from .surface_interior import AOVS, SurfaceInterior
 COARSEST_PHOTO = 30  # pixels across the object on the coarsest level
 SMALLEST_PHOTO_SIDE = 12  # pixels on the shorter side of the coarsest level
 # The damping is relative to the curvature's diagonal, before the last level and on it, the least damping to its largest entry.
-COARSE_DAMPING, FINE_DAMPING, MIN_DAMPING = 0.1, 0.01, 1e-5
+COARSE_DAMPING, FINE_DAMPING, MIN_PHOTO_DAMPING = 0.1, 0.01, 1e-5
 MAX_PHOTO_STEP = 0.1  # largest entry of a step
 ALPHA_BLURS = (1.0, 0.7)  # pixels, of alpha on coarse levels; of three levels the last but one has the second
 FEW_HARMONICS = 4  # number for the light on the coarsest level
@@ -65,7 +65,7 @@ class Crop(NamedTuple):
     extent: float  # pixels
 
     @staticmethod
-    def around(task: PoseTask, shot: Shot, pose: Pose) -> Crop:
+    def around(task: PoseTask, shot: TargetView, pose: Pose) -> Crop:
         H, W = shot.camera.size
         whole = Crop(0, 0, H, W, float(max(H, W)) / 2)
         camera = task.lens(shot.camera, pose)
@@ -191,7 +191,7 @@ class PhotoLevel:
 
     def step(self, normal: NormalEquations, longest: float = MAX_PHOTO_STEP) -> Tensor | None:
         """Return the damped step (n,), or None where nothing depends on the parameters."""
-        return normal.damped(FINE_DAMPING if self.last else COARSE_DAMPING, MIN_DAMPING, longest)
+        return normal.damped(FINE_DAMPING if self.last else COARSE_DAMPING, MIN_PHOTO_DAMPING, longest)
 
     def focused(self, seen: Sequence[PictureComparison]) -> PhotoLevel:
         """Return the level with contours as sharp as the pictures show them where the object is: one of CONTOUR_BLURS for
@@ -296,7 +296,7 @@ def photo_levels(
         rows, columns = slice(crop.top, crop.bottom), slice(crop.left, crop.right)
         weight = None if shot.weight is None else shot.weight[rows, columns]
         camera = shot.camera.crop(crop.top, crop.left, crop.bottom - crop.top, crop.right - crop.left)
-        shots.append(Shot(camera, shot.target[rows, columns], None, weight))
+        shots.append(TargetView(camera, shot.target[rows, columns], None, weight))
         cut.append(None if depth is None else depth[rows, columns])
         across.append(crop.extent)
     finest = [min(1.0, max_size / max(shot.camera.size)) for shot in shots]

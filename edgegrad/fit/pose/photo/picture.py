@@ -12,7 +12,7 @@ from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ...contour_colors import PIXEL_NOISE, mask_noise
 from ...views import area_mean
-from ..task import Shot
+from ..task import TargetView
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Picture:
     noise: float = PIXEL_NOISE  # standard deviation of mixed pixels of `outlined`
 
     @staticmethod
-    def from_shot(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int]) -> Picture:
+    def from_shot(shot: TargetView, masked: bool, depth: Tensor | None, size: tuple[int, int]) -> Picture:
         """Return the picture of a shot; `masked`: its last channel is a mask."""
         radiance, mask = area_mean(shot.target, size), None
         if masked:
