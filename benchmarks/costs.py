@@ -53,6 +53,7 @@ def backward(bench: Bench) -> list[Row]:
     images: list[Tensor] = []
 
     def render() -> None:
+        assert mesh.colors is not None
         mesh.verts.grad = mesh.colors.grad = None
         images[:] = [eg.render(mesh, camera)]
 
@@ -120,7 +121,8 @@ def bits(bench: Bench) -> list[Row]:
     kernel = big()
     found = []
     for n in (1, 2):
-        kernel.forward(n), kernel.backward(appearance=True, threads=n)
+        kernel.forward(n)
+        kernel.backward(appearance=True, threads=n)
         found.append([tensor.clone() for tensor in (kernel.image, *kernel.grads.values())])
     same = all(torch.equal(a, b) for a, b in zip(*found, strict=True))
     return [Row("same bits at 1 and 2 threads (1: yes)", float(same))]

@@ -6,6 +6,7 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +15,8 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.library import core
 
+from . import mitsuba
 from .common import Kernel, Step, parts, sphere
-from .error_time import mitsuba
 from .table import Bench, Row, Skipped, median_time, quartiles
 
 Run = Callable[[float, int], tuple[Tensor, float]]  # (budget, seed) → gradient (V, 3), seconds
@@ -86,7 +87,7 @@ def equal_error(
     turns: int,
     unit: str,
     samples: str = "its default samples",
-    **target: float,
+    **target: Any,
 ) -> list[Row]:
     """How many times longer `theirs` takes to the wanted error of `part` of the gradient."""
     _, inside, edges = equal()

@@ -76,7 +76,7 @@ void bind_scene_functions(nb::module_& m) {
     m.def(
         "bare_loop",
         [](const Scene& scene, const Camera& camera, const ImageOptions& options, int packet_width, int threads) {
-            return unlocked(threads, [&](Team& team) {
+            return unlocked(threads, [&](ThreadTeam& team) {
                 GeometryWork work;
                 return bare_loop(camera, scene.geometry({}, team, work)->caster(), options, packet_width, team);
             });
@@ -87,7 +87,7 @@ void bind_scene_functions(nb::module_& m) {
         "cast_rays",
         [](const Scene& scene, In<double, 2> origins, In<double, 2> directions, In<double, 1> ends,
            In<int32_t, 1> ignored, In<int64_t, 1> first, Out<int32_t, 1> face, Out<uint8_t, 1> hidden) {
-            return unlocked(1, [&](Team& team) {
+            return unlocked(1, [&](ThreadTeam& team) {
                 GeometryWork work;
                 const auto geometry = scene.geometry({}, team, work);
                 cast_rays(geometry->caster(), {origins.data(), directions.data(), ends.data(), int64_t(ends.size())},
@@ -103,7 +103,7 @@ void bind_scene_functions(nb::module_& m) {
            Out<double, 2> verts, std::optional<Out<double, 2>> colors) {
             const GradientOptions options{.seed = image.seed, .boundary = false, .pixel_spp = image.spp};
             const Gradients grad{.verts = verts.data(), .colors = colors ? colors->data() : nullptr};
-            return unlocked(threads, [&](Team& team) {
+            return unlocked(threads, [&](ThreadTeam& team) {
                 std::vector<uint8_t> seen(scene.faces.shape(0), 1);
                 GeometryWork work;
                 const auto geometry = scene.geometry({}, team, work);
@@ -300,7 +300,7 @@ NB_MODULE(_core_tests, p) {
         "random"_a, "n"_a, "first"_a = 0);
     p.def("z_order", &z_order);
     p.def("systematic", [](std::vector<double> measure, int64_t n, double shift) {
-        Team team(1);
+        ThreadTeam team(1);
         Array<double> ends(measure.size());
         std::copy(measure.begin(), measure.end(), ends.begin());
         Systematic systematic(ends, team);
@@ -314,7 +314,7 @@ NB_MODULE(_core_tests, p) {
     });
     using Image = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
     p.def("importance", [](Image adjoint, double radius, A2 low, A2 high) {
-        Team team(2);
+        ThreadTeam team(2);
         const Importance importance(adjoint.data(), int(adjoint.shape(1)), int(adjoint.shape(0)), int(adjoint.shape(2)),
                                     radius, team);
         return importance.mean(vec(low), vec(high));
@@ -324,7 +324,7 @@ NB_MODULE(_core_tests, p) {
     using Faces = nb::ndarray<const int32_t, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
     // The faces of each edge, as (face, corner, backwards); the vertices from first[i] on have spacing[i].
     p.def("edges", [](Verts verts, Faces faces, std::vector<int32_t> first, std::vector<double> spacing) {
-        Team team(1);
+        ThreadTeam team(1);
         Topology topology(faces.data(), faces.shape(0), verts.shape(0), team);
         topology.weld(verts.data(), {first, spacing}, team);
         std::vector<std::vector<std::tuple<int, int, bool>>> out(topology.n_edges());
@@ -337,7 +337,7 @@ NB_MODULE(_core_tests, p) {
     // turned round.
     p.def("intersections", [](Verts verts, Faces faces, Faces windings, double spacing, In<float, 1> shares,
                               uint64_t seed, int threads) {
-        Team team(threads);
+        ThreadTeam team(threads);
         FaceOrder order;
         const Spacing all{{0}, {spacing}};
         Topology topology(windings.data(), faces.shape(0), verts.shape(0), team);
