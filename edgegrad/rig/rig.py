@@ -175,16 +175,14 @@ class Rig:
         verts, of_meshes, joints = self._bent(known, settings)
         t, s, R = whole["translation"], whole["scale"], whole["orientation"]
 
+        moves = any(value is not None for value in (translation, scale, orientation))
+
         def placed(points: Tensor, dtype: torch.dtype) -> Tensor:
-            linear = s[..., None, None] * R
-            shift = self.center + t - (linear @ self.center[:, None])[..., 0]
-            moved = points @ linear.mT.to(dtype) + shift[..., None, :].to(dtype)
-            return moved if batch is None else moved.expand(batch, *moved.shape[-2:])
-
-        if all(value is None for value in (translation, scale, orientation)):
-
-            def placed(points: Tensor, dtype: torch.dtype) -> Tensor:
-                return points if batch is None else points.expand(batch, *points.shape[-2:])
+            if moves:
+                linear = s[..., None, None] * R
+                shift = self.center + t - (linear @ self.center[:, None])[..., 0]
+                points = points @ linear.mT.to(dtype) + shift[..., None, :].to(dtype)
+            return points if batch is None else points.expand(batch, *points.shape[-2:])
 
         normals = [None if n is None else (n @ R.mT.to(n) if orientation is not None else n) for n in of_meshes]
         return Shape(
