@@ -16,7 +16,7 @@ from .formats.context import UnreadLog
 from .formats.part import FormatError, errors_with_path
 from .formats.views import View, matched
 from .parts import GLTFS, read_cameras
-from .paths import PathLike, check_readable, check_suffix, replacing
+from .paths import PathLike, check_readable, check_suffix, write_json
 
 CALIBRATIONS = (".yml", ".yaml", ".xml")
 UNREAD = "not all of it is read"
@@ -38,8 +38,7 @@ def save_camera(path: PathLike, camera: Camera) -> None:
     }
     if camera.distortion is not None:
         fields["distortion"] = camera.distortion.tolist()
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
+    write_json(file, fields, indent=1)
 
 
 def load_camera(

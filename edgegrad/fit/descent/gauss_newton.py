@@ -22,12 +22,10 @@ from .curvature import MAX_NUMBERS, check_pointwise, curvature
 from .loop import Optimizer, is_finite
 from .objective import Objective
 
-START_DAMPING, MIN_DAMPING, MAX_DAMPING = 0.03, 1e-4, 1e4  # λ
-REGION_DAMPING = (
-    1.0  # the first λ by regions, whose colours are those of a wrong place (Nielsen's τ for a start that may be far)
-)
+START_LAMBDA, MIN_LAMBDA, MAX_LAMBDA = 0.03, 1e-4, 1e4  # λ
+REGION_LAMBDA = 1.0  # the first λ by regions, whose start may be far (Nielsen's τ): colours are those of a wrong place
 UNSEEN_DAMPING = 1e-4  # of the largest entry of H, added to λ diag H: what the pictures do not show stays at rest
-MAX_STEP = 10.0  # learning rates, of a number in a step
+MAX_STEP_RATES = 10.0  # learning rates, of a number in a step
 LOSS_DEVIATIONS = 2.0  # standard deviations of the noise, by which the loss of an accepted step may rise
 SETTLED_STEPS = 5  # steps in which the loss falls no longer, until the fit ends
 COMPARISON_STEPS = 2**20, 2**21  # seeds of the losses that are compared: steps that no fit reaches
@@ -58,7 +56,7 @@ class GaussNewtonOptimizer(Optimizer):
         self.unseen_damping = UNSEEN_DAMPING
         self.losses: list[float] = []  # those of the last accepted point, one for each of COMPARISON_STEPS
         self.noise = 0.0  # variance of their mean difference
-        self.damping, self.raised = REGION_DAMPING if options.loss == REGION else START_DAMPING, RAISE
+        self.damping, self.raised = REGION_LAMBDA if options.loss == REGION else START_LAMBDA, RAISE
         self.settled, self.accepted = 0, 0
         self.predicted_decrease = 0.0  # decrease of the loss by the present step
         self.places: list[Tensor] = []  # accepted points since the loss fell no longer
@@ -104,7 +102,7 @@ class GaussNewtonOptimizer(Optimizer):
         fall, slack = sum(falls) / len(falls), LOSS_DEVIATIONS * math.sqrt(max(self.noise, square))
         if not finite or fall < -slack:
             self.damping, self.raised = self.damping * self.raised, 2.0 * self.raised
-            self.flat = self.damping > MAX_DAMPING or (not known and self.step > 20)
+            self.flat = self.damping > MAX_LAMBDA or (not known and self.step > 20)
             return
         if known:
             self.noise = 0.7 * self.noise + 0.3 * square if self.accepted > 1 else square
@@ -113,7 +111,7 @@ class GaussNewtonOptimizer(Optimizer):
                 if self.settled == 1:
                     self.monitor.reset()
             gain = fall / self.predicted_decrease if fall > slack and self.predicted_decrease > 0.0 else 1.0
-            self.damping = max(self.damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), MIN_DAMPING)
+            self.damping = max(self.damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), MIN_LAMBDA)
             self.raised = RAISE
         self.here, self.losses, self.accepted = self._flat(self.values), losses, self.accepted + 1
         self.monitor.end_step(self.loss, gradients)
@@ -150,7 +148,7 @@ class GaussNewtonOptimizer(Optimizer):
         A = self.H + torch.diag(self.damping * diagonal + self.unseen_damping * diagonal.max() + 1e-300)
         step = torch.zeros_like(self.slope)
         step[free] = -torch.linalg.solve(A[free][:, free], self.slope[free])
-        return step * min(1.0, MAX_STEP / max(float(step.abs().max()), 1e-300)) * self.rates
+        return step * min(1.0, MAX_STEP_RATES / max(float(step.abs().max()), 1e-300)) * self.rates
 
     def _flat(self, tensors: Mapping[str, Tensor]) -> Tensor:
         return torch.cat([tensor.detach().double().flatten() for tensor in tensors.values()])

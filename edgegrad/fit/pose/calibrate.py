@@ -6,7 +6,6 @@ the one lens together (bundle_adjustment.py).
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +19,7 @@ from tqdm import tqdm
 from ...camera.camera import Camera
 from ...check import check_flag, check_int
 from ...files.cameras import save_camera
-from ...files.paths import PathLike, replacing
+from ...files.paths import PathLike, write_figures, write_json
 from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -141,20 +140,14 @@ class Calibration:
         """
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
-        written = []
-        for name, content in (("calibration.json", self._summary()), ("history.json", plain_history(self.history))):
-            with replacing(out / name) as temporary:
-                temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-            written.append(name)
+        written = ["calibration.json", "history.json"]
+        write_json(out / "calibration.json", self._summary())
+        write_json(out / "history.json", plain_history(self.history))
         for k, camera in enumerate(self.cameras):
             save_camera(out / f"camera-{k}.json", camera)
             written.append(f"camera-{k}.json")
         draw = {"fit.png": self.plot} | ({"loss.png": self.plot_history} if self.history else {})
-        for name in draw if figures else ():
-            with replacing(out / name) as temporary:
-                draw[name]().savefig(temporary)
-            written.append(name)
-        return written
+        return written + (write_figures(out, draw) if figures else [])
 
     def _summary(self) -> dict[str, Any]:
         camera = self.camera

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from ...camera.camera import Camera
 from ...camera.lens import COEFFICIENT_COUNTS
 from ...check import check_flag, check_int
 from ...files.cameras import save_camera
-from ...files.paths import PathLike, replacing
+from ...files.paths import PathLike, write_json
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..history import Record, plain_history
@@ -120,8 +119,7 @@ class CameraFit:
 
     def write_history(self, folder: PathLike) -> str:
         """Write history.json alone, with loss, gradient norms and cameras of each step; return its name. Raises OSError."""
-        with replacing(Path(folder) / "history.json") as temporary:
-            temporary.write_text(json.dumps(plain_history(self.history), indent=2) + "\n", encoding="utf-8")
+        write_json(Path(folder) / "history.json", plain_history(self.history))
         return "history.json"
 
     def _record(self, number: int, step: Step) -> Record:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...camera.poses import rigid
-from ...files.paths import PathLike, replacing
+from ...files.paths import PathLike, write_text
 from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..ending import Ending, reason_of
@@ -114,8 +114,7 @@ class PoseFit:
         """
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
-        with replacing(out / "pose.json") as temporary:
-            temporary.write_text(self.to_json() + "\n", encoding="utf-8")
+        write_text(out / "pose.json", self.to_json() + "\n")
         if not self.history:
             return ["pose.json"]
         pictures = require("edgegrad.fit.pose.pictures", *DRAWING)

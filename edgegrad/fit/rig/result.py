@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from ...files.paths import PathLike, replacing
+from ...files.paths import PathLike, write_json
 from ...files.save import save_scene
 from ...rig.rig import Rig
 from ...scene.mesh import Mesh
@@ -107,15 +106,13 @@ class RigFit:
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         content = {name: value.tolist() for name, value in self.values.items()}
-        with replacing(out / "pose.json") as temporary:
-            temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_json(out / "pose.json", content)
         known = {} if self.uncertainty is None else self.uncertainty.degrees
         joints = {
             name: {"explained": self.explained.get(name), "degrees": known.get(name)}
             for name in {**known, **self.explained}
         }
-        with replacing(out / "joints.json") as temporary:
-            temporary.write_text(json.dumps(joints, indent=2) + "\n", encoding="utf-8")
+        write_json(out / "joints.json", joints)
         save_scene(out / "posed.glb", self.fit.scene.replace(background=None))
         return ["pose.json", "joints.json", "posed.glb", *self.fit.save(out, figures)]
 
