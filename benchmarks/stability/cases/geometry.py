@@ -78,20 +78,12 @@ def zero_area() -> Problem:
     return everything(Scene([tilted_cube()], background()), CAMERA, shown=shown)
 
 
-@group.add("duplicate-faces", "every face listed twice")
-def duplicate_faces() -> Problem:
+@group.add("duplicate-faces", "every face listed twice", [1, 2, 0])
+@group.add("duplicate-reversed", "every face listed twice, the copy with its back to the front", [0, 2, 1])
+def duplicate_faces(order: list[int]) -> Problem:
     def shown(scene: Scene) -> Scene:
         (mesh,) = scene.meshes
-        return scene.replace(meshes=[mesh.replace(faces=torch.cat([mesh.faces, mesh.faces[:, [1, 2, 0]]]))])
-
-    return everything(Scene([tilted_cube()], background()), CAMERA, shown=shown)
-
-
-@group.add("duplicate-reversed", "every face listed twice, the copy with its back to the front")
-def duplicate_reversed() -> Problem:
-    def shown(scene: Scene) -> Scene:
-        (mesh,) = scene.meshes
-        return scene.replace(meshes=[mesh.replace(faces=torch.cat([mesh.faces, mesh.faces[:, [0, 2, 1]]]))])
+        return scene.replace(meshes=[mesh.replace(faces=torch.cat([mesh.faces, mesh.faces[:, order]]))])
 
     return everything(Scene([tilted_cube()], background()), CAMERA, shown=shown)
 
