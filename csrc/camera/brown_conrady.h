@@ -54,7 +54,7 @@ struct BrownConrady {
         return g + 2 * s * slope(s, g);
     }
 
-    // With g = A / B, r' = (A B + 2 s (A' B − A B')) / B². The sign changes at the zeros of that numerator, of A, and
+    // r' = (A B + 2 s (A' B − A B')) / B², with g = A / B. The sign changes at the zeros of that numerator, of A, and
     // at poles.
     std::vector<double> turning_radii(double most) const {
         const Polynomial A{1, k1, k2, k3}, B{1, k4, k5, k6}, AB = product(A, B);

@@ -88,7 +88,7 @@ Vec2 WideFisheye::distort(Vec2 n) const {
     return scaled(fisheye_.at_angle(p.angle) * p.along) + Vec2{k_[2] / scale_.x, k_[5] / scale_.y};
 }
 
-// With e = m / |m| and ρ = |(d.x, d.z)|: δm = e ∂θ'/∂θ δθ + θ'/ρ (1 − e eᵀ) (δd.x, δd.z), where δθ = (ρ δd.y − d.y e ·
+// Uses e = m / |m| and ρ = |(d.x, d.z)|: δm = e ∂θ'/∂θ δθ + θ'/ρ (1 − e eᵀ) (δd.x, δd.z), where δθ = (ρ δd.y − d.y e ·
 // (δd.x, δd.z)) / |d|². On the axis δm = (δd.x, δd.z) / −d.y.
 Mat2 WideFisheye::jacobian(Vec2 n) const {
     const Vec3 d = side_.direction(n);
