@@ -1,5 +1,5 @@
-// Lists the accumulations of samples: reverse mode, forward mode, the screen-space gradient, and recorded
-// samples for differentiation elsewhere (records.h). interior/accumulation.cpp applies them to samples inside faces,
+// Lists the accumulations of samples: reverse mode, forward mode, the screen-space gradient, and recorded samples for
+// differentiation elsewhere (records.h). interior/accumulation.cpp applies them to samples inside faces,
 // boundary/accumulation.cpp to samples on curves.
 #pragma once
 

@@ -1,5 +1,5 @@
-// Implements OpenCV's lens model: radial and decentring distortion (Brown 1966, Conrady 1919) with a rational
-// radial part.
+// Implements OpenCV's lens model: radial and decentring distortion (Brown 1966, Conrady 1919) with a rational radial
+// part.
 #pragma once
 
 #include <cmath>

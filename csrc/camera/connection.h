@@ -1,5 +1,4 @@
-// Finds where a camera shows surface points if nothing occludes them. Light tracing connects paths to pixels
-// with it.
+// Finds where a camera shows surface points if nothing occludes them. Light tracing connects paths to pixels with it.
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,5 @@
-// Describes the faces of a cube around the eye, for lenses that see more than a half space. Each face has its
-// own frame, in which it is a pinhole with |n.x|, |n.y| ≤ 1. Each direction belongs to one face.
+// Describes the faces of a cube around the eye, for lenses that see more than a half space. Each face has its own
+// frame, in which it is a pinhole with |n.x|, |n.y| ≤ 1. Each direction belongs to one face.
 #pragma once
 
 #include <limits>

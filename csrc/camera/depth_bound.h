@@ -1,5 +1,5 @@
-// Bounds the depth of what is hit in a pixel, one bound per face, which the backward pass keeps per pixel.
-// Whatever lies behind the bound in all pixels that it touches is most likely occluded (occlusion.h).
+// Bounds the depth of what is hit in a pixel, one bound per face, which the backward pass keeps per pixel. Whatever
+// lies behind the bound in all pixels that it touches is most likely occluded (occlusion.h).
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// Implements the lens of a panorama, whose image axes are longitude and latitude: the equirectangular
-// projection (Snyder, Map Projections: A Working Manual, 1987, § 12).
+// Implements the lens of a panorama, whose image axes are longitude and latitude: the equirectangular projection
+// (Snyder, Map Projections: A Working Manual, 1987, § 12).
 #pragma once
 
 #include <cmath>

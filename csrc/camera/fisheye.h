@@ -1,5 +1,5 @@
-// Implements OpenCV's fisheye lens (Kannala and Brandt 2006). The distance from the image centre is a
-// polynomial of the angle to the axis.
+// Implements OpenCV's fisheye lens (Kannala and Brandt 2006). The distance from the image centre is a polynomial of the
+// angle to the axis.
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,5 @@
-// Defines lenses. A lens distorts normalised image coordinates n to m, and K maps m to pixels. Straight lines
-// in n become curves in m, and areas grow by det ∂m/∂n. Faces, edges and the view volume are therefore handled in the
+// Defines lenses. A lens distorts normalised image coordinates n to m, and K maps m to pixels. Straight lines in n
+// become curves in m, and areas grow by det ∂m/∂n. Faces, edges and the view volume are therefore handled in the
 // undistorted image, K n; only samples are distorted.
 #pragma once
 

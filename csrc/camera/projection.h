@@ -1,5 +1,5 @@
-// Projects camera coordinates q to normalised image coordinates n along straight rays. A camera selects its
-// projection once (Camera::projection); other code does not ask for it.
+// Projects camera coordinates q to normalised image coordinates n along straight rays. A camera selects its projection
+// once (Camera::projection); other code does not ask for it.
 #pragma once
 
 #include <cmath>

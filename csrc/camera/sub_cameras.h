@@ -1,6 +1,6 @@
-// Splits a camera into sub-cameras: one image plane, or the faces of a cube around the eye of a panorama or
-// wide fisheye. Each has its own frame, and a lens that maps its undistorted image to the one image. Together they see
-// each direction once. Rendering and differentiation loop over sub-cameras.
+// Splits a camera into sub-cameras: one image plane, or the faces of a cube around the eye of a panorama or wide
+// fisheye. Each has its own frame, and a lens that maps its undistorted image to the one image. Together they see each
+// direction once. Rendering and differentiation loop over sub-cameras.
 #pragma once
 
 #include <vector>

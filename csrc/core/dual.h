@@ -1,5 +1,5 @@
-// Implements numbers and vectors with a derivative in one direction (forward-mode automatic differentiation).
-// Code written for S = double computes its _vjp's counterpart, the _jvp, with S = Dual.
+// Implements numbers and vectors with a derivative in one direction (forward-mode automatic differentiation). Code
+// written for S = double computes its _vjp's counterpart, the _jvp, with S = Dual.
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,5 @@
-// Implements vectors and matrices in double precision, each operation followed by its reverse-mode derivative
-// (_vjp). A _vjp takes the inputs and the cotangent of the output, and adds to the cotangents of the inputs.
+// Implements vectors and matrices in double precision, each operation followed by its reverse-mode derivative (_vjp). A
+// _vjp takes the inputs and the cotangent of the output, and adds to the cotangents of the inputs.
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,4 @@
-// Generates sample points without state, as a function of seed, stream and index, so that no thread keeps a
-// generator.
+// Generates sample points without state, as a function of seed, stream and index, so that no thread keeps a generator.
 #pragma once
 
 #include <bit>

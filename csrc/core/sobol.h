@@ -1,5 +1,4 @@
-// Generates scrambled Sobol points in the plane, which pixels share so that neighbours' samples complement
-// each other.
+// Generates scrambled Sobol points in the plane, which pixels share so that neighbours' samples complement each other.
 //
 // The points form a (0,2)-sequence (Sobol 1967). Every run of consecutive points that begins at a multiple of its
 // length 2^m is stratified: each box 2^−a × 2^(a−m) of the unit square gets equally many. Pixels in the order of a

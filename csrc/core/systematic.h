@@ -1,6 +1,6 @@
-// Implements systematic sampling: n equally spaced points over a cumulative measure, all moved by one random
-// shift. It serves triangles and curves. Each point by itself is distributed as the measure, so sums weighted with M /
-// (n m) are unbiased. Neighbours in the list get neighbouring points, so the error falls faster than 1/√n.
+// Implements systematic sampling: n equally spaced points over a cumulative measure, all moved by one random shift. It
+// serves triangles and curves. Each point by itself is distributed as the measure, so sums weighted with M / (n m) are
+// unbiased. Neighbours in the list get neighbouring points, so the error falls faster than 1/√n.
 #pragma once
 
 #include <algorithm>

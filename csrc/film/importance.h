@@ -1,5 +1,4 @@
-// Computes the importance of a region of the image: the mean size of the adjoint over a rectangle, in
-// constant time.
+// Computes the importance of a region of the image: the mean size of the adjoint over a rectangle, in constant time.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// Tests alpha-tested faces. A point of one exists where an alpha texture, at its texture coordinates, is at
-// least a cutoff. Rays pass through elsewhere.
+// Tests alpha-tested faces. A point of one exists where an alpha texture, at its texture coordinates, is at least a
+// cutoff. Rays pass through elsewhere.
 #pragma once
 
 #include "camera/face_map.h"

@@ -1,5 +1,5 @@
-// Declares the part of Embree's C interface (version 4, https://www.embree.org/api.html) that raycast.cpp
-// uses. The library comes with the embreex wheel, which carries no headers; it is opened at run time.
+// Declares the part of Embree's C interface (version 4, https://www.embree.org/api.html) that raycast.cpp uses. The
+// library comes with the embreex wheel, which carries no headers; it is opened at run time.
 #pragma once
 
 #include <cstddef>

@@ -1,5 +1,4 @@
-// Keeps a ray structure over triangles, and casts batches of any rays. This folder is the only door to
-// Embree.
+// Keeps a ray structure over triangles, and casts batches of any rays. This folder is the only door to Embree.
 #pragma once
 
 #include <atomic>

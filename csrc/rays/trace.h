@@ -1,5 +1,5 @@
-// Traces rays of any origin through a scene, and tests the visibility between points. Embree proposes hits in
-// float; double decides about them, and about alpha-tested faces.
+// Traces rays of any origin through a scene, and tests the visibility between points. Embree proposes hits in float;
+// double decides about them, and about alpha-tested faces.
 #pragma once
 
 #include <cstdint>

@@ -13,8 +13,8 @@
 namespace edgegrad {
 
 struct LightParts {
-    const double*
-        corner;  // (L, 3, 3) world coordinates, or directions towards a light at infinity; a point is given three times
+    // (L, 3, 3) holds world coordinates, or directions towards a light at infinity; a point is given three times.
+    const double* corner;
     const double* chance;  // (L,) > 0
     const int32_t* face;   // (L,) the part's face in the scene, −1: none
     int64_t count = 0;

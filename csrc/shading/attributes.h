@@ -1,6 +1,6 @@
-// Computes what a face shows besides its radiance: alpha, attributes of vertices or faces, barycentrics and
-// texture coordinates. All are affine in the barycentrics b, except a direction m, which is normalised after
-// interpolation: n = m / |m|, δn = (δm − n (n · δm)) / |m|.
+// Computes what a face shows besides its radiance: alpha, attributes of vertices or faces, barycentrics and texture
+// coordinates. All are affine in the barycentrics b, except a direction m, which is normalised after interpolation: n =
+// m / |m|, δn = (δm − n (n · δm)) / |m|.
 #pragma once
 
 #include "accumulate/gradients.h"

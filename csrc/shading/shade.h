@@ -1,6 +1,6 @@
-// Evaluates the radiance of a face at given barycentrics, followed by its attributes. Radiance is an
-// interpolated colour, or a texture at interpolated coordinates. A new light or material is one more file here and one
-// more line in shade and shade_vjp.
+// Evaluates the radiance of a face at given barycentrics, followed by its attributes. Radiance is an interpolated
+// colour, or a texture at interpolated coordinates. A new light or material is one more file here and one more line in
+// shade and shade_vjp.
 #pragma once
 
 #include <array>

@@ -1,6 +1,5 @@
-// Builds mipmap pyramids: an image and its means over squares of 2, 4, 8 … texels (Williams 1983), level
-// after level, row by row. A level is half as high and wide as the one before, rounded down. Odd sizes use overlapping
-// windows.
+// Builds mipmap pyramids: an image and its means over squares of 2, 4, 8 … texels (Williams 1983), level after level,
+// row by row. A level is half as high and wide as the one before, rounded down. Odd sizes use overlapping windows.
 #pragma once
 
 #include <cstdint>

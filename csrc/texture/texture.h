@@ -1,5 +1,4 @@
-// Samples textures bilinearly or at the nearest texel. Texel centres are at +0.5, and row 0 is on top while v
-// runs up.
+// Samples textures bilinearly or at the nearest texel. Texel centres are at +0.5, and row 0 is on top while v runs up.
 #pragma once
 
 #include <algorithm>

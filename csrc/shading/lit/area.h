@@ -1,5 +1,5 @@
-// Evaluates emissive faces: E = L cos θ / r² over the pdf. The pdf is with respect to area, of a point that
-// keeps its barycentrics while faces move.
+// Evaluates emissive faces: E = L cos θ / r² over the pdf. The pdf is with respect to area, of a point that keeps its
+// barycentrics while faces move.
 #pragma once
 
 #include "shading/lit/light.h"

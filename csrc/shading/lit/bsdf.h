@@ -1,5 +1,5 @@
-// Evaluates BSDFs and their _vjp: Lambert's law f = base / π, and the metallic-roughness model of glTF 2.0
-// (appendix B). edgegrad/scene/material.py names its terms.
+// Evaluates BSDFs and their _vjp: Lambert's law f = base / π, and the metallic-roughness model of glTF 2.0 (appendix
+// B). edgegrad/scene/material.py names its terms.
 #pragma once
 
 #include <algorithm>

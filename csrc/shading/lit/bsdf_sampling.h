@@ -1,5 +1,5 @@
-// Samples directions by the BSDF of a glossy surface: the view direction, mirrored at microfacet normals that
-// the viewer sees. pdfs are with respect to solid angle.
+// Samples directions by the BSDF of a glossy surface: the view direction, mirrored at microfacet normals that the
+// viewer sees. pdfs are with respect to solid angle.
 #pragma once
 
 #include <algorithm>

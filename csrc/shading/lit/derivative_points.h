@@ -1,5 +1,4 @@
-// Samples the points of lights for surfaces. Glossy surfaces get antithetic sets where only derivatives are
-// wanted.
+// Samples the points of lights for surfaces. Glossy surfaces get antithetic sets where only derivatives are wanted.
 #pragma once
 
 #include <algorithm>

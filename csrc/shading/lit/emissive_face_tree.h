@@ -1,6 +1,5 @@
-// Holds a bounding volume hierarchy of the faces of an emissive mesh, which finds the faces in a direction.
-// It works in double precision and ray by ray: each surface point asks for a few directions, and the answers decide
-// about pdfs.
+// Holds a bounding volume hierarchy of the faces of an emissive mesh, which finds the faces in a direction. It works in
+// double precision and ray by ray: each surface point asks for a few directions, and the answers decide about pdfs.
 #pragma once
 
 #include <algorithm>

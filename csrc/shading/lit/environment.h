@@ -1,5 +1,5 @@
-// Evaluates environment light: constant radiance, or an image of directions as edgegrad/scene/environment.py
-// defines it. pdfs are with respect to solid angle.
+// Evaluates environment light: constant radiance, or an image of directions as edgegrad/scene/environment.py defines
+// it. pdfs are with respect to solid angle.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// Samples points of lights that illuminate a surface (next-event estimation), and evaluates their
-// contributions to its radiance. A sample's pdf is with respect to area on meshes, and to solid angle on environments.
+// Samples points of lights that illuminate a surface (next-event estimation), and evaluates their contributions to its
+// radiance. A sample's pdf is with respect to area on meshes, and to solid angle on environments.
 #pragma once
 
 #include <cstdint>

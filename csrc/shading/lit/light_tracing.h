@@ -1,7 +1,6 @@
-// Traces light that has reached points of surfaces on to the camera (light tracing; Dutré, Lafortune and
-// Willems 1993). Each point scatters it into a sampled direction, and each point that is hit connects to the camera if
-// nothing occludes it. Curves that the camera does not see directly need this, because paths from pixels do not find
-// them.
+// Traces light that has reached points of surfaces on to the camera (light tracing; Dutré, Lafortune and Willems 1993).
+// Each point scatters it into a sampled direction, and each point that is hit connects to the camera if nothing
+// occludes it. Curves that the camera does not see directly need this, because paths from pixels do not find them.
 //
 // Let B_k arrive at a point x_k from the unit direction i. With the normals n for shading and g of the face, and the
 // terminator t (terminator()), the point sends

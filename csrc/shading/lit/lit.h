@@ -1,5 +1,5 @@
-// Computes the radiance of surfaces with materials, lit by the scene's lights. Shaders written in PyTorch see
-// the same points as Hits.
+// Computes the radiance of surfaces with materials, lit by the scene's lights. Shaders written in PyTorch see the same
+// points as Hits.
 //
 //     L(y, v) = emission + Σ f(y, v, l) max(0, n·l) V(y, l) E(y) + irradiance without shadows · base / π
 //

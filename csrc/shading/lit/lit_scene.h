@@ -1,5 +1,4 @@
-// Holds a scene with materials and lights, as tables and references to them by number, and points of its
-// surfaces.
+// Holds a scene with materials and lights, as tables and references to them by number, and points of its surfaces.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// Samples points of an emissive mesh for a surface point y: by the directions towards them, converted by the
-// solid angle per area, or by what a lobe's direction hits.
+// Samples points of an emissive mesh for a surface point y: by the directions towards them, converted by the solid
+// angle per area, or by what a lobe's direction hits.
 //
 // A direction l may pass through several faces. Each point q of them then has the pdf p(l) |dl/dq|, because on one face
 // l determines q and q determines l. All of them are candidates, and the pdf of one is independent of the others.

@@ -1,5 +1,5 @@
-// Computes the shading normal of a point, and its _vjp. The normal is that of the face, interpolated between
-// vertex normals, or perturbed by a normal map.
+// Computes the shading normal of a point, and its _vjp. The normal is that of the face, interpolated between vertex
+// normals, or perturbed by a normal map.
 #pragma once
 
 #include "shading/lit/source.h"

@@ -1,5 +1,5 @@
-// Traces paths backwards from points of surfaces, for light that surfaces have scattered before: light, xₙ,
-// …, x₂, x₁, viewer. It uses next-event estimation, MIS by the balance heuristic for images, and Russian roulette.
+// Traces paths backwards from points of surfaces, for light that surfaces have scattered before: light, xₙ, …, x₂, x₁,
+// viewer. It uses next-event estimation, MIS by the balance heuristic for images, and Russian roulette.
 //
 // Paths are sampled once, without derivatives; path_radiance.h evaluates them as a function of what moves. Each point
 // x₂ … stays at the barycentrics of its face while faces move, and the pdfs of all samples are constants. Paths that

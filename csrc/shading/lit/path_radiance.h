@@ -1,5 +1,5 @@
-// Evaluates the radiance that a path carries to the viewer of its first point x₁, and the _vjp. With the
-// direct light D_k that x_k scatters along the path,
+// Evaluates the radiance that a path carries to the viewer of its first point x₁, and the _vjp. With the direct light
+// D_k that x_k scatters along the path,
 //
 //     L_k = D_k + f(x_k) (n_k · l_k) |M_{k+1} · d_k| / |d_k|³ / p_{k+1} · L_{k+1},
 //     d_k = x_{k+1} − x_k,  l_k = d_k / |d_k|

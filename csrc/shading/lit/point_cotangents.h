@@ -1,5 +1,5 @@
-// Holds what derivatives at points of surfaces share: cotangents of their positions and of the tables, and
-// points that move in one direction.
+// Holds what derivatives at points of surfaces share: cotangents of their positions and of the tables, and points that
+// move in one direction.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// Looks up material parameters, and implements the _vjp. A source is a constant, an array over vertices,
-// faces or corners, or a texture.
+// Looks up material parameters, and implements the _vjp. A source is a constant, an array over vertices, faces or
+// corners, or a texture.
 #pragma once
 
 #include <algorithm>

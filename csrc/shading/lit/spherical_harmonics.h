@@ -1,5 +1,5 @@
-// Evaluates irradiance as a function of the normal, in real, orthonormal spherical harmonics up to the second
-// order (Ramamoorthi and Hanrahan 2001).
+// Evaluates irradiance as a function of the normal, in real, orthonormal spherical harmonics up to the second order
+// (Ramamoorthi and Hanrahan 2001).
 #pragma once
 
 #include "shading/lit/light.h"

@@ -1,5 +1,5 @@
-// Holds the tensors of lit scenes as tables of rows, and the cotangents of the rows. Tables store vertices,
-// normals, texture coordinates, texels and constants.
+// Holds the tensors of lit scenes as tables of rows, and the cotangents of the rows. Tables store vertices, normals,
+// texture coordinates, texels and constants.
 #pragma once
 
 #include <cstdint>

@@ -1,6 +1,6 @@
-// Computes the light that goes from one surface point, the reflector, to another, the shading point, if
-// nothing occludes it. The reflector gets light from lights, or from further surfaces. Let L be its radiance towards
-// the shading point, without its own emission. The viewer sees
+// Computes the light that goes from one surface point, the reflector, to another, the shading point, if nothing
+// occludes it. The reflector gets light from lights, or from further surfaces. Let L be its radiance towards the
+// shading point, without its own emission. The viewer sees
 //
 //     f(v, l) L (n · l) / |g · l|
 //
