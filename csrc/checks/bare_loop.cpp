@@ -1,4 +1,4 @@
-// The yardstick of the benchmarks: the rays of the forward pass, made beforehand, cast and nothing else.
+// Is the reference of the benchmarks: it casts the rays of the forward pass, made beforehand, and does nothing else.
 
 #include <algorithm>
 #include <numeric>
