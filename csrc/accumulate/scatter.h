@@ -1,4 +1,4 @@
-// Is the only writer of gradients; it gives the same bits at any number of threads.
+// Writes all gradients, with the same bits at any number of threads. No other file writes gradients.
 //
 // Samples are processed in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own, one for
 // each owner of destinations. Each thread then adds, chunk after chunk, the rows whose destination it owns. Each sum

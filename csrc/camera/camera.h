@@ -1,9 +1,9 @@
 // Maps points in camera coordinates q = R p + t to pixels and back, each with its _vjp.
 //
-// A camera is a projection to normalised image coordinates n (projection.h), a lens that may distort these to m
-// (lens.h), and the affine map K of m. K n is the undistorted image; for a pinhole it is the image. World coordinates
-// enter only at the ends. Vertices are transformed once, and the cotangents of q become those of p, R and t once, after
-// all samples.
+// A camera is a projection to normalised image coordinates n (projection.h), followed by a lens and the affine map K.
+// The lens (lens.h) may distort n to m, and K maps m to pixels. K n is the undistorted image; for a pinhole it is the
+// image. World coordinates enter only at the ends. Vertices are transformed once, and the cotangents of q become those
+// of p, R and t once, after all samples.
 #pragma once
 
 #include <algorithm>
@@ -35,7 +35,7 @@ struct IntrinsicsGrad {
 // borders of a sub-camera's box (sub_cameras.h) that belong to its neighbours, in the order of ViewVolume.
 struct LensView {
     LensDisc disc;
-    // The angle to the axis, radians, where the image ends, if it ends.
+    // It is the angle to the axis, radians, where the image ends, if it ends.
     std::optional<double> end;
     Vec2 low, high;
     Mat2 most = {1, 0, 0, 1};

@@ -30,7 +30,7 @@ concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_
     lens.distort_vjp(n, n, n_bar, coefficients_bar);
 };
 
-// Sees through a face of a cube (cube_face.h); each face is a sub-camera (sub_cameras.h).
+// Names a lens that sees through a face of a cube (cube_face.h). Each face is a sub-camera (sub_cameras.h).
 template <class L>
 concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 box) {
     { lens.scale() } -> std::same_as<Vec2>;
@@ -45,8 +45,8 @@ concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 
 };
 static_assert(SideLens<Equirectangular> && SideLens<WideFisheye>);
 
-// Is radial, or nearly so. These give the radial part of |m| at |n| = r, its derivative, and the radii up to a limit at
-// which either changes its sign. is_radial() says whether no other part exists.
+// Names a radial or nearly radial lens. Its functions give the radial part of |m| at |n| = r, its derivative, and the
+// radii up to r where either changes its sign. is_radial() says whether no other part exists.
 template <class L>
 concept RadialLens = Lens<L> && requires(const L lens, double r) {
     { lens.radius(r) } -> std::same_as<double>;

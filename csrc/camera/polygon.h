@@ -125,8 +125,8 @@ class PolygonSampler {
         const double t = share_ > 0 ? std::clamp((s - begin_) / share_, 0.0, 1 - 0x1p-53) : 0;
         const Vec2 p = curve_.point(uint32_t(t * (1u << levels_)), u);
         lambda_ = {p.x, p.y};
-        // The triangle is scaled from its first corner. For a uniform point, the fraction ρ = x + y of the way to the
-        // far side has a density of 2 ρ, and its square is uniform.
+        // The triangle is scaled from its first corner. Let ρ = x + y be the fraction of the way to the far side. For a
+        // uniform point, ρ has a density of 2 ρ, and its square is uniform.
         const Vec2 e1 = corner[triangle_ - 1] - corner[0], e2 = corner[triangle_] - corner[0];
         if (!polygon_->starred) return corner[0] + p.x * e1 + p.y * e2;
         const double rho = p.x + p.y;

@@ -12,7 +12,7 @@ namespace edgegrad {
 
 // Bounds the visible rectangle of the undistorted image, widened by the radius of the pixel filter. Its four planes n ·
 // q + d ≥ 0 pass through the camera and the rectangle's sides. Whatever lies inside all of them is in front of the
-// camera (adding opposite planes gives Z · width ≥ 0), so no near plane is needed.
+// camera, because adding opposite planes gives Z · width ≥ 0. No near plane is needed.
 struct ViewVolume {
     Vec3 normal[4];
     double offset[4];

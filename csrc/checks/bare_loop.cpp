@@ -1,4 +1,5 @@
-// Is the reference of the benchmarks: it casts the rays of the forward pass, made beforehand, and does nothing else.
+// Provides the reference of the benchmarks: it casts the rays of the forward pass, made beforehand, and does nothing
+// else.
 
 #include <algorithm>
 #include <numeric>

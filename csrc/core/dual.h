@@ -1,5 +1,5 @@
 // Implements numbers and vectors with a derivative in one direction (forward-mode automatic differentiation). Code
-// written for S = double computes its _vjp's counterpart, the _jvp, with S = Dual.
+// written for S = double computes its _jvp with S = Dual.
 #pragma once
 
 #include <cmath>
@@ -8,7 +8,7 @@
 
 namespace edgegrad {
 
-// They overload those of Dual.
+// Dual overloads these.
 using std::cos;
 using std::log2;
 using std::sqrt;

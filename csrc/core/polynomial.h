@@ -1,4 +1,4 @@
-// Handles polynomials of one variable, Σ cᵢ xⁱ.
+// Evaluates polynomials of one variable, Σ cᵢ xⁱ.
 #pragma once
 
 #include <vector>

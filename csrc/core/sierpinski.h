@@ -1,7 +1,7 @@
 // Implements Sierpiński's space-filling curve through a triangle. Equal steps along it cover equal areas, and close
-// points on it are close in the triangle. Equally spaced points, each moved at random within its cell, have an error
-// that falls as 1/n for smooth integrands (He and Owen 2016, "Extensible grids: uniform sampling on a space filling
-// curve"). Consecutive rays, texels and adjoints are also close in memory.
+// points on it are close in the triangle. The error of equally spaced points, jittered within their cells, falls as 1/n
+// for smooth integrands (He and Owen 2016, "Extensible grids: uniform sampling on a space filling curve"). Consecutive
+// rays, texels and adjoints are also close in memory.
 #pragma once
 
 #include <bit>

@@ -64,7 +64,7 @@ void ReachablePixels::distort_bounds(const Camera& camera) {
         }
         for (int j = 0; j < 2 * pieces; j += 2) {
             const Vec2 a = distorted[j].x, b = distorted[j + 2].x;
-            // No piece leaves twice the distance of its middle from the chord.
+            // A margin of twice the distance of a piece's middle from its chord contains the piece.
             const double more = margin_ + 2 * length(distorted[j + 1].x - 0.5 * (a + b));
             const auto row = [&](double y) { return int(std::clamp(y, 0.0, double(camera.height))); };
             const Span piece{std::min(a.x, b.x) - more, std::max(a.x, b.x) + more};

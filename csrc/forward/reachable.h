@@ -25,7 +25,7 @@ class ReachablePixels {
     // `q` holds the vertices in the camera's frame.
     ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius, Team& team);
 
-    // Half-open range of pixels in row y.
+    // Holds a half-open range of pixels in row y.
     struct Range {
         int first, end;
     };

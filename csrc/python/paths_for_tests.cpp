@@ -15,7 +15,7 @@ namespace edgegrad {
 
 namespace {
 
-// Returns a dict of arrays (N, …): `points` of each path; (N, bounces, …) with face, b and density of its points; (N,
+// Returns a dict of arrays (N, …): `points` of each path; (N, bounces, …) with face, b and pdf of its points; (N,
 // bounces, lights, …) with index, uv, light_pdf and seen of points of lights.
 template <class T>
 nb::dict find_paths(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& from,

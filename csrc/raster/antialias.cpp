@@ -60,8 +60,8 @@ struct Neighbours {
     double size(const Frames& frames) const { return 2 / double(axis == 0 ? frames.width : frames.height); }
 };
 
-// Returns where the line of a side crosses the line through two centres, as a fraction of the way from the near to the
-// far one. Returns none where the side does not reach it, is behind the eye, or is more parallel to it than across.
+// Returns where the line of a side crosses the line through two centres, as a fraction of the way from near to far.
+// Returns none where the side does not reach it, is behind the eye, or is more parallel to it than across.
 template <class T>
 std::optional<double> share_at(const SideLine& side, const Neighbours& at, const Frames& frames) {
     const Vec3 p = at.center(frames);

@@ -198,7 +198,7 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, c
     if (int64_t(order.face.size()) == n_faces) {
         make_boxes(faces, verts, team);
         find_surfaces(topology, team);
-        // At half as large again, more than twice the pairs overlap.
+        // If boxes are half as large again, more than twice the pairs overlap.
         if (spread() <= 1.5 * order.spread) return;
     }
     // Returns the centroid of a face.

@@ -1,10 +1,10 @@
 // Proves that parts of surfaces have no intersections, because a height field cannot pass through itself.
 //
 // Take a prism with a parallelogram as its base, and all faces that touch it. Assume that (1) each of them faces along
-// the prism, and (2) none reaches its top or bottom. Assume also that (3) they have no border, so every edge has a face
-// on both sides, and (4) one line along the prism meets one face. Then each such line does. The number of faces met
+// the prism, and (2) none reaches its top or bottom. Assume that (3) every edge has a face on both sides, so there is
+// no border. Assume that (4) one line along the prism hits one face. Then each such line does. The number of faces hit
 // over the base is a degree, the same everywhere, and no face counts against another. Two faces that pass through each
-// other would be met by the same lines. No face in the prism thus needs a comparison with any other. (Volino and
+// other would be hit by the same lines. No face in the prism thus needs a comparison with any other. (Volino and
 // Magnenat-Thalmann 1994 test instead whether the outline of a patch crosses itself.)
 //
 // Prisms surround the nodes of a tree, and where one fails, its leaves. Smooth surfaces pass unless something else is

@@ -30,7 +30,7 @@ struct Attributes {
     bool alpha = false;              // It is 1 wherever a face is seen.
     const double* vertex = nullptr;  // (V, vertex_width) values at the vertices
     int vertex_width = 0;
-    int unit = -1;                 // The first of three columns of `vertex` that hold a unit direction, −1: none.
+    int unit = -1;                 // It is the first of three columns of `vertex` with a unit direction, −1: none.
     const double* face = nullptr;  // (F, face_width) values of whole faces
     int face_width = 0;            // It is at most most_of_face.
     bool barycentrics = false;     // It adds 3 channels.

@@ -40,8 +40,8 @@ class DrawnLobe {
         const double nv = dot(n_, v);
         v_ = nv >= 0 ? v : unit(v - nv * n_);
         nv_ = std::max(nv, 0.0);
-        // The bound limits the normals to the cap whose mirrored directions are above the surface (Tokuyoshi and Eto
-        // 2024, "Bounded VNDF sampling for the Smith-GGX BRDF", eq. 6).
+        // The bound limits normals to the cap whose mirrored directions are above the surface (Tokuyoshi and Eto 2024,
+        // "Bounded VNDF sampling for the Smith-GGX BRDF", eq. 6).
         const double a2 = alpha_ * alpha_, s = 1 + std::sqrt(std::max(0.0, 1 - nv_ * nv_));
         bound_ = (1 - a2) * s * s / (s * s + a2 * nv_ * nv_);
     }

@@ -81,10 +81,9 @@ class ResampledAntitheticSets {
     std::vector<AntitheticPoints> kept_;
 };
 
-// Returns how many antithetic sets replace one sample of a light. They are more where a face is seen at a grazing
-// angle, and its normal differs from the shading normal n by a part of that angle. Light then sets behind the face
-// within the lobe (terminator()). All derivatives are noisier there; nearly all noise of such surfaces' motion comes
-// from there.
+// Returns how many antithetic sets replace one sample of a light. More are used at grazing angles, where the face's
+// normal differs from the shading normal n by a part of that angle. Light then sets behind the face within the lobe
+// (terminator()). All derivatives are noisier there; nearly all noise of such surfaces' motion comes from there.
 template <class S>
 int sets_of(const Surface<S>& o) {
     constexpr double aside = 0.2, part = 0.1;
