@@ -30,11 +30,11 @@ def bounces(bench: Bench) -> list[Row]:
 
 
 def bounced_gradients(bench: Bench) -> list[Row]:
-    return [*gradients(bench), *borders(bench), *mirrors(bench)]
+    return [*gradients(bench), *secondary_edges(bench), *mirrors(bench)]
 
 
 def gradients(bench: Bench) -> list[Row]:
-    """By the colour of a wall and by all vertices, at default samples."""
+    """Time gradients with respect to the colour of a wall and to all vertices, with default samples."""
     rows = []
     for what in ("the colour of a wall", "the block's vertices"):
         room = box_room()
@@ -58,8 +58,8 @@ def gradients(bench: Bench) -> list[Row]:
     return rows
 
 
-def borders(bench: Bench) -> list[Row]:
-    """Of what surfaces see of one another, alone, past a ball of 20,480 faces: samples double until its translation has 2 %."""
+def secondary_edges(bench: Bench) -> list[Row]:
+    """Time secondary edges alone, of a ball of 20,480 faces: samples double until the error of its translation is 2 %."""
     ball = icosphere(5)
     verts = 0.4 * ball.verts.double() + vector(0.15, -0.35, 0.1).double()
     ball = eg.Mesh(verts, ball.faces, material=eg.Material(torch.tensor([0.6], dtype=torch.float64)))
@@ -88,13 +88,13 @@ def borders(bench: Bench) -> list[Row]:
             samples *= 2
             slopes, taken = zip(*(gradient(samples, seed) for seed in range(seeds)), strict=True)
             noise = _noise(torch.stack(slopes))
-    what = "2 bounces: borders past 20,480 faces, translation at 2 %, over the image of 64² × 16"
+    what = "2 bounces: secondary edges of 20,480 faces, translation at 2 %, over the image of 64² × 16"
     note = f"{samples:,} samples, noise {100 * noise:.1f} % over {seeds} seeds"
     return [median_row(what, [seconds / below for seconds in taken], must=10.0, note=note)]
 
 
 def mirrors(bench: Bench) -> list[Row]:
-    """The gradient inside of faces at default samples, by what a surface of roughness 0.2 is made of and by its motion."""
+    """Measure the noise of the interior term of a surface of roughness 0.2, with respect to its material and its motion."""
     rows = []
     for what, found, name in (("a block", cornell(), "block"), ("a plate that lights another", plates(), "left")):
         slopes: dict[str, list[Tensor]] = {"base colour": [], "roughness": [], "translation": []}
@@ -115,13 +115,13 @@ def mirrors(bench: Bench) -> list[Row]:
 
 
 def _larger(found: BounceScene) -> eg.Camera:
-    """Its view, in SIZE pixels."""
+    """Return the camera of a scene with SIZE × SIZE pixels."""
     scale = torch.tensor([[SIZE], [SIZE], [1.0]]).double() / torch.tensor([[32.0], [32.0], [1.0]]).double()
     return found.camera.replace(K=found.camera.K * scale, size=(SIZE, SIZE))
 
 
 def _noise(values: Tensor) -> float:
-    """(N, n) of single seeds: the standard deviation of all components over the size of the mean."""
+    """Return the deviation of gradients (N seeds, n), all components together, relative to the size of their mean."""
     return float(values.var(0).sum().sqrt() / values.mean(0).norm())
 
 
@@ -151,7 +151,7 @@ def images(bench: Bench, room: str) -> list[Row]:
 
 
 def _timed(work: Callable[[], Tensor]) -> Callable[[], tuple[Tensor, float]]:
-    """With its seconds of processor time, of all threads."""
+    """Return `work` with the seconds of processor time, of all threads, beside its result."""
 
     def call() -> tuple[Tensor, float]:
         begin = time.process_time()

@@ -1,5 +1,4 @@
-"""What the benchmarks share: the sphere and its adjoint, passes of the kernel and steps of an optimisation with their seconds,
-and converged gradients to compare with."""
+"""What rows of speed share: a sphere, passes of the kernel, steps of an optimisation, converged gradients."""
 
 from __future__ import annotations
 
@@ -15,11 +14,13 @@ import edgegrad as eg
 from edgegrad.files.paths import replacing
 from edgegrad.kernel.operators import Hits, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad.kernel.request import make_request
-from edgegrad.library import core
+from edgegrad.library import core, load
 
 from .error_time.methods import differentiate
 from .error_time.references import standard_error
 from .scenes import ReportScene, icosphere, smooth_adjoint
+
+parts = load("_core_tests")  # what only tests and benchmarks call
 
 
 def sphere(size: int | tuple[int, int], subdivisions: int = 6) -> tuple[eg.Mesh, eg.Camera, Tensor]:
@@ -30,13 +31,13 @@ def sphere(size: int | tuple[int, int], subdivisions: int = 6) -> tuple[eg.Mesh,
 
 
 def single(mesh: eg.Mesh) -> eg.Mesh:
-    """A mesh with colours of vertices in float32, as users have them."""
+    """Return the mesh with vertices and colours in float32, as users have them."""
     assert mesh.colors is not None
     return mesh.replace(verts=mesh.verts.float(), colors=mesh.colors.float())
 
 
 class Kernel:
-    """A scene before a camera as the kernel takes it: its two passes, without the share of torch and Python."""
+    """The two passes of the kernel for a scene, without the overhead of torch and Python."""
 
     def __init__(self, scene: eg.Scene | eg.Mesh, camera: eg.Camera, adjoint: Tensor, spp: int = 16) -> None:
         request = make_request(scene, camera, spp)
@@ -55,7 +56,7 @@ class Kernel:
         self.forward()
 
     def forward(self, threads: int | None = None) -> float:
-        """Seconds; writes `image`."""
+        """Write `image` and return the seconds."""
         threads = threads or torch.get_num_threads()
         begin = time.perf_counter()
         self.profile = self.scene.forward(
@@ -74,7 +75,7 @@ class Kernel:
         appearance: bool = False,
         threads: int | None = None,
     ) -> float:
-        """Seconds; writes `grads`: that of the vertices and, with `appearance`, those of what colours them."""
+        """Write `grads`, of vertices and with `appearance` of colours or texels, and return the seconds."""
         wanted = {name: grad.zero_().numpy() for name, grad in self.grads.items() if appearance or name == "verts"}
         options = core.GradientOptions(
             surface_samples=surface_samples,
@@ -91,17 +92,17 @@ class Kernel:
         return time.perf_counter() - begin
 
     def gradient(self, surface_samples: int, edge_samples: int, seed: int, **terms: Any) -> tuple[Tensor, float]:
-        """∂(image · adjoint)/∂verts (V, 3) and the seconds of the backward pass."""
+        """Return ∂(image · adjoint)/∂verts (V, 3) and the seconds of the backward pass."""
         seconds = self.backward(surface_samples, edge_samples, seed, **terms)
         return self.grads["verts"].clone(), seconds
 
     def default_samples(self) -> tuple[int, int]:
-        """On surfaces and at edges, which the kernel takes when it is not told."""
+        """Return the default numbers of surface samples and edge samples."""
         self.backward()
         return int(self.profile["surface_samples"]), int(self.profile["edge_samples"])
 
     def references(self) -> tuple[Tensor, Tensor]:
-        """Converged gradients (V, 3) of the two terms: 128 times the default surface samples, 512 times the edge samples."""
+        """Return converged gradients (V, 3) of both terms: 128 times the default surface samples, 512 times the edge samples."""
         surface, edge = self.default_samples()
         inside, _ = self.gradient(128 * surface, -1, 991, boundary=False)
         edges, _ = self.gradient(-1, 512 * edge, 992, interior=False)
@@ -117,7 +118,7 @@ class Step:
         self._elsewhere = mesh.replace(verts=mesh.verts * 1.001)
 
     def __call__(self, spp: int = 16, **options: Any) -> tuple[Tensor, float]:
-        """∂(image · adjoint)/∂verts (V, 3) float64 and the seconds of all."""
+        """Return ∂(image · adjoint)/∂verts (V, 3) float64 and the seconds of the step."""
         with torch.no_grad():
             eg.render(self._elsewhere, self.camera, spp=1)
         begin = time.perf_counter()
@@ -160,6 +161,6 @@ class Converged:
         self.made_by: str = kept["made_by"]
 
     def error(self, gradients: list[Tensor]) -> float:
-        """‖g − g*‖ / ‖g*‖, root mean square, less what the converged gradient's own error adds to it."""
+        """Return ‖g − g*‖ / ‖g*‖, root mean square, less what the error of g* itself adds."""
         squares = [float(((gradient - self.gradient) ** 2).sum()) / self.norm**2 for gradient in gradients]
         return max(0.0, sum(squares) / len(squares) - self.own_error**2) ** 0.5

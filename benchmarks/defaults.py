@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -60,12 +61,15 @@ def default_step(
     what: str,
     scene: ReportScene,
     *,
-    error: dict[str, float] | None = None,
-    over_image: dict[str, float] | None = None,
-    milliseconds: dict[str, float] | None = None,
+    error: dict[str, Any] | None = None,
+    over_image: dict[str, Any] | None = None,
+    milliseconds: dict[str, Any] | None = None,
 ) -> list[Row]:
-    """A step at default settings as a user writes it, after the vertices moved: the backward pass beside the image of 16 samples
-    a pixel, and the error of the per-vertex gradient. Each is a row; those that have a target say so."""
+    """Measure a step with default settings, after the vertices moved.
+
+    The rows are the backward pass relative to the image of 16 samples a pixel, its time, and the error of the gradient of
+    vertices. `error`, `over_image` and `milliseconds` are their targets.
+    """
     bench.bar.set_postfix_str("converged gradient")
     correct = Converged(scene, CONVERGED, kernel_hash())
     elsewhere = scene.moved((scene.verts * 1.001).float())
@@ -76,7 +80,9 @@ def default_step(
         with torch.no_grad():
             eg.render(elsewhere, scene.camera, spp=1)
         gradient, image_seconds, backward_seconds = differentiate(scene, spp=16, seed=turn)
-        gradients.append(gradient), ahead.append(image_seconds), back.append(1e3 * backward_seconds)
+        gradients.append(gradient)
+        ahead.append(image_seconds)
+        back.append(1e3 * backward_seconds)
     ratios = [a / (1e3 * b) for a, b in zip(back[1:], ahead[1:], strict=True)]
     surface, edge = default_samples(scene.scene, scene.camera, scene.adjoint)
     times = f"{statistics.median(back[1:]):.3g} ms over {1e3 * statistics.median(ahead[1:]):.3g} ms"

@@ -6,6 +6,7 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +15,8 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.library import core
 
-from .common import Kernel, Step, sphere
-from .error_time import mitsuba
+from . import mitsuba
+from .common import Kernel, Step, parts, sphere
 from .table import Bench, Row, Skipped, median_time, quartiles
 
 Run = Callable[[float, int], tuple[Tensor, float]]  # (budget, seed) → gradient (V, 3), seconds
@@ -86,7 +87,7 @@ def equal_error(
     turns: int,
     unit: str,
     samples: str = "its default samples",
-    **target: float,
+    **target: Any,
 ) -> list[Row]:
     """How many times longer `theirs` takes to the wanted error of `part` of the gradient."""
     _, inside, edges = equal()
@@ -161,7 +162,7 @@ def interior(bench: Bench) -> list[Row]:
         # The forward pass again, and the shading differentiated at each hit. The seconds are those of its pixel loop and of
         # adding up; not of what the kernel sets up around it and this estimator does not need.
         image = core.ImageOptions(spp=round(spp), filter="box", seed=seed)
-        seconds = core.for_tests.pixel_backward(
+        seconds = parts.pixel_backward(
             kernel.scene, kernel.camera, image, torch.get_num_threads(), kernel.adjoint.numpy(), verts.zero_().numpy()
         )
         return verts.clone(), seconds

@@ -1,8 +1,8 @@
-"""What losses make of heavy-tailed noise: the roughness of a metal ball under two small bright lamps, from 0.6.
+"""What losses make of heavy-tailed noise: the roughness of a metal ball under two small bright lights, from 0.6.
 
     python -m benchmarks.fit_losses
 
-A glossy surface that meets a small lamp has rare bright pixels. Printed is the roughness found, where 0.3 is right.
+A glossy surface that meets a small light has rare bright pixels. Printed is the roughness found, where 0.3 is right.
 """
 
 from __future__ import annotations

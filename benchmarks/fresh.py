@@ -1,4 +1,4 @@
-"""What needs a process of its own; speed.py starts it:
+"""Measurements that need a fresh process, which speed starts:
 python -m benchmarks.fresh import | first cube | first sphere | steps edgegrad | steps torch | memory"""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 
 def import_seconds() -> dict[str, float]:
-    """Of edgegrad, after torch."""
+    """Return the seconds of importing edgegrad after torch."""
     import torch  # noqa: F401
 
     begin = time.perf_counter()
@@ -24,7 +24,7 @@ def import_seconds() -> dict[str, float]:
 
 
 def first_render(name: str) -> dict[str, float]:
-    """Seconds of the first render of the process, and of later ones: vertices moved, and the same again."""
+    """Return seconds of the first render of the process, and of later ones: vertices moved, and the same again."""
     import torch
 
     import edgegrad as eg
@@ -51,7 +51,7 @@ def first_render(name: str) -> dict[str, float]:
 
 
 def steps(first: str, repeats: int = 50) -> dict[str, float]:
-    """Median and 90 % quantile of the seconds of a step as users write it, by what was imported first."""
+    """Return median and 90 % quantile of the seconds of a step as users write it, by what was imported first."""
     if first == "edgegrad":
         import edgegrad as eg
 
@@ -81,7 +81,7 @@ def steps(first: str, repeats: int = 50) -> dict[str, float]:
 
 
 def memory(height: int = 1080, width: int = 1920, spp: int = 64) -> dict[str, float]:
-    """Bytes of the peak of an image and its gradients (vertices and colours) above scene, image, adjoint and gradients."""
+    """Return the peak of bytes that an image and its gradients take beyond scene, image, adjoint and gradients."""
     import edgegrad as eg
 
     from .common import single, sphere
@@ -91,6 +91,7 @@ def memory(height: int = 1080, width: int = 1920, spp: int = 64) -> dict[str, fl
     # Code, threads and what torch keeps of a first backward pass are not this image's.
     tiny = single(cube())
     eg.render(tiny.replace(verts=tiny.verts.requires_grad_()), front_camera(16)).sum().backward()
+    assert mesh.colors is not None
     verts, colors = mesh.verts.clone().requires_grad_(), mesh.colors.clone().requires_grad_()
     mesh = mesh.replace(verts=verts, colors=colors)
     if hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
@@ -106,7 +107,7 @@ def memory(height: int = 1080, width: int = 1920, spp: int = 64) -> dict[str, fl
 
 
 def _status(key: str) -> int:
-    """Bytes, from what Linux says of this process."""
+    """Return bytes of an entry of /proc/self/status."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith(key + ":"))
 

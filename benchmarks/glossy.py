@@ -1,5 +1,4 @@
-"""A metal ball under skies, and one on a metal floor under lamps: how noisy their images are, beside Mitsuba's `direct` of as
-much time."""
+"""Noise in images of metal balls under skies and small lights, compared with that of Mitsuba's `direct` in the same time."""
 
 from __future__ import annotations
 
@@ -15,25 +14,25 @@ from torch import Tensor
 
 import edgegrad as eg
 
-from .error_time import mitsuba
+from . import mitsuba
 from .scenes import icosphere
 from .table import Bench, Row, median_time, quartiles, seconds_of
 
 SIZE = 96
-LAMPS = ((14, 40, 4, 60.0), (20, 90, 3, 120.0), (30, 64, 5, 40.0))  # row, column, size and radiance
-# The most noise of a pixel in percent of its radiance: under an even sky at 4 light samples, under lamps at 32.
-EVEN, UNDER_LAMPS = {0.5: 5.0, 0.2: 3.0, 0.05: 2.0}, {1.0: 4.0, 0.5: 5.0, 0.3: 7.0, 0.2: 10.0}
+LIGHTS = ((14, 40, 4, 60.0), (20, 90, 3, 120.0), (30, 64, 5, 40.0))  # row, column, size and radiance
+# The most noise of a pixel in percent of its radiance: under an even sky at 4 light samples, under lights at 32.
+EVEN, UNDER_LIGHTS = {0.5: 5.0, 0.2: 3.0, 0.05: 2.0}, {1.0: 4.0, 0.5: 5.0, 0.3: 7.0, 0.2: 10.0}
 
 
 def sky(kind: str) -> Tensor:
     image = torch.full((64, 128, 3), 1.0 if kind == "even" else 0.2)
-    for row, column, size, radiance in LAMPS if kind != "even" else ():
+    for row, column, size, radiance in LIGHTS if kind != "even" else ():
         image[row : row + size, column : column + size] = radiance
     return image
 
 
 class Images:
-    """Of one ball under a sky, with a seed each."""
+    """Images of one ball under a sky, by seed."""
 
     def __init__(self, kind: str, roughness: float, light_samples: int = 4) -> None:
         verts = torch.nn.functional.normalize(icosphere(5).verts.float(), dim=1)
@@ -48,20 +47,14 @@ class Images:
 
 
 class MitsubaImages:
-    """The same by Mitsuba's `direct`: a draw of the light and one of the material for each of 64 samples a pixel."""
+    """Mitsuba's images of the same ball: 64 samples a pixel, each with one sample of the light and one of the BSDF."""
 
     def __init__(self, mi: Any, kind: str, roughness: float) -> None:
-        turn = mi.ScalarTransform4f
-        to_world = turn().look_at([0, 0.3, 3.2], [0, 0, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         metal = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
-        image = mi.Bitmap(mitsuba.sky_image(sky(kind)).numpy())
-        sky_ = {"type": "envmap", "bitmap": image, "to_world": turn().rotate([0, 1, 0], 180)}
-        sensor = {"type": "perspective", "fov": 40, "fov_axis": "y", "to_world": to_world, "film": film}
         parts = {
             "integrator": {"type": "direct"},
-            "sensor": sensor,
-            "sky": sky_,
+            "sensor": mitsuba.sensor(mi, (0, 0.3, 3.2), (0, 0, 0), 40, (SIZE, SIZE)),
+            "sky": mitsuba.sky(mi, sky(kind)),
             "ball": {"type": "sphere", "bsdf": metal},
         }
         self.mi, self.scene = mi, mi.load_dict({"type": "scene", **parts})
@@ -70,7 +63,7 @@ class MitsubaImages:
         return torch.from_numpy(np.array(self.mi.render(self.scene, spp=64, seed=seed)))
 
 
-FLOOR, BALL, LAMP_BALL = 3.0, ((0.0, 0.6, 0.0), 0.6), ((-1.0, 2.0, -1.5), 0.5)
+FLOOR, BALL, LIGHT_BALL = 3.0, ((0.0, 0.6, 0.0), 0.6), ((-1.0, 2.0, -1.5), 0.5)
 # Centre, half sides and radiance.
 QUADS = {
     "a quad": ((0.0, 2.2, -1.8), (0.4, 0.0, 0.0), (0.0, 0.25, 0.3), 20.0),
@@ -78,8 +71,8 @@ QUADS = {
 }
 
 
-class LampImages:
-    """Of a ball on a floor, both of metal, under a lamp."""
+class LightImages:
+    """Images of a ball on a plane, both of metal, under an area light."""
 
     def __init__(self, kind: str, roughness: float) -> None:
         metal = eg.Material(base_color=torch.ones(3), metallic=1.0, roughness=roughness)
@@ -91,25 +84,23 @@ class LampImages:
         if kind in QUADS:
             center, u, v, radiance = QUADS[kind]
             vectors = torch.tensor(center), torch.tensor(u), torch.tensor(v)
-            lamp = eg.AreaLight.rectangle(*vectors, radiance, two_sided=False)
+            light = eg.AreaLight.rectangle(*vectors, radiance, two_sided=False)
         else:
-            place, size = LAMP_BALL
+            place, size = LIGHT_BALL
             verts = torch.nn.functional.normalize(icosphere(3).verts.float(), dim=1) * size + torch.tensor(place)
-            lamp = eg.AreaLight.of(eg.Mesh(verts, icosphere(3).faces), 10.0)
-        self.scene = eg.Scene([ball, floor, lamp])
+            light = eg.AreaLight.of(eg.Mesh(verts, icosphere(3).faces), 10.0)
+        self.scene = eg.Scene([ball, floor, light])
         self.camera = eg.Camera.look_at((0.0, 1.6, 3.6), (0.0, 0.35, 0.0), (0.0, 1.0, 0.0), 36.0, (SIZE, SIZE))
 
     def __call__(self, seed: int) -> Tensor:
         return eg.render(self.scene, self.camera, spp=16, light_samples=4, seed=seed)
 
 
-class MitsubaLampImages:
-    """The same by Mitsuba's `direct` at 64 samples a pixel."""
+class MitsubaLightImages:
+    """Mitsuba's images of the same scene, with 64 samples a pixel."""
 
     def __init__(self, mi: Any, kind: str, roughness: float) -> None:
         turn = mi.ScalarTransform4f
-        to_world = turn().look_at([0, 1.6, 3.6], [0, 0.35, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         metal = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
         if kind in QUADS:
             centre, u, v, radiance = QUADS[kind]
@@ -117,17 +108,17 @@ class MitsubaLampImages:
             frame[:3, 0], frame[:3, 1], frame[:3, 3] = u, v, centre
             n = np.cross(u, v)
             frame[:3, 2] = n / np.linalg.norm(n)
-            lamp: dict[str, Any] = {"type": "rectangle", "to_world": turn(frame)}
+            light: dict[str, Any] = {"type": "rectangle", "to_world": turn(frame)}
         else:
-            (place, size), radiance = LAMP_BALL, 10.0
-            lamp = {"type": "sphere", "center": list(place), "radius": size}
-        lamp["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+            (place, size), radiance = LIGHT_BALL, 10.0
+            light = {"type": "sphere", "center": list(place), "radius": size}
+        light["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
         parts = {
             "integrator": {"type": "direct"},
-            "sensor": {"type": "perspective", "fov": 36, "fov_axis": "y", "to_world": to_world, "film": film},
+            "sensor": mitsuba.sensor(mi, (0, 1.6, 3.6), (0, 0.35, 0), 36, (SIZE, SIZE)),
             "ball": {"type": "sphere", "center": list(BALL[0]), "radius": BALL[1], "bsdf": metal},
             "floor": {"type": "rectangle", "to_world": turn().rotate([1, 0, 0], -90).scale(FLOOR), "bsdf": dict(metal)},
-            "lamp": lamp,
+            "light": light,
         }
         self.mi, self.scene = mi, mi.load_dict({"type": "scene", **parts})
 
@@ -136,7 +127,7 @@ class MitsubaLampImages:
 
 
 def drawn(images: Callable[[int], Tensor], count: int, first: int = 0) -> tuple[Tensor, list[float]]:
-    """(count, pixels around the middle, C) and seconds."""
+    """Return pixels around the middle (count, n, C) and the seconds of each image."""
     images(first)
     found: list[Tensor] = []
     seconds = [seconds_of(lambda s=s: found.append(images(first + s))) for s in range(1, count + 1)]
@@ -146,12 +137,12 @@ def drawn(images: Callable[[int], Tensor], count: int, first: int = 0) -> tuple[
 
 
 def noise(pixels: Tensor) -> float:
-    """The root mean square of that of pixels, over the mean radiance."""
+    """Return the root mean square noise of pixels, relative to the mean radiance."""
     return float(pixels.var(0).mean().sqrt() / pixels.mean())
 
 
 def relative(kind: str, roughness: float, light_samples: int, count: int) -> float:
-    """The mean of each pixel's noise over its radiance, in percent."""
+    """Return the mean over pixels of noise relative to radiance, in percent."""
     pixels, _ = drawn(Images(kind, roughness, light_samples), count)
     return 100 * float((pixels.std(0) / pixels.mean(0)).mean())
 
@@ -164,12 +155,12 @@ def glossy(bench: Bench) -> list[Row]:
     ]
     rows += [
         Row(
-            f"… sky with lamps, 32 light samples, roughness {r}: noise",
-            relative("lamps", r, 32, n),
+            f"… sky with small lights, 32 light samples, roughness {r}: noise",
+            relative("lights", r, 32, n),
             unit=" %",
             must=must,
         )
-        for r, must in UNDER_LAMPS.items()
+        for r, must in UNDER_LIGHTS.items()
     ]
     try:
         mi = importlib.import_module("mitsuba")
@@ -178,22 +169,24 @@ def glossy(bench: Bench) -> list[Row]:
     mi.set_variant("scalar_rgb")
     threads = torch.get_num_threads()
     skies = [
-        beside(bench, Images(kind, r), MitsubaImages(mi, kind, r), f"sky: {kind}, roughness {r}", threads)
-        for kind in ("even", "lamps")
+        against_mitsuba(bench, Images(kind, r), MitsubaImages(mi, kind, r), f"sky: {kind}, roughness {r}", threads)
+        for kind in ("even", "lights")
         for r in (0.5, 0.2, 0.1)
     ]
-    lamps = [
-        beside(bench, LampImages(kind, r), MitsubaLampImages(mi, kind, r), f"lamp: {kind}, roughness {r}", threads)
+    lights = [
+        against_mitsuba(
+            bench, LightImages(kind, r), MitsubaLightImages(mi, kind, r), f"light: {kind}, roughness {r}", threads
+        )
         for kind in (*QUADS, "a ball")
         for r in (1.0, 0.5, 0.2, 0.05)
     ]
-    return rows + skies + lamps
+    return rows + skies + lights
 
 
-def beside(
+def against_mitsuba(
     bench: Bench, ours: Callable[[int], Tensor], theirs: Callable[[int], Tensor], what: str, threads: int
 ) -> Row:
-    """Noise over Mitsuba's in as much time: of independent samples it falls with the root of the time."""
+    """Compare noise with Mitsuba's at equal time; noise of independent samples falls with the root of the time."""
     ratios, seconds, others = [], [], []
     for turn in range(bench.repeats(8)):
         found, own = drawn(ours, 4, 10 * turn)

@@ -1,4 +1,4 @@
-"""How noisy gradients of glossy surfaces are, by default samples.
+"""Noise in gradients of glossy surfaces with default samples.
 
 The loss is the squared difference to the image of a scene that one parameter tells from this one, without its noise: the gradient
 is that of an image times a fixed residual. Printed is the standard deviation of the gradient over its size, as vectors, in
@@ -11,7 +11,6 @@ import math
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +19,8 @@ from torch.nn.functional import normalize
 
 import edgegrad as eg
 
+from . import mitsuba
 from .document import duration
-from .error_time import mitsuba
 from .glossy import SIZE, sky
 from .scenes import icosphere
 from .table import Bench, Row
@@ -38,7 +37,7 @@ UVS = 0.01 * torch.tensor([1.0, 0.7])
 
 
 def ball(kind: str, roughness: float) -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
-    """Of a metal that is not quite one. Normals and vertices have a common shift, texels of the sky a factor for 8 × 8."""
+    """Return a ball of metallic 0.8. One shift moves all normals, one all vertices; a factor scales 8 × 8 texels of the sky."""
     given = {
         "roughness": torch.tensor(roughness),
         "metallic": torch.tensor(0.8),
@@ -59,7 +58,7 @@ def ball(kind: str, roughness: float) -> tuple[Parameters, Callable[[Parameters]
 
 
 def sheet() -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
-    """A metal sheet with a wavy normal map under a point light, by the texture coordinates of its 81 vertices."""
+    """Return a metal sheet with a wavy normal map under a point light; its texture coordinates are the parameters."""
     line = torch.linspace(-1, 1, 9)
     y, x = torch.meshgrid(line, line, indexing="ij")
     i = torch.arange(81).reshape(9, 9)
@@ -83,7 +82,7 @@ def sheet() -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
 def residuals(
     given: Parameters, scene: Callable[[Parameters], eg.Scene], changes: Parameters, camera: eg.Camera
 ) -> dict[str, Tensor]:
-    """The derivative of each loss by the image, (H, W, 3)."""
+    """Return the derivative of each loss with respect to the image, (H, W, 3)."""
 
     def clean(p: Parameters) -> Tensor:
         with torch.no_grad():
@@ -95,8 +94,7 @@ def residuals(
 def noise(
     given: Parameters, scene: Callable[[Parameters], eg.Scene], changes: Parameters, camera: eg.Camera, seeds: int
 ) -> dict[str, float]:
-    """Of the gradient by each parameter, all taken at once, in percent."""
-
+    """Return the noise of the gradient with respect to each parameter, in percent."""
     residual = residuals(given, scene, changes, camera)
     found: dict[str, list[Tensor]] = {name: [] for name in changes}
     for seed in range(seeds):
@@ -109,12 +107,12 @@ def noise(
 
 
 def _relative(g: Tensor) -> float:
-    """In percent."""
+    """Return the deviation relative to the size of the mean, in percent."""
     return 100 * float(g.var(0).sum().sqrt()) / _size(g)
 
 
 def _size(g: Tensor) -> float:
-    """Of the mean, whose square has its own noise in it, which is taken off."""
+    """Return the size of the mean; the noise in its square is subtracted."""
     return float((g.mean(0).square().sum() - g.var(0).sum() / len(g)).clamp(min=1e-30).sqrt())
 
 
@@ -125,67 +123,12 @@ KEYS = {
 }  # fmt: skip
 
 
-def gltf_material(mi: Any, dr: Any, given: Parameters) -> Any:
-    """edgegrad's Material as a plugin of Mitsuba, whose `principled` mixes a metal and a dielectric, not their reflectances: at
-    metallic 0.8 that is a tenth brighter, and its derivative by metallic near zero. Directions are drawn by visible normals
-    in a share (1 + metallic) / 2 of all, else by the cosine."""
-
-    class Gltf(mi.BSDF):
-        def __init__(self, props: Any) -> None:
-            mi.BSDF.__init__(self, props)
-            self.base_color = mi.Color3f(*given["base color"].tolist())
-            self.metallic, self.roughness = mi.Float(float(given["metallic"])), mi.Float(float(given["roughness"]))
-            self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
-            self.m_flags = self.m_components[0]
-
-        def traverse(self, callback: Any) -> None:
-            for name in ("base_color", "metallic", "roughness"):
-                callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
-
-        def lobe(self) -> tuple[Any, Any]:
-            alpha = dr.detach(dr.square(self.roughness))
-            return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha), dr.detach(0.5 + 0.5 * self.metallic)
-
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
-            lobe, share = self.lobe()
-            half, _ = lobe.sample(si.wi, sample2)
-            out = dr.select(sample1 < share, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
-            found = dr.zeros(mi.BSDFSample3f)
-            found.wo, found.eta, found.pdf = out, 1.0, self.pdf(ctx, si, out, active)
-            found.sampled_type, found.sampled_component = mi.UInt32(+mi.BSDFFlags.GlossyReflection), 0
-            some = active & (found.pdf > 0)
-            return found, dr.select(some, self.eval(ctx, si, out, active) / found.pdf, 0.0)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            nv, nl = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-            half = dr.normalize(si.wi + wo)
-            a2 = dr.square(dr.square(self.roughness))
-            density = a2 / (dr.pi * dr.square(dr.square(half.z) * (a2 - 1.0) + 1.0))
-            masked = nl * dr.sqrt(a2 + (1.0 - a2) * nv * nv) + nv * dr.sqrt(a2 + (1.0 - a2) * nl * nl)
-            f0 = 0.04 + (self.base_color - 0.04) * self.metallic
-            fresnel = f0 + (1.0 - f0) * (1.0 - dr.dot(si.wi, half)) ** 5
-            f = (1.0 - fresnel) * self.base_color * (1.0 - self.metallic) / dr.pi + fresnel * density * 0.5 / masked
-            return dr.select(active & (nv > 0) & (nl > 0), f * nl, 0.0)
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            nv, nl = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-            half = dr.normalize(si.wi + wo)
-            lobe, share = self.lobe()
-            density = share * lobe.pdf(si.wi, half) / (4.0 * dr.dot(wo, half)) + (1.0 - share) * nl / dr.pi
-            return dr.select(active & (nv > 0) & (nl > 0), density, 0.0)
-
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-        def to_string(self) -> str:
-            return "Gltf[]"
-
-    return Gltf(mi.Properties())
-
-
 class MitsubaGradients:
-    """The same ball by Mitsuba. Its `prb` differentiates at points that are drawn by the light and by the material, and does not
-    differentiate how these are drawn; for what moves silhouettes `prb_projective`. Loss and camera are edgegrad's."""
+    """Mitsuba's gradients of the same ball, loss and camera.
+
+    `prb` differentiates at samples of the light and of the BSDF, and not how these are drawn. `prb_projective` is used for what
+    moves silhouettes.
+    """
 
     PRIMAL = 16  # samples a pixel of the image, edgegrad's default
 
@@ -194,14 +137,11 @@ class MitsubaGradients:
         dr.set_thread_count(torch.get_num_threads())
         (mesh,), (light,) = scene.meshes, scene.lights
         assert isinstance(light, eg.Environment) and mesh.normals is not None
-        turn = mi.ScalarTransform4f
-        sensor = {
-            "type": "perspective", "fov": 40, "fov_axis": "y",
-            "to_world": turn().look_at([0, 0.3, 3.2], [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
-        }  # fmt: skip
+        mitsuba.register(mi, dr)
         props = mi.Properties()
-        props["bsdf"] = gltf_material(mi, dr, given)
+        props["bsdf"] = mi.load_dict(
+            mitsuba.bsdf(given["base color"].tolist(), float(given["metallic"]), float(given["roughness"]))
+        )
         ball = mi.Mesh("ball", len(mesh.verts), len(mesh.faces), props, has_vertex_normals=True)
         shape = mi.traverse(ball)
         shape["vertex_positions"] = mi.Float(mesh.verts.numpy().ravel())
@@ -209,8 +149,8 @@ class MitsubaGradients:
         shape["faces"] = mi.UInt32(mesh.faces.numpy().astype(np.uint32).ravel())
         shape.update()
         self.radiance = light.radiance
-        bitmap = mi.Bitmap(mitsuba.sky_image(light.radiance).numpy())
-        sky_ = {"type": "envmap", "bitmap": bitmap, "to_world": turn().rotate([0, 1, 0], 180)}
+        sensor = mitsuba.sensor(mi, (0, 0.3, 3.2), (0, 0, 0), 40, (SIZE, SIZE))
+        sky_ = mitsuba.sky(mi, light.radiance)
         self.scene = mi.load_dict({"type": "scene", "sensor": sensor, "sky": sky_, "ball": ball})
         self.integrators = {name: mi.load_dict({"type": name, "max_depth": 2}) for name in ("prb", "prb_projective")}
         self.params = mi.traverse(self.scene)
@@ -218,7 +158,7 @@ class MitsubaGradients:
         self.residual = {name: mi.TensorXf(r.numpy()) for name, r in residual.items()}
 
     def __call__(self, name: str, spp: int, seed: int) -> Tensor:
-        """By one parameter."""
+        """Return the gradient with respect to one parameter."""
         mi, dr, key = self.mi, self.dr, KEYS[name]
         given = type(self.values[name])(self.values[name])
         dr.enable_grad(given)
@@ -240,18 +180,22 @@ class MitsubaGradients:
         return self.by_blocks(found[..., :3]) if name == "texels" else found.flatten()
 
     def by_blocks(self, by_data: Tensor) -> Tensor:
-        """What is by texels of Mitsuba's image of the sky, before whose first column the last one stands and behind the last one
-        the first, by factors of ours."""
+        """Return the gradient with respect to factors of our sky from that of Mitsuba's texels.
+
+        Mitsuba's image repeats its last column before the first one, and its first after the last one.
+        """
         factor = torch.ones((8, 16, 3), dtype=torch.float64, requires_grad=True)
         image = mitsuba.sky_image(self.radiance * factor.repeat_interleave(8, 0).repeat_interleave(8, 1))
         data = torch.cat([image[:, -1:], image, image[:, :1]], 1)
         return torch.autograd.grad((data * by_data).sum(), factor)[0].flatten()
 
 
-def beside_mitsuba(bench: Bench, kind: str, roughness: float, camera: eg.Camera) -> list[Row]:
-    """How many times longer Mitsuba takes to the error that a gradient by default samples has, in processor time. Both sides
-    are unbiased, so that errors are deviations: Mitsuba's fall with the root of its samples, whose number follows from all that
-    were measured; its time is interpolated, and no less than that of the fewest. Both errors are over the size of edgegrad's."""
+def against_mitsuba(bench: Bench, kind: str, roughness: float, camera: eg.Camera) -> list[Row]:
+    """Measure how much longer Mitsuba takes to the error of a gradient with default samples, in processor time.
+
+    Both sides are unbiased, so errors are deviations, relative to the size of edgegrad's gradient. Mitsuba's fall with the root
+    of its samples, whose number follows from all that were measured. Its time is interpolated, and at least that of the fewest.
+    """
     given, scene = ball(kind, roughness)
     residual = residuals(given, scene, CHANGES, camera)
     theirs, seeds = MitsubaGradients(scene(given), given, residual), bench.repeats(24)
@@ -298,10 +242,10 @@ def _measured(gradient: Callable[[int], Tensor], seeds: int) -> tuple[Tensor, fl
 def glossy_gradients(bench: Bench) -> list[Row]:
     camera = eg.Camera.look_at((0.0, 0.3, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (SIZE, SIZE))
     rows, seeds = [], bench.repeats(24)
-    for kind in ("even", "lamps"):
+    for kind in ("even", "lights"):
         for roughness in (0.5, 0.2, 0.1, 0.05):
             found = noise(*ball(kind, roughness), CHANGES, camera, seeds)
-            sky_ = "smooth sky" if kind == "even" else "sky with lamps"
+            sky_ = "smooth sky" if kind == "even" else "sky with small lights"
             rows += [
                 Row(
                     f"a metal ball, {sky_}, roughness {roughness}: gradient by {name}",
@@ -316,6 +260,6 @@ def glossy_gradients(bench: Bench) -> list[Row]:
     value = noise(*sheet(), {"uvs": UVS}, above, seeds)["uvs"]
     rows.append(Row("a normal-mapped sheet: gradient by texture coordinates", value, unit=" %", must=40.0, aim=20.0))
     if mitsuba.available():
-        for kind, roughness in (("even", 0.5), ("even", 0.2), ("lamps", 0.5), ("lamps", 0.2)):
-            rows += beside_mitsuba(bench, kind, roughness, camera)
+        for kind, roughness in (("even", 0.5), ("even", 0.2), ("lights", 0.5), ("lights", 0.2)):
+            rows += against_mitsuba(bench, kind, roughness, camera)
     return rows

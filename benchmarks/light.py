@@ -17,32 +17,32 @@ from edgegrad.kernel.request import make_request
 from edgegrad.library import core
 from edgegrad.light.radiance import Lighting
 from edgegrad.points.frame import Frame
-from edgegrad.shader import Effort, _Image
+from edgegrad.shader import Effort, UserShader, _Image
 
-from .common import Kernel
+from .common import Kernel, parts
 from .scenes import ReportScene, build
 from .table import Bench, Row, median_time, ratio_row, seconds_of
 
 # Samples on the borders of shadows.
 COUNTS = {
-    lamp: tuple(1 << k for k in range(8, most + 1, 2)) for lamp, most in (("point", 18), ("area", 20), ("sky", 18))
+    kind: tuple(1 << k for k in range(8, most + 1, 2)) for kind, most in (("point", 18), ("area", 20), ("sky", 18))
 }
 CONVERGED = 1 << 20
 WANTED = {"point": 3.0, "area": 3.0, "sky": 5.0}  # errors, in percent
-OVER_IMAGE: dict[str, dict[str, float]] = {
+OVER_IMAGE: dict[str, dict[str, Any]] = {
     "point": {"must": 0.5, "aim": 0.2},
     "area": {"must": 5, "aim": 2},
     "sky": {"aim": 10},
 }
-SLOPES: dict[str, dict[str, float]] = {"point": {"must": -0.9, "aim": -1}, "area": {"must": -0.6, "aim": -0.75}}
+SLOPES: dict[str, dict[str, Any]] = {"point": {"must": -0.9, "aim": -1}, "area": {"must": -0.6, "aim": -0.75}}
 
 
 def light(bench: Bench) -> list[Row]:
-    return [*images(bench), *(row for lamp in ("point", "area", "sky") for row in borders(bench, lamp))]
+    return [*images(bench), *(row for kind in ("point", "area", "sky") for row in shadow_boundaries(bench, kind))]
 
 
 def images(bench: Bench) -> list[Row]:
-    """A textured sphere of latitude and longitude under two punctual lights."""
+    """Time images and gradients of a textured globe under two punctual lights."""
     globe = build("globe", 512, rows=143)
     (mesh,) = globe.scene.meshes
     lights = [
@@ -67,11 +67,11 @@ def images(bench: Bench) -> list[Row]:
 
     def whole() -> None:
         moved = mesh.replace(verts=leaves[0], texture=leaves[1], material=eg.Material())
-        shining = [lamp.replace(intensity=power) for lamp, power in zip(lights, powers, strict=True)]
+        shining = [kind.replace(intensity=power) for kind, power in zip(lights, powers, strict=True)]
         images[:] = [eg.render(eg.Scene([moved], lights=shining), globe.camera)]
 
     bare, plain, open_, shadowed, ahead, back = bench.interleaved(
-        9, lambda: core.for_tests.bare_loop(kernel.scene, kernel.camera, kernel.options, packet, threads),
+        9, lambda: parts.bare_loop(kernel.scene, kernel.camera, kernel.options, packet, threads),
         image(unlit), image(lit, shadows=False), image(lit), lambda: seconds_of(whole),
         lambda: seconds_of(lambda: torch.autograd.backward(images[0], globe.adjoint, inputs=[*leaves, *powers])),
     )  # fmt: skip
@@ -99,8 +99,8 @@ def images(bench: Bench) -> list[Row]:
     ]  # fmt: skip
 
 
-class Borders(_Image):
-    """The image with samples on the borders of shadows alone."""
+class ShadowBoundaries(_Image):
+    """The image with samples on shadow boundaries alone."""
 
     def render(self) -> Tensor:
         image = self._values()
@@ -110,24 +110,26 @@ class Borders(_Image):
         return found
 
 
-def border_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, float]:
-    """(V, 3) float64 of the shadow's term by `count` samples (−1: the default), and its seconds, image left out."""
+def shadow_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, float]:
+    """Return the shadow term (V, 3), float64, from `count` samples (−1: default), and its seconds without the image."""
     verts = scene.verts.float().requires_grad_()
     moved = scene.moved(verts)
     request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
-    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False, Effort(keeps_little=True, additive=True))
+    image = ShadowBoundaries(
+        Frame(moved, request, 0), UserShader(Lighting(True, 1)), False, False, Effort(keeps_little=True, additive=True)
+    )
     found = image.render()
     begin = time.perf_counter()
     (gradient,) = torch.autograd.grad((found * scene.adjoint).sum(), verts)
     return gradient.double(), image.seconds + time.perf_counter() - begin
 
 
-def borders(bench: Bench, lamp: str) -> list[Row]:
-    """The time of the term at an error of its per-vertex gradient, over the image's; and the law by which the error falls."""
-    scene = build(f"lit-{lamp}", 256)
-    wanted = WANTED[lamp] / 100.0
+def shadow_boundaries(bench: Bench, kind: str) -> list[Row]:
+    """Compare the time of the term, at a given error, with that of the image; and measure how the error falls with samples."""
+    scene = build(f"lit-{kind}", 256)
+    wanted = WANTED[kind] / 100.0
     runs, most = (2, CONVERGED // 4) if bench.quick else (4, CONVERGED)
-    correct = torch.stack([border_gradient(scene, most, (1 << 40) + k)[0] for k in range(runs)]).mean(0)
+    correct = torch.stack([shadow_gradient(scene, most, (1 << 40) + k)[0] for k in range(runs)]).mean(0)
     norm = float(correct.norm())
 
     def image() -> None:
@@ -135,30 +137,31 @@ def borders(bench: Bench, lamp: str) -> list[Row]:
             eg.render(scene.scene, scene.camera)
 
     n = bench.repeats(9)
-    image(), border_gradient(scene, 256, 0)
+    image()
+    shadow_gradient(scene, 256, 0)
     ahead = statistics.median(seconds_of(image) for _ in range(n))
     errors, seconds = [], []
-    counts = COUNTS[lamp][:-1] if bench.quick else COUNTS[lamp]
+    counts = COUNTS[kind][:-1] if bench.quick else COUNTS[kind]
     for count in (*counts, -1):
-        bench.bar.set_postfix_str(f"{lamp}, {count} samples")
-        found = [border_gradient(scene, count, seed) for seed in range(n)]
+        bench.bar.set_postfix_str(f"{kind}, {count} samples")
+        found = [shadow_gradient(scene, count, seed) for seed in range(n)]
         errors.append(math.sqrt(statistics.fmean(float((g - correct).norm() / norm) ** 2 for g, _ in found)))
         seconds.append(statistics.median(s for _, s in found))
     error, time_ = errors.pop(), seconds.pop()
     slope = float(np.polyfit(np.log(counts), np.log(errors), 1)[0])
     rows = [
         Row(
-            f"shadow of a {lamp} light: its term at default samples over the image", time_ / ahead,
+            f"shadow of a {kind} light: its term at default samples over the image", time_ / ahead,
             note=f"{1e3 * time_:.3g} ms over {1e3 * ahead:.3g} ms; error {100 * error:.2g} %",
         ),
-        Row(f"shadow of a {lamp} light: slope of the error by samples", slope, **SLOPES.get(lamp, {})),
+        Row(f"shadow of a {kind} light: slope of the error by samples", slope, **SLOPES.get(kind, {})),
     ]  # fmt: skip
     if min(errors) > wanted:
         note = f"{100 * min(errors):.2g} % with {counts[-1]:,} samples in {1e3 * seconds[-1]:.3g} ms"
-        what = f"shadow of a {lamp} light: {100 * wanted:g} % over the image"
+        what = f"shadow of a {kind} light: {100 * wanted:g} % over the image"
         return [Row(what, seconds[-1] / ahead, bound=True, note=note), *rows]
     at = float(np.exp(np.interp(-math.log(wanted), -np.log(errors), np.log(seconds))))
     many = float(np.exp(np.interp(-math.log(wanted), -np.log(errors), np.log(counts))))
-    what = f"shadow of a {lamp} light: its term at {100 * wanted:g} % over the image"
+    what = f"shadow of a {kind} light: its term at {100 * wanted:g} % over the image"
     note = f"{1e3 * at:.3g} ms over {1e3 * ahead:.3g} ms, {many:,.0f} samples"
-    return [Row(what, at / ahead, note=note, **OVER_IMAGE[lamp]), *rows]
+    return [Row(what, at / ahead, note=note, **OVER_IMAGE[kind]), *rows]

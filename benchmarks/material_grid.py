@@ -1,5 +1,5 @@
 """Balls of all materials, metallic × roughness as in Khronos' sample, beside the image of Mitsuba's `direct`
-with the same scattering written as a BSDF of its own: how far apart they are, in standard errors.
+with the same scattering as a plugin: how far apart they are, in standard errors.
 
 Run:  python -m benchmarks.material_grid [--out FILE.png] [--seeds N]          (with mitsuba installed)
 """
@@ -19,9 +19,8 @@ from torch.nn.functional import normalize
 from tqdm import tqdm
 
 import edgegrad as eg
-from edgegrad.light.bsdf import DIELECTRIC
 
-from .error_time import mitsuba
+from . import mitsuba
 from .scenes import icosphere
 from .stability.statistics import holm
 from .table import Bench, Row, Skipped
@@ -31,11 +30,13 @@ ROUGHNESS = (0.1, 0.25, 0.5, 0.75, 1.0)
 BASE = (0.9, 0.6, 0.3)
 TILE = 16  # pixels a ball
 HEIGHT, WIDTH = len(METALLIC) * TILE, len(ROUGHNESS) * TILE
+EYE = (0.0, 0.0, 40.0)  # from so far that all balls look alike
+FOV = 2 * math.degrees(math.atan(1.2 * len(METALLIC) / 40.0))  # 2.4 units are a tile
 CHANCE = 0.01  # of a false alarm in a run, by Holm
 
 
 def sky() -> Tensor:
-    """Brighter above, with three lamps."""
+    """Return a sky, brighter above, with three small lights."""
     image = torch.linspace(1.0, 0.2, 32)[:, None, None].repeat(1, 64, 3)
     for row, column, radiance in ((7, 12, 15.0), (10, 44, 25.0), (16, 30, 8.0)):
         image[row : row + 3, column : column + 3] = radiance
@@ -43,7 +44,7 @@ def sky() -> Tensor:
 
 
 def places() -> list[tuple[float, float, float, float]]:
-    """Of each ball: x and y of its centre, metallic, roughness."""
+    """Return x and y of the centre, metallic and roughness of each ball."""
     rows, columns = len(METALLIC), len(ROUGHNESS)
     return [
         (2.4 * (j - (columns - 1) / 2), 2.4 * ((rows - 1) / 2 - i), METALLIC[i], ROUGHNESS[j])
@@ -53,9 +54,7 @@ def places() -> list[tuple[float, float, float, float]]:
 
 
 def camera() -> eg.Camera:
-    # From so far that all balls look alike: 2.4 units are a tile.
-    fov = 2 * math.degrees(math.atan(1.2 * len(METALLIC) / 40.0))
-    return eg.Camera.look_at((0.0, 0.0, 40.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), fov, (HEIGHT, WIDTH))
+    return eg.Camera.look_at(EYE, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), FOV, (HEIGHT, WIDTH))
 
 
 def ours(seed: int) -> Tensor:
@@ -74,56 +73,8 @@ def ours(seed: int) -> Tensor:
     return eg.render(scene, camera(), spp=16, light_samples=16, seed=seed)
 
 
-def scattering(mi: Any, dr: Any) -> type:
-    """glTF's model (appendix B) with correlated masking (Heitz 2014, eq. 99), for any variant of Mitsuba."""
-
-    class MetallicRoughness(mi.BSDF):
-        def __init__(self, props: Any) -> None:
-            mi.BSDF.__init__(self, props)
-            self.base, self.metallic = mi.Color3f(*BASE), props["metallic"]
-            self.alpha = props["roughness"] ** 2
-            self.normals = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.alpha, sample_visible=False)
-            self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
-            self.m_flags = self.m_components[0]
-
-        def sample(self, ctx: Any, si: Any, one: Any, two: Any, active: Any = True) -> Any:
-            """Half by the cosine, half by D(h) n·h."""
-            h, _ = self.normals.sample(si.wi, two)
-            wo = dr.select(one < 0.5, mi.warp.square_to_cosine_hemisphere(two), mi.reflect(si.wi, h))
-            value, pdf = self.eval_pdf(ctx, si, wo, active)
-            sample = mi.BSDFSample3f()
-            sample.wo, sample.pdf, sample.eta = wo, pdf, 1.0
-            sample.sampled_type, sample.sampled_component = mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(0)
-            return sample, dr.select(pdf > 0, value / dr.select(pdf > 0, pdf, 1.0), 0.0)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval_pdf(ctx, si, wo, active)[1]
-
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            v, l = si.wi, wo
-            nv, nl = v.z, l.z
-            above = active & (nv > 0) & (nl > 0)
-            h = dr.normalize(v + l)
-            a2, vh = self.alpha**2, dr.dot(v, h)
-            D = a2 / (math.pi * dr.square(h.x * h.x + h.y * h.y + a2 * h.z * h.z))
-            masking = 0.5 / (nl * dr.sqrt(a2 + (1 - a2) * nv * nv) + nv * dr.sqrt(a2 + (1 - a2) * nl * nl))
-            f0 = DIELECTRIC + (self.base - DIELECTRIC) * self.metallic
-            fresnel = f0 + (1 - f0) * (1 - vh) ** 5
-            f = (1 - fresnel) * self.base * (1 - self.metallic) / math.pi + fresnel * D * masking
-            pdf = 0.5 * nl / math.pi + 0.5 * D * h.z / (4 * vh)
-            return dr.select(above, f * nl, mi.Color3f(0.0)), dr.select(above, pdf, 0.0)
-
-        def to_string(self) -> str:
-            return "MetallicRoughness[]"
-
-    return MetallicRoughness
-
-
 class Mitsuba:
-    """Where LLVM is found, by that, and else point by point."""
+    """Mitsuba's images, by LLVM where it is found, else by its scalar variant."""
 
     def __init__(self) -> None:
         try:
@@ -132,20 +83,14 @@ class Mitsuba:
             mi, dr = (importlib.import_module(name) for name in ("mitsuba", "drjit"))
             mi.set_variant("scalar_rgb")
         self.mi = mi
-        mi.register_bsdf("metallic_roughness", scattering(mi, dr))
-        turn = mi.ScalarTransform4f
-        view = camera()
-        fov = 2 * math.degrees(math.atan(0.5 * HEIGHT / float(view.K[1, 1])))
-        film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
-        look = turn().look_at([0, 0, 40], [0, 0, 0], [0, 1, 0])
-        bitmap = mi.Bitmap(mitsuba.sky_image(sky()).numpy())
+        mitsuba.register(mi, dr)
         parts: dict[str, Any] = {
             "integrator": {"type": "direct", "hide_emitters": True},
-            "sensor": {"type": "perspective", "fov": fov, "fov_axis": "y", "to_world": look, "film": film},
-            "sky": {"type": "envmap", "bitmap": bitmap, "to_world": turn().rotate([0, 1, 0], 180)},
+            "sensor": mitsuba.sensor(mi, EYE, (0, 0, 0), FOV, (HEIGHT, WIDTH)),
+            "sky": mitsuba.sky(mi, sky()),
         }
         for k, (x, y, metallic, roughness) in enumerate(places()):
-            bsdf = {"type": "metallic_roughness", "metallic": metallic, "roughness": roughness}
+            bsdf = mitsuba.bsdf(BASE, metallic, roughness)
             parts[f"ball{k}"] = {"type": "sphere", "center": [x, y, 0], "radius": 1.0, "bsdf": bsdf}
         self.scene = mi.load_dict({"type": "scene", **parts})
 
@@ -155,7 +100,7 @@ class Mitsuba:
 
 
 def balls(images: Tensor) -> Tensor:
-    """(n, balls, 3): means over the inner two thirds of each ball, where both shapes are the same."""
+    """Return means (n, balls, 3) over the inner part of each ball, where both shapes are the same."""
     n = len(images)
     tiles = images.reshape(n, len(METALLIC), TILE, len(ROUGHNESS), TILE, 3).movedim(2, 3)
     tiles = tiles.reshape(n, -1, TILE, TILE, 3).double()
@@ -165,7 +110,7 @@ def balls(images: Tensor) -> Tensor:
 
 
 def compared(seeds: int) -> tuple[Row, Tensor]:
-    """How many of the balls' colours are not those of Mitsuba, and both images."""
+    """Count the colours of balls that differ from Mitsuba's, and return that row and both images."""
     theirs = Mitsuba()
     found = [torch.stack([render(seed) for seed in tqdm(range(seeds))]) for render in (ours, theirs)]
     a, b = (balls(images) for images in found)

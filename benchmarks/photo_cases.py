@@ -38,7 +38,7 @@ class Placed:
 
     @property
     def matrix(self) -> Tensor:
-        """(4, 4)."""
+        """The pose as a matrix (4, 4)."""
         M = torch.eye(4, dtype=torch.float64)
         M[:3, :3], M[:3, 3] = self.R, self.t
         return M
@@ -46,7 +46,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class Case:
-    """What a fit is given, and where the object is."""
+    """The input of a fit, and the true pose."""
 
     name: str
     mesh: eg.Mesh
@@ -59,25 +59,25 @@ class Case:
 
     @property
     def center(self) -> Tensor:
-        """(3,) of the bounding box, in the mesh's units."""
+        """Centre (3,) of the bounding box, in the mesh's units."""
         low, high = self.mesh.verts.double().aminmax(dim=0)
         return (low + high) / 2
 
     @property
     def size(self) -> float:
-        """The diagonal of the bounding box."""
+        """Diagonal of the bounding box."""
         low, high = self.mesh.verts.double().aminmax(dim=0)
         return float((high - low).norm())
 
     def alpha(self, pose: Placed, camera: eg.Camera | None = None) -> Tensor:
-        """(H, W), the silhouette at a pose, as the camera sees it, or another one."""
+        """Return the silhouette (H, W) at a pose, seen by the case's camera or another one."""
         placed = self.mesh.transformed(pose.R.float(), pose.t.float())
         return eg.render_aovs(eg.Mesh(placed.verts, placed.faces), camera or self.camera, ["alpha"], 16)["alpha"][
             ..., 0
         ]
 
-    def beside(self, pose: Placed, degrees: float, shift: float, rng: np.random.Generator) -> Placed:
-        """The pose turned by an angle and shifted by a length, both in random directions."""
+    def perturbed(self, pose: Placed, degrees: float, shift: float, rng: np.random.Generator) -> Placed:
+        """Return the pose rotated by an angle and shifted by a length, both in random directions."""
         R = turned(degrees, rng) @ pose.R.double()
         center = pose.R.double() @ self.center + pose.t.double() + shift * direction(rng)
         return Placed(R, center - R @ self.center)
@@ -95,17 +95,17 @@ class Case:
 
 
 def direction(rng: np.random.Generator) -> Tensor:
-    """(3,) of length 1, in any direction alike."""
+    """Return a uniformly random unit vector (3,)."""
     return F.normalize(torch.from_numpy(rng.normal(size=3)), dim=0)
 
 
 def turned(degrees: float, rng: np.random.Generator) -> Tensor:
-    """(3, 3), about a random axis."""
+    """Return a rotation (3, 3) by an angle about a random axis."""
     return rotation(math.radians(degrees) * direction(rng))
 
 
 def rendered(name: str, mesh: eg.Mesh, photographs: Sequence[Tensor], kind: Kind, seed: int) -> Case:
-    """A case of a kind.
+    """Return a case of a kind.
 
     easy     one pose, light and photograph of a mesh for all seeds; colours as they are lit, hardly worn (QUALITY 85)
     lit      any pose, sun, sky, exposure ± 1 stop, white balance ± 20 %, worn
@@ -132,7 +132,7 @@ def rendered(name: str, mesh: eg.Mesh, photographs: Sequence[Tensor], kind: Kind
 
 
 def several(meshes: Sequence[eg.Mesh], photographs: Sequence[Tensor], seed: int) -> list[Case]:
-    """A picture of several meshes, as `lit` ones, of which one covers OVERLAP of another: a case for each."""
+    """Return a case for each of several meshes in one `lit` picture, where one leaves OVERLAP of another visible."""
     rng = np.random.default_rng(seed)
     camera = eg.Camera.look_at((0, 0.4, -3.4), (0, 0, 0), (0, 1, 0), fov_y=40.0, size=(SIZE, SIZE))
     small = [mesh.replace(verts=mesh.verts * SMALLER) for mesh in map(_centred, meshes)]
@@ -157,7 +157,7 @@ def several(meshes: Sequence[eg.Mesh], photographs: Sequence[Tensor], seed: int)
 
 
 def _shares(meshes: Sequence[eg.Mesh], camera: eg.Camera) -> list[float]:
-    """Of each mesh, how much the others leave of it to be seen."""
+    """Return the visible share of each mesh among the others."""
     labels = torch.eye(len(meshes))
     bare = [eg.Mesh(mesh.verts, mesh.faces) for mesh in meshes]
     painted = [mesh.replace(colors=label.expand(len(mesh.verts), -1)) for mesh, label in zip(bare, labels, strict=True)]
@@ -185,13 +185,13 @@ def clutter(seed: int, size: int = SIZE) -> Tensor:
 
 
 def _centred(mesh: eg.Mesh) -> eg.Mesh:
-    """About the origin, of a diagonal that the camera sees well."""
+    """Return the mesh centred at the origin and scaled to the camera's view."""
     low, high = mesh.verts.aminmax(dim=0)
     return mesh.replace(verts=(mesh.verts - (low + high) / 2) / (high - low).norm() * 1.8, material=None)
 
 
 def _view(photograph: Tensor, rng: np.random.Generator) -> Tensor:
-    """(SIZE, SIZE, 3): a square of a photograph, as large as it fits."""
+    """Return the largest square of a photograph at a random place, as (SIZE, SIZE, 3)."""
     H, W = photograph.shape[:2]
     side = min(H, W)
     top, left = rng.integers(0, H - side + 1), rng.integers(0, W - side + 1)
@@ -202,7 +202,7 @@ def _view(photograph: Tensor, rng: np.random.Generator) -> Tensor:
 def _lit(
     given: Sequence[eg.Mesh], camera: eg.Camera, behind: Tensor, shadow: bool, rng: np.random.Generator
 ) -> Tensor:  # fmt: skip
-    """(SIZE, SIZE, 3), matte, with the shadows that they cast on themselves and on one another."""
+    """Return an image (SIZE, SIZE, 3) of matte meshes with the shadows they cast on themselves and on one another."""
     way = torch.from_numpy(rng.normal(size=3)).float()
     way[1], way[2] = -way[1].abs() - 0.3, 0.7 * way[2].abs()  # from above, and from the camera's side
     way = F.normalize(way, dim=0)

@@ -43,11 +43,11 @@ class Profile:
         return rows, self.along[columns + 1] + STEP * 0.5 * (a - c) / (a - 2.0 * b + c), b
 
     def quantiles(self) -> list[float]:
-        """Half and 90 % of the distances are as short, pixels."""
+        """Return median and 90 % quantile of the distances, in pixels."""
         return np.quantile(self.distances(), [0.5, 0.9]).tolist()
 
     def distances(self) -> np.ndarray:
-        """(k,) pixels, from points to the strongest edges near them; of those that have one."""
+        """Return distances (k,) in pixels from points to the strongest edges near them, of points that have one."""
         rows, offsets, strengths = self.maxima()
         best: dict[int, tuple[float, float]] = {}
         for row, offset, strength in zip(rows.tolist(), offsets.tolist(), strengths.tolist(), strict=True):
@@ -56,14 +56,14 @@ class Profile:
 
 
 def across(picture: Tensor, alpha: Tensor, reach: float) -> Profile:
-    """Of a photograph (H, W, 3), linear, across the contour of alpha (H, W), as far as `reach` pixels to both sides."""
+    """Read a linear photograph (H, W, 3) across the contour of alpha (H, W), up to `reach` pixels to both sides."""
     points, normals = _outline(alpha.double().numpy())
     along = np.arange(-reach, reach + 0.5 * STEP, STEP)
     y, x = (points[:, None, k] + along * normals[:, None, k] - 0.5 for k in (1, 0))
     image = linear_to_srgb(picture.clamp(0.0, 1.0)).double().numpy()
     squares = np.zeros_like(x)
     for channel in np.moveaxis(image, -1, 0):
-        slopes = [ndimage.gaussian_filter(channel, SIGMA, order=order) for order in ((0, 1), (1, 0))]
+        slopes = [ndimage.gaussian_filter(channel, SIGMA, order=order) for order in ((0, 1), (1, 0))]  # type: ignore[arg-type]
         read = [ndimage.map_coordinates(slope, [y, x], order=1, mode="nearest") for slope in slopes]
         squares += (read[0] * normals[:, None, 0] + read[1] * normals[:, None, 1]) ** 2
     return Profile(points, normals, along, np.sqrt(squares))
@@ -117,22 +117,22 @@ def corners(picture: Tensor, alpha: Tensor, reach: float) -> Corners:
 
 
 def _line(points: np.ndarray) -> np.ndarray:
-    """(3,): a normal, and its distance from the origin."""
+    """Return a line (3,) through points: normal and offset."""
     middle = points.mean(0)
     normal = np.linalg.svd(points - middle)[2][1]
     return np.r_[normal, -normal @ middle]
 
 
 def _ransac(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
-    """The line that most of the points are on, and how many they are, of `count`."""
+    """Return the line through most of the points, and the share of `count` that lies on it."""
     rng = np.random.default_rng(0)
-    best = np.zeros(len(points), bool)
+    line, best = np.full(3, np.nan), np.zeros(len(points), bool)
     for _ in range(LINES if len(points) > 1 else 0):
-        line = _line(points[rng.choice(len(points), 2, replace=False)])
-        on = np.abs(points @ line[:2] + line[2]) < ON_LINE
+        tried = _line(points[rng.choice(len(points), 2, replace=False)])
+        on = np.abs(points @ tried[:2] + tried[2]) < ON_LINE
         best = on if on.sum() > best.sum() else best
     if best.sum() < 5:
-        return np.full(3, np.nan), 0.0
+        return line, 0.0
     for _ in range(5):
         line = _line(points[best])
         best = np.abs(points @ line[:2] + line[2]) < ON_LINE
@@ -140,6 +140,6 @@ def _ransac(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
 
 
 def _met(lines: list[np.ndarray]) -> np.ndarray:
-    """(n, 2), each line with the one before it."""
+    """Return the intersections (n, 2) of each line with the one before it."""
     pairs = [np.cross(line, before) for line, before in zip(lines, [lines[-1], *lines[:-1]], strict=True)]
     return np.array([pair[:2] / pair[2] for pair in pairs])

@@ -22,7 +22,7 @@ WHOLE = 0.99  # share of a pixel that depth must cover
 
 
 def photographs(folder: Path) -> list[Tensor]:
-    """(H, W, 3) linear, of what is there."""
+    """Return those photographs that are there, (H, W, 3), linear."""
     names = ("squirrel/frame.png", "cracker_box/image_rgb.png", "gelatin_box/000001-color.png",
              "bottle/_sequence/color_camera_image_200.png")  # fmt: skip
     return [eg.read_image(folder / name, channels=3) for name in names if (folder / name).exists()]
@@ -70,7 +70,7 @@ def bottle(folder: Path, frame: int, with_depth: bool) -> Case:
 
 
 def reprojected(depth: Tensor, K: Tensor, to_world: Tensor, camera: eg.Camera) -> Tensor:
-    """(H, W) of `camera` from depth (h, w) of an OpenCV camera K that stands at `to_world` (4, 4), NaN where it is not known.
+    """Return depth (H, W) seen by `camera` from depth (h, w) of an OpenCV camera K at `to_world` (4, 4); NaN where unknown.
 
     Neighbouring measurements that lie on one surface are the corners of triangles, which are rendered from where `camera` is: so
     what is hidden from there is hidden, and every pixel has its depth, whichever camera has the more of them.
@@ -107,13 +107,15 @@ def _case(name: str, mesh: eg.Mesh, picture: Path, K: Any, truth: Placed, depth:
 
 
 def textured(mesh: Path, texture: Path) -> eg.Mesh:
-    """With the texture that its file names otherwise, or not at all."""
+    """Return the mesh with a texture that its file does not name."""
     return eg.load_mesh(mesh, materials=False).replace(texture=eg.read_image(texture, channels=3))
 
 
 def _integers(path: Path) -> Tensor:
-    """(H, W) of 16 bits, as they are in the file."""
-    return torch.from_numpy(oiio.ImageBuf(str(path)).get_pixels(oiio.UINT16)[..., 0].astype(np.float32))
+    """Return an image (H, W) of 16 bits as its integers."""
+    pixels = oiio.ImageBuf(str(path)).get_pixels(oiio.UINT16)
+    assert pixels is not None
+    return torch.from_numpy(pixels[..., 0].astype(np.float32))
 
 
 def _placed(R: Any, t: Any) -> Placed:

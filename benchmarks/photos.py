@@ -59,7 +59,7 @@ RIM = 0.3  # share of a pixel by which a neighbour's alpha is higher on a contou
 
 @dataclass(frozen=True)
 class Limits:
-    """What a fit must reach, and how many fits."""
+    """Largest errors of a fit that counts as right, and the share of fits that must be."""
 
     degrees: float
     shift: float  # of the object's size
@@ -156,7 +156,7 @@ WIDTHS = (22, 10, 17, 7, 7, 7, 7, 5, 6, 7, 8, 34, 6)
 
 @dataclass(frozen=True)
 class Run:
-    """What all parts are given."""
+    """Settings of all parts."""
 
     starts: int
     first: int  # number of the first picture that is made here
@@ -176,7 +176,7 @@ class Run:
         self, part: Part, case: Case, start: Placed | None, truth: Placed, label: str,
         mask: Tensor | None = None, search: bool = True,
     ) -> tuple[Trial, PoseFit]:  # fmt: skip
-        """Without a start, it is looked for."""
+        """Fit a pose from a start, or without one by a global search."""
         began = Work.now()
         fit = fit_pose(
             case.mesh, case.picture, case.camera, mask, None if start is None else start.matrix, depth=case.depth,
@@ -228,7 +228,7 @@ class Run:
 
 
 def outlined(case: Case, start: Placed | None, found: Placed, camera: eg.Camera | None = None) -> Tensor:
-    """(H, W, 3): the photograph with the contour of the start in blue and that of the fit, by its own camera, in yellow."""
+    """Return the photograph (H, W, 3) with the contours of the start (blue) and of the fit by its own camera (yellow)."""
     image = case.picture
     for pose, seen, colour in (
         (start, case.camera, (0.1, 0.3, 1.0)), (found, camera or case.camera, (1.0, 0.9, 0.0)),
@@ -249,7 +249,7 @@ def _scenes(kind: Kind, degrees: float, shift: float, limits: Limits) -> Callabl
         for k, case in run.made(kind, 100):
             rng = np.random.default_rng([k, round(degrees)])
             share = (rng.uniform(1 / 3, 1.0), rng.uniform()) if kind == "easy" else (1.0, 1.0)
-            start = case.beside(case.truth, degrees * share[0], shift * case.size * share[1], rng)
+            start = case.perturbed(case.truth, degrees * share[0], shift * case.size * share[1], rng)
             run.fitted(part, case, start, case.truth, f"{name}-{k:02d}")
         return part
 
@@ -265,7 +265,7 @@ def _several(count: int, limits: Limits) -> Callable[[Run, str], Part]:
             meshes = [run.meshes[(k + n) % len(run.meshes)][1] for n in range(count)]
             cases = several(meshes, run.backgrounds, 300 + k)
             rng = np.random.default_rng([k, count])
-            starts = [case.beside(case.truth, 15.0, 0.05 * case.size, rng) for case in cases]
+            starts = [case.perturbed(case.truth, 15.0, 0.05 * case.size, rng) for case in cases]
             run.together(part, cases, starts, f"{name}-{k:02d}")
         return part
 
@@ -279,7 +279,7 @@ def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
         part = Part(name, limits)
         for k, case in run.made("lit", 100):
             rng = np.random.default_rng([k, 10])
-            start = case.beside(case.truth, 10.0, 0.05 * case.size, rng)
+            start = case.perturbed(case.truth, 10.0, 0.05 * case.size, rng)
             # The camera that sees the object at rest as the case's camera sees it at the start.
             moved = start.matrix @ torch.linalg.inv(case.truth.matrix)
             W, K = case.camera.world_to_camera.double(), case.camera.K.clone()
@@ -323,7 +323,7 @@ def _around(run: Run, part: Part, case: Case, truth: Placed, turns: tuple[float,
     ends = []
     for k in range(run.starts):
         rng = np.random.default_rng([7, k])
-        start = case.beside(truth, rng.uniform(*turns), rng.uniform(0.0, shift), rng)
+        start = case.perturbed(truth, rng.uniform(*turns), rng.uniform(0.0, shift), rng)
         fit = run.fitted(part, case, start, truth, f"{part.name.replace(',', '').replace(' ', '-')}-{k:02d}")[1]
         ends.append(Placed(fit.R, fit.t))
     middle = ends[int(np.argmin([statistics.median(case.apart(end, other)[0] for other in ends) for end in ends]))]
@@ -384,7 +384,7 @@ REAL: dict[str, Callable[[Run, Path], Iterator[Part]]] = {
 
 
 def _mesh(given: str) -> tuple[str, eg.Mesh]:
-    """By its name: of a file, or of a file and that of its texture, with a comma between."""
+    """Return the name and mesh of a file, or of FILE,TEXTURE."""
     if given == STONE:
         return STONE, pebble()
     file, _, texture = given.partition(",")
@@ -418,7 +418,7 @@ def main() -> None:
     done: list[Part] = []
     for name in parts:
         print(name, flush=True)
-        found = [MADE[name](run, name)] if name in MADE else REAL[name](run, given.folder)
+        found = [MADE[name](run, name)] if name in MADE else REAL[name](run, given.folder)  # type: ignore[arg-type]
         for part in found:
             done.append(part)
             if given.json is not None:

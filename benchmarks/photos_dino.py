@@ -44,7 +44,8 @@ class Photo:
     known: Tensor  # (H, W), 0 where the mask may be a shadow's
 
     def resized(self, factor: float) -> Photo:
-        size = tuple(round(n * factor) for n in self.camera.size)
+        H, W = self.camera.size
+        size = round(H * factor), round(W * factor)
 
         def smaller(x: Tensor) -> Tensor:
             x = x.reshape(*x.shape[:2], -1).movedim(-1, 0)[None]
@@ -78,12 +79,12 @@ def _closed(mask: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _largest(mask: np.ndarray) -> np.ndarray:
-    label, count = ndimage.label(mask)
+    label, count = ndimage.label(mask)  # type: ignore[misc]
     return label == 1 + np.argmax(ndimage.sum(mask, label, range(1, count + 1)))
 
 
 def shape(photos: list[Photo], steps: int = 150) -> Fit:
-    """By contours alone: the visual hull, and from it the smallest surface that has the silhouettes."""
+    """Fit the smallest surface that has the silhouettes, from the visual hull."""
     masks = [torch.maximum(p.mask, 1.0 - p.known) for p in photos]
     start = visual_hull([p.camera for p in photos], masks, resolution=64, faces=4000)
 
@@ -100,8 +101,10 @@ def shape(photos: list[Photo], steps: int = 150) -> Fit:
 
 
 def refined(mesh: eg.Mesh, photos: list[Photo], rounds: int = 3) -> Iterator[eg.Mesh]:
-    """With a texture; then by turns the shape on which that texture shows what the photographs do, and the texture again: what is
-    hollow, contours do not tell, but a texture slides on a surface that is not where the figure's is."""
+    """Fit a texture, then in turns the shape under that texture, and the texture again.
+
+    Contours do not show what is hollow, but a texture slides on a surface that is not where the figure's is.
+    """
     half = [p.resized(0.5) for p in photos]
     cameras, images = [p.camera for p in half], [p.image for p in half]
     masks, weights = [p.mask for p in half], [p.known for p in half]
@@ -175,7 +178,7 @@ def dino(folder: Path, first: int = 2, out: Path | None = None) -> None:
 
 
 def report(stage: str, began: tuple[float, float], mesh: eg.Mesh, held: list[Photo], seen: list[Photo]) -> None:
-    """A line for each view held out, and the mean of those fitted."""
+    """Print a line for each view held out, and the mean of the fitted views."""
     wall, work = time.perf_counter() - began[0], time.process_time() - began[1]
     print(f"{stage}, after {wall:.0f} s, {work:.0f} s of processor time")
     rows = {photo.name: measured(mesh, photo)[0] for photo in held}

@@ -1,4 +1,4 @@
-"""What a process of its own shows: peak memory, the first render, the order of imports."""
+"""Rows that need fresh processes: peak memory, the first render, the order of imports."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def start(bench: Bench) -> list[Row]:
 
 
 def fresh(*arguments: str) -> dict[str, float]:
-    """What fresh.py measures in a process of its own."""
+    """Return what fresh.py measures in its own process."""
     command = [sys.executable, "-m", "benchmarks.fresh", *arguments]
     root = Path(__file__).parents[1]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
@@ -43,7 +43,7 @@ def fresh(*arguments: str) -> dict[str, float]:
 
 
 def order(bench: Bench) -> list[Row]:
-    """A step where torch was imported first, over one where edgegrad was: alone, and beside two busy processes."""
+    """Compare a step after importing torch first with one after importing edgegrad first, on a quiet and a busy machine."""
     rows = []
     for load in (0, 2):
         busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(load)]

@@ -45,7 +45,7 @@ class Step:
         self.topology = dr.antialias_construct_topology_hash(self.faces)
 
     def clip_space(self, verts: Tensor, near: float = 0.1, far: float = 10.0) -> Tensor:
-        """(B, V, 4)"""
+        """Return clip-space positions (B, V, 4)."""
         out = []
         for camera in self.cameras:
             pose, f = camera.world_to_camera.float(), 2 * float(camera.K[0, 0]) / SIZE
@@ -74,7 +74,7 @@ IMAGES = 32
 
 
 def batch(lit: bool) -> Callable[[], None]:
-    """A step of render_batch() over meshes that share vertices."""
+    """Return a step of render_batch() over meshes that share vertices."""
     mesh = icosphere(3)
     camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (64, 64))
     lights = [eg.DirectionalLight(torch.tensor([0.0, -0.3, -1.0]))] if lit else []
@@ -91,7 +91,7 @@ def batch(lit: bool) -> Callable[[], None]:
 
 
 def hashing(blocks: int = 300) -> None:
-    """Work that threads share perfectly."""
+    """Do work that threads share perfectly."""
     block, threads = bytes(1 << 20), torch.get_num_threads()
 
     def part(_: int) -> None:
@@ -122,7 +122,7 @@ def middle(numbers: Iterable[float]) -> float:
 
 
 def by_turns(works: dict[str, Callable[[], None]], rounds: int) -> dict[str, dict[int, list[Times]]]:
-    """Of each, with one thread and with two; a first round is left out."""
+    """Measure each with one thread and with two, in turns; the first round does not count."""
     found: dict[str, dict[int, list[Times]]] = {name: {1: [], 2: []} for name in works}
     for turn in range(rounds + 1):
         for name, work in works.items():

@@ -1,4 +1,4 @@
-"""What bends: how exactly poses are found, and what a pose costs.
+"""Rigs: how exactly poses are found, and what a pose costs.
 
     python -m benchmarks.rigs body [--count 10] [--first 0] [--size 192]
     python -m benchmarks.rigs picture | anny | arm | walk | evaluation
@@ -66,11 +66,11 @@ def bodies(count: int, first: int, size: int) -> None:
 
 
 def in_light(mesh: eg.Mesh, lights: list[Any]) -> eg.Scene:
-    """Matte, with smooth normals, before black."""
+    """Return the mesh as a matte surface with smooth normals before black."""
     assert mesh.colors is not None
     normals = eg.vertex_normals(mesh.verts, mesh.faces)
     material = eg.Material(base_color=mesh.colors)
-    return eg.Scene(mesh.replace(colors=None, normals=normals, material=material), lights=lights)
+    return eg.Scene([mesh.replace(colors=None, normals=normals, material=material)], lights=lights)
 
 
 def harmonic(posed: eg.Mesh, light: Tensor) -> eg.Scene:
@@ -78,15 +78,17 @@ def harmonic(posed: eg.Mesh, light: Tensor) -> eg.Scene:
 
 
 def sunny(posed: eg.Mesh, sky: Tensor, sun: Tensor, tint: Tensor) -> eg.Scene:
-    """A sun in the direction `sun`, which casts shadows, and a sky that casts none."""
+    """Light the mesh by a sun in the direction `sun`, which casts shadows, and a sky that casts none."""
     like = posed.verts
     lights = [eg.DirectionalLight(-sun.to(like), 1.0, color=tint.to(like)), eg.SphericalHarmonics(sky.to(like))]
     return in_light(posed, lights)
 
 
 def sun_of(light: Tensor) -> dict[str, Parameter]:
-    """Where to begin, from irradiance (9, 3): what is brighter on one side is the sun's, max(0, n·s), whose harmonics are √π/2
-    of order 0 and √(π/3) of order 1 (Ramamoorthi and Hanrahan 2001)."""
+    """Return where a sun and a sky begin, from irradiance (9, 3).
+
+    Order 1 is the sun's, max(0, n·s), whose harmonics are √π/2 of order 0 and √(π/3) of order 1 (Ramamoorthi and Hanrahan 2001).
+    """
     first = light[[3, 1, 2]]  # (xyz, channels)
     sun = first.mean(1) / first.mean(1).norm()
     tint = (sun @ first / math.sqrt(math.pi / 3.0)).clamp(min=0.1)
@@ -96,7 +98,7 @@ def sun_of(light: Tensor) -> dict[str, Parameter]:
 
 
 def sun_and_sky(seed: int) -> list[Any]:
-    """From above, at random."""
+    """Return a sun from a random direction above, and a sky."""
     g = torch.Generator().manual_seed(100 + seed)
     x, z = torch.randn(2, generator=g).tolist()
     sky = torch.zeros(9, 3)
@@ -108,7 +110,7 @@ def sun_and_sky(seed: int) -> list[Any]:
 
 
 def visible(rig: eg.Rig, posed: eg.Mesh, camera: eg.Camera) -> Tensor:
-    """(J,) whether its limb covers some pixels."""
+    """Return for each joint (J,) whether its limb covers more than SEEN pixels."""
     skin = rig.deformer.skins[0]  # type: ignore[attr-defined]
     shares = eg.render(posed.replace(colors=skin.weights.to(posed.verts)), camera, 16)
     return shares.sum((0, 1)) > SEEN
@@ -155,8 +157,8 @@ TURNED = [
 
 
 def model() -> tuple[eg.Rig, Any]:
-    """anny, of which these bones turn."""
-    import anny
+    """Return the body model anny, of which the bones TURNED rotate."""
+    import anny  # type: ignore[import-not-found]
     import roma
 
     given = anny.Anny(skinning_method="lbs")
@@ -170,7 +172,9 @@ def model() -> tuple[eg.Rig, Any]:
         return given(poses, phenotype)["vertices"]
 
     controls = {"rotations": eg.Control(torch.zeros(len(TURNED), 3), names=tuple(TURNED), rotates=True)}
-    controls |= {name: eg.Control(torch.tensor(0.5), 0.0, 1.0) for name in given.phenotype_labels}
+    controls |= {
+        name: eg.Control(torch.tensor(0.5), torch.tensor(0.0), torch.tensor(1.0)) for name in given.phenotype_labels
+    }
     return eg.Rig.from_function(function, given.get_triangular_faces(), controls, batched=True), given
 
 
@@ -194,12 +198,15 @@ def model_bodies(count: int, first: int, size: int, degrees: float = 20.0) -> No
         )
         truth = {n: 0.2 + 0.6 * torch.rand((), generator=g, dtype=F64) for n in rig.controls if n != "rotations"}
         with torch.no_grad():
-            posed = rig.posed(turns, **truth)
+            posed = rig.posed(turns, **truth)  # type: ignore[arg-type]
+        assert isinstance(posed, eg.Mesh)
         tall = float(posed.verts[:, 2].max() - posed.verts[:, 2].min())
         began = time.process_time()
         fit = fit_rig(rig, cameras, masks=masks_of(posed, cameras), seed=seed, progress=False)
         seconds.append(time.process_time() - began)
-        error = (fit.posed().verts - posed.verts).norm(dim=1)
+        found = fit.posed()
+        assert isinstance(found, eg.Mesh)
+        error = (found.verts - posed.verts).norm(dim=1)
         off.append(float(error.mean()) / tall)
         print(
             f"body {seed}: vertices {off[-1]:.2%} of the height in the mean, {float(error.max()) / tall:.2%} at most; "
@@ -223,7 +230,7 @@ def arms(count: int, first: int, size: int) -> None:
 
 
 def stride(phase: float) -> Tensor:
-    """(20, 3) of the figure that walks, at a phase in turns."""
+    """Return rotations (20, 3) of the walking figure at a phase from 0 to 1."""
     s, c = math.sin(math.tau * phase), math.cos(math.tau * phase)
     names = [bone[0] for bone in figure.BONES]
     found = torch.zeros(len(names), 3, dtype=F64)
@@ -265,7 +272,7 @@ def walk(count: int, first: int, size: int) -> None:
 
 
 def evaluation(count: int, first: int, size: int) -> None:
-    """20,000 vertices and 60 joints: posed and back, and a step of the renderer with the same mesh."""
+    """Time a pose and its gradient (20,000 vertices, 60 joints), and a step of the renderer with the same mesh."""
     g = torch.Generator().manual_seed(first)
     rings, sides, joints = 200, 100, 60
     y, a = torch.linspace(0.0, 2.0, rings), math.tau * torch.arange(sides) / sides

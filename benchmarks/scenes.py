@@ -1,4 +1,4 @@
-"""The scenes of the reports, procedural but for the scan, and the pieces from which the tests build theirs."""
+"""Scenes to measure gradients on, procedural but for the scan, and the pieces from which tests build theirs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BACKGROUND = (0.15, 0.25, 0.4)
 
 @dataclass(frozen=True, eq=False)
 class ReportScene:
-    """What a gradient is measured on: the loss is image · adjoint."""
+    """A scene on which a gradient is measured; the loss is image · adjoint."""
 
     name: str
     title: str  # what it shows, in a few words
@@ -40,12 +40,12 @@ class ReportScene:
 
     @property
     def moving(self) -> Sequence[Mesh]:
-        """The meshes that the gradient is of."""
+        """Meshes whose vertices have the gradient."""
         return self.scene.meshes[: self.objects]
 
     @property
     def verts(self) -> Tensor:
-        """(V, 3) float64, of these end to end."""
+        """Vertices (V, 3) of these meshes, end to end, float64."""
         return torch.cat([mesh.verts.double() for mesh in self.moving])
 
     @property
@@ -54,11 +54,11 @@ class ReportScene:
 
     @property
     def center(self) -> Tensor:
-        """(3,) float64, the centroid of the vertices: what the object is turned about."""
+        """Centroid (3,) of the vertices, float64; the object rotates about it."""
         return self.verts.mean(0)
 
     def moved(self, verts: Tensor) -> Scene:
-        """The scene with other vertices (V, 3)."""
+        """Return the scene with other vertices (V, 3)."""
         parts = verts.split([len(mesh.verts) for mesh in self.moving])
         moved = [mesh.replace(verts=part) for mesh, part in zip(self.moving, parts, strict=True)]
         return self.scene.replace(meshes=[*moved, *self.scene.meshes[len(moved) :]])
@@ -81,8 +81,9 @@ class ReportScene:
 
 
 def build(name: str, size: int = 256, mesh: Path | None = None, **variant: float) -> ReportScene:
-    """A scene by its name, in float32, before a camera of size × size pixels; `mesh` is the file of the scan. A variant is
-    what else the function of the scene takes, such as subdivisions=3.
+    """Return a scene by its name, in float32, seen in size × size pixels.
+
+    `mesh` is the file of the scan. `variant` holds other arguments of the function of the scene, such as subdivisions=3.
 
     Raises ValueError for another name or a mesh that cannot be framed, OSError and ImportError where the scan is not there.
     """
@@ -103,7 +104,7 @@ def build(name: str, size: int = 256, mesh: Path | None = None, **variant: float
 
 
 def front_camera(size: int | tuple[int, int] = 64, projection: str = "perspective") -> Camera:
-    """A camera 4 units from the origin, off every axis and tilted, that sees the ball of radius 1.2 around it."""
+    """Return a tilted camera off every axis, 4 units from the origin, that sees the ball of radius 1.2 around it."""
     size = (size, size) if isinstance(size, int) else size
     eye = 4.0 * torch.nn.functional.normalize(torch.tensor([0.31, 0.23, 1.0], dtype=torch.float64), dim=0)
     target, up = torch.zeros_like(eye), torch.tensor([0.17, 1.0, 0.0], dtype=torch.float64)
@@ -113,7 +114,7 @@ def front_camera(size: int | tuple[int, int] = 64, projection: str = "perspectiv
 
 
 def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
-    """World points (…, 3) at the pixel positions (…, 2) and the depths Z (…) of a camera."""
+    """Return world points (…, 3) at the pixel positions (…, 2) and the depths Z (…) of a camera."""
     xy = torch.linalg.solve(camera.K[:2, :2], (pixels - camera.K[:2, 2])[..., None])[..., 0]
     if camera.projection == "perspective":
         xy = xy * depth[..., None]
@@ -122,14 +123,14 @@ def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
 
 
 def one_triangle() -> Scene:
-    """One large triangle with smooth colours on a coloured background, in float64."""
+    """Return one large triangle with smooth colours on a coloured background, in float64."""
     verts = torch.tensor([[-0.83, -0.61, 0.2], [0.87, -0.42, -0.3], [0.13, 0.79, 0.1]], dtype=torch.float64)
     colors = torch.tensor([[0.9, 0.2, 0.1], [0.3, 0.8, 0.2], [0.1, 0.4, 1.0]], dtype=torch.float64)
     return Scene([Mesh(verts, torch.tensor([[0, 1, 2]]), colors=colors)], background())
 
 
 def occluded_triangle() -> Scene:
-    """A triangle with smooth colours, partly behind another one."""
+    """Return a triangle with smooth colours, partly behind another one."""
     behind = one_triangle().meshes[0]
     verts = torch.tensor([[-0.31, -0.93, 0.9], [0.95, 0.17, 0.8], [-0.43, 0.57, 1.0]], dtype=torch.float64)
     colors = torch.tensor([[0.2, 0.9, 0.7], [0.8, 0.1, 0.6], [0.6, 0.5, 0.05]], dtype=torch.float64)
@@ -137,7 +138,7 @@ def occluded_triangle() -> Scene:
 
 
 def cube(half: float = 0.6) -> Mesh:
-    """A cube of edge length 2 · half: 8 vertices, 12 faces, outward, with a colour for each vertex."""
+    """Return a cube of edge length 2 · half: 8 vertices, 12 outward faces, a colour for each vertex."""
     x, y, z = (np.arange(8) >> 2) & 1, (np.arange(8) >> 1) & 1, np.arange(8) & 1
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     faces = [[q[0], q[i], q[i + 1]] for q in quads for i in (1, 2)]
@@ -146,7 +147,7 @@ def cube(half: float = 0.6) -> Mesh:
 
 
 def icosphere(subdivisions: int = 3) -> Mesh:
-    """Unit sphere of 20 · 4^subdivisions faces (3: 1,280; 6: 81,920), watertight, outward, with smooth colours: an icosphere."""
+    """Return a watertight unit sphere of 20 · 4^subdivisions faces (3: 1,280; 6: 81,920) with smooth colours."""
     phi = (1.0 + math.sqrt(5.0)) / 2.0
     # Corners (0, ±1, ±φ) and its rotations of coordinates: three rectangles, one in each plane.
     rectangle = np.array([[-1, phi, 0], [1, phi, 0], [-1, -phi, 0], [1, -phi, 0]])
@@ -172,7 +173,7 @@ def icosphere(subdivisions: int = 3) -> Mesh:
 
 
 def soup(mesh: Mesh) -> Mesh:
-    """Every face with vertices of its own."""
+    """Return the mesh with separate vertices for each face."""
     assert mesh.texture is None
     index = mesh.faces.long().reshape(-1)
     colors = None if mesh.colors is None else mesh.colors[index]
@@ -180,8 +181,11 @@ def soup(mesh: Mesh) -> Mesh:
 
 
 def random_slivers(count: int, seed: int, camera: Camera) -> Mesh:
-    """Long thin triangles (half to nine tenths of the image, 1 to 3 % of it wide) that overlap heavily in the view of
-    `camera`, each at a depth of its own, so that no two meet, with a random colour for each."""
+    """Return long thin triangles that overlap heavily in the view of `camera`.
+
+    They are half to nine tenths of the image long and 1 to 3 % of it wide. Each has its own depth, so that no two meet, and a
+    random colour.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float) -> Tensor:
@@ -201,13 +205,13 @@ def random_slivers(count: int, seed: int, camera: Camera) -> Mesh:
 
 
 def smooth_colors(points: Tensor) -> Tensor:
-    """Colours (V, 3) in (0, 1) that vary slowly with the position (V, 3)."""
+    """Return colours (V, 3) in (0, 1) that vary slowly with the position (V, 3)."""
     directions = torch.tensor([[2.1, 0.7, -1.3], [-0.9, 2.3, 1.1], [1.7, -1.9, 0.6]], dtype=points.dtype)
     return 0.5 + 0.4 * torch.sin(points @ directions + torch.tensor([0.3, 1.1, 2.0], dtype=points.dtype))
 
 
 def smooth_adjoint(height: int, width: int, channels: int) -> Tensor:
-    """A smooth adjoint image (H, W, C), float64, of both signs, without symmetry."""
+    """Return a smooth adjoint image (H, W, C) of both signs without symmetry, float64."""
     y = torch.linspace(0.0, 1.0, height, dtype=torch.float64)[:, None, None]
     x = torch.linspace(0.0, 1.0, width, dtype=torch.float64)[None, :, None]
     c = torch.arange(channels, dtype=torch.float64)
@@ -215,12 +219,12 @@ def smooth_adjoint(height: int, width: int, channels: int) -> Tensor:
 
 
 def noise_adjoint(height: int, width: int, channels: int) -> Tensor:
-    """White noise (H, W, C), float64: what an L1 loss, or a photograph's noise, leaves near the optimum."""
+    """Return white noise (H, W, C), float64, as the adjoint of an L1 loss or of a noisy photograph near the optimum."""
     return torch.randn((height, width, channels), dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
 
 def background() -> Tensor:
-    """(3,) float64."""
+    """Return the background (3,) of all scenes, float64."""
     return torch.tensor(BACKGROUND, dtype=torch.float64)
 
 
@@ -241,7 +245,7 @@ def _sphere(size: int, subdivisions: int = 6) -> Built:
 
 
 def _tangled(size: int, noise: float = 0.03, subdivisions: int = 5) -> Built:
-    """As the first steps of a plain shape fit leave it: each vertex moved by normal noise, as a share of the radius."""
+    """Return a sphere like one in the first steps of a shape fit: normal noise, a share of the radius, moves each vertex."""
     title, scene, camera = _sphere(size, subdivisions)
     (mesh,) = scene.meshes
     shift = torch.randn(mesh.verts.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -268,7 +272,7 @@ def _slivers(size: int) -> Built:
 
 
 def _globe(size: int, rows: int = 128) -> Built:
-    """A sphere by latitude and longitude, as files bring it: its vertices have copies along the seam of the texture."""
+    """Return a sphere by latitude and longitude, with copies of vertices along the seam of its texture, as in files."""
     columns = 2 * rows
     latitude = math.pi * torch.arange(rows + 1, dtype=torch.float64) / rows
     longitude = 2.0 * math.pi * torch.arange(columns + 1, dtype=torch.float64) / columns
@@ -294,7 +298,7 @@ def _globe(size: int, rows: int = 128) -> Built:
 
 
 def _quad(size: int) -> Built:
-    """Slanted, and wider than the picture, so that its edges are out of view."""
+    """Return a slanted quad larger than the image: its edges are out of view."""
     camera = front_camera(size)
     corners = size * torch.tensor([[-0.11, -0.17], [1.13, -0.12], [1.21, 1.14], [-0.15, 1.19]], dtype=torch.float64)
     verts = unproject(camera, corners, torch.tensor([3.6, 4.1, 4.4, 3.8], dtype=torch.float64))
@@ -310,13 +314,16 @@ def _million(size: int) -> Built:
 
 
 def _lit(size: int, light: Light | Mesh, title: str, subdivisions: int = 6) -> Built:
-    """A black ellipsoid and its shadow on a plane. The gradient is that of the ellipsoid: that of the plane's corners, which all
-    of the image moves, would hide it. Were it lit, each edge of it would be a crease, which Mitsuba does not sample."""
+    """Return a black ellipsoid and its shadow on a plane.
+
+    The gradient is that of the ellipsoid. That of the plane's corners, which move all of the image, would hide it. If the
+    ellipsoid were lit, each of its edges would be a crease, which Mitsuba does not sample.
+    """
     ball = icosphere(subdivisions)
     look = Material(base_color=torch.tensor([0.8, 0.6, 0.4], dtype=torch.float64))
     size_of, at = torch.tensor(
         [[0.5, 0.3, 0.4], [0.0, 0.0, 1.0]], dtype=torch.float64
-    )  # a turn of a ball would change nothing
+    )  # rotating a ball would change nothing
     raised = ball.verts * size_of + at
     square = 4.0 * torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64)
     plane = Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=look)
@@ -325,15 +332,15 @@ def _lit(size: int, light: Light | Mesh, title: str, subdivisions: int = 6) -> B
     return f"shadow of a black ellipsoid of {len(ball.faces):,} faces, {title}", Scene(meshes, lights=[light]), camera
 
 
-LAMP = (0.9, -0.6, 2.4)
+LIGHT_AT = (0.9, -0.6, 2.4)
 
 
 def _lit_point(size: int, subdivisions: int = 6) -> Built:
-    return _lit(size, PointLight(torch.tensor(LAMP, dtype=torch.float64), 10.0), "point light", subdivisions)
+    return _lit(size, PointLight(torch.tensor(LIGHT_AT, dtype=torch.float64), 10.0), "point light", subdivisions)
 
 
 def _lit_area(size: int, subdivisions: int = 6) -> Built:
-    at, u, v = (torch.tensor(x, dtype=torch.float64) for x in (LAMP, (0.0, 0.3, 0.0), (0.4, 0.0, 0.1)))
+    at, u, v = (torch.tensor(x, dtype=torch.float64) for x in (LIGHT_AT, (0.0, 0.3, 0.0), (0.4, 0.0, 0.1)))
     panel = AreaLight.rectangle(at, u, v, 8.0, two_sided=False)  # u × v points down
     return _lit(size, panel, "area light", subdivisions)
 
@@ -343,7 +350,7 @@ def _lit_sky(size: int, subdivisions: int = 6) -> Built:
 
 
 def _room(size: int, light: Mesh, at: tuple[float, float, float], title: str, subdivisions: int = 3) -> Built:
-    """A black ellipsoid in a room with coloured walls, open towards −y. As in `_lit`, its edges are no creases."""
+    """Return a black ellipsoid in a room with coloured walls, open towards −y. As in `_lit`, its edges are no creases."""
     ball, (x, y, z) = icosphere(subdivisions), at
     size_of, centre = torch.tensor([[0.45, 0.25, 0.35], [x, y, z]], dtype=torch.float64)
     meshes = [Mesh(ball.verts * size_of + centre, ball.faces, colors=torch.zeros_like(ball.verts))]
@@ -374,13 +381,13 @@ def _panel(height: float, x: float, side: float, down: bool) -> Mesh:
     return Mesh(torch.tensor(corners, dtype=torch.float64), faces, material=look)
 
 
-def _bounce_lamp(size: int, subdivisions: int = 3) -> Built:
-    return _room(size, _panel(1.95, 0.1, 0.3, True), (0.15, -0.1, 0.75), "lamp above", subdivisions)
+def _bounce_down(size: int, subdivisions: int = 3) -> Built:
+    return _room(size, _panel(1.95, 0.1, 0.3, True), (0.15, -0.1, 0.75), "light above", subdivisions)
 
 
 def _bounce_up(size: int, subdivisions: int = 3) -> Built:
-    """What the camera sees below the ceiling is lit by the bounce alone."""
-    return _room(size, _panel(1.2, -0.45, 0.25, False), (0.3, 0.0, 0.7), "lamp towards the ceiling", subdivisions)
+    """Return the room lit from below: all surfaces in view below the ceiling get indirect light only."""
+    return _room(size, _panel(1.2, -0.45, 0.25, False), (0.3, 0.0, 0.7), "light towards the ceiling", subdivisions)
 
 
 def _scan(size: int, path: Path | None) -> Built:
@@ -395,7 +402,7 @@ def _scan(size: int, path: Path | None) -> Built:
 
 
 def pattern(x: Tensor, y: Tensor) -> Tensor:
-    """A texture (h, w, 3) float64 of waves from 2 to 61 to the side, that repeats; x (1, w) and y (h, 1), sides of length 1."""
+    """Return a repeating texture (h, w, 3), float64, of 2 to 61 waves a side, at x (1, w) and y (h, 1) from 0 to 1."""
     generator = torch.Generator().manual_seed(3)
     color = torch.zeros((*torch.broadcast_shapes(x.shape, y.shape), 3), dtype=torch.float64)
     for waves in (2, 5, 11, 23, 37, 61):
@@ -419,8 +426,8 @@ SCENES: dict[str, Callable[..., Built]] = {
     "lit-point": _lit_point,
     "lit-area": _lit_area,
     "lit-sky": _lit_sky,
-    "bounce-lamp": _bounce_lamp,
+    "bounce-down": _bounce_down,
     "bounce-up": _bounce_up,
 }
-BOUNCED = ("bounce-lamp", "bounce-up")
+BOUNCED = ("bounce-down", "bounce-up")
 LIT = ("lit-point", "lit-area", "lit-sky", *BOUNCED)

@@ -16,6 +16,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -42,7 +44,7 @@ def harmonics(n: Tensor) -> Tensor:
 
 
 def steps_of_time() -> dict[str, Callable[[int], None]]:
-    """One step each: the kernel's own colours and texture, and shaders."""
+    """Return one step each of the kernel's own colours and texture, and of shaders."""
     mesh, camera, _ = sphere(256)
     adjoint = smooth_adjoint(256, 256, 3).float()
     texture = torch.rand((256, 256, 3), generator=torch.Generator().manual_seed(0)).requires_grad_()
@@ -98,7 +100,7 @@ def times(repeats: int = 9) -> None:
 
 
 def peak(gradient: bool) -> None:
-    """Prints what this process needs above its start, MB."""
+    """Print the memory that this process needs above its start, in MB."""
     mesh, camera, _ = sphere((1080, 1920))
     net, verts = network(), mesh.verts.clone().requires_grad_(gradient)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -114,14 +116,13 @@ def peak(gradient: bool) -> None:
 def memory() -> None:
     print("| 1920 × 1080, 16 samples a pixel, network 3 × 64 | MB |\n|---|---|")
     for gradient in (False, True):
-        found = subprocess.run(
-            [sys.executable, __file__, "--peak", str(int(gradient))], capture_output=True, check=True
-        )
+        command = [sys.executable, "-m", "benchmarks.shaders", "--peak", str(int(gradient))]
+        found = subprocess.run(command, capture_output=True, check=True, cwd=Path(__file__).parents[1])
         print(f"| {'image and gradient' if gradient else 'image'} | {float(found.stdout):.0f} |")
 
 
 def noise(seeds: int = 64) -> None:
-    """Of an image whose faces are shaded once in a pixel, beside one whose samples all are: the pixels of one 4 × 4 as fine."""
+    """Print the noise of images whose faces are shaded once a pixel, and of ones shaded at every sample (4 × 4 as fine)."""
     camera, fine = front_camera(64), 4
     finer = camera.replace(K=torch.cat([fine * camera.K[:2], camera.K[2:]]), size=(64 * fine, 64 * fine))
     texture = torch.rand((64, 64, 3), generator=torch.Generator().manual_seed(0), dtype=F64)
@@ -148,13 +149,13 @@ def noise(seeds: int = 64) -> None:
 
 
 def mipmaps(seeds: int = 16, converged: int = 32) -> None:
-    """The gradient of a texture much finer than the pixels, at default samples, against a converged one of the same filter."""
+    """Print the error of gradients of a texture much finer than the pixels, with default samples, by filter."""
     scene = build("quad", 24)
     (quad,) = scene.scene.meshes
     print("| error of the gradient at 24 px of 256² texels | vertices | texels |\n|---|---|---|")
     for filter in ("linear", "mipmap"):
 
-        def gradient(seed: int, filter: str = filter, **samples: int) -> tuple[Tensor, ...]:
+        def gradient(seed: int, filter: str = filter, **samples: Any) -> tuple[Tensor, ...]:
             assert quad.texture is not None
             verts, texture = quad.verts.clone().requires_grad_(), quad.texture.clone().requires_grad_()
             mesh = quad.replace(verts=verts, texture=texture, filter=filter)
@@ -174,7 +175,7 @@ def mipmaps(seeds: int = 16, converged: int = 32) -> None:
 PARTS = {"time": times, "memory": memory, "noise": noise, "mipmaps": mipmaps}
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--peak", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()

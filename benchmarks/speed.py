@@ -21,12 +21,12 @@ from typing import Any
 
 from tqdm import tqdm
 
+from . import mitsuba
 from .bounces import bounced_gradients, bounces
 from .costs import aovs, backward, bits, forward, large, lenses, small, sparse, textures, threads, update
 from .defaults import deep, flat_colors, noise, tangled
 from .document import machine
 from .equal_error import boundary, interior, step
-from .error_time import mitsuba
 from .glossy import glossy
 from .glossy_gradients import glossy_gradients
 from .light import light
@@ -68,7 +68,7 @@ GROUPS = {"safe": ("deep", "tangled", "flat-colors", "noise")}
 
 
 def settings(quick: bool) -> dict[str, Any]:
-    """Where and of what this was measured."""
+    """Return when, where and of which versions this was measured."""
     return {
         "date": time.strftime("%Y-%m-%d %H:%M:%S"), "quick": quick, "load": os.getloadavg()[0],
         "mitsuba": mitsuba.available(), **machine(),

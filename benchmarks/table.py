@@ -59,7 +59,7 @@ def line(cells: Sequence[str]) -> str:
 
 
 class Skipped(Exception):
-    """A row cannot be measured here; says how it could."""
+    """Raised where a row cannot be measured; the message says what it needs."""
 
 
 class Bench:
@@ -72,7 +72,7 @@ class Bench:
         return max(3, n // 4) if self.quick else n
 
     def interleaved(self, repeats: int, *sides: Callable[[], Value]) -> list[list[Value]]:
-        """What each side returns, its seconds, in turns: A B A B …; the first turn is not counted."""
+        """Return what each side returned, in turns A B A B …; the first turn does not count."""
         n = self.repeats(repeats)
         found: list[list[Value]] = [[] for _ in sides]
         for turn in range(n + 1):

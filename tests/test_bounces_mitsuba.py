@@ -12,7 +12,7 @@ from room_scenes import ROOMS, towards_room, without_alpha
 from scipy.stats import t as student
 
 import edgegrad as eg
-from benchmarks.error_time import mitsuba
+from benchmarks import mitsuba
 from benchmarks.stability.statistics import holm
 
 CHANCE = 1e-3  # of a false alarm in an image, by Holm

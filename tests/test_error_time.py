@@ -12,9 +12,9 @@ from PIL import Image
 from trimesh.creation import icosphere
 
 import edgegrad as eg
-from benchmarks import scenes
+from benchmarks import mitsuba, scenes
 from benchmarks.command import INTERRUPTED
-from benchmarks.error_time import mitsuba, references
+from benchmarks.error_time import references
 from benchmarks.error_time import run as module
 from benchmarks.error_time.__main__ import main
 from benchmarks.error_time.methods import Edgegrad, FiniteDifferences, rigid

@@ -19,7 +19,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from benchmarks.stability.cases.case import Parts, Problem
-from benchmarks.stability.cases.glossy import GLOSSY, LAMPS
+from benchmarks.stability.cases.glossy import GLOSSY, LIGHTS
 from benchmarks.stability.cases.measure import Effort as Seeds
 from benchmarks.stability.cases.measure import Running, differences
 from benchmarks.stability.statistics import holm
@@ -45,7 +45,7 @@ def few(scene: eg.Scene, camera: eg.Camera, seed: int) -> Tensor:
 def sky_lamps() -> list[Ball]:
     """Far away, around the middles of the lamps of a sky."""
     found = []
-    for row, column, _ in LAMPS:
+    for row, column, _ in LIGHTS:
         polar, turn = math.pi * (row + 1) / 16, math.pi * (column + 1) / 16 - math.pi
         across = math.sin(polar)
         d = torch.tensor([across * math.sin(turn), math.cos(polar), -across * math.cos(turn)], dtype=F64)

@@ -16,7 +16,7 @@ from test_docs import FENCE, FOLDER
 from torch import Tensor
 
 import edgegrad as eg
-from benchmarks.error_time.mitsuba import sky_image
+from benchmarks.mitsuba import sky_image
 
 SIZE = (12, 16)
 ORIGIN, TARGET, UP = [1.0, -2.5, 2.0], [0.1, 0.0, 0.2], [0.0, 0.0, 1.0]

@@ -21,9 +21,9 @@ from edgegrad.render import render
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
+from .. import mitsuba
 from ..scenes import ReportScene
 from ..supersampling import supersampled
-from . import mitsuba
 
 VERSION = importlib.metadata.version("edgegrad")
 FORWARD_SPP = 16  # of the image in a whole step; the gradient does not depend on it, as the loss is linear
@@ -60,7 +60,7 @@ class Method(Protocol):
         ...
 
     def label(self, budget: float) -> str:
-        """The budget in words."""
+        """Return the budget in words."""
         ...
 
     def gradient(self, budget: float, seed: int) -> Gradient:
@@ -69,13 +69,13 @@ class Method(Protocol):
 
 
 def rigid(scene: ReportScene, vertex: Tensor) -> dict[str, Tensor]:
-    """The metrics of a gradient for vertices (V, 3): it, and that for translation (3,) and rotation (3,) of all of them."""
+    """Return the gradients for vertices (V, 3), and for translation (3,) and rotation (3,) of all of them."""
     arm = scene.verts - scene.center
     return {"vertex": vertex, "translation": vertex.sum(0), "rotation": torch.linalg.cross(arm, vertex).sum(0)}
 
 
 def differentiate(scene: ReportScene, **options: object) -> tuple[Tensor, float, float]:
-    """(V, 3) float64 by edgegrad, and the seconds of update and image, and of the backward pass."""
+    """Return edgegrad's gradient (V, 3) float64, the seconds of update and image, and those of the backward pass."""
     leaves = [mesh.verts.detach().clone().requires_grad_() for mesh in scene.moving]
     begin = time.perf_counter()
     meshes = [mesh.replace(verts=verts) for mesh, verts in zip(scene.moving, leaves, strict=True)]
@@ -90,7 +90,7 @@ def differentiate(scene: ReportScene, **options: object) -> tuple[Tensor, float,
 
 
 def default_samples(scene: Scene | Mesh, camera: Camera, adjoint: Tensor) -> tuple[int, int]:
-    """How many surface and edge samples the kernel takes when it is not told, for the gradient of the vertices."""
+    """Return the default numbers of surface samples and edge samples for the gradient of vertices."""
     request = make_request(scene, camera, FORWARD_SPP)
     _, hits, _ = forward_kernel(request)
     _, (profile,) = backward_kernel(adjoint.to(hits.coverage.dtype)[None], hits, request, ["verts"])
@@ -120,7 +120,7 @@ class Edgegrad:
         return f"× {budget:g}" if budget >= 1 else f"÷ {1 / budget:g}"
 
     def counts(self, budget: float) -> tuple[int, int]:
-        """Surface and edge samples of a budget; the kernel takes at least one."""
+        """Return surface samples and edge samples of a budget; the kernel takes at least one."""
         surface, edge = (max(1, round(budget * count)) for count in self.samples)
         return surface, edge
 
@@ -217,7 +217,7 @@ class Peer:
 
     @classmethod
     def all(cls, scene: ReportScene, name: str) -> list[Peer]:
-        """In lit scenes also with guided samples of the borders of shadows."""
+        """Return one peer, and for lit scenes one more with guided samples of shadow boundaries."""
         return [cls(scene, name, guiding) for guiding in ((False, True) if scene.scene.is_lit else (False,))]
 
     @property
@@ -233,7 +233,7 @@ class Peer:
 
 
 def pixels_per_unit(scene: ReportScene) -> float:
-    """How far in the image, in pixels, the centroid goes when it moves by one unit across the view."""
+    """Return by how many pixels the centroid moves in the image, for one unit across the view."""
     focal = float(scene.camera.K[0, 0])
     if scene.camera.projection == "orthographic":
         return focal
@@ -268,7 +268,7 @@ METHODS: dict[str, Callable[[ReportScene], Sequence[Method]]] = {
 
 
 def missing(name: str) -> str | None:
-    """What a method lacks on this machine and how to get it; None if nothing."""
+    """Return what a method lacks on this machine and how to get it, or None."""
     if name in PEERS and mitsuba.available() is None:
         return "Mitsuba is not installed or finds no LLVM; pip install 'edgegrad[peers]'"
     return None

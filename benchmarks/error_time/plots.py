@@ -117,7 +117,7 @@ def _panel(axes: Axes, document: Document, scene: str, metric: str) -> None:
 
 
 def _limits(axes: Axes, document: Document, scene: str) -> None:
-    """Those of a whole row: all its points, bars and dotted lines."""
+    """Set limits that show all points, bars and dotted lines of a row."""
     points = [pair for metric in METRICS for method in STYLES for pair in curve(document, scene, method, metric)]
     if not points:
         return
@@ -130,7 +130,7 @@ def _limits(axes: Axes, document: Document, scene: str) -> None:
 
 
 def _label(axes: Axes) -> None:
-    """Names of the curves beside the panel, each as high as its curve ends, moved apart where they would overlap."""
+    """Write the names of curves at their right ends, moved apart where they would overlap."""
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return
@@ -152,7 +152,7 @@ def _label(axes: Axes) -> None:
 
 
 def curve(document: Document, scene: str, method: str, metric: str) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """The points of a method and their errors, by budget, without what logarithms cannot show."""
+    """Return points of a method and their errors, by budget, without those that logarithms cannot show."""
     points = [p for p in document["points"] if (p["scene"], p["method"]) == (scene, method) and metric in p["metrics"]]
     points.sort(key=lambda point: point["budget"])
     pairs = [(point, point["metrics"][metric]) for point in points]

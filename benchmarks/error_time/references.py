@@ -1,5 +1,8 @@
-"""What the methods are measured against: exact pixel integrals where they can be had, else long runs of edgegrad, which
-finite differences check for whole-object translation and rotation. Each with its own error."""
+"""References of the methods, with their own errors.
+
+They are exact pixel integrals where possible, else long runs of edgegrad. Finite differences check these for translation and
+rotation of the whole object.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +32,10 @@ Keep = Callable[
 
 @dataclass(frozen=True)
 class Effort:
-    """How long the long runs are: so many samples, but no fewer than `factor` times the default, and no more than `most`. Where
-    faces pass through each other too often, each run draws lines of its own: so there are many."""
+    """Lengths of long runs: numbers of samples, at least `factor` times the default and at most `most`.
+
+    There are many runs, because each draws its own lines of intersection where faces intersect too often.
+    """
 
     surface_samples: int = 1 << 23
     edge_samples: int = 1 << 20
@@ -104,14 +109,14 @@ def _in_no_file(name: str, compute: Callable[[], Values]) -> Values:
 
 
 def _runs(keep: Keep, name: str, method: Method, budget: float, count: int) -> list[dict[str, Tensor]]:
-    """The metrics of so many runs."""
+    """Return the metrics of `count` runs."""
     return [
         keep(f"-{name}-{run}", lambda run=run: method.gradient(budget, SEED + run).metrics()) for run in range(count)
     ]
 
 
 def exact(scene: ReportScene) -> Reference:
-    """By exact pixel integrals in float64."""
+    """Compute the reference by exact pixel integrals in float64."""
 
     def gradient(visibility: bool) -> Tensor:
         verts = scene.verts.requires_grad_()
@@ -126,7 +131,7 @@ def exact(scene: ReportScene) -> Reference:
 
 
 def long_run(scene: ReportScene, effort: Effort, keep: Keep = _in_no_file) -> Reference:
-    """The mean of several long runs of each term; their spread gives the error of the mean."""
+    """Compute the reference as the mean of long runs of each term; their spread gives its error."""
     runs: dict[str, list[Tensor]] = {}
     factors = {}
     for part, least in (("interior", effort.surface_samples), ("boundary", effort.edge_samples)):
@@ -152,7 +157,7 @@ def long_run(scene: ReportScene, effort: Effort, keep: Keep = _in_no_file) -> Re
 def check(
     scene: ReportScene, found: Reference, effort: Effort, keep: Keep = _in_no_file
 ) -> dict[str, dict[str, float]]:
-    """The distance of the reference to finite differences, which know nothing of how edgegrad differentiates."""
+    """Return the distance of the reference to finite differences, which are independent of edgegrad's gradients."""
     method = FiniteDifferences(scene)
     runs = _runs(keep, "check", method, effort.check_spp, effort.check_seeds)
     result = {}
@@ -168,12 +173,12 @@ def check(
 
 
 def disagrees(check: dict[str, float]) -> bool:
-    """Whether chance and the step of the finite differences (2 % allowed) do not explain the distance."""
+    """Return True if chance and the step of the finite differences (2 % allowed) do not explain the distance."""
     return check["difference"] > 4.0 * check["standard_error"] + 0.02
 
 
 def standard_error(runs: list[Tensor]) -> float:
-    """Of the mean of several runs: the root of the summed variances of its components."""
+    """Return the standard error of the mean of runs: the root of the summed variances of its components."""
     if len(runs) < 2:
         return float("nan")
     return float((torch.stack(runs).var(0).sum() / len(runs)).sqrt())

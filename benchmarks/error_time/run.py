@@ -104,7 +104,7 @@ class _Run:
         tqdm.write(text)
 
     def _resume(self, now: dict[str, Any]) -> Document:
-        """What is there of these settings. What is there of others steps aside under a name of its own, until they come again."""
+        """Return the document of these settings, if any. One of other settings is renamed, and found again with these."""
         if self.file.exists():
             before = self._read(self.file)
             if before["settings"] == now:
@@ -142,7 +142,7 @@ class _Run:
             temporary.write_text(json.dumps(self.document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
     def publish(self) -> None:
-        """The table and the figure, of all points there are."""
+        """Write the table and the figure of all points."""
         from . import plots  # matplotlib takes a while to import
 
         plots.write_table(self.out / f"{NAME}.md", self.document)
@@ -240,12 +240,12 @@ class _Run:
 
 
 def cost_of_terms(scene: ReportScene) -> dict[str, float]:
-    """Median seconds of each part of a step, as edgegrad.profile measures them: of the kernel, so none of lit scenes."""
+    """Return median seconds of each part of a step, by edgegrad.profile; none for lit scenes."""
     return {} if scene.scene.is_lit else dict(profile(scene.scene, scene.camera, scene.adjoint))
 
 
 def _expected(costs: list[tuple[float, float]], budget: float) -> float:
-    """Seconds of the next point, on the line through the last two (budget, seconds)."""
+    """Return the seconds of the next point, extrapolated from the last two (budget, seconds)."""
     if not costs:
         return 0.0
     (x1, t1), (x0, t0) = costs[-1], costs[-2] if len(costs) > 1 else (costs[-1][0] - 1.0, costs[-1][1])

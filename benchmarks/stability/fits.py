@@ -26,7 +26,7 @@ Say = Callable[[str], Any]
 
 
 def measure(quick: bool = False, say: Say = lambda text: None) -> list[dict[str, Any]]:
-    """The loss at each step of each fit. Raises ImportError without cholespy."""
+    """Return the loss at each step of each fit. Raises ImportError without cholespy."""
     steps = STEPS // 10 if quick else STEPS
     return [camera_fit(steps, say), *(vertex_fit(steps, preconditioned, say) for preconditioned in (False, True))]
 
@@ -41,7 +41,7 @@ def summary(name: str, losses: list[float], error: tuple[str, float, float]) -> 
 
 
 def camera_fit(steps: int = STEPS, say: Say = lambda text: None) -> dict[str, Any]:
-    """The distance is off by half and the focal length too, so that the size in the image is right: Adam on both logarithms."""
+    """Fit distance and focal length, which start off by half so that the size in the image is right, by Adam on logarithms."""
     camera, scene = front_camera(48), Scene([icosphere(3)], background())
 
     def view(distance: Tensor, focal: Tensor) -> Camera:
@@ -68,7 +68,7 @@ def camera_fit(steps: int = STEPS, say: Say = lambda text: None) -> dict[str, An
 
 
 def vertex_fit(steps: int = STEPS, preconditioned: bool = False, say: Say = lambda text: None) -> dict[str, Any]:
-    """A sphere of 10,242 vertices becomes a bumpy one that four cameras see; each vertex is free.
+    """Fit a sphere of 10,242 free vertices to a bumpy one that four cameras see.
 
     Preconditioned: Adam, with one scale for all, on u = (I + λ L) v (Nicolet, Jacobson and Jakob, Large Steps in Inverse
     Rendering of Geometry, 2021), solved by cholespy.

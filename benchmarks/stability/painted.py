@@ -21,7 +21,7 @@ F64 = torch.float64
 
 
 def shaded_sphere(camera: Camera) -> Problem:
-    """Colours of vertices by a shader."""
+    """Return a sphere whose shader interpolates colours of vertices."""
     mesh = icosphere(2)
     colors = mesh.colors
     assert colors is not None
@@ -34,13 +34,13 @@ def _texels() -> Tensor:
 
 
 def _floors(hits: Hits) -> Tensor:
-    """The texels, found by floor()."""
+    """Look texels up by floor()."""
     column, row = hits.floor(4 * torch.stack([hits.uv[:, 0], 1 - hits.uv[:, 1]], 1)).long().clamp(0, 3).unbind(1)
     return _texels()[row, column]
 
 
 def board(camera: Camera, shader: Callable[[Hits], Tensor] | None = None, **look: Any) -> Problem:
-    """A tilted square of 4 × 4 texels, and what it is equal to: as many squares, those that are cut out left away."""
+    """Return a tilted square of 4 × 4 texels. It equals 16 squares, without those that alpha masks."""
     n = 4
     place = torch.cartesian_prod(*[torch.linspace(0, 1, n + 1, dtype=F64)] * 2)  # (25, 2), v and u of corners
     v, u = place.unbind(1)

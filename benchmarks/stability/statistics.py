@@ -1,4 +1,4 @@
-"""Is the gradient unbiased, how heavy are its tails, and what becomes of a squared loss."""
+"""Bias of the gradient, tails of its samples, and bias of a squared loss."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ Say = Callable[[str], Any]
 
 
 def measure(quick: bool = False, say: Say = lambda text: None) -> dict[str, Any]:
-    """The three tables. Raises ImportError without SciPy."""
+    """Return the three tables. Raises ImportError without SciPy."""
     return {"unbiased": unbiased(quick, say), "tails": tails(quick, say), "squared loss": squared_loss(quick, say)}
 
 
@@ -126,7 +126,7 @@ def components(problem: Problem, seeds: int) -> Components:
 
 
 def lit_components(problem: Problem, seeds: int) -> Components:
-    """Of the parts alone: the chance of both sides, and the degrees of freedom of Welch (1947)."""
+    """Compare parts with finite differences; both sides have noise, with the degrees of freedom of Welch (1947)."""
     others = max(4, seeds // 8)
     effort = Effort(difference_seeds=(others,))
     adjoint = problem.cotangent(torch.empty(0))
@@ -152,7 +152,7 @@ def lit_components(problem: Problem, seeds: int) -> Components:
 
 
 def holm(p: Tensor, alpha: float) -> Tensor:
-    """Which hypotheses are rejected (Holm, A simple sequentially rejective multiple test procedure, 1979)."""
+    """Return which hypotheses are rejected (Holm, A simple sequentially rejective multiple test procedure, 1979)."""
     order = torch.argsort(p)
     steps = p[order] <= alpha / torch.arange(len(p), 0, -1)
     steps = steps.to(torch.int).cumprod(0).bool()  # stops at the first that stays
@@ -165,12 +165,12 @@ def holm(p: Tensor, alpha: float) -> Tensor:
 
 
 def _plane_camera() -> Camera:
-    """Half a unit above a plane, looking 2° down along it."""
+    """Return a camera half a unit above a plane, looking 2° down along it."""
     return Camera.look_at((0.0, 0.05, 0.0), (0.0, -0.3, -10.0), (0.1, 1.0, 0.0), 40.0, (48, 48)).to(F64)
 
 
 def _grid(n: int, size: float) -> Mesh:
-    """A sheet of 2 n² faces in y = 0."""
+    """Return a sheet of 2 n² faces in y = 0."""
     x = torch.linspace(-size, size, n + 1, dtype=F64)
     z, y = torch.meshgrid(x - 1.2 * size, x, indexing="ij")
     verts = torch.stack([y, 0.01 * torch.sin(5.0 * y + 3.0 * z), z], -1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Steps within faces: the error of the gradient against the spacing of the lines that find them.
+"""Discontinuities within faces: the error of the gradient against the spacing of the lines that find them.
 
 Each painting has a size t, and the derivative of its painted area by t is known. The lines of the report are those that
 `step_spacing` of render() lays through the image: what a shader declares, and what the kernel knows of itself.
@@ -33,15 +33,18 @@ Painting = Callable[[Tensor], tuple[Mesh, Callable[[Hits], Tensor] | None]]
 
 
 class Case(NamedTuple):
-    """What is painted: its mesh and shader by t, at t = 0, and the derivative of its area by t, in square units."""
+    """A painting: mesh and shader as functions of t, and the derivative of its area at t = 0, in square units."""
 
     paint: Painting
     area: float
 
 
 def measure(quick: bool = False, say: Callable[[str], Any] = lambda text: None) -> dict[str, Any]:
-    """For each spacing and each case the mean error of the derivative, its standard error, the root mean square error of that
-    of one image, all relative to what it should be, and the time of an image and its gradient."""
+    """Return rows with the errors and times of each case, by spacing.
+
+    Errors are relative to the correct derivative: the mean error, its standard error, and the root mean square error of one
+    image. Times are of an image and its gradient.
+    """
     seeds = SEEDS // 4 if quick else SEEDS
     rows = []
     for spacing in SPACINGS:
@@ -59,7 +62,7 @@ def measure(quick: bool = False, say: Callable[[str], Any] = lambda text: None) 
 
 
 def derivative(case: Case, spacing: float, seed: int) -> Tensor:
-    """Of the sum of the image by t."""
+    """Return the derivative of the sum of the image with respect to t."""
     K = torch.tensor([[SCALE, 0, SIZE / 2], [0, SCALE, SIZE / 2], [0, 0, 1]], dtype=F64)
     camera = Camera(torch.eye(4, dtype=F64), K, (SIZE, SIZE), "orthographic")
     t = torch.zeros((), dtype=F64, requires_grad=True)
@@ -85,7 +88,7 @@ def cases() -> dict[str, Case]:
 
 
 def disc(place: Tensor, t: Tensor) -> Tensor:
-    """31 px wide; t grows its radius. A polynomial of degree 2, which bilinear texels follow closely."""
+    """Paint a disc 31 px wide, whose radius grows with t: a polynomial of degree 2, which bilinear texels follow closely."""
     return (RADIUS + t) ** 2 - (place - MIDDLE).square().sum(-1)
 
 
@@ -119,14 +122,14 @@ def _by_alpha(painter: Painter) -> Painting:
 
 
 def _board() -> Tensor:
-    """(h, w, 1) a checkerboard before black."""
+    """Return a checkerboard (h, w, 1) before black."""
     n = TEXELS[0]
     dark = (torch.arange(n)[:, None] + torch.arange(n)) % 2
     return torch.nn.functional.pad(dark.to(F64), (1, 1, 1, 1))[..., None]
 
 
 def _turned(t: Tensor) -> Mesh:
-    """Texture coordinates such that the board lies askew in the middle of the square, larger by 1 + t."""
+    """Set texture coordinates that show the board rotated in the middle of the square, scaled by 1 + t."""
     mesh = _square()
     c, s = math.cos(0.5), math.sin(0.5)
     turn = torch.tensor([[c, -s], [s, c]], dtype=F64)

@@ -33,6 +33,6 @@ void cast_rays(const RayCaster& caster, const RayArrays& rays, const IgnoredArra
 
 // Returns the seconds that casting the rays of the forward pass takes, without anything else.
 double bare_loop(const Camera& camera, const RayCaster& caster, const ImageOptions& options, int packet_width,
-                 Team& team);
+                 ThreadTeam& team);
 
 }  // namespace edgegrad

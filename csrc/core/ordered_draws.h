@@ -19,10 +19,10 @@ class OrderedDraws {
     // Orders n samples by kinds; kind i ends at the primitive ends[i]. Samples of a kind follow the 16-bit key(k) of
     // their primitive k. Those of one primitive are adjacent.
     template <class Key>
-    OrderedDraws(const Systematic& systematic, int64_t n, const std::vector<int64_t>& ends, Key key, Team& team)
+    OrderedDraws(const Systematic& systematic, int64_t n, const std::vector<int64_t>& ends, Key key, ThreadTeam& team)
         : systematic_(systematic) {
         std::vector<std::vector<Run>> parts((n + part - 1) / part);
-        team.each(int64_t(parts.size()), [&](int64_t p) {
+        team.parallel_for(int64_t(parts.size()), [&](int64_t p) {
             std::vector<Run> runs;
             int64_t k = systematic.primitive(systematic.position(p * part));
             for (int64_t i = p * part; i < std::min(n, (p + 1) * part); ++i) {

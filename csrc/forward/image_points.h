@@ -29,9 +29,9 @@ struct PlaceHits {
 // Requires geometry with its parts.
 template <class T>
 PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry, const Places& places,
-                  Team& team);
+                  ThreadTeam& team);
 
 // Where the lens shows nothing, a ray is NaN. Derivatives need `intrinsics`.
-RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, Team& team);
+RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, ThreadTeam& team);
 
 }  // namespace edgegrad

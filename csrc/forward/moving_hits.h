@@ -27,12 +27,12 @@ struct MovingHits {
 
 // Writes barycentrics (N, rays, 3). A face without area, or edge-on, gets those of its first corner, without
 // derivatives.
-void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, Team& team);
+void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team);
 // Adds to the cotangents of vertices and camera, and writes those of `along`.
 void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
-                    const MovingArrays<double>& to, Team& team);
+                    const MovingArrays<double>& to, ThreadTeam& team);
 void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
-                    const MovingArrays<const double>& tangents, double* b_dot, Team& team);
+                    const MovingArrays<const double>& tangents, double* b_dot, ThreadTeam& team);
 
 // Describes how numbers of samples move with rows of a table: each is the sum over its rows of by · moved row.
 struct LinearForm {
@@ -42,6 +42,6 @@ struct LinearForm {
 };
 
 // Adds Σ bar[sample] · by to the rows of the table's cotangent.
-void form_vjp(const LinearForm& form, const double* bar, double* table_bar, Team& team);
+void form_vjp(const LinearForm& form, const double* bar, double* table_bar, ThreadTeam& team);
 
 }  // namespace edgegrad

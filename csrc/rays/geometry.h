@@ -56,7 +56,7 @@ class Geometry {
 // Interrupted where the call is to stop.
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
                                                  int64_t n_verts, const Spacing& spacing, GeometryWanted wanted,
-                                                 Team& team, GeometryWork& work);
+                                                 ThreadTeam& team, GeometryWork& work);
 
 // Releases all kept geometry that is not in use.
 void clear_geometry();
@@ -64,6 +64,6 @@ void clear_geometry();
 // These surround fork(), so that the child can render. Only the forking thread survives there. before_fork() waits
 // until no thread changes kept geometry or builds a ray structure, because the child would find their locks taken.
 void before_fork();
-void after_fork(bool child);  // The parent and the child both call it.
+void after_fork();  // The parent and the child both call it.
 
 }  // namespace edgegrad

@@ -23,7 +23,7 @@ class RayCaster {
 
     // Sets new positions (V, 3), world units. Throws std::invalid_argument if floats cannot hold the faces together,
     // and Interrupted, after which the caster is unusable.
-    void update(const double* verts, Team& team);
+    void update(const double* verts, ThreadTeam& team);
 
     // Bounds the memory of Embree's structure, and of the copies of faces and vertices from which it is made. Resident
     // memory grew by 74.4 bytes a face between spheres of 327,680 and 1,310,720 faces. Of these, the faces take 12, the

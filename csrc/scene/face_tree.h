@@ -81,7 +81,7 @@ class FaceTree {
 
     // Builds the tree at the positions (V, 3). Makes an order if there is none, or the old one no longer fits.
     FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, const Topology& topology, FaceOrder& order,
-             Team& team);
+             ThreadTeam& team);
 
     int64_t n_leaves() const { return levels_[0].size(); }
     const BoxGroup& leaf(int64_t i) const { return levels_[0][i]; }
@@ -120,8 +120,8 @@ class FaceTree {
     }
 
    private:
-    void make_boxes(const int32_t* faces, const double* verts, Team& team);
-    void find_surfaces(const Topology& topology, Team& team);
+    void make_boxes(const int32_t* faces, const double* verts, ThreadTeam& team);
+    void find_surfaces(const Topology& topology, ThreadTeam& team);
     double spread() const;
 
     // Group i of a level holds the boxes of groups 8 i … 8 i + 7 of the level below.

@@ -22,7 +22,7 @@ namespace edgegrad {
 
 class HeightFields {
    public:
-    HeightFields(const FaceTree& tree, const Topology& topology, Team& team);
+    HeightFields(const FaceTree& tree, const Topology& topology, ThreadTeam& team);
 
     // Returns whether some face may pass through those of the leaf.
     bool crossed(int64_t leaf) const { return by_[leaf] != Crossed::by_none; }

@@ -39,7 +39,7 @@ struct PlacedFaces {
 class Intersections {
    public:
     // Finds all intersections, if they are few. `order` persists between calls.
-    Intersections(const PlacedFaces& faces, FaceOrder& order, Team& team);
+    Intersections(const PlacedFaces& faces, FaceOrder& order, ThreadTeam& team);
     Intersections(const Intersections&) = delete;  // The tree points to its order.
 
     // A noisy tangle, or a soup of large triangles, has so many intersections that finding all would take longer than
@@ -51,7 +51,8 @@ class Intersections {
 
     // Returns the intersections of drawn faces with one another, sorted by faces. Face f is drawn with the probability
     // share[f]. If there would still be too many, only some pairs of leaves are drawn.
-    Array<Intersection> drawn(const PlacedFaces& faces, const Array<float>& share, uint64_t seed, Team& team) const;
+    Array<Intersection> drawn(const PlacedFaces& faces, const Array<float>& share, uint64_t seed,
+                              ThreadTeam& team) const;
 
     // Bounds the memory for these numbers of intersections and faces: both lists before and after sorting, the sort
     // keys, and the probabilities. Lists double as they grow.
@@ -66,7 +67,7 @@ class Intersections {
         int32_t face[2];
         double stands_for;
     };
-    std::vector<Pair> some_pairs(const PlacedFaces& faces, Team& team) const;
+    std::vector<Pair> some_pairs(const PlacedFaces& faces, ThreadTeam& team) const;
 
     Array<Intersection> all_{0};
     // These serve drawing; they are null where all were found.

@@ -29,12 +29,12 @@ struct HalfEdge {
 // Groups faces into connected parts: faces that share vertices by index, directly or through others.
 class Parts {
    public:
-    Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team);
+    Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team);
 
     int64_t size() const { return size_; }
     // Returns the part of a face, by one of its vertices.
     int32_t of(int32_t vertex) const { return part_[vertex]; }
-    // Returns the part of all faces in a block (Team::each_block), or −1 if they belong to several.
+    // Returns the part of all faces in a block (ThreadTeam::parallel_for_blocks), or −1 if they belong to several.
     int32_t of_block(int64_t block) const { return of_block_[block]; }
 
    private:
@@ -44,10 +44,10 @@ class Parts {
 
 class Topology {
    public:
-    Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team);
+    Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team);
 
     // Welds coincident vertices at the positions (V, 3).
-    void weld(const double* verts, const Spacing& spacing, Team& team);
+    void weld(const double* verts, const Spacing& spacing, ThreadTeam& team);
 
     // Returns whether vertices were welded.
     bool welds() const { return !welded_.empty(); }
@@ -78,7 +78,7 @@ class Topology {
     void prefetch(int64_t edge) const { edgegrad::prefetch(&offset_[edge]); }
 
    private:
-    void build(Team& team);
+    void build(ThreadTeam& team);
 
     const int32_t* faces_;
     int64_t n_faces_, n_verts_;

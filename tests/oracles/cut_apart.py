@@ -1,4 +1,4 @@
-"""Scenes whose faces pass through each other, cut apart so that exact.py can integrate them.
+"""Scenes whose faces intersect, cut apart so that exact.py can integrate them.
 
 Each face is cut by the planes of all faces that pass through it. The pieces meet along those planes and none passes through
 another, and their corners are differentiable functions of the scene's vertices; so the exact gradient of the pieces' image is
@@ -20,7 +20,7 @@ Corner = tuple[Tensor, Tensor]  # position and colour
 
 
 def cut_apart(scene: Scene) -> Scene:
-    """The same surfaces as a soup of triangles with colours of corners. Meshes must not have textures."""
+    """Return the same surfaces as a soup of triangles with colours of corners. Meshes must not have textures."""
     assert all(mesh.texture is None for mesh in scene.meshes), "cut_apart: meshes must not have textures"
     corners = torch.cat([mesh.verts.double()[mesh.faces.long()] for mesh in scene.meshes])
     colors = torch.cat([corner_colors(mesh, scene.channels) for mesh in scene.meshes])
@@ -38,7 +38,7 @@ def cut_apart(scene: Scene) -> Scene:
 
 
 def faces_that_cross(corners: Tensor) -> Tensor:
-    """(F, F) bool, symmetric, for triangles (F, 3, 3): a side of one pierces the other, inside both."""
+    """Return (F, F), symmetric, whether a side of one of two triangles (F, 3, 3) pierces the other inside both."""
     a, b = corners, corners[:, [1, 2, 0]]  # the sides of each
 
     def volume(p: Tensor, q: Tensor, r: Tensor, s: Tensor) -> Tensor:
@@ -57,7 +57,7 @@ def faces_that_cross(corners: Tensor) -> Tensor:
 
 
 def _cut(polygon: list[Corner], triangle: Tensor) -> list[list[Corner]]:
-    """What lies on either side of the plane of a triangle."""
+    """Return the parts of a polygon on both sides of the plane of a triangle."""
     normal = torch.linalg.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
     distance = [normal @ (position - triangle[0]) for position, _ in polygon]
     sides = []

@@ -260,7 +260,7 @@ class Lines(NamedTuple):
     ends: Tensor  # (L, 2) the vertices it passes through
 
     def shared(self, a: Tensor, b: Tensor) -> Tensor:
-        """Which of the two ends of each line b (…) is an end of the line a (…) as well: (…, 2)."""
+        """Return which of the two ends of each line b (…) is also an end of the line a (…), as (…, 2)."""
         return (self.ends[a][..., None] == self.ends[b][..., None, :]).any(-2)
 
 
@@ -273,25 +273,25 @@ class Polygons(NamedTuple):
     face: Tensor  # (N,) whose surface it is
 
     def take(self, rows: Tensor) -> Polygons:
-        """Some of them, by index or mask."""
+        """Return some of them, by index or mask."""
         return Polygons(*(field[rows] for field in self))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         return self.xy.amin(1), self.xy.amax(1)
 
     def before(self) -> Tensor:
-        """(N, M) the line of the side that ends in corner k."""
+        """Return the line (N, M) of the side that ends in corner k."""
         k = torch.arange(self.side.shape[1])
         last = self.corners[:, None] - 1
         return self.side.gather(1, torch.where((k == 0) | (k > last), last.clamp(min=0), k - 1))
 
     def area(self) -> Tensor:
-        """(N,) in square pixels; not for empty ones."""
+        """Return areas (N,) in square pixels; polygons must not be empty."""
         spokes = self.xy - self.xy[:, :1]
         return 0.5 * _wedge(spokes[:, :-1], spokes[:, 1:]).sum(1)
 
     def cut(self, lines: Lines, line: Tensor, sign: int = 1) -> Polygons:
-        """What lies on the positive (or negative) side of the lines number `line` (N,), one for each polygon.
+        """Return the parts on the positive (or negative) side of the lines number `line` (N,), one for each polygon.
 
         Sutherland and Hodgman (Reentrant polygon clipping, 1974). A corner on the line stays, and takes the line for
         the side that begins there if the old side leaves; so a side along the line is never intersected with it.
@@ -407,7 +407,7 @@ def _triangles(view: View) -> Polygons:
 
 
 def _occluders(faces: Polygons, view: View, lines: Lines) -> Tensor:
-    """For each face (F,) the faces that lie before some of it, padded with -1, those that cover most of it first."""
+    """Return for each face (F,) those in front of it, padded with -1, the ones that cover most of it first."""
     low, high = faces.bounds()
     overlap = ((low[:, None] < high) & (high[:, None] > low)).all(-1)
     i, j = torch.nonzero(torch.triu(overlap, 1), as_tuple=True)

@@ -1,4 +1,4 @@
-"""Images of small lit scenes once more, slowly: brute force in float64, textbook formulas, lights by quadrature.
+"""Images of small lit scenes by brute force in float64: textbook formulas, and lights by quadrature.
 
     L(y, v) = emission + Σ_k f(v, l_k) max(0, n·l_k) V(y, l_k) E_k(y)
 
@@ -37,7 +37,7 @@ class LightPoint(NamedTuple):
 
 
 def lit_image(scene: Scene, camera: Camera, grid: int = 8, fine: int = 12) -> Tensor:
-    """(H, W, C) float64 from grid × grid points a pixel, and about fine² of each light with an extent.
+    """Return the image (H, W, C), float64, from grid × grid points a pixel and about fine² of each light with an extent.
 
     Materials with constants alone, normals of faces or interpolated ones; a single perspective camera; no alpha, and no
     environment in the background.
@@ -55,7 +55,7 @@ def lit_image(scene: Scene, camera: Camera, grid: int = 8, fine: int = 12) -> Te
 
 
 def _surface(scene: Scene, camera: Camera, points: Tensor, faces: Tensor, fine: int) -> Tensor:
-    """(N, C) radiance of faces (N,) at image points (N, 2)."""
+    """Return the radiance (N, C) of faces (N,) at image points (N, 2)."""
     triangles = torch.cat([mesh.verts.double()[mesh.faces.long()] for mesh in scene.meshes])  # (F, 3, 3)
     M, K = camera.world_to_camera.double(), camera.K.double()
     ray = torch.linalg.solve(K, torch.cat([points, torch.ones_like(points[:, :1])], 1).mT).mT @ M[:3, :3]
@@ -169,7 +169,7 @@ def _points(scene: Scene, light: Light | Mesh, at: Surface, fine: int) -> list[L
 
 
 def _panel(scene: Scene, mesh: Mesh, at: Surface, fine: int) -> list[LightPoint]:
-    """Middles of fine² triangles of each face."""
+    """Return the middles of fine² triangles of each face."""
     material = mesh.material
     assert material is not None
     radiance = torch.as_tensor(material.emission).detach().double().reshape(1, -1)
@@ -193,7 +193,7 @@ def _panel(scene: Scene, mesh: Mesh, at: Surface, fine: int) -> list[LightPoint]
 
 
 def _sky(light: Environment, at: Surface, fine: int) -> list[LightPoint]:
-    """Equal solid angles around the axis of the image."""
+    """Return directions of equal solid angles around the axis of the image."""
     found = []
     none = torch.empty(0, dtype=torch.int64)
     R = torch.eye(3, dtype=F64) if light.rotation is None else light.rotation.detach().double()
@@ -212,7 +212,7 @@ def _sky(light: Environment, at: Surface, fine: int) -> list[LightPoint]:
 
 
 def _texel(image: Tensor, down: float, right: float) -> Tensor:
-    """(C,) bilinear at a place in [0, 1]², around the turn."""
+    """Look a colour (C,) up bilinearly at a place in [0, 1]², periodic in longitude."""
     h, w = image.shape[:2]
     row, column = down * h - 0.5, right * w - 0.5
     i, j = math.floor(row), math.floor(column)
@@ -225,7 +225,7 @@ def _texel(image: Tensor, down: float, right: float) -> Tensor:
 
 
 def _hidden(place: Tensor, face: Tensor, point: LightPoint, rows: Tensor, triangles: Tensor) -> Tensor:
-    """(N,) bool: whether a face lies between, by Möller and Trumbore's test (1997); not the point's own face."""
+    """Return (N,) whether a face other than the point's own lies between (Möller and Trumbore 1997)."""
     a, b, c = triangles.unbind(1)
     e1, e2 = b - a, c - a
     others = torch.ones(len(triangles), dtype=torch.bool)
@@ -249,7 +249,7 @@ def _hidden(place: Tensor, face: Tensor, point: LightPoint, rows: Tensor, triang
 
 
 def _weights(place: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """(N, 3) barycentrics."""
+    """Return barycentrics (N, 3)."""
     normal = torch.linalg.cross(b - a, c - a)
     squared = _dot(normal, normal)
     parts = [_dot(torch.linalg.cross(q - p, place - p), normal) / squared for p, q in ((b, c), (c, a), (a, b))]

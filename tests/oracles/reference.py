@@ -110,7 +110,7 @@ def closest_faces(scene: Scene, camera: Camera, points: Tensor) -> Tensor:
 
 
 def _shows(scene: Scene, faces: Tensor, barycentrics: Tensor) -> Tensor:
-    """Whether the faces (n,) are there at these points of them (m, n, 3), or cut out: (m, n)."""
+    """Return (m, n) whether alpha shows the faces (n,) at these barycentrics (m, n, 3)."""
     shows = torch.ones(barycentrics.shape[:-1], dtype=torch.bool)
     first = 0
     for mesh in scene.meshes:
@@ -171,7 +171,7 @@ def _surface_radiance(scene: Scene, camera: Camera, points: Tensor, faces: Tenso
 
 
 def _corner_values(mesh: Mesh, channels: int, faces: Tensor) -> Tensor:
-    """What the mesh interpolates over its faces (N,), at their corners: colours (N, 3, C), or uvs (N, 3, 2)."""
+    """Return what is interpolated over faces (N,), at their corners: colours (N, 3, C) or uvs (N, 3, 2)."""
     if mesh.texture is not None:
         return _corner_uvs(mesh, faces)
     if mesh.colors is not None:
@@ -184,7 +184,7 @@ def _corner_values(mesh: Mesh, channels: int, faces: Tensor) -> Tensor:
 
 
 def _corner_uvs(mesh: Mesh, faces: Tensor) -> Tensor:
-    """(N, 3, 2) of faces (N,)."""
+    """Return texture coordinates (N, 3, 2) of faces (N,)."""
     assert mesh.uvs is not None and mesh.uv_faces is not None
     return mesh.uvs.double()[mesh.uv_faces.long()[faces]]
 
@@ -217,7 +217,7 @@ def _wrapped(index: Tensor, count: int, wrap: str) -> Tensor:
 
 
 def _background(scene: Scene) -> Tensor:
-    """(C,) or (H, W, C), black when the scene has none."""
+    """Return the background (C,) or (H, W, C), black when the scene has none."""
     return torch.zeros(scene.channels, dtype=torch.float64) if scene.background is None else scene.background.double()
 
 

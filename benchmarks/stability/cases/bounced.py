@@ -1,12 +1,12 @@
-"""Light that surfaces scatter on one another, in scenes whose image is known: through a hole, in closed rooms, off a mirror, past
-what stands on what sends the light, past a million faces.
+"""Indirect light in scenes whose image is known: through a hole, in closed rooms, off a mirror, past a block on the lit floor,
+past a million faces.
 
-What a plate in the sun sends is the same everywhere and in all directions, so what another surface gets of it is
+The radiance L of a sunlit plate is the same everywhere and in all directions, so the irradiance of another surface by it is
 
-    E(y) = L ∫ cos θ dω over what y sees of it,
+    E(y) = L ∫ cos θ dω over the part of the plate that y sees,
 
-which has a closed form for polygons (Lambert 1760) and spheres. What stands between is black. Pixels are integrals of E by Gauss
-and Legendre: nothing is drawn at random.
+which has a closed form for polygons (Lambert 1760) and spheres. Objects between are black. Pixels are integrals of E by
+Gauss–Legendre quadrature: nothing is drawn at random.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ SIDES = torch.tensor([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0
 WALL, FLOOR = vector(0.8, 0.6, 0.4), vector(0.5, 0.7, 0.9)  # base colours of what is seen, and of what lights it
 
 
-# -- what a surface gets ------------------------------------------------------------------------------------------------
+# -- irradiance ------------------------------------------------------------------------------------------------
 
 
 def gauss(fine: int) -> tuple[Tensor, Tensor]:
-    """Points in [0, 1] and their weights, which add up to 1 (Gauss and Legendre)."""
+    """Return Gauss–Legendre points in [0, 1] and their weights, which sum to 1."""
     at, share = (torch.from_numpy(x) / 2 for x in np.polynomial.legendre.leggauss(fine))
     return at + 0.5, share
 
 
 def seen(camera: Camera, place: Tensor, normal: Tensor, fine: int = 4) -> tuple[Tensor, Tensor]:
-    """(H · W · fine², 3) points of a plane that fills the view, fine² in each pixel, and the weights of these (fine²,)."""
+    """Return points (H · W · fine², 3) of a plane that fills the view, fine² a pixel, and their weights (fine²,)."""
     H, W = camera.size
     at, share = gauss(fine)
     y, x = ((torch.arange(n)[:, None] + at).reshape(-1) for n in (H, W))
@@ -59,13 +59,15 @@ def seen(camera: Camera, place: Tensor, normal: Tensor, fine: int = 4) -> tuple[
 
 
 def pixels(camera: Camera, radiance: Tensor, weights: Tensor) -> Tensor:
-    """(H, W, C) from the radiance (N, C) of such points."""
+    """Return the image (H, W, C) from the radiance (N, C) of such points."""
     return (radiance.reshape(*camera.size, len(weights), -1) * weights[:, None]).sum(2)
 
 
 def cosines(y: Tensor, n: Tensor, polygon: Tensor) -> Tensor:
-    """(N,) ∫ cos θ dω over plane polygons (K, 3) or (N, K, 3) above the horizon of y (N, 3), whose normal is n (3,): half the sum
-    of the angles of the sides, each times the cosine of its plane. Corners may repeat."""
+    """Return ∫ cos θ dω (N,) over plane polygons (K, 3) or (N, K, 3) above the horizon of y (N, 3), whose normal is n (3,).
+
+    It is half the sum of the angles of the sides, each times the cosine of its plane. Corners may repeat.
+    """
     u = normalize(polygon - y[:, None], dim=-1)
     v = u.roll(-1, 1)
     across = torch.linalg.cross(u, v)
@@ -76,8 +78,11 @@ def cosines(y: Tensor, n: Tensor, polygon: Tensor) -> Tensor:
 
 
 def clipped(y: Tensor, polygon: Tensor, window: Tensor) -> tuple[Tensor, Tensor]:
-    """The part of a convex polygon (K, 3) that points y (N, 3) see in front of another one (4, 3): (N, 16 K, 3), of which corners
-    repeat, and whether there is any (N,). By Sutherland and Hodgman (1974), with the planes through y and the window's sides."""
+    """Return the part (N, 16 K, 3) of a convex polygon (K, 3) that points y (N, 3) see in front of another one (4, 3).
+
+    Corners of the part repeat. The second result (N,) tells whether there is any. The polygon is clipped (Sutherland and Hodgman
+    1974) by the planes through y and the sides of the window.
+    """
     found, some = polygon.expand(len(y), *polygon.shape), torch.ones(len(y), dtype=torch.bool)
     for a, b in zip(window, window.roll(-1, 0), strict=True):
         plane = torch.linalg.cross(a - y, b - y)
@@ -112,14 +117,14 @@ def view(eye: Tensor, target: Tensor, fov: float, size: int) -> Camera:
 
 
 def problem(parts: Parts, make: Any, exact: Any, size: int = 8, **fields: Any) -> Problem:
-    """The loss is the mean of the image, all but."""
+    """Return a problem whose loss is nearly the mean of the image."""
     y, x = torch.meshgrid(torch.arange(size) / size, torch.arange(size) / size, indexing="ij")
     weights = (1.0 + 0.3 * torch.sin(3.0 * x + 2.0 * y)).double()[..., None].expand(-1, -1, 3)
     return Problem(parts, make, exact, "closed form", adjoint=weights, **fields)
 
 
 ROOMS = 1.5, 1.0  # the length of each, and half of their width and height
-LAMP = vector(0.3, 0.7, 0.8)  # what it sends through the hole itself ends on black walls
+LIGHT_AT = vector(0.3, 0.7, 0.8)  # what it sends through the hole itself ends on black walls
 
 
 def hole(half: float, roughness: float | None, size: int, fine: int, spp: int, samples: dict[str, int]) -> Problem:
@@ -134,7 +139,7 @@ def hole(half: float, roughness: float | None, size: int, fine: int, spp: int, s
     walls = [[[x, y, z] for y, z in (width * ring).tolist()] for x in (-length, length)]
     camera = view(vector(-0.1, 0.0, 0.1), vector(-length, 0.05, 0.0), 40.0 if roughness is None else 24.0, size)
     parts: Parts = {
-        "hole": torch.zeros((4, 2), dtype=F64), "lamp": LAMP, "brightness": vector(10.0),
+        "hole": torch.zeros((4, 2), dtype=F64), "light": LIGHT_AT, "brightness": vector(10.0),
         "colour of the lit wall": FLOOR, "colour of the seen wall": WALL,
     }  # fmt: skip
 
@@ -149,7 +154,7 @@ def hole(half: float, roughness: float | None, size: int, fine: int, spp: int, s
         between = black(torch.cat([border, opening(parts)]), sides)
         meshes = [seen_wall, plate(walls[1], parts["colour of the lit wall"]), between]
         meshes.append(black(torch.tensor(around, dtype=F64), sides))
-        return Scene(meshes, lights=[PointLight(parts["lamp"], parts["brightness"])]), camera
+        return Scene(meshes, lights=[PointLight(parts["light"], parts["brightness"])]), camera
 
     def exact(parts: Parts) -> Tensor:
         normal = vector(1.0, 0.0, 0.0)
@@ -164,9 +169,9 @@ def hole(half: float, roughness: float | None, size: int, fine: int, spp: int, s
         squared = (away * away).sum(-1)
         l = away / squared[..., None].sqrt()
         there = y[:, None] + 2 * length / away[..., :1] * away  # on the lit wall
-        light = parts["lamp"] - there
-        distance = light.norm(dim=-1)
-        sent = parts["brightness"] * -light[..., 0] / distance**3 / math.pi
+        to_light = parts["light"] - there
+        distance = to_light.norm(dim=-1)
+        sent = parts["brightness"] * -to_light[..., 0] / distance**3 / math.pi
         got = sent * l[..., 0] ** 2 / squared * area  # cos at y, cos at the hole
         v = normalize(camera.eye - y, dim=1)
         scattered = _scattered(got, parts["colour of the seen wall"], roughness, v, l)
@@ -176,7 +181,7 @@ def hole(half: float, roughness: float | None, size: int, fine: int, spp: int, s
 
 
 def _scattered(got: Tensor, color: Tensor, roughness: float | None, v: Tensor, l: Tensor) -> Tensor:
-    """(N, 3) ∑ f got in the plane x = 0: Lambert, or a metal by the model of glTF 2.0, appendix B. v (N, 3), l and got (N, M)."""
+    """Return ∑ f got (N, 3) in the plane x = 0, by Lambert or as a metal of glTF 2.0, appendix B. v (N, 3), l and got (N, M)."""
     if roughness is None:
         return got.sum(1, keepdim=True) * color / math.pi
     h = normalize(v[:, None] + l, dim=-1)
@@ -202,18 +207,18 @@ def mirror(roughness: float) -> Problem:
     return hole(0.2, roughness, 8, 28, 1024, {"surface_samples": 10_000, "edge_samples": 150_000})
 
 
-@group.add("integrating-sphere", "a lamp inside of a closed ball of albedo 0.9, 8 bounces", seeds=32)
+@group.add("integrating-sphere", "a light inside of a closed ball of albedo 0.9, 8 bounces", seeds=32)
 def inside() -> Problem:
     """What a ball scatters once comes back evenly: after k bounces the irradiance is ρᵏ times the mean of the first."""
     bounces, ball, camera = 8, icosphere(4), view(vector(0.2, -0.1, 0.0), vector(-1.0, 0.3, 0.2), 60.0, 8)
     parts = {
-        "lamp": vector(0.3, 0.1, 0.2), "brightness": vector(3.0), "albedo": vector(0.9, 0.8, 0.5),
+        "light": vector(0.3, 0.1, 0.2), "brightness": vector(3.0), "albedo": vector(0.9, 0.8, 0.5),
         "radius": torch.ones(1, dtype=F64),
     }  # fmt: skip
 
     def make(parts: Parts) -> View:
         mesh = Mesh(ball.verts * parts["radius"], ball.faces, material=Material(parts["albedo"]))
-        return Scene([mesh], lights=[PointLight(parts["lamp"], parts["brightness"])]), camera
+        return Scene([mesh], lights=[PointLight(parts["light"], parts["brightness"])]), camera
 
     def exact(parts: Parts) -> Tensor:
         on_plane, weights = seen(camera, vector(-1.0, 0.0, 0.0), vector(1.0, 0.0, 0.0))
@@ -221,8 +226,8 @@ def inside() -> Problem:
         ray = normalize(on_plane - eye, dim=1)
         along = ray @ eye
         y = eye + (-along + (along**2 + R**2 - eye @ eye).sqrt())[:, None] * ray
-        light = parts["lamp"] - y
-        first = (light * -y).sum(1, keepdim=True) / R / light.norm(dim=1, keepdim=True) ** 3
+        to_light = parts["light"] - y
+        first = (to_light * -y).sum(1, keepdim=True) / R / to_light.norm(dim=1, keepdim=True) ** 3
         rho = parts["albedo"]
         further = sum(rho**k for k in range(1, bounces)) / R**2
         return pixels(camera, parts["brightness"] * rho / math.pi * (first + further), weights)
@@ -246,7 +251,7 @@ def furnace(bounces: int) -> Problem:
 
 @group.add("all-cancels", "the same with 4 bounces: as the block moves all terms of the gradient cancel", 4, seeds=32)
 def cancelling(bounces: int) -> Problem:
-    """By the block in its widths, against the whole brightness: without borders 15 % of that would be left."""
+    """The block moves in two directions. Relative to the whole brightness, 15 % would be left without secondary edges."""
     parts = {"albedo": vector(1.0), "emission": vector(0.2), "block": torch.zeros(2, dtype=F64)}
     samples = {"surface_samples": 20_000, "edge_samples": 8_000}
     return _furnace(parts, bounces, spp=256, options={"bounces": bounces, **samples})
@@ -300,7 +305,7 @@ def standing() -> Problem:
         return Scene([*meshes, black(box(parts), block.faces)], lights=[sun]), camera
 
     def exact(parts: Parts) -> Tensor:
-        """Of the floor less the block and its shadow, both less where the block hides the shadow."""
+        """Integrate over the floor without the block and its shadow, less where the block hides the shadow."""
         y, weights = seen(camera, normal * parts["wall"], normal)
         ground = torch.tensor(floor, dtype=F64)
         got = cosines(y, normal, ground)
@@ -350,7 +355,7 @@ def million(subdivisions: int) -> Problem:
         return Scene(meshes, lights=[DirectionalLight(travels, parts["brightness"])]), camera
 
     def exact(parts: Parts) -> Tensor:
-        """Of the plate less the ball, (R / d)² π cos θ, less the shadow, which it hides from nowhere."""
+        """Integrate over the plate without the ball, (R / d)² π cos θ, and without the shadow, which the ball never hides."""
         y, weights = seen(camera, vector(-2.0, 0.0, 0.0), normal)
         away = centre(parts) - y
         angle = 2 * math.pi * torch.arange(256, dtype=F64)[:, None] / 256

@@ -25,7 +25,7 @@ def vector(*numbers: float) -> Tensor:
 
 
 def upright(eye: Tensor, size: int = 48, focal: float = 50.0) -> Camera:
-    """A camera at `eye` that looks along −z with y up; its axes are those of the world, to the last bit."""
+    """Return a camera at `eye` that looks along −z with y up; its axes are exactly those of the world."""
     R = torch.diag(vector(1.0, -1.0, -1.0))
     M = torch.eye(4, dtype=F64)
     M[:3, :3], M[:3, 3] = R, -R @ eye
@@ -34,7 +34,7 @@ def upright(eye: Tensor, size: int = 48, focal: float = 50.0) -> Camera:
 
 
 def flat(mesh: Mesh) -> Mesh:
-    """A colour for each face."""
+    """Return the mesh with a colour for each face."""
     return Mesh(mesh.verts, mesh.faces, face_colors=smooth_colors(3.0 * mesh.verts[mesh.faces.long()].mean(1)))
 
 
@@ -50,7 +50,7 @@ def narrow(fov: float) -> Problem:
 @group.add("fov-120", "field of view 120°, the object towards the corner", 120.0, 40.0, 48)
 @group.add("fov-170", "field of view 170°, the object 72° from the axis", 170.0, 72.0, 128)
 def wide(fov: float, angle: float, size: int) -> Problem:
-    """The camera looks past the object by `angle` degrees."""
+    """Let the camera look past the object by `angle` degrees."""
     eye = 1.4 * torch.nn.functional.normalize(vector(0.31, 0.23, 1.0), dim=0)
     past = rotation(vector(0.6, 0.75, -0.28) * math.radians(angle)) @ -eye
     camera = Camera.look_at(eye, eye + past, vector(0.2, 1.0, 0.1), fov, (size, size))
@@ -83,10 +83,12 @@ def inside(creases: bool) -> Problem:
 
 @group.add("on-surface", "the eye on a face, looking away from it")
 def on_surface() -> Problem:
-    """A quad through the eye, at right angles to the view: it hides nothing."""
+    """Put a quad through the eye at right angles to the view; it hides nothing."""
     camera = upright(vector(0.25, 0.125, 4.0))
     wall = vector(-1, -2, 4, 3, -2, 4, 3, 3, 4, -2, 3, 4).reshape(4, 3)
-    return _beside(Mesh(wall, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.ones((2, 3), dtype=F64)), camera)
+    return _with_unseen(
+        Mesh(wall, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.ones((2, 3), dtype=F64)), camera
+    )
 
 
 @group.add("on-vertex", "the eye on a vertex of a mesh that reaches into the view behind it")
@@ -94,25 +96,29 @@ def on_vertex() -> Problem:
     camera = upright(vector(0.25, 0.125, 4.0))
     tip = vector(0.25, 0.125, 4, -1, -1, 5, 1, -0.5, 6, 0.5, 2, 5).reshape(4, 3)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
-    return _beside(Mesh(tip, faces, face_colors=torch.ones((4, 3), dtype=F64)), camera)
+    return _with_unseen(Mesh(tip, faces, face_colors=torch.ones((4, 3), dtype=F64)), camera)
 
 
 @group.add("along-surface", "the eye on a face, looking along it: it is seen end-on")
 def along_surface() -> Problem:
     camera = upright(vector(0.25, -0.75, 4.0))
     floor = vector(-9, -0.75, 9, 9, -0.75, 9, 9, -0.75, -9, -9, -0.75, -9).reshape(4, 3)
-    return _beside(Mesh(floor, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.ones((2, 3), dtype=F64)), camera)
+    return _with_unseen(
+        Mesh(floor, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.ones((2, 3), dtype=F64)), camera
+    )
 
 
 @group.add("edge-on", "a quad seen exactly edge-on before a cube")
 def edge_on() -> Problem:
     camera = upright(vector(0.25, 0.125, 4.0))
     quad = vector(0.25, -1, 1, 0.25, 1, 1, 0.25, 1, 2, 0.25, -1, 2).reshape(4, 3)
-    return _beside(Mesh(quad, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.ones((2, 3), dtype=F64)), camera)
+    return _with_unseen(
+        Mesh(quad, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.ones((2, 3), dtype=F64)), camera
+    )
 
 
-def _beside(unseen: Mesh, camera: Camera) -> Problem:
-    """A cube with a mesh that cannot be seen: everything but the latter is a part."""
+def _with_unseen(unseen: Mesh, camera: Camera) -> Problem:
+    """Return a cube and an invisible mesh; everything but the latter is a part."""
     return everything(
         Scene([tilted_cube()], background()), camera, camera_too=False,
         shown=lambda scene: scene.replace(meshes=[*scene.meshes, unseen]),

@@ -27,7 +27,7 @@ KINDS = ("colors", "face_colors", "corner_colors")  # of colours
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is rendered, and what it is compared with. The loss is image · adjoint.
+    """A scene with its moving parts, and its reference. The loss is image · adjoint.
 
     parts      where the gradient is taken; that of each is compared relative to its own size
     make       parts ↦ (scene, camera)
@@ -82,7 +82,7 @@ class Group:
         self._last: tuple[Callable[..., Problem], int] | None = None
 
     def add(self, name: str, extreme: str, *arguments: Any, **fields: Any) -> Callable[[Callable[..., Problem]], Any]:
-        """A decorator: the function, called with `arguments`, builds the problem of a case."""
+        """Return a decorator; its function, called with `arguments`, builds the problem of a case."""
 
         def register(build: Callable[..., Problem]) -> Callable[..., Problem]:
             # Decorators of one function come from the last to the first.
@@ -98,7 +98,7 @@ class Group:
 
 
 def camera_parts(camera: Camera) -> tuple[Parts, Callable[[Parts], Camera]]:
-    """The camera's own motion q ↦ exp(turn) q + shift, and the numbers of K, each as a part."""
+    """Return as parts the camera's own motion q ↦ exp(turn) q + shift, and the numbers of K."""
     M, K = camera.world_to_camera.double(), camera.K.double()
     zeros = torch.zeros(3, dtype=F64)
     parts = {
@@ -223,7 +223,7 @@ def _problem(
 
 
 def in_view(scene: Scene, camera: Camera) -> Scene:
-    """The same image from faces that lie before the camera: those that reach behind it are clipped to its view.
+    """Return the scene with faces that reach behind the camera clipped to its view; the image is the same.
 
     The planes are those through the eye and the image's border, grown by half an image to each side, and stand still; what
     they cut is out of the image, and new corners stay on their edges, so gradients are those of the whole faces.
@@ -261,7 +261,7 @@ def _clip(mesh: Mesh, planes: Tensor, channels: int) -> Mesh | None:
 
 
 def _halve(polygon: list[Tensor], plane: Tensor) -> list[Tensor]:
-    """The part of a polygon on the positive side of a plane (4,)."""
+    """Return the part of a polygon on the positive side of a plane (4,)."""
     kept = []
     for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         da, db = ((p[:3].detach() @ plane[:3] + plane[3]).item() for p in (a, b))

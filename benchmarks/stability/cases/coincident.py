@@ -24,7 +24,7 @@ CAMERA = front_camera(48)
 
 
 def along_axes(size: int = 48, height: float = 2.4, turned: float = 0.0) -> Camera:
-    """Orthographic, along −z to the last bit; turned about its axis by so many radians."""
+    """Return an orthographic camera exactly along −z, rotated about its axis by so many radians."""
     camera = upright(vector(0.0, 0.0, 4.0), size, size / height)
     c, s = math.cos(turned), math.sin(turned)
     M = camera.world_to_camera.clone()
@@ -114,7 +114,7 @@ def copies_of_colors() -> Problem:
 
 
 def _sheet(x: tuple[float, float], y: tuple[float, float], color: Tensor) -> Mesh:
-    """A rectangle in a tilted plane."""
+    """Return a rectangle in a tilted plane."""
     u, v, o = vector(0.9, 0.2, -0.3), vector(-0.25, 0.85, 0.2), vector(0.02, 0.05, 0.0)
     corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
     verts = torch.stack([o + a * u + b * v for a, b in corners])
@@ -151,7 +151,7 @@ def coplanar_abut() -> Problem:
 
 
 def _t_junction(fold: float, color: Callable[[Tensor], dict[str, Tensor]], dtype: torch.dtype) -> Problem:
-    """A quad left of an edge and two right of it that share half of it each; on the left, the edge is whole."""
+    """Join a quad left of an edge to two right of it that share half of it each; on the left, the edge is whole."""
     verts = vector(
         -0.8, -0.7, 0.1, 0.05, -0.75, 0.2, 0.15, 0.7, 0.1, -0.75, 0.75, 0.0,  # left
         0.9, -0.65, 0.2 - fold, 0.85, 0.72, 0.1 - fold,  # right

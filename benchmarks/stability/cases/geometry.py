@@ -24,7 +24,7 @@ CAMERA = front_camera(48)
 
 
 def on_screen(pixels: list[list[float]], depth: list[float], faces: list[list[int]], **fields: Any) -> Mesh:
-    """A mesh by the pixels and depths of its vertices before CAMERA."""
+    """Return a mesh whose vertices have these pixels and depths for CAMERA."""
     verts = unproject(CAMERA, torch.tensor(pixels, dtype=F64), torch.tensor(depth, dtype=F64))
     return Mesh(verts, torch.tensor(faces), **fields)
 
@@ -38,7 +38,7 @@ def of_faces(*colors: tuple[float, float, float]) -> Tensor:
 @group.add("sliver-thin", "a sliver of aspect 1e6 inside the image: 40 px by 4e-5 px", 40.0, 4e-5, False)
 @group.add("sliver-thin-smooth", "the same with smooth colours", 40.0, 4e-5, True)
 def sliver(length: float, width: float, smooth: bool) -> Problem:
-    """Not the camera: what it moves is the difference of two sides, 1e6 times as large."""
+    """The camera is no part: its gradient is the difference of two sides, each 1e6 times as large."""
     angle = 0.4
     along = 0.5 * length * vector(math.cos(angle), math.sin(angle))
     across = 0.5 * width * vector(-math.sin(angle), math.cos(angle))
@@ -136,7 +136,7 @@ def huge_triangle() -> Problem:
 
 @group.add("million-in-a-pixel", "a sphere of 1.3 M faces inside one pixel", slow=True)
 def million_in_a_pixel() -> Problem:
-    """Of one colour; a sphere is seen as an ellipse, whose area is known."""
+    """The sphere has one colour and is seen as an ellipse, whose area is known."""
     ball = icosphere(8)
     size, focal = (5, 5), 40.0
     camera = front_camera(48).replace(
@@ -235,7 +235,7 @@ def spikes() -> Problem:
     slow=True,
 )
 def tangled() -> Problem:
-    """As the first steps of a plain shape fit leave it. Moved as a whole; against finite differences."""
+    """The sphere looks like one in the first steps of a shape fit. It moves as a whole; the reference are differences."""
     ball = icosphere(3).transformed(scale=0.9)
     verts = ball.verts + 0.09 * _noise(len(ball.verts))
     ball = ball.replace(colors=torch.rand(len(verts), 3, generator=torch.Generator().manual_seed(0), dtype=F64))

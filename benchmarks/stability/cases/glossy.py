@@ -1,4 +1,4 @@
-"""Ten glossy scenes for the test of unbiasedness: light that is drawn by what it meets."""
+"""Ten glossy scenes for the test of unbiasedness: light samples are chosen by what the surface reflects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from edgegrad.scene.scene import Scene
 from ...scenes import icosphere
 from .camera import ORIGIN, vector
 from .case import F64, Parts, Problem, View
-from .light import LAMP, Lamp, adjoint, panel, stage, torus, view
+from .light import LIGHT_AT, MakeLight, adjoint, panel, stage, torus, view
 
 SIZE = 16
 STILL = {
@@ -29,26 +29,26 @@ STILL = {
     "camera": vector(1.0, 0.2, 0.3)[None],
 }
 MOVES = {**STILL, "light": vector(1.0, 0.3, 0.2)[None]}
-MIRRORED = vector(-0.5, 1.5, 1.9)  # where the plane mirrors a lamp into the view
+MIRRORED = vector(-0.5, 1.5, 1.9)  # where the plane mirrors a light into the view
 TEXELS = 4  # parts of a sky side by side whose brightness counts by itself
-LAMPS = ((4, 6, 20.0), (5, 21, 30.0), (8, 13, 10.0))  # row, column and radiance, two texels wide and high
+LIGHTS = ((4, 6, 20.0), (5, 21, 30.0), (8, 13, 10.0))  # row, column and radiance, two texels wide and high
 
 
-def sky(lamps: bool) -> Lamp:
-    """A gradient, or one with three lamps. Not in the view, so that finite differences have less noise."""
+def sky(small_lights: bool) -> MakeLight:
+    """Return a smooth sky, with or without three small lights; the camera does not see it, which lowers the noise."""
     image = torch.linspace(1.0, 0.3, 16, dtype=F64)[:, None].repeat(1, 32)
-    for row, column, radiance in LAMPS if lamps else ():
+    for row, column, radiance in LIGHTS if small_lights else ():
         image[row : row + 2, column : column + 2] = radiance
 
-    def lamp(at: Tensor, level: Tensor) -> Environment:
+    def make_light(at: Tensor, level: Tensor) -> Environment:
         levels = level.expand(TEXELS).repeat_interleave(32 // TEXELS)
         return Environment((levels * image)[..., None], visible=False)
 
-    return lamp
+    return make_light
 
 
 def bulb(at: Tensor, level: Tensor) -> Mesh:
-    """A sphere that emits."""
+    """Return a sphere that emits light."""
     shape = icosphere(1)
     return Mesh(shape.verts, shape.faces, material=Material(base_color=0.0, emission=12.0 * level)).transformed(
         scale=0.3, t=at
@@ -56,7 +56,7 @@ def bulb(at: Tensor, level: Tensor) -> Mesh:
 
 
 def softbox(at: Tensor, level: Tensor) -> Mesh:
-    """As large as what it lights."""
+    """Return an area light as large as the lit objects."""
     corners = torch.tensor([[-1.5, -1, 0], [1.5, -1, 0], [1.5, 1, 0], [-1.5, 1, 0]], dtype=F64)
     faces = torch.tensor([[0, 2, 1], [0, 3, 2]])  # downwards
     return Mesh(corners + at, faces, material=Material(base_color=0.0, emission=2.0 * level))
@@ -66,12 +66,12 @@ def point(at: Tensor, level: Tensor) -> PointLight:
     return PointLight(at, 10.0 * level)
 
 
-def staged(lamp: Lamp, roughness: float, metallic: float, **fields: Any) -> Problem:
-    """A box over a plane. By steps so short that what the differences are off by themselves is below their noise."""
-    of_sky = lamp(LAMP, torch.ones(1, dtype=F64))
+def staged(make_light: MakeLight, roughness: float, metallic: float, **fields: Any) -> Problem:
+    """Return a box over a plane. Steps are so short that the error of finite differences is below their noise."""
+    of_sky = make_light(LIGHT_AT, torch.ones(1, dtype=F64))
     is_sky = isinstance(of_sky, Environment)
     problem = stage(
-        lamp, MIRRORED, camera=view(size=SIZE), adjoint=adjoint(SIZE), moves=STILL if is_sky else MOVES, step=0.004,
+        make_light, MIRRORED, camera=view(size=SIZE), adjoint=adjoint(SIZE), moves=STILL if is_sky else MOVES, step=0.004,
         material={"roughness": roughness, "metallic": metallic}, **fields,
     )  # fmt: skip
     if is_sky:
@@ -79,11 +79,11 @@ def staged(lamp: Lamp, roughness: float, metallic: float, **fields: Any) -> Prob
     return problem
 
 
-def ball(lamp: Lamp, roughness: float, metallic: float) -> Problem:
-    """A ball over a plane, whose normals move too."""
+def ball(make_light: MakeLight, roughness: float, metallic: float) -> Problem:
+    """Return a ball over a plane; its normals are a part, too."""
     shape = icosphere(2).transformed(scale=0.5).transformed(t=vector(0.0, 0.0, 0.8))
     shape = Mesh(shape.verts, shape.faces, normals=vertex_normals(shape.verts, shape.faces))
-    problem = staged(lamp, roughness, metallic, caster=shape)
+    problem = staged(make_light, roughness, metallic, caster=shape)
     made = problem.make
 
     def make(parts: Parts) -> View:
@@ -97,12 +97,12 @@ def ball(lamp: Lamp, roughness: float, metallic: float) -> Problem:
     return dataclasses.replace(problem, parts=parts, make=make, equal=None, steps={**problem.steps, "normals": 0.01})
 
 
-def veiled(lamp: Lamp, roughness: float, metallic: float) -> Problem:
-    """A sheet of one face's thickness, seen from behind, before a plane that shows through it."""
+def veiled(make_light: MakeLight, roughness: float, metallic: float) -> Problem:
+    """Return a sheet seen from behind, alpha-blended before a plane."""
     corners = torch.tensor([[-0.7, -0.6, 0.5], [0.8, -0.5, 0.6], [0.7, 0.6, 1.0], [-0.6, 0.5, 0.9]], dtype=F64)
     faces = torch.tensor([[0, 2, 1], [0, 3, 2]])
     sheet = Mesh(corners, faces, uvs=corners[:, :2], uv_faces=faces)
-    problem = staged(lamp, roughness, metallic, caster=sheet)
+    problem = staged(make_light, roughness, metallic, caster=sheet)
     made = problem.make
 
     def make(parts: Parts) -> View:
@@ -117,8 +117,8 @@ def veiled(lamp: Lamp, roughness: float, metallic: float) -> Problem:
     return dataclasses.replace(problem, parts=parts, make=make, equal=None, steps={**problem.steps, "alpha": 0.01})
 
 
-def mapped(lamp: Lamp, roughness: float, metallic: float, filter: str = "linear") -> Problem:
-    """A plane with waves in its normal map, and textures of roughness and base colour; the texture coordinates move too.
+def mapped(make_light: MakeLight, roughness: float, metallic: float, filter: str = "linear") -> Problem:
+    """Return a plane with a wavy normal map and textures of roughness and base colour; texture coordinates are a part, too.
     With mipmaps, the textures repeat until a pixel holds several texels."""
     repeats = 4.0 if filter == "mipmap" else 1.0
     corners = torch.tensor([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=F64)
@@ -145,7 +145,7 @@ def mapped(lamp: Lamp, roughness: float, metallic: float, filter: str = "linear"
         )
         verts = torch.cat([1.5 * corners, torch.zeros(4, 1, dtype=F64)], 1) + parts["shift"] * vector(0.2, 0.3, 1.0)
         plane = Mesh(verts, faces, uvs=uvs, uv_faces=faces, material=look)
-        return Scene([plane], lights=[lamp(LAMP, parts["brightness"])]), view(target=ORIGIN, size=SIZE)
+        return Scene([plane], lights=[make_light(LIGHT_AT, parts["brightness"])]), view(target=ORIGIN, size=SIZE)
 
     steps = {
         "shift": 0.004, "texture coordinates": 0.002, "roughness": 0.005 * roughness, "metallic": 0.01, "brightness": 0.1,
@@ -160,13 +160,13 @@ def mapped(lamp: Lamp, roughness: float, metallic: float, filter: str = "linear"
 
 GLOSSY: dict[str, Callable[[], Problem]] = {
     "glossy, metal ball of roughness 0.25, smooth sky": partial(ball, sky(False), 0.25, 0.95),
-    "glossy, plastic of roughness 0.15, sky with lamps": partial(staged, sky(True), 0.15, 0.05),
-    "glossy, metal of roughness 0.1, sky with lamps": partial(staged, sky(True), 0.1, 0.95),
+    "glossy, plastic of roughness 0.15, sky with small lights": partial(staged, sky(True), 0.15, 0.05),
+    "glossy, metal of roughness 0.1, sky with small lights": partial(staged, sky(True), 0.1, 0.95),
     "glossy, metal torus of roughness 0.4, quad that emits": partial(staged, panel(), 0.4, 0.95, caster=torus()),
     "glossy, metal of roughness 0.3, ball that emits": partial(staged, bulb, 0.3, 0.95),
     "glossy, metal of roughness 0.2, softbox": partial(staged, softbox, 0.2, 0.95),
     "glossy, plastic of roughness 0.3, point light": partial(staged, point, 0.3, 0.05),
     "glossy, normal map, smooth sky": partial(mapped, sky(False), 0.25, 0.7),
-    "glossy, mipmaps, sky with lamps": partial(mapped, sky(True), 0.3, 0.7, filter="mipmap"),
+    "glossy, mipmaps, sky with small lights": partial(mapped, sky(True), 0.3, 0.7, filter="mipmap"),
     "glossy, sheet that blends, seen from behind, quad that emits": partial(veiled, panel(), 0.25, 0.5),
 }

@@ -24,10 +24,10 @@ from .case import F64, Group, Parts, Problem, View
 
 group = Group("light")
 
-Lamp = Callable[
+MakeLight = Callable[
     [Tensor, Tensor], "Light | Mesh"
 ]  # from where it is and how bright: 1, or what that is differentiated by
-LAMP = vector(1.1, -0.7, 2.4)
+LIGHT_AT = vector(1.1, -0.7, 2.4)
 EYE = vector(1.2, -3.5, 2.6)
 BASE = vector(0.8, 0.6, 0.4)
 ANY = {  # what moves, and along which directions (n, 3)
@@ -41,11 +41,11 @@ MANY_EDGES = {"light_samples": 4, "edge_samples": 10_000}
 STANDING = {**ANY, "caster": torch.stack([vector(1.0, 0.4, 0.0), vector(-0.3, 1.0, 0.0)]), "receiver": None}
 
 
-def point(power: float = 10.0) -> Lamp:
+def point(power: float = 10.0) -> MakeLight:
     return lambda at, level: PointLight(at, power * level)
 
 
-def panel(power: float = 8.0, **fields: Any) -> Lamp:
+def panel(power: float = 8.0, **fields: Any) -> MakeLight:
     u, v = vector(0.4, 0.0, 0.1), vector(0.0, 0.3, 0.0)
     return lambda at, level: AreaLight.rectangle(at, u, v, power * level, **fields)
 
@@ -56,7 +56,7 @@ def ground(size: float = 4.0) -> Mesh:
 
 
 def box(x: float, y: float, z: float, centre: Tensor, turn: Tensor | None = None) -> Mesh:
-    """With these half sides."""
+    """Return a box with these half sides."""
     mesh = cube(1.0)
     verts = mesh.verts * vector(x, y, z)
     return Mesh(verts if turn is None else verts @ rotation(turn).mT, mesh.faces).transformed(t=centre)
@@ -71,7 +71,7 @@ def view(eye: Tensor = EYE, target: Tensor = ORIGIN, fov: float = 42.0, size: in
 
 
 def adjoint(size: int = 32) -> Tensor:
-    """Smooth, and of one sign: most borders of a shadow count alike, where those of two signs would cancel."""
+    """Return a smooth adjoint image of one sign, with which shadow boundaries do not cancel."""
     y, x = torch.meshgrid(torch.arange(size) / size, torch.arange(size) / size, indexing="ij")
     return (
         (1.0 + 0.8 * torch.sin(5.0 * x + 2.0 * y - 2.2) + 0.1 * torch.cos(7.0 * y))
@@ -81,8 +81,8 @@ def adjoint(size: int = 32) -> Tensor:
 
 
 def stage(
-    lamp: Lamp,
-    at: Tensor = LAMP,
+    make_light: MakeLight,
+    at: Tensor = LIGHT_AT,
     caster: Mesh | None = None,
     receiver: Mesh | None = None,
     camera: Camera | None = None,
@@ -91,17 +91,18 @@ def stage(
     far: float = 1.0,
     unit: float = 1.0,
     place: Tensor = ORIGIN,
-    beside: tuple[Mesh, ...] = (),
+    others: tuple[Mesh, ...] = (),
     material: Mapping[str, float] | None = None,
     equal: Mesh | None = None,
     dtype: torch.dtype = F64,
     step: float | Mapping[str, float] = 0.015,
     **fields: Any,
 ) -> Problem:
-    """A caster over a receiver under a lamp; each moves along some directions, and so does the camera.
+    """A caster over a receiver under a light; each moves along some directions, and so does the camera.
 
-    far     by so much the lamp moves farther than the others
-    unit    what is one unit here in the scene, in which that stands at `place`, with meshes beside it
+    far     by so much the light moves farther than the others
+    unit    what is one unit here in the scene, in which that stands at `place`
+    others  more meshes of the scene
     equal   a caster that casts the same shadow, of which finite differences are taken
     """
     caster, receiver, camera = caster or floating(), receiver or ground(), camera or view()
@@ -119,11 +120,11 @@ def stage(
         for name, mesh in (("receiver", receiver), ("caster", caster)):
             there = mesh.transformed(t=shift(parts, name)).transformed(scale=unit).transformed(t=place)
             meshes.append(there.replace(material=look))
-        light = lamp(unit * (at + far * shift(parts, "light")) + place, parts["brightness"])
+        light = make_light(unit * (at + far * shift(parts, "light")) + place, parts["brightness"])
         M = camera.world_to_camera
         moved = M[:3, 3] * unit - M[:3, :3] @ place + unit * shift(parts, "camera")
         M = torch.cat([torch.cat([M[:3, :3], moved[:, None]], 1), M[3:]])
-        scene = Scene([*meshes, *(mesh.replace(material=look) for mesh in beside)], lights=[light])
+        scene = Scene([*meshes, *(mesh.replace(material=look) for mesh in others)], lights=[light])
         return scene.to(dtype), camera.replace(world_to_camera=M)
 
     def alike(parts: Parts) -> View:
@@ -148,13 +149,13 @@ def stage(
 def near(unit: float) -> Problem:
     other = box(0.4, 0.3, 0.5, vector(-0.9, 0.6, 0.5))
     return stage(
-        point(10.0 * unit**2), receiver=ground(2.0 / unit), unit=unit, place=vector(0.3, 0.2, 0.0), beside=(other,)
+        point(10.0 * unit**2), receiver=ground(2.0 / unit), unit=unit, place=vector(0.3, 0.2, 0.0), others=(other,)
     )
 
 
 @group.add("light-1e5", "a point light 1e5 times the scene's size away", 1e5)
 def distant(distance: float) -> Problem:
-    at = LAMP / LAMP.norm() * distance
+    at = LIGHT_AT / LIGHT_AT.norm() * distance
     return stage(point(distance**2), at, far=distance)
 
 
@@ -167,8 +168,8 @@ def intensity(power: float) -> Problem:
 @group.add("zero-point", "a point light of intensity zero", point())
 @group.add("zero-panel", "a panel that emits nothing", panel())
 @group.add("zero-sky", "a black environment", lambda at, level: Environment(level * torch.ones(1), visible=False))
-def dark(lamp: Lamp) -> Problem:
-    return stage(lamp, level=0.0)
+def dark(make_light: MakeLight) -> Problem:
+    return stage(make_light, level=0.0)
 
 
 @group.add("on-face", "a point light exactly on a side of a box; both move along it")
@@ -217,12 +218,12 @@ def behind() -> Problem:
 def spot() -> Problem:
     axis = vector(-1.1, 0.7, -2.1)
 
-    def lamp(at: Tensor, level: Tensor) -> SpotLight:
+    def make_light(at: Tensor, level: Tensor) -> SpotLight:
         return SpotLight(at, axis, 10.0 * level, inner_angle=0.22, outer_angle=0.27)
 
     # As the camera comes nearer the rim grows: where it only shifts, nearly all cancels.
     moves = {**ANY, "receiver": None, "camera": -EYE[None] / EYE.norm()}
-    return stage(lamp, moves=moves, options={"surface_samples": 100_000})
+    return stage(make_light, moves=moves, options={"surface_samples": 100_000})
 
 
 @group.add("sun-low", "a sun 3° above the plane", more=2)
@@ -274,8 +275,8 @@ def _fine(mesh: Mesh, halvings: int) -> Mesh:
 
 @group.add("lit-standing", "a box that stands on the plane, under a point light", point())
 @group.add("lit-standing-panel", "a box that stands on the plane, under a panel", panel())
-def standing(lamp: Lamp) -> Problem:
-    return stage(lamp, caster=box(0.35, 0.3, 0.4, vector(0.0, 0.0, 0.4), vector(0.0, 0.0, 0.3)), moves=STANDING)
+def standing(make_light: MakeLight) -> Problem:
+    return stage(make_light, caster=box(0.35, 0.3, 0.4, vector(0.0, 0.0, 0.4), vector(0.0, 0.0, 0.3)), moves=STANDING)
 
 
 @group.add("lit-touching", "a sphere that touches the plane in a vertex", more=4)
@@ -295,7 +296,7 @@ def small_panel() -> Problem:
 @group.add("sky-bright", "an environment with a texel 1e6 times as bright as the others")
 def bright_sky() -> Problem:
     image = torch.full((8, 16, 1), 1e-3, dtype=F64)
-    image[4, 14] = 1e3  # about where the lamp is
+    image[4, 14] = 1e3  # about where the light is
     many = {"light_samples": 4, "edge_samples": 50_000, "surface_samples": 50_000}
     moves = {**ANY, "light": None, "caster": None}  # of the caster nearly all cancels
     return stage(
@@ -308,7 +309,7 @@ def bright_sky() -> Problem:
 
 
 def torus(major: float = 0.55, minor: float = 0.22, around: int = 32, across: int = 16) -> Mesh:
-    """With interpolated normals, tilted, above the plane."""
+    """Return a tilted torus with interpolated normals above the plane."""
     u, v = (2 * math.pi * torch.arange(n, dtype=F64) / n for n in (around, across))
     u, v = torch.meshgrid(u, v, indexing="ij")
     radius = major + minor * v.cos()
@@ -338,9 +339,9 @@ def _sky(at: Tensor, level: Tensor) -> Environment:
     return Environment(level * image, visible=False)
 
 
-def _closely(lamp: Lamp, **fields: Any) -> Callable[[], Problem]:
-    """By steps so short that what the differences are off by themselves is below their noise."""
-    return lambda: stage(lamp, step=0.004, **fields)
+def _closely(make_light: MakeLight, **fields: Any) -> Callable[[], Problem]:
+    """Return a stage whose steps are so short that the error of finite differences is below their noise."""
+    return lambda: stage(make_light, step=0.004, **fields)
 
 
 LIT: dict[str, Callable[[], Problem]] = {

@@ -1,4 +1,4 @@
-"""How far the image and the gradient of a case are from its reference, and what that says."""
+"""Errors of image and gradient of a case against its reference, and the verdict."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RIGHT, LIMIT, WRONG, NOISY, RAISED = "right", "limit", "wrong", "too noisy to te
 
 @dataclass(frozen=True)
 class Effort:
-    """How many seeds: more of them until the standard error of everything is below `noise`."""
+    """Numbers of seeds, which grow until the standard error of everything is below `noise`."""
 
     seeds: tuple[int, ...] = (8, 32, 128, 512)
     noise: float = 0.004
@@ -32,7 +32,7 @@ class Effort:
     seconds: float = 30.0  # no more seeds after that
 
     def up_to(self, more: int) -> Effort:
-        """So many times as many seeds, where those here leave more noise."""
+        """Return an effort with `more` times as many seeds at most."""
         if more == 1:
             return self
         seeds, differences = ((*n, more * n[-1]) for n in (self.seeds, self.difference_seeds))
@@ -65,7 +65,7 @@ class Running:
 
 
 def measure(case: Case, effort: Effort) -> dict[str, Any]:
-    """The row of a case, as data. What it raises becomes its verdict."""
+    """Return the row of a case as data. An error that it raises becomes its verdict."""
     begin = time.perf_counter()
     row: dict[str, Any] = {"group": case.group, "name": case.name, "extreme": case.extreme}
     try:
@@ -81,7 +81,7 @@ def measure(case: Case, effort: Effort) -> dict[str, Any]:
 
 
 def compare(problem: Problem, effort: Effort) -> dict[str, Any]:
-    """Relative errors of the image and of the gradient of each part, with the standard errors of both sides together."""
+    """Return relative errors of the image and of the gradient of each part, with the standard errors of both sides."""
     wanted_image, wanted = reference(problem, effort)
     begin = time.perf_counter()
     background = problem.make(problem.parts)[0].background
@@ -114,7 +114,7 @@ def compare(problem: Problem, effort: Effort) -> dict[str, Any]:
 
 
 def _relative(found: Estimate, wanted: Estimate, size: float, zero: float = 0.0, unit: float = 1.0) -> dict[str, float]:
-    """Errors relative to `size`, that of the reference; to `unit` where that is no more than `zero`."""
+    """Return errors relative to `size`, that of the reference, or to `unit` where the size is at most `zero`."""
     scale = size if size > zero else unit
     return {
         "error": float((found.mean - wanted.mean).norm()) / scale,
@@ -124,7 +124,7 @@ def _relative(found: Estimate, wanted: Estimate, size: float, zero: float = 0.0,
 
 
 def verdict(row: dict[str, Any], case: Case) -> tuple[str, str]:
-    """(verdict, the quantity that decides it)."""
+    """Return the verdict and the quantity that decides it."""
     entries = {"image": row["image"], **row["parts"]}
     worst = max(entries, key=lambda name: entries[name]["error"] - 4.0 * entries[name]["noise"])
     off = [e["error"] - 4.0 * e["noise"] - TOLERANCE for e in entries.values()]
@@ -143,7 +143,7 @@ def worst_part(row: dict[str, Any]) -> tuple[str, dict[str, float]]:
 
 
 def sample(problem: Problem, seed: int, **options: Any) -> tuple[Tensor, Parts]:
-    """Image and gradient from one seed."""
+    """Return image and gradient from one seed."""
     leaves = {name: value.detach().clone().requires_grad_() for name, value in problem.parts.items()}
     image = render(*problem.make(leaves), **{"spp": problem.spp, "seed": seed, **problem.options, **options})
     adjoint = problem.cotangent(image).to(image.dtype)
@@ -152,7 +152,7 @@ def sample(problem: Problem, seed: int, **options: Any) -> tuple[Tensor, Parts]:
 
 
 def reference(problem: Problem, effort: Effort) -> tuple[Tensor, dict[str, Estimate]]:
-    """The image and the gradients as they should be."""
+    """Return the correct image and gradients."""
     if problem.exact is None:
         return by_differences(problem, effort)
     image, grads = exact(problem, problem.exact)
@@ -185,7 +185,7 @@ def by_differences(problem: Problem, effort: Effort) -> tuple[Tensor, dict[str, 
 
 
 def differences(problem: Problem, adjoint: Tensor, name: str, scale: float, effort: Effort) -> Running:
-    """Of each component of a part, from each seed of the effort until the noise is below what it asks for."""
+    """Return differences of each component of a part, from as many seeds as the wanted noise takes."""
     make, finer = problem.equal or problem.make, problem.finer
     value, h = problem.parts[name], scale * problem.steps[name]
     units = torch.eye(value.numel(), dtype=value.dtype).reshape(-1, *value.shape)

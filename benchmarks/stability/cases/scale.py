@@ -24,7 +24,7 @@ def tilted_cube(half: float = 0.5) -> Mesh:
 
 
 def moved(camera: Camera, scale: float = 1.0, by: Tensor | None = None) -> Camera:
-    """The camera where the world around it is larger by `scale` and then moved."""
+    """Return the camera after the world around it was scaled and then moved."""
     M = camera.world_to_camera.clone()
     M[:3, 3] *= scale
     if by is not None:
@@ -33,7 +33,7 @@ def moved(camera: Camera, scale: float = 1.0, by: Tensor | None = None) -> Camer
 
 
 def single(scene: Scene) -> Scene:
-    """As users have it: in float32."""
+    """Return the scene in float32, as users have it."""
     return scene.to(torch.float32)
 
 

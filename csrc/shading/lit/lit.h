@@ -22,7 +22,7 @@ namespace edgegrad {
 // Writes (N, channels) radiance, which is null where only derivatives are wanted, and (N, light samples) visibility.
 template <class T>
 void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-           const LitOptions& options, double* radiance, int8_t* seen, Team& team);
+           const LitOptions& options, double* radiance, int8_t* seen, ThreadTeam& team);
 // Shades about shaded_at_once points on one thread, reusing memory between calls.
 constexpr int64_t shaded_at_once = 256;
 struct ShadeBuffers;
@@ -32,17 +32,17 @@ void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster&
                 const LitOptions& options, ShadeBuffers& buffers, double* radiance, int8_t* seen);
 // Writes the points of one light that illuminate these points, `options.samples` for each.
 void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int light,
-                       LightPoint* out, Team& team);
+                       LightPoint* out, ThreadTeam& team);
 // Adds to the cotangents of the tables, and writes the cotangents of the points, given what shade() found.
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, Team& team);
+               const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, ThreadTeam& team);
 // Does both at once where only derivatives are wanted: it also traces what each point sees.
 template <class T>
 void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                          const LitPoints& points, const LitOptions& options, const double* bar,
-                         const std::vector<TableBar>& to, LitPlaces<double> places, Team& team);
+                         const std::vector<TableBar>& to, LitPlaces<double> places, ThreadTeam& team);
 // Writes the derivative for the tangents of the tables and of the points.
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               LitPlaces<const double> dot, double* radiance_dot, Team& team);
+               LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team);
 
 }  // namespace edgegrad

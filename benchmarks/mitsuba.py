@@ -1,7 +1,7 @@
-"""Mitsuba 3 as a peer of the report: the gradient of an edgegrad scene by its projective-sampling integrators.
+"""Mitsuba 3 as a peer: its module, lights and materials as edgegrad has them, and gradients by projective sampling.
 
-Unlit radiance becomes an emitter on both sides of a mesh, the background a constant one; both integrators stop at the
-first hit.
+In `Mitsuba`, unlit radiance becomes an emitter on both sides of a mesh, and the background a constant one. Both integrators stop
+at the first hit.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,14 @@ import torch
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
+from edgegrad.light.bsdf import DIELECTRIC, LEAST_ALPHA
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import PointLight
 from edgegrad.scene.material import Material, Texture
 from edgegrad.scene.mesh import PLAIN, Mesh
 from edgegrad.scene.scene import Scene
 
+BSDF = "metallic_roughness"  # the plugin of edgegrad's materials
 INTEGRATORS = ("direct_projective", "prb_projective")
 VARIANT = "llvm_ad_rgb"
 LLVM = 16  # the oldest that is let through: 15 aborts the whole process on prb_projective ("Cannot select: fminimum")
@@ -30,7 +33,7 @@ SPLIT = 8  # interior samples for each boundary sample: one of the latter costs 
 
 
 def available() -> str | None:
-    """Mitsuba's version, or None where it is not installed or finds no LLVM."""
+    """Return Mitsuba's version, or None where it is not installed or finds no LLVM."""
     try:
         return load()[0].__version__
     except (ImportError, RuntimeError):
@@ -38,7 +41,7 @@ def available() -> str | None:
 
 
 def load() -> tuple[Any, Any]:
-    """The modules mitsuba and drjit, in the variant that runs on the CPU with derivatives."""
+    """Return the modules mitsuba and drjit, in the variant that runs on the CPU with derivatives."""
     try:
         mi, dr = importlib.import_module("mitsuba"), importlib.import_module("drjit")
     except ImportError as error:
@@ -58,13 +61,130 @@ def load() -> tuple[Any, Any]:
 
 
 def sky_image(radiance: Tensor) -> Tensor:
-    """(2 h + 1, w, C): an environment's image (h, w, C) as Mitsuba's `envmap` takes it. That has the first and the last row at
-    the poles and all others evenly between, where edgegrad has the centres of texels half a row off the poles: an image taken as
-    it is would be stretched by h / (h − 1). Every second row is one of the image, and both interpolate alike."""
+    """Return the image (h, w, C) of an environment as Mitsuba's `envmap` takes it, (2 h + 1, w, C).
+
+    Mitsuba has the first and the last row at the poles and all others evenly between. In edgegrad the centres of texels lie half
+    a row off the poles, so an unchanged image would be stretched by h / (h − 1). Here every second row is one of the image, and
+    both interpolate alike.
+    """
     between = (radiance[1:] + radiance[:-1]) / 2
     poles_and_between = torch.cat([radiance[:1], between, radiance[-1:]])
     rows = torch.stack([poles_and_between[:-1], radiance], 1).flatten(0, 1)
     return torch.cat([rows, poles_and_between[-1:]])
+
+
+def sky(mi: Any, radiance: Tensor) -> dict[str, Any]:
+    """Return an `envmap` of the image (h, w, C) of an environment, turned by half a turn to edgegrad's axes."""
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 180)
+    return {"type": "envmap", "bitmap": mi.Bitmap(sky_image(radiance).float().numpy()), "to_world": turned}
+
+
+def sensor(
+    mi: Any, eye: tuple[float, ...], target: tuple[float, ...], fov_y: float, size: tuple[int, int]
+) -> dict[str, Any]:
+    """Return the camera of Camera.look_at with y up; `size` is (height, width), `fov_y` in degrees."""
+    film = {"type": "hdrfilm", "width": size[1], "height": size[0], "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f().look_at(list(eye), list(target), [0, 1, 0])
+    return {"type": "perspective", "fov": fov_y, "fov_axis": "y", "to_world": to_world, "film": film}
+
+
+def bsdf_class(mi: Any, dr: Any) -> type:
+    """Return edgegrad's Material as a plugin, for any variant of Mitsuba.
+
+    It is glTF's model (appendix B) with correlated masking (Heitz 2014, eq. 99), or Lambert's where `roughness` is negative,
+    under an optional normal map with the shadow terminator of Chiang, Li and Burley (2019). Mitsuba's `principled` mixes a
+    metal and a dielectric, not their reflectances: at metallic 0.8 that is a tenth brighter. Directions are drawn by the
+    visible normals in a share (1 + metallic) / 2, else by the cosine; how they are drawn is not differentiated.
+    """
+
+    class MetallicRoughness(mi.BSDF):
+        def __init__(self, props: Any) -> None:
+            mi.BSDF.__init__(self, props)
+            self.base_color = mi.Color3f(*(props[f"base_color{c}"] for c in range(3)))
+            self.metallic, self.roughness = mi.Float(props["metallic"]), mi.Float(props["roughness"])
+            self.glossy, self.two_sided, self.map = props["roughness"] >= 0, props["two_sided"], None
+            if "normal_map" in props:
+                self.map = props["normal_map"]
+            self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
+            self.m_flags = self.m_components[0]
+
+        def traverse(self, callback: Any) -> None:
+            for name in ("base_color", "metallic", "roughness"):
+                callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+
+        def _alpha(self) -> Any:
+            return dr.maximum(dr.square(self.roughness), LEAST_ALPHA)
+
+        def _lobe(self) -> tuple[Any, Any]:
+            """Return the distribution of visible normals and the share of samples drawn by it."""
+            alpha, share = dr.detach(self._alpha()), dr.detach(0.5 + 0.5 * self.metallic)
+            return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha), share
+
+        def _frame(self, si: Any, active: Any) -> tuple[Any, Any]:
+            """Return the sign of the visible side, and the frame of the mapped normal there, on the front."""
+            side = dr.select(si.wi.z > 0, mi.Float(1), mi.Float(-1))
+            if self.map is None:
+                return side, mi.Frame3f(mi.Normal3f(0, 0, 1))
+            return side, mi.Frame3f(dr.normalize(mi.Normal3f(2 * self.map.eval_3(si, active) - 1)))
+
+        def sample(self, ctx: Any, si: Any, one: Any, two: Any, active: Any = True) -> Any:
+            side, frame = self._frame(si, active)
+            l = mi.warp.square_to_cosine_hemisphere(two)
+            if self.glossy:
+                lobe, share = self._lobe()
+                v = frame.to_local(side * si.wi)
+                h, _ = lobe.sample(v, two)
+                l = dr.select(one < share, mi.reflect(v, h), l)
+            sample = dr.zeros(mi.BSDFSample3f)
+            sample.wo, sample.eta = side * frame.to_world(l), 1.0
+            value, sample.pdf = self.eval_pdf(ctx, si, sample.wo, active)
+            sample.sampled_type, sample.sampled_component = mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(0)
+            return sample, dr.select(sample.pdf > 0, value / dr.select(sample.pdf > 0, sample.pdf, 1.0), 0.0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            side, frame = self._frame(si, active)
+            gv, gl = side * si.wi.z, side * wo.z  # by the normal of the face
+            v, l = frame.to_local(side * si.wi), frame.to_local(side * wo)
+            nl = l.z
+            above = active & (gl > 0) & (nl > 0) & (gv > 0)
+            above &= mi.Mask(True) if self.two_sided else si.wi.z > 0
+            f, pdf = self.base_color / math.pi, nl / math.pi
+            if self.glossy:
+                lobe, share = self._lobe()
+                h = dr.normalize(v + l)
+                a2, vh, nv = dr.square(self._alpha()), dr.dot(v, h), dr.maximum(v.z, 0)
+                D = a2 / (math.pi * dr.square(h.x * h.x + h.y * h.y + a2 * h.z * h.z))
+                masking = 0.5 / (nl * dr.sqrt(a2 + (1 - a2) * nv * nv) + nv * dr.sqrt(a2 + (1 - a2) * nl * nl))
+                f0 = DIELECTRIC + (self.base_color - DIELECTRIC) * self.metallic
+                fresnel = f0 + (1 - f0) * (1 - vh) ** 5
+                f = (1 - fresnel) * self.base_color * (1 - self.metallic) / math.pi + fresnel * D * masking
+                pdf = (1 - share) * pdf + share * lobe.pdf(v, h) / (4 * vh)
+            if self.map is not None:
+                G = dr.clip(gl / (dr.maximum(frame.n.z, 1e-6) * dr.maximum(nl, 1e-12)), 0, 1)
+                f = f * (G + G * G - G * G * G)
+            return dr.select(above, f * nl, mi.Color3f(0.0)), dr.select(above, pdf, 0.0)
+
+        def to_string(self) -> str:
+            return "MetallicRoughness[]"
+
+    return MetallicRoughness
+
+
+def bsdf(base_color: Sequence[float], metallic: float, roughness: float, two_sided: bool = False) -> dict[str, Any]:
+    """Return the description of a material by the plugin BSDF, which `register` makes known."""
+    colors = {f"base_color{c}": float(value) for c, value in enumerate(base_color)}
+    return {"type": BSDF, "metallic": metallic, "roughness": roughness, "two_sided": two_sided, **colors}
+
+
+def register(mi: Any, dr: Any) -> None:
+    """Make the plugin BSDF known to the present variant."""
+    mi.register_bsdf(BSDF, bsdf_class(mi, dr))
 
 
 class Mitsuba:
@@ -184,7 +304,7 @@ class Mitsuba:
 
 
 def _resized(scene: Scene, camera: Camera) -> tuple[Scene, Camera, float]:
-    """The same view of the scene around the origin with the radius RADIUS, and how many times as large it is."""
+    """Return the same view of the scene, centred and scaled to the radius RADIUS, and the scale."""
     meshes = [mesh.replace(verts=mesh.verts.detach().cpu().double()) for mesh in scene.meshes]
     verts = torch.cat([mesh.verts for mesh in meshes])
     center = verts.mean(0)
@@ -230,7 +350,7 @@ def _rgb(color: Tensor) -> dict[str, Any]:
 
 
 def _lights(mi: Any, scene: Scene, background: Tensor, scale: float) -> dict[str, Any]:
-    """Beside meshes that emit. A black background is none, so that no samples of lights go there."""
+    """Return lights other than emissive meshes. A black background is left out, so that no light samples go there."""
     found: dict[str, Any] = {}
     for i, light in enumerate(scene.lights):
         if isinstance(light, PointLight):
@@ -256,7 +376,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _by_vertex(verts: int, faces: Tensor, corners: Tensor) -> Tensor | None:
-    """Values of corners (F, 3, n) as values of vertices (V, n), or None where the corners of a vertex differ."""
+    """Return values of corners (F, 3, n) as values of vertices (V, n), or None where the corners of a vertex differ."""
     values = corners.new_zeros((verts, corners.shape[-1]))
     values[faces] = corners
     return values if torch.equal(values[faces], corners) else None
@@ -305,7 +425,7 @@ def _shape(mi: Any, dr: Any, mesh: Mesh, name: str, lit: bool) -> Any:
 
 
 def _material(mi: Any, props: Any, mesh: Mesh) -> None:
-    """A Lambertian constant that both sides show, light from the front of a surface that scatters nothing, or black."""
+    """Set a two-sided Lambertian constant, emission from the front of a black surface, or black."""
     material = Material(base_color=0.0) if mesh.material is None else mesh.material
     given = [
         1.0 if material.base_color is None else material.base_color,
@@ -337,7 +457,7 @@ def _filled(mi: Any, props: Any, name: str, verts: Tensor, faces: Tensor, uvs: T
 
 
 def _two_sided(mi: Any, dr: Any, radiance: Any) -> Any:
-    """An emitter that shines on both sides: Mitsuba's "area" is black from behind, which open meshes show."""
+    """Return an emitter that shines on both sides: Mitsuba's "area" is black from behind, which open meshes show."""
 
     class TwoSided(mi.Emitter):
         def __init__(self, props: Any) -> None:
@@ -365,7 +485,7 @@ def _two_sided(mi: Any, dr: Any, radiance: Any) -> Any:
 
 
 def _seamed(mi: Any, bitmap: Any) -> Any:
-    """A texture whose coordinates belong to corners, as attributes face_u and face_v of the mesh."""
+    """Return a texture whose coordinates belong to corners, as attributes face_u and face_v of the mesh."""
 
     class Seamed(mi.Texture):
         def __init__(self, props: Any) -> None:
