@@ -124,8 +124,7 @@ struct Camera {
     // Returns the least length of a pixel in world units at a depth.
     double pixel_at_depth(double z) const { return unit_at_depth(z) / pixels_per_unit; }
 
-    // Returns whether something whose depths have this ratio moves in the image nearly as an affine function of its
-    // corners.
+    // Returns whether a face with this ratio of depths moves in the image nearly as an affine function of its corners.
     bool is_nearly_affine(double depths) const { return !perspective || depths < 2; }
 
     // Returns the orientation of (q0, q1, q2) in the image, x to the right and y down: > 0 where (x1 − x0) ∧ (x2 − x0)
@@ -138,8 +137,7 @@ struct Camera {
         return s * k_det > 0 ? 1 : -1;
     }
 
-    // Returns how many roundings the denominator w of a point has, relative to itself, if its depth sums terms of this
-    // size.
+    // Returns the roundings of a point's denominator w, relative to itself, if its depth sums terms of this size.
     double roundings_of_weight(double terms, double w) const { return perspective ? terms / w : 1; }
 
     // Returns a generous bound of the rounding of pixel positions in or near the image. A position sums products with
@@ -180,8 +178,7 @@ struct Camera {
     }
 
    private:
-    // Finds the visible part, or takes it from the cache. A fisheye that shows more than one cube face becomes a
-    // WideFisheye.
+    // Finds the visible part, or takes it from the cache. A fisheye with more than one cube face becomes a WideFisheye.
     void look_through_lens();
     void find_lens_view();
     LensView view_through_lens() const;
@@ -254,8 +251,7 @@ inline void normalised_vjp(const Camera& c, Vec2 n, Vec2 bar, IntrinsicsGrad& in
     k_bar[3] += y * m.x, k_bar[4] += y * m.y, k_bar[5] += y;
 }
 
-// Holds the position at which the lens shows a point u of the undistorted image, and the growth of areas there; 0:
-// nowhere.
+// Holds where the lens shows a point u of the undistorted image, and the growth of areas there; 0: nowhere.
 struct Distorted {
     Vec2 x;
     double area_scale = 1;
@@ -279,8 +275,7 @@ inline Vec2 undistort(const Camera& c, Vec2 x) {
 
 Vec2 normalised_jvp(const Camera& c, Vec2 n, const IntrinsicsGrad& intrinsics);
 
-// These return the cotangents of positions from that of n: A⁻ᵀ n̄ for the undistorted image, and that of the pixel
-// position.
+// These return cotangents of positions from that of n: A⁻ᵀ n̄ in the undistorted image, and that of the pixel.
 inline Vec2 place_vjp(const Camera& c, Vec2 n_bar) {
     const double* A = c.k_inverse;
     return {A[0] * n_bar.x + A[2] * n_bar.y, A[1] * n_bar.x + A[3] * n_bar.y};

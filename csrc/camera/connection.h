@@ -24,8 +24,7 @@ class CameraConnections {
             sub_cameras_.push_back({sub_camera, {sub_camera, reach}});
     }
 
-    // Calls body(CameraConnection) for each image position of the point y of a face. e1 and e2 are the face's sides, in
-    // world coordinates.
+    // Calls body(CameraConnection) for each image position of the point y of a face with the sides e1 and e2 (world).
     template <class Body>
     void each(Vec3 y, Vec3 e1, Vec3 e2, Body body) const {
         for (const SubCamera& sub_camera : sub_cameras_) {

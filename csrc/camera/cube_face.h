@@ -20,8 +20,7 @@ struct Box2 {
     void add(Vec2 p);
 };
 
-// Returns the bounding box of r (sin λ, cos λ) for radii and angles between two limits. The angles differ by at most 2
-// π.
+// Returns the bounding box of r (sin λ, cos λ) for radii and angles between limits, at most 2 π apart.
 Box2 sector_box(double inner, double outer, double from, double to);
 
 // Describes one cube face. Directions d have a longitude λ = atan2(d.x, d.z) and a latitude φ = atan2(d.y, hypot(d.x,
@@ -36,8 +35,7 @@ struct CubeFace {
     Vec3 direction(Vec2 n) const { return transposed_times(turn, {n.x, n.y, 1}); }
     // Returns the n of a direction, if it belongs to this face.
     std::optional<Vec2> place(Vec3 d) const;
-    // Returns how far a unit direction lies outside. A rotation of the direction changes this by at most twice its
-    // angle.
+    // Returns how far a unit direction lies outside. Rotating it changes this by at most twice the angle.
     double outside(Vec3 d) const;
 
     // Bounds λ and φ over a box of n.

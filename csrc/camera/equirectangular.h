@@ -56,8 +56,7 @@ class Equirectangular {
 
     // Returns a box of pixel positions that contains the image of a box of n.
     Box2 image_box(Box2 n) const;
-    // Returns a box of n that contains all that a box of pixel positions shows of this face and position; none if
-    // nothing.
+    // Returns a box of n of all that a box of pixel positions shows of this face and position; none if nothing.
     std::optional<Box2> side_box(Box2 x) const;
 
     // Returns how much lengths grow from the undistorted image to the image in a box of n, approximately and at most.

@@ -1,5 +1,4 @@
-// Implements OpenCV's fisheye lens (Kannala and Brandt 2006). The distance from the image centre is a polynomial of the
-// angle to the axis.
+// Implements OpenCV's fisheye lens (Kannala and Brandt 2006). The radius is a polynomial of the angle to the axis.
 #pragma once
 
 #include <cmath>

@@ -28,8 +28,7 @@ double least_area_scale(const L& lens, double r) {
     return least;
 }
 
-// Returns r in [0, fold] with lens.radius(r) = m, or the fold. It takes Newton steps, and bisects where they leave the
-// bracket.
+// Returns r in [0, fold] with lens.radius(r) = m, or the fold. Newton steps are bisected where they leave the bracket.
 template <RadialLens L>
 double undistorted_radius(const L& lens, double fold, double m) {
     double low = 0, high = fold, r = std::min(m, fold);

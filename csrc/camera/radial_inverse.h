@@ -14,8 +14,8 @@ class RadialInverse {
     // Covers |m| ≤ farthest, as far as the disc reaches.
     RadialInverse(const AnyLens& lens, double fold, double farthest);
 
-    // Replaces k positions m by n. Returns false if some lie outside the table, or near the fold, where h is no
-    // polynomial.
+    // Replaces k positions m by n. Returns false if some lie outside the table, or near the fold, where h is not
+    // smooth.
     bool undistort(int k, double* x, double* y) const;
 
    private:

@@ -136,8 +136,7 @@ std::optional<Vec2> WideFisheye::undistort(Vec2 m) const {
     return side_.place(direction_of(angle(size), size > 0 ? (1 / size) * at : Vec2{}));
 }
 
-// All directions within the circle are near the middle one. Their distance is at most half the range of angles plus the
-// arc around the axis.
+// Directions within the circle are at most half the range of angles plus the arc from the middle one.
 bool WideFisheye::may_show(Vec2 x, double reach) const {
     const Vec2 m = m_of_pixel(x);
     const double size = length(m), step = reach * length(Vec2{std::fabs(inverse_[0]) + std::fabs(inverse_[1]),

@@ -47,8 +47,7 @@ class WideFisheye {
     std::optional<Box2> side_box(Box2 x) const;
     double stretch(Box2 n) const;
 
-    // These return the m of a lens boundary point, its derivative with respect to the angle of e in the image, and its
-    // direction.
+    // These return m of a lens boundary point, its derivative with respect to the image angle of e, and its direction.
     Vec2 lens_boundary_point(Vec2 e) const;
     Vec2 lens_boundary_tangent(Vec2 e) const;
     Vec3 lens_boundary_direction(Vec2 e) const { return direction_of(lens_boundary_, e); }

@@ -1,5 +1,4 @@
-// Provides the reference of the benchmarks: it casts the rays of the forward pass, made beforehand, and does nothing
-// else.
+// Provides the benchmarks' reference: it casts the forward pass's rays, made beforehand, and does nothing else.
 
 #include <algorithm>
 #include <numeric>

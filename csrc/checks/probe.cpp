@@ -1,5 +1,4 @@
-// Exposes internals to the tests: any rays, and the radiance of one interior sample on a known face with its
-// derivative.
+// Exposes internals to tests: any rays, and the radiance of an interior sample on a known face with its derivative.
 
 #include "checks/probe.h"
 

@@ -16,8 +16,7 @@ template <class T>
 void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces,
                   const double* points, const double* radiance_bar, const Gradients& grad);
 
-// Holds rays as arrays: origins and directions (N, 3), ends (N,). The lists of faces that each ignores are
-// concatenated.
+// Holds rays: origins and directions (N, 3), ends (N,). The lists of faces that each ignores are concatenated.
 struct RayArrays {
     const double *origins, *directions, *ends;
     int64_t size;

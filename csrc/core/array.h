@@ -39,8 +39,7 @@ inline void prefer_large_pages([[maybe_unused]] void* p, [[maybe_unused]] size_t
 }
 
 // Holds elements that several threads write before anything reads them. Unlike std::vector, it sets nothing to zero.
-// One thread would do that, and fetch all pages, while the others wait. A page belongs to the thread that writes it
-// first.
+// One thread would do that, and fetch all pages, while the others wait. The first writer of a page fetches it.
 template <class T>
 class Array {
    public:

@@ -3,8 +3,8 @@
 
 namespace edgegrad {
 
-// N > 0 means N channels, all of radiance. N < 0 means −N channels, some of them attributes (shading/attributes.h). 0
-// means any number.
+// N > 0 means N channels, all of radiance. N < 0 means −N channels, with attributes (shading/attributes.h). 0 means any
+// number.
 template <int N>
 inline constexpr int all_channels = N < 0 ? -N : N;
 template <int N>

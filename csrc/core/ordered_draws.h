@@ -1,6 +1,6 @@
 // Orders the samples of a systematic draw so that neighbours are close in the image. Their rays then pass the same
-// boxes, and their primitives' data is in the cache. Meshes come in any order: that of a subdivision alternates between
-// distant faces.
+// boxes, and their primitives' data is in the cache. Meshes come in any order: subdivisions alternate between distant
+// faces.
 #pragma once
 
 #include <algorithm>

@@ -26,8 +26,7 @@ inline Polynomial product(const Polynomial& a, const Polynomial& b) {
     return out;
 }
 
-// Returns where c changes its sign in [low, high], ascending. It bisects between zeros of the derivative, where c is
-// monotone.
+// Returns where c changes its sign in [low, high], ascending. It bisects between the derivative's zeros.
 inline std::vector<double> sign_changes(const Polynomial& c, double low, double high) {
     if (c.size() < 2) return {};
     std::vector<double> stops = sign_changes(derivative(c), low, high), out;

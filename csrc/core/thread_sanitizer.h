@@ -1,6 +1,5 @@
-// Informs ThreadSanitizer about synchronisation. It does not see how OpenMP's runtime, which is not built
-// with it, hands work over. Whatever one thread does before it releases an address precedes what another does after it
-// acquired that address.
+// Informs ThreadSanitizer about synchronisation. It does not see how OpenMP's runtime, which is not built with it,
+// hands work over. What a thread does before it releases an address precedes what others do after they acquire it.
 #pragma once
 
 #ifdef __SANITIZE_THREAD__

@@ -99,8 +99,7 @@ class Importance {
 
     double radius() const { return radius_; }  // It is the filter's radius, less ½.
 
-    // Returns the mean difference of neighbouring pixels over the mean size: small for a smooth adjoint, √2 for white
-    // noise.
+    // Returns the mean difference of neighbouring pixels over the mean size: small if smooth, √2 for white noise.
     double roughness() const { return roughness_; }
 
     // Returns the importance of a pixel whose adjoint has this size.

@@ -107,8 +107,7 @@ class PixelRow {
     }
 
    private:
-    // Holds what the samples on one face share. Some faces are kept, because the faces of a pixel alternate, and recur
-    // in the next pixel.
+    // Holds what the samples on one face share. Some are kept, as faces alternate in a pixel and recur in the next.
     struct alignas(N ? 256 : 8) Shaded {
         int32_t face = -1;
         bool textured = false, indirect = false;

@@ -140,8 +140,7 @@ LitImage<T> render_lit(const LitScene& given, const SceneView<T>& scene, const C
     SkyGuide guide(given);
     const bool guides = options.bounces > 1 && options.samples == 1 && options.shadows && guide.has_sky();
     if (guides) {
-        // The pilot uses other random numbers than the image. Otherwise its results would correlate with the samples
-        // that it guides.
+        // The pilot's random numbers differ from the image's, or its results would correlate with the guided samples.
         const std::vector<uint8_t> pixels = sparse_pixels(camera);
         const ImageOptions few{1, image.filter, hash(image.seed, pilot)};
         shade_pixels(given, few, {0, camera.height, 1, pixels.data(), spread}, hash(sampling.again, pilot), &guide);

@@ -17,8 +17,7 @@ struct LitSampling {
     uint64_t seed, again;  // They serve the first pass, and pixels that are shaded again.
 };
 
-// Holds the radiance (H · W, C) without what lies behind the surfaces, and whether some point asked for each light's
-// shadow.
+// Holds the radiance (H · W, C) without the background, and whether some point asked for each light's shadow.
 template <class T>
 struct LitImage {
     Array<T> radiance;

@@ -25,8 +25,7 @@ struct MovingHits {
     int rays = 1;  // It counts the rays per face.
 };
 
-// Writes barycentrics (N, rays, 3). A face without area, or edge-on, gets those of its first corner, without
-// derivatives.
+// Writes barycentrics (N, rays, 3). Degenerate or edge-on faces get those of the first corner, without derivatives.
 void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team);
 // Adds to the cotangents of vertices and camera, and writes those of `along`.
 void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,

@@ -1,8 +1,7 @@
 // Lists what the samples of an image hit, for shaders written in PyTorch.
 //
-// All samples of a pixel that hit the same face are one hit, at one of them drawn at random. A shader is thus evaluated
-// once for each face in a pixel, and the mean over samples keeps its expected value. On request, several samples
-// represent all.
+// All samples of a pixel that hit the same face are one hit, at one of them drawn at random. A shader runs once for
+// each face in a pixel, and the mean over samples keeps its expected value. On request, several samples represent all.
 #pragma once
 
 #include <cstdint>

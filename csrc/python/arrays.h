@@ -1,5 +1,4 @@
-// Holds the arrays of a scene, of a camera and of the image's hits. It keeps them alive, checks them, and gives the
-// kernel its views.
+// Keeps alive and checks the arrays of scenes, cameras and image hits, and gives the kernel its views.
 #pragma once
 
 #include <memory>

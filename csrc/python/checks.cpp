@@ -40,8 +40,7 @@ std::string text(double number) {
 template <class T>
 constexpr T largest = T(std::numeric_limits<float>::max());
 
-// Returns whether all values are finite and at most the largest float. Several counters avoid waiting for each
-// addition.
+// Returns whether all values are finite and at most the largest float. Several counters add in parallel.
 constexpr int counts = 16;
 template <class T>
 EDGEGRAD_VECTORIZED bool are_finite(const T* values, int64_t n) {

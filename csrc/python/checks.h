@@ -23,8 +23,7 @@ using Out = nb::ndarray<T, nb::numpy, nb::ndim<Dimensions>, nb::c_contig, nb::de
 // Returns a position in rows of this width, as Python writes it.
 std::string at(int64_t index, int64_t width);
 
-// Returns whether all blocks of the numbers first … last − 1 pass. It uses several threads where these save more than
-// they cost.
+// Returns whether all blocks of the numbers first … last − 1 pass. It uses threads where they save more than they cost.
 bool all_pass(int64_t n, int threads, const std::function<bool(int64_t first, int64_t last)>& pass);
 
 // Rejects values beyond the largest float, and NaN, in float or double arrays. Squares and products of larger ones

@@ -1,5 +1,4 @@
-// Estimates the memory of the passes, an upper bound in bytes by part, from their owners' formulas. Callers ask before
-// they allocate.
+// Bounds the memory of the passes, in bytes by part, by their owners' formulas, before anything is allocated.
 
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/map.h>
@@ -75,8 +74,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         bytes["ray structure"] = RayCaster::bytes(s.faces, s.verts);
     }
     if (interior) {
-        // The first part is the measure, and what controls need of each vertex. Large textured faces are left to
-        // pixels.
+        // First come the measure, and what controls need per vertex. Large textured faces are left to pixels.
         const int64_t per_vertex = ImageHits::bytes_per_vertex + s.channels * s.number + 2 * word * w.motion;
         bytes["faces in view"] = (word + 1) * s.faces + per_vertex * s.verts + (s.faces + word * s.pixels) * s.textured;
         bytes["controls"] = w.motion ? rows(s.faces, s.faces, 3, 2, s.verts) : 0;
@@ -92,7 +90,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         if (w.face_attributes) samples += rows(n, s.faces, 1, s.face_attributes, s.faces);
     }
     if (w.steps) {
-        // A line meets a discontinuity in a few points. Each moves three vertices, three texture coordinates and four
+        // A line crosses a discontinuity at few points. Each moves three vertices, three texture coordinates and four
         // alphas.
         constexpr int64_t points = 4;
         const int64_t lines = w.step_lines < 0 ? many / points : w.step_lines;
@@ -103,8 +101,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         if (w.alphas) steps += points * rows(lines, -1, 4, 1, s.alphas);
     }
     if (w.boundary) {
-        // Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a tangled mesh's
-        // edges.
+        // If all attributes are indexed like vertices, curves are silhouettes: a quarter of a tangled mesh's edges.
         const int64_t curves = w.curves < 0 ? s.edges() / (s.jumps ? 1 : 4) : w.curves;
         bytes["edges in view"] = s.faces + curves * bytes_per_curve();
         bytes["creases"] = s.jumps ? 2 * word * s.verts + int64_t(sizeof(CreaseFace)) * s.faces +

@@ -1,5 +1,4 @@
-// Binds the operators on triangles in clip space: rasterization, interpolation, texturing and antialiasing, for
-// edgegrad/raster.
+// Binds edgegrad/raster's operators on clip-space triangles: rasterize, interpolate, sample textures, antialias.
 
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>

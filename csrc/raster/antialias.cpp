@@ -22,8 +22,7 @@ struct SideLine {
     }
 };
 
-// Returns whether the surface folds over, or ends, at a side of a triangle, so that no other triangle continues beyond
-// it.
+// Returns whether the surface folds over or ends at a side of a triangle; no other continues beyond it.
 template <class T>
 bool is_silhouette(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t item, int64_t half_edge) {
     // It returns the corner opposite to a half-edge.

@@ -12,8 +12,7 @@ namespace edgegrad {
 
 namespace {
 
-// Holds which levels of a pyramid one pixel uses: the weight of the second of two levels, and whether that has a
-// derivative.
+// Holds which levels of a pyramid one pixel uses: two of them, the second one's weight, and whether that moves.
 struct Levels {
     int below = 0, above = 0;
     double share = 0;
@@ -164,8 +163,7 @@ void texels_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& planes
     });
 }
 
-// Returns the cotangent of the texels. It sums per image of a texture, then moves the levels to their places among all
-// images'.
+// Returns the cotangent of the texels. It sums per image, then moves the levels to their places among all images'.
 template <class T>
 Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, ThreadTeam& team) {
     TextureShape one = in.shape;

@@ -12,8 +12,7 @@ namespace edgegrad {
 
 enum class Border { wrap, clamp, zero, cube };
 
-// Describes levels of halves, one after the other. Each has all images' textures; each texture has its sides, row by
-// row.
+// Describes levels of halves, one after the other. Each has all images' textures with their sides, row by row.
 struct TextureShape {
     int64_t images;  // 1 means that all images share the texture.
     int64_t height, width;
@@ -93,8 +92,7 @@ inline int64_t cube_texel(const TexelPlane& plane, int side, int64_t x, int64_t 
                     (int64_t(to.t_sign) * place[to.t] + n - 1) / 2);
 }
 
-// Holds one coordinate as texels: two of them, the weight of the second, and its derivative with respect to the
-// coordinate.
+// Holds one coordinate as two texels, the weight of the second, and its derivative by the coordinate.
 struct Steps {
     int64_t i0, i1;  // −1 means outside.
     double share, slope;

@@ -1,5 +1,4 @@
-// Computes positions in textures from texture coordinates, and pyramid levels from their derivatives in the image, each
-// with its _vjp.
+// Computes texture positions from coordinates, and pyramid levels from their image derivatives, each with its _vjp.
 #pragma once
 
 #include <cmath>

@@ -6,12 +6,10 @@
 
 namespace edgegrad {
 
-// Opens libembree4 and makes the device, with Embree's own options. Throws std::runtime_error when it is missing or not
-// version 4.
+// Opens libembree4 and makes the device, with Embree's options. Throws std::runtime_error if it is missing or not 4.x.
 void open_embree(const std::string& path, const std::string& options = "");
 
-// Whoever makes, builds or frees a ray structure holds this, so that fork() can wait until nobody does: see
-// before_fork().
+// Making, building or freeing a ray structure holds this, so that fork() can wait (before_fork()).
 extern std::mutex embree_mutex;
 
 // Waits, with embree_mutex held, until Embree's threads sleep after the last build.

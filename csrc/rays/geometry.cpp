@@ -15,8 +15,7 @@ Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
 namespace {
 
 std::mutex mutex;
-// The most recently used is first. The list is never destroyed, because another thread may render while the process
-// ends.
+// The most recently used is first. The list is never destroyed, as threads may render while the process ends.
 std::list<std::shared_ptr<Geometry>>& kept = *new std::list<std::shared_ptr<Geometry>>;
 constexpr size_t most_kept = 8;
 
@@ -60,8 +59,7 @@ class KeptGeometry {
     }
 
    private:
-    // Returns whether there is geometry at these positions. If not, takes an unused one out of the list to be moved, if
-    // there is one.
+    // Returns whether there is geometry at these positions. If not, takes an unused one out of the list, if any.
     bool find(GeometryWanted wanted) {
         const std::lock_guard lock(mutex);
         auto found = kept.end();
@@ -127,8 +125,7 @@ void clear_geometry() {
 
 namespace {
 
-// Counts this thread's open calls of before_fork(), because Python registers them anew when the package is imported
-// again.
+// Counts this thread's open calls of before_fork(), which Python registers again with each import of the package.
 thread_local int forks = 0;
 
 }  // namespace

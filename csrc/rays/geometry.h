@@ -1,5 +1,4 @@
-// Keeps what depends on faces and positions alone between calls: the ray structure, the edges, and the intersections of
-// faces.
+// Keeps what depends on faces and positions alone between calls: ray structure, edges, and intersections of faces.
 #pragma once
 
 #include <cstdint>

@@ -5,8 +5,8 @@
 
 namespace edgegrad {
 
-// Returns this distance in world units: some spacings of the input's coordinates, plus the roundings of doubles for a
-// thing of that size.
+// Returns this distance in world units: some spacings of the input's coordinates, plus roundings of doubles of that
+// size.
 inline constexpr double rounding_of_doubles = 64 * std::numeric_limits<double>::epsilon();
 inline double contact(double spacing, double coordinate, double size) {
     return 8 * spacing * coordinate + rounding_of_doubles * size;

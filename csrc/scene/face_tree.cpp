@@ -28,8 +28,7 @@ struct CornerLanes {
     }
 };
 
-// Sets float boxes that contain the double ones. A float lies within half a spacing of the double that was rounded to
-// it.
+// Sets float boxes that contain the double ones. A float lies within half a spacing of its double.
 EDGEGRAD_VECTORIZED void set_boxes(const CornerLanes& l, BoxGroup& boxes) {
     constexpr double most = 0x1p127;  // It is the range of floats.
     for (int k = 0; k < 3; ++k) {

@@ -19,8 +19,7 @@ constexpr double least_part = 0.1;
 constexpr int lanes = CornerGroup::size;
 constexpr float infinity = std::numeric_limits<float>::infinity();
 
-// Bounds the relative error of a coordinate: four products and sums of floats have half a spacing each; this is twice
-// that.
+// Bounds the relative error of a coordinate: twice four products and sums of floats of half a spacing each.
 constexpr float rounding = 0x1p-20f;
 
 struct Interval {

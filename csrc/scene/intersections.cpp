@@ -110,8 +110,7 @@ class PairFinder {
     PairFinder(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces, const DrawnPairs& drawn)
         : tree_(tree), fields_(fields), faces_(faces), drawn_(drawn), coarsest_(faces.spacing.coarsest()) {}
 
-    // Calls found(other) for the leaves from this one on that overlap it, if their drawn faces may pass through each
-    // other.
+    // Calls found(other) for leaves from this one on that overlap it, if drawn faces may pass through each other.
     template <class FoundIntersections>
     void each_overlapping(int64_t leaf, FoundIntersections found) const {
         if (!drawn_.in(leaf) || !fields_.crossed(leaf)) return;

@@ -17,8 +17,7 @@ namespace edgegrad {
 struct Intersection {
     int32_t face[2];  // They ascend.
     // A surface may pass through a face exactly along an edge: face[ending] ends there, and `next` continues on the
-    // other side. Motion one way lets one of them pass through, motion the other way the other; each therefore counts
-    // half.
+    // other side. Motion one way lets one of them pass through, motion the other way the other; each counts half.
     int32_t next = -1;
     int32_t ending = 0;
     // The fraction of the gradient that goes to this pair, because copies of faces have the same segment. It exceeds 1

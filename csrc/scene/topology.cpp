@@ -138,8 +138,7 @@ Topology::Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Threa
 
 void Topology::weld(const double* verts, const Spacing& spacing, ThreadTeam& team) {
     if (candidates_.empty()) return;
-    // Copies with different roundings may lie between others of a coarser spacing, never the reverse, so coarse ones
-    // come first.
+    // Copies may lie between others of a coarser spacing, never the reverse, so coarse ones come first.
     std::vector<double> spacings = spacing.value;
     std::sort(spacings.begin(), spacings.end(), std::greater<>());
     spacings.erase(std::unique(spacings.begin(), spacings.end()), spacings.end());

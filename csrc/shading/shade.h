@@ -1,6 +1,6 @@
 // Evaluates the radiance of a face at given barycentrics, followed by its attributes. Radiance is an interpolated
-// colour, or a texture at interpolated coordinates. A new light or material is one more file here and one more line in
-// shade and shade_vjp.
+// colour, or a texture at interpolated coordinates. A new material is one more file here, and a line in shade and
+// shade_vjp.
 #pragma once
 
 #include <array>
@@ -110,8 +110,7 @@ class AffineRadiance {
     Sum value_ = Sum(0), d_u_ = Sum(0), d_v_ = Sum(0);
 };
 
-// Sums the cotangents of a face's three corners over a run of samples. They belong to colours or texture coordinates,
-// and to attributes.
+// Sums cotangents of a face's corners (colours, or texture coordinates; attributes) over a run of samples.
 struct CornerGrad {
     int width = 0;
     std::vector<double> value, attributes;  // Their shapes are (3, width) and (3, attributes).
@@ -131,8 +130,7 @@ struct CornerGrad {
     }
 };
 
-// Returns the cotangent of the barycentrics. Adds the cotangents of the corners to `corners`, and those of texels to
-// `grad`.
+// Returns the cotangent of the barycentrics. Adds cotangents of corners to `corners`, and of texels to `grad`.
 template <int N, class T>
 Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, const double* bar, bool want_texels,
                        CornerGrad& corners, LocalGradients& grad) {

@@ -1,5 +1,4 @@
-// Completes directions to antithetic sets, in which the positive and negative parts of a glossy lobe's derivatives
-// cancel.
+// Completes directions to antithetic sets, in which positive and negative parts of a glossy lobe's derivatives cancel.
 #pragma once
 
 #include <algorithm>

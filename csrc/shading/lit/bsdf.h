@@ -42,8 +42,8 @@ Lobe<S> lobe(S roughness, Vector<S> v, Vector<S> n, Vector<S> l) {
     const S squared = roughness * roughness;
     const S alpha = plain(squared) < least_alpha ? S(least_alpha) : squared;
     o.a2 = alpha * alpha;
-    // Walter et al. 2007 define D. The sine comes from a cross product, because 1 − cos² would round away what a small
-    // α depends on.
+    // Walter et al. 2007 define D. The sine comes from a cross product, as 1 − cos² would round away what a small α
+    // needs.
     o.sine = cross(n, o.half), o.nh = dot(n, o.half);
     o.d = dot(o.sine, o.sine) + o.a2 * o.nh * o.nh;
     o.D = o.a2 / (S(M_PI) * o.d * o.d);

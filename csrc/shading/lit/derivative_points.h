@@ -47,8 +47,7 @@ class ResampledAntitheticSets {
         double target = 0, running = 0;  // `pdf` of a point holds its measure.
     };
 
-    // Adds a candidate. The lobe's pdf is known above the surface alone (bsdf_sampling.h), so its samples below are
-    // dropped.
+    // Adds a candidate. The lobe has no pdf below the surface (bsdf_sampling.h), so its samples there are dropped.
     void add(const LightPoint& p, Vec3 l, bool of_lobe) {
         if (of_lobe && !(dot(n_, l) > 0)) return;
         const AntitheticSet all(v_, n_, alpha_, l);

@@ -1,5 +1,5 @@
-// Computes the irradiance of flat faces from punctual lights at their corners. It differs across an edge where radiance
-// may jump.
+// Computes the irradiance of flat faces from punctual lights at their corners. It differs at edges where radiance
+// jumps.
 #pragma once
 
 #include <algorithm>

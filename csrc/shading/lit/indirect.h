@@ -1,6 +1,5 @@
-// Computes indirect light at the points that lit.h lights directly, as radiance to be added. It traces one path of at
-// most options.bounces points for each. The points' seeds supply the random numbers, so derivatives retrace the same
-// paths.
+// Computes indirect light at the points that lit.h lights directly, as radiance to be added. It traces a path of at
+// most options.bounces points each. The points' seeds supply the random numbers, so derivatives retrace the same paths.
 #pragma once
 
 #include <memory>

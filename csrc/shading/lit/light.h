@@ -70,8 +70,7 @@ inline Picked pick(const double* running, int64_t first, int64_t n, int64_t step
     return {low, mass > 0 ? std::clamp((at - before(low)) / mass, 0.0, 1.0) : 0.5};
 }
 
-// Samples a point from numbers in [0, 1); close numbers give close points. An environment selects its row first, then
-// its column.
+// Samples a point from numbers in [0, 1); close numbers give close points. Environments select row, then column.
 inline LightPoint draw(const Light& light, Vec2 u) {
     if (light.is_punctual()) return {};
     if (light.kind == Light::Kind::environment) {

@@ -162,8 +162,7 @@ class Resampled {
         }
     }
 
-    // Evaluates the BSDF times the cosine. Nearly black colours are raised to `dark`, because they have derivatives,
-    // too.
+    // Evaluates the BSDF times the cosine. Nearly black colours become `dark`, as they have derivatives, too.
     class Target {
        public:
         template <class S>

@@ -103,8 +103,7 @@ struct LitOptions {
     bool shadows = true;
     int samples = 1;  // It counts the points of each light with an extent.
     int only = -1;    // Only this light contributes; −1 means all.
-    // Says that only derivatives are wanted. Points of environments are then drawn in antithetic sets on glossy
-    // surfaces.
+    // Only derivatives are wanted. Glossy surfaces then sample environments in antithetic sets.
     bool antithetic = false;
     // Light sampling treats darker glossy surfaces as this dark, because black ones have derivatives, too.
     double dark = 0;
@@ -116,8 +115,7 @@ struct LitOptions {
     int by_paths = -1;  // Paths find this light from Lambertian surfaces, which draw no points of it.
 };
 
-// Marks a light sample that was not traced, as the surface faces away from it. Otherwise visibility is 1, or 0 in
-// shadow.
+// Marks a light sample behind the surface, which is not traced. Otherwise visibility is 1, or 0 in shadow.
 constexpr int8_t not_asked = -1;
 
 struct LightSample {

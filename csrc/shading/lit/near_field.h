@@ -1,5 +1,4 @@
-// Splits the light that reaches the first point x₁ of a path into a near part, φ, and the rest, 1 − φ. With d = |x₂ −
-// x₁|,
+// Splits light that reaches the first point x₁ of a path into a near part, φ, and the rest, 1 − φ. With d = |x₂ − x₁|,
 //
 //     φ = (1 − d² / r²)² for d < r, else 0.
 //

@@ -59,9 +59,8 @@ inline void smooth_normal_vjp(const std::vector<Table>& tables, const NormalSour
     }
 }
 
-// A perturbed normal of at most this length before normalisation determines no direction. Its derivatives would be as
-// large as it is short. An 8-bit map is off by up to 1/255 in each component, √3/255 in length. The map is ignored
-// there.
+// A perturbed normal that is not longer than this, unnormalised, has no direction. Its derivatives would be as large as
+// it is short. An 8-bit map is off by up to 1/255 in each component, √3/255 in length. The map is ignored there.
 constexpr double faintest_normal = 1.0 / 128;
 
 // Holds the frame of texture coordinates at the point, and the map's normal in it.

@@ -104,8 +104,7 @@ class Paths {
             return true;
         });
     }
-    // Traces paths from points that `place(i, surface)` sets where it returns true, viewed as it says. Lights are
-    // sampled for them, too.
+    // Traces paths from points that `place(i, surface)` sets if it returns true, and samples lights for them, too.
     template <class T, class Place>
     void find_lit(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Place place) {
         begin(from, place);

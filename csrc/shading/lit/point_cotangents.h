@@ -1,5 +1,4 @@
-// Holds what derivatives at points of surfaces share: cotangents of their positions and of the tables, and points that
-// move in one direction.
+// Holds what derivatives at surface points share: cotangents of positions and tables, and points that move.
 #pragma once
 
 #include <algorithm>

@@ -19,8 +19,7 @@ inline void from_direction_vjp(const std::vector<Table>& tables, const Light& li
     power_vjp(tables, light, channels, bar.E, to);
 }
 
-// Evaluates a spot's falloff towards a point: the square of (cos θ − cos outer) / (cos inner − cos outer), clamped to
-// [0, 1].
+// Evaluates a spot's falloff: the square of (cos θ − cos outer) / (cos inner − cos outer), clamped to [0, 1].
 constexpr double least_ramp = 1e-3;  // glTF limits the denominator to this.
 template <class S>
 struct Cone {

@@ -1,5 +1,5 @@
-// Looks up material parameters, and implements the _vjp. A source is a constant, an array over vertices, faces or
-// corners, or a texture.
+// Looks up material parameters, and implements the _vjp. They are constants, arrays over vertices, faces or corners, or
+// textures.
 #pragma once
 
 #include <algorithm>
@@ -95,8 +95,7 @@ void each_texel(const TexelGrid& grid, Uv<S> uv, Visit visit) {
 }
 
 // Selects the level of a pyramid (Williams 1983): log2 of the distance between neighbouring pixels in texels. The
-// larger distance of both directions counts, and two levels are interpolated linearly. edgegrad/points/footprints.py
-// computes the same.
+// larger distance of both directions counts; two levels are interpolated. edgegrad/points/footprints.py does the same.
 template <class S>
 struct Level {
     int fine = 0;
