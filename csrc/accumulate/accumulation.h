@@ -1,6 +1,6 @@
-// The accumulations of samples: reverse mode, forward mode, the gradient by places in the image, and the samples
-// themselves, for whoever contracts them elsewhere (records.h). What each does with a sample inside a face stands in
-// interior/accumulation.cpp, with one on a curve in boundary/accumulation.cpp.
+// Lists the accumulations of samples: reverse mode, forward mode, the screen-space gradient, and recorded samples for
+// differentiation elsewhere (records.h). interior/accumulation.cpp applies them to samples inside faces,
+// boundary/accumulation.cpp to samples on curves.
 #pragma once
 
 #include <variant>
@@ -10,15 +10,15 @@
 
 namespace edgegrad {
 
-// To cotangents of the parameters; `geometry`: also of what moves inside faces.
+// Accumulates the adjoint: cotangents of the parameters. `geometry` includes what moves inside faces.
 struct Reverse {
     bool geometry;
 };
-// To derivatives of the pixels in several directions.
+// Accumulates tangents: derivatives of the pixels in several directions.
 struct Forward {
     Directions directions;
 };
-// To the gradient by the places of what is seen, two numbers a pixel.
+// Accumulates the gradient with respect to image positions, two numbers a pixel.
 struct Screen {};
 
 using Accumulation = std::variant<Reverse, Forward, Screen, Record>;

@@ -1,4 +1,4 @@
-// The points of surfaces that samples on curves show, end to end: what a shader is asked for.
+// Lists the surface points that samples on curves show, for evaluation by a shader.
 #pragma once
 
 #include <algorithm>
@@ -16,13 +16,13 @@ struct CurveHits {
         : sample(n), face(n), side(n), b(3 * n), x(2 * n), factor(n), to_background(samples) {}
 
     Array<int64_t> sample;
-    Array<int32_t> face, side;    // side: which of the sample's surfaces it is
-    Array<double> b, x, factor;   // (N, 3) barycentrics, (N, 2) pixel position
+    Array<int32_t> face, side;    // `side` says which of the sample's surfaces it is.
+    Array<double> b, x, factor;   // (N, 3) barycentrics, (N, 2) pixel position, (N,)
     Array<double> to_background;  // (S,) the factor of what lies behind all surfaces
 };
 
-// Barycentrics are no less than `least`, a little inside of a face, so that rounding does not take a step along its
-// border for passed: at u = 1 a texture that repeats begins anew. `one`: of the first surface alone.
+// Collects the hits. Barycentrics are at least `least`, slightly inside a face, so that rounding does not cross a
+// discontinuity along its border: at u = 1 a repeating texture begins anew. `one` selects the first surface alone.
 inline CurveHits curve_hits(const std::vector<CurveRecords>& parts, double least, bool one, ThreadTeam& team) {
     constexpr int all = CurveRecords::surfaces;
     const int most = one ? 1 : all;

@@ -1,4 +1,4 @@
-// What a gradient can be asked for: one table, from which Python reads too.
+// Lists the parameters of a gradient in one table, which Python reads, too.
 #pragma once
 
 #include <cstdint>
@@ -8,7 +8,7 @@
 
 namespace edgegrad {
 
-// An array of doubles for each parameter; null: none.
+// Points to an array of numbers for each parameter; null: none.
 template <class Number>
 struct Slots {
     Number* verts = nullptr;
@@ -24,21 +24,21 @@ struct Slots {
     Number* distortion = nullptr;       // (8,), see lens.h
 
     bool geometry() const { return verts || world_to_camera || K || distortion; }
-    // What moves steps within faces.
+    // Returns whether discontinuities within faces move.
     bool steps() const { return geometry() || uvs || alphas; }
     bool appearance() const { return colors || uvs || texels || vertex_attributes || face_attributes; }
 };
 
-// Where gradients are added, in double whatever the arrays hold; null where none is wanted.
+// Points to the gradients, in double whatever the arrays hold; null where none is wanted.
 using Gradients = Slots<double>;
 
-// Derivatives of the parameters in one direction; null where they are zero.
+// Points to the parameters' derivatives in one direction; null where they are zero.
 using Tangents = Slots<const double>;
 
-// A new differentiable parameter is a member above, a row here, and what computes it.
+// Describes one parameter. A new differentiable parameter is a member above, a row here, and the code that computes it.
 template <class T>
 struct GradientSlot {
-    const char* name;  // of the array that it belongs to, in edgegrad/kernel/request.py
+    const char* name;  // It names the array in edgegrad/kernel/request.py.
     double* Gradients::* to;
     const double* Tangents::* from;
     int64_t (*size)(const SceneView<T>& scene, int64_t pixels);

@@ -4,7 +4,7 @@
 
 namespace edgegrad {
 
-// The rows of both, and their width.
+// Pairs the rows of both with their width.
 constexpr int as_radiance = 0, as_pixels = -1, as_vertex_attributes = -2, as_face_attributes = -3;
 struct RowSlot {
     RowBuffer LocalGradients::* rows;
@@ -30,7 +30,7 @@ constexpr RowSlot row_slots[] = {
 int64_t RowBuffer::bytes(const Load& load, int threads) {
     const int64_t chunks = std::min((load.samples + scatter_chunk - 1) / scatter_chunk, chunks_in_flight * threads);
     const int64_t samples = std::min(load.samples, scatter_chunk * chunks), owners = std::min(threads, most_owners);
-    // They come in order, so there are no more runs than primitives and ends of chunks.
+    // Samples come in order, so runs are at most as many as primitives and ends of chunks.
     const int64_t runs = load.primitives < 0 ? samples : std::min(samples, load.primitives + chunks);
     const int64_t used = std::min<int64_t>(owners, (load.destinations + run - 1) / run);
     const int64_t rows = std::max(load.each * runs, chunks * used * int64_t(fewest_rows));

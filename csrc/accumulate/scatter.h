@@ -1,8 +1,8 @@
-// The only writer of gradients: the same bits at any number of threads.
+// Writes all gradients, with the same bits at any number of threads. No other file writes gradients.
 //
-// Samples are worked on in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own, one for
-// each owner of destinations; then each thread adds, chunk after chunk, the rows whose destination it owns. So each sum
-// has one owner and one order. Chunks are taken in waves, which bounds the memory; how many a wave has changes no
+// Samples are processed in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own, one for
+// each owner of destinations. Each thread then adds, chunk after chunk, the rows whose destination it owns. Each sum
+// therefore has one owner and one order. Chunks come in waves, which bounds the memory; the size of a wave changes no
 // order.
 #pragma once
 
@@ -21,9 +21,9 @@ namespace edgegrad {
 
 class RowBuffer {
    public:
-    // Bytes, at most, of the buffers that take the rows of `samples` samples, for Scatter's owners and chunks: `each`
-    // rows of `width` numbers come together for a run of samples on one primitive. There are `primitives`, or, if that
-    // is −1, as many as samples; and so many `destinations`.
+    // Describes the rows of `samples` samples, for an upper bound in bytes with Scatter's owners and chunks. `each`
+    // rows of `width` numbers come together for a run of samples on one primitive. There are `primitives`, or as many
+    // as samples if that is −1, and `destinations`.
     struct Load {
         int64_t samples, primitives, each, destinations;
         int width;
@@ -42,12 +42,12 @@ class RowBuffer {
             r.count = 0;
         }
     }
-    // W: the width at compile time, or 0.
+    // W is the width at compile time, or 0.
     template <int W = 0>
     void add(int64_t index, const double* values) {
         const int width = W ? W : width_;
-        // Neighbours in a mesh come soon after one another and share destinations: most rows are added to one that is
-        // there. Which are does not depend on the owners.
+        // Neighbours in a mesh follow each other closely and share destinations, so most rows are added to an existing
+        // one. The choice does not depend on the owners.
         Recent& recent = recent_[uint64_t(index) % n_recent];
         if (recent.index == index) {
             double* row = rows_[recent.owner].value.data() + size_t(recent.row) * width;
@@ -95,50 +95,49 @@ class RowBuffer {
             for (int c = 0; c < width; ++c) destination[r.index[k] * width + c] += Number(r.value[k * width + c]);
     }
     static constexpr int n_recent = 256;
-    static constexpr size_t fewest_rows = 16;  // that a buffer has room for as soon as there is one
-    // Of destinations in turn, which balances and keeps owners apart in cache lines.
+    static constexpr size_t fewest_rows = 16;  // A buffer has room for this many once it is used.
+    // Owners take runs of destinations in turn, which balances work and keeps owners apart in cache lines.
     static constexpr uint64_t run = 32;
     int width_ = 0;
-    std::vector<Rows> rows_;  // one for each owner
+    std::vector<Rows> rows_;  // Each owner has one.
     std::vector<Recent> recent_;
 };
 
-// How a border of a shadow moves with the point of the light that casts it; of one sample, for records of it alone.
+// Holds how a shadow boundary moves with the light's point that casts it, for the record of one sample.
 struct LightMotion {
     int32_t part = -1;
     Vec2 uv;
-    Vec3 by_place;  // camera coordinates
+    Vec3 by_place;  // It is in camera coordinates.
 };
 
-// What the samples of one chunk give.
+// Holds the thread-local gradients of one chunk of samples.
 struct LocalGradients {
-    RowBuffer q, x, colors, uvs, texels, alphas;  // vertices: q in camera coordinates, x in the image
+    RowBuffer q, x, colors, uvs, texels, alphas;  // Vertices have q in camera coordinates and x in the image.
     RowBuffer vertex_attributes, face_attributes;
-    RowBuffer pixels;  // of what has the size of the image
+    RowBuffer pixels;  // They belong to an array of the image's size.
     IntrinsicsGrad k;
     LightMotion light;
     Records records;
 };
 
-// Where it goes; null where none is wanted.
+// Points to the gradients' destinations; null where none is wanted.
 struct GradientSink {
     double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *alphas = nullptr;
     double *vertex_attributes = nullptr, *face_attributes = nullptr, *pixels = nullptr;
-    int pixel_width = 0;  // numbers a pixel
+    int pixel_width = 0;  // It counts numbers per pixel.
     IntrinsicsGrad k = {};
     bool want_k = false;
     RecordList* records = nullptr;
 };
 
-struct RowSlot;  // the rows of both, and their width
+struct RowSlot;  // It pairs the rows of both with their width.
 
-// Samples in a chunk, chunks that are in memory at a time for each thread, and owners at most: more would only split
-// the buffers further.
+// Limits samples per chunk, chunks in memory per thread, and owners. More owners would only split the buffers further.
 constexpr int64_t scatter_chunk = 512, chunks_in_flight = 16;
 constexpr int most_owners = 16;
 
-// Calls body(first, last, chunk) for all samples 0 … n − 1, after prepare(chunk, owners); then add(chunk, owner) for
-// the chunks in order and each owner, and last(chunk). `seconds`: of the samples and of the adding.
+// Calls body(first, last, chunk) for all samples 0 … n − 1, after prepare(chunk, owners). Then calls add(chunk, owner)
+// for the chunks in order and each owner, and last(chunk). `seconds` gets the times of sampling and of adding.
 template <class Chunk, class Prepare, class Body, class Add, class Last>
 void scatter_in_waves(ThreadTeam& team, int64_t n, std::vector<Chunk>& chunks, Prepare prepare, Body body, Add add,
                       Last last, double (&seconds)[2]) {
@@ -147,7 +146,7 @@ void scatter_in_waves(ThreadTeam& team, int64_t n, std::vector<Chunk>& chunks, P
     if (const int64_t most = std::min(wave, (n + size - 1) / size); int64_t(chunks.size()) < most) chunks.resize(most);
     Stopwatch watch;
     for (int64_t first = 0; first < n; first += size * wave) {
-        team.check();  // the calling thread may get no chunk of a wave
+        team.check();  // The calling thread may get no chunk of a wave.
         const int64_t count = std::min(wave, (n - first + size - 1) / size);
         team.parallel_for(count, [&](int64_t i) {
             prepare(chunks[i], owners);
@@ -163,7 +162,7 @@ void scatter_in_waves(ThreadTeam& team, int64_t n, std::vector<Chunk>& chunks, P
     }
 }
 
-// The buffers of one backward pass, whose parts use them one after the other.
+// Holds the buffers of one backward pass, which its parts use one after the other.
 class Scatter {
    public:
     struct Widths {
@@ -171,8 +170,8 @@ class Scatter {
     };
     Scatter(ThreadTeam& team, Widths widths) : team_(team), widths_(widths) {}
 
-    // Calls body(first, last, grad) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
-    // samples and of the adding.
+    // Calls body(first, last, grad) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds` gets the times
+    // of sampling and of adding.
     using Body = std::function<void(int64_t first, int64_t last, LocalGradients& grad)>;
     void add(int64_t n, GradientSink& to, double (&seconds)[2], const Body& body);
 

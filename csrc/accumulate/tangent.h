@@ -1,4 +1,4 @@
-// Forward mode: derivatives in given directions. What a sample finds is added to the pixels around it.
+// Implements forward mode: derivatives in given directions. Each sample adds to the pixels around it.
 #pragma once
 
 #include <span>
@@ -12,8 +12,7 @@
 
 namespace edgegrad {
 
-// One direction: the tangents of the arrays, and what follows from them for the vertices in the camera and for its
-// intrinsics.
+// Holds one direction: the tangents of the arrays, and of the vertices in the camera and its intrinsics.
 struct Direction {
     Tangents tangents;
     Array<Vec3> q{0};  // (V,) camera coordinates; empty: nothing moves
@@ -22,7 +21,7 @@ struct Direction {
     bool moves() const { return !q.empty(); }
 };
 
-// q = R p + t: q̇ = R ṗ + Ṙ p + ṫ.
+// Uses q = R p + t: q̇ = R ṗ + Ṙ p + ṫ.
 inline Direction make_direction(const Tangents& tangents, const Camera& sub_camera, const double* verts,
                                 int64_t n_verts, ThreadTeam& team) {
     Direction out{.tangents = tangents};

@@ -1,4 +1,5 @@
-// Radial and decentring distortion as OpenCV has it (Brown 1966, Conrady 1919), with its rational radial part.
+// Implements OpenCV's lens model: radial and decentring distortion (Brown 1966, Conrady 1919) with a rational radial
+// part.
 #pragma once
 
 #include <cmath>
@@ -9,11 +10,11 @@
 
 namespace edgegrad {
 
-// With s = |n|² and g = (1 + k1 s + k2 s² + k3 s³) / (1 + k4 s + k5 s² + k6 s³):
+// Distorts n to m. With s = |n|² and g = (1 + k1 s + k2 s² + k3 s³) / (1 + k4 s + k5 s² + k6 s³):
 //
 //     m = g n + (2 p1 n.x n.y + p2 (s + 2 n.x²), p1 (s + 2 n.y²) + 2 p2 n.x n.y)
 struct BrownConrady {
-    static constexpr int coefficients = 8;  // in OpenCV's order; those of its shorter lists are the first
+    static constexpr int coefficients = 8;  // They are in OpenCV's order, whose shorter lists are prefixes.
     double k1, k2, p1, p2, k3, k4, k5, k6;
 
     explicit BrownConrady(const double* c)
@@ -41,7 +42,7 @@ struct BrownConrady {
     }
 
     bool is_radial() const { return p1 == 0 && p2 == 0; }
-    // Whether the image is that of a pinhole.
+    // Returns whether the lens is a pinhole.
     bool is_identity() const {
         for (const double c : {k1, k2, p1, p2, k3, k4, k5, k6})
             if (c != 0) return false;
@@ -53,7 +54,8 @@ struct BrownConrady {
         return g + 2 * s * slope(s, g);
     }
 
-    // With g = A / B, and since r' = (A B + 2 s (A' B − A B')) / B²: the zeros of that numerator, of A, and the poles.
+    // r' = (A B + 2 s (A' B − A B')) / B², with g = A / B. The sign changes at the zeros of that numerator, of A, and
+    // at poles.
     std::vector<double> turning_radii(double most) const {
         const Polynomial A{1, k1, k2, k3}, B{1, k4, k5, k6}, AB = product(A, B);
         Polynomial rise = AB;
@@ -68,7 +70,7 @@ struct BrownConrady {
    private:
     double above(double s) const { return 1 + s * (k1 + s * (k2 + s * k3)); }
     double below(double s) const { return 1 + s * (k4 + s * (k5 + s * k6)); }
-    // ∂g/∂s
+    // Returns ∂g/∂s.
     double slope(double s, double g) const {
         return (k1 + s * (2 * k2 + s * 3 * k3) - g * (k4 + s * (2 * k5 + s * 3 * k6))) / below(s);
     }

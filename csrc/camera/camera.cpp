@@ -13,16 +13,16 @@ namespace edgegrad {
 
 namespace {
 
-constexpr double margin = 1;  // px, by which a filter may reach over the border of the image
+constexpr double margin = 1;  // A filter may reach this many px over the border of the image.
 
-// This cache keeps what is visible through the lenses of recent calls. That depends on a camera's size, K and
-// coefficients alone, and finding it takes as long as a small image. Each entry takes about 10 KiB.
+// This cache keeps the visible parts of recent lenses. They depend on a camera's size, K and coefficients alone, and
+// finding one takes as long as a small image. Each entry takes about 10 KiB.
 class LensViews {
    public:
     using Key = std::array<uint64_t, 9 + most_coefficients>;
     struct View {
         Key key;
-        AnyLens lens;  // a fisheye may have become a wide one
+        AnyLens lens;  // A fisheye may have become a WideFisheye.
         LensView view;
     };
 
@@ -56,7 +56,7 @@ class LensViews {
 };
 
 LensViews& lens_views() {
-    static auto* views = new LensViews;  // for threads that outlive the end of main()
+    static auto* views = new LensViews;  // It is never freed, as threads may outlive the end of main().
     return *views;
 }
 
@@ -89,8 +89,8 @@ LensView Camera::view_through_lens() const {
                          {width + margin, height + margin}})
         most = std::max(most, length(normalised(*this, x)));
     view.disc.inverse = std::make_shared<const RadialInverse>(lens, view.disc.fold, (1 + 1e-9) * most);
-    // The border of the image: what is seen within it lies within its image.
-    constexpr int points = 256;  // a side
+    // The border of the image suffices, because whatever is seen within it lies within its image.
+    constexpr int points = 256;  // Each side has these.
     constexpr double infinite = std::numeric_limits<double>::infinity();
     Vec2 low{infinite, infinite}, high{-infinite, -infinite};
     const auto add = [&](Vec2 u) {
@@ -106,11 +106,11 @@ LensView Camera::view_through_lens() const {
     }
     double radius = view.disc.fold;
     if (view.end) {
-        // The whole disc: K takes it to an ellipse.
+        // K maps the whole disc to an ellipse.
         const Vec2 reach{std::hypot(k[0], k[1]) * radius, std::hypot(k[3], k[4]) * radius};
         low = Vec2{k[2], k[5]} - reach, high = Vec2{k[2], k[5]} + reach;
     } else {
-        // Between its points the border is bent by less than a hundredth of their distance, or so.
+        // Between its points, the border is distorted by less than about a hundredth of their distance.
         const Vec2 more = (1.0 / points) * (high - low);
         low = low - more, high += more;
         double farthest = 0;
@@ -119,7 +119,7 @@ LensView Camera::view_through_lens() const {
         radius = std::min(radius, farthest);
     }
     view.low = low, view.high = high;
-    // The derivatives are smooth: a twentieth is more than they change between neighbours of these.
+    // The derivatives are smooth; they change by less than a twentieth between neighbouring samples.
     constexpr int radii = 64, angles = 16;
     for (int i = 0; i <= radii; ++i)
         for (int j = 0; j < angles; ++j) {
@@ -134,7 +134,7 @@ LensView Camera::view_through_lens() const {
 
 namespace {
 
-// Of a camera without skew.
+// Returns the box for a camera without skew.
 Box2 normalised_box(const Camera& c, Vec2 low, Vec2 high) {
     const Vec2 a = normalised(c, low), b = normalised(c, high);
     return {{std::min(a.x, b.x), std::min(a.y, b.y)}, {std::max(a.x, b.x), std::max(a.y, b.y)}};
@@ -146,7 +146,7 @@ double Camera::stretch(Vec2 low, Vec2 high) const {
     return with_side_lens(lens, 1.0, [&](const auto& l) { return l.stretch(normalised_box(*this, low, high)); });
 }
 
-// By the mean value theorem, from a place of the box, or the nearest that is seen at all.
+// Uses the mean value theorem from a point of the box, or from the nearest visible one.
 std::pair<Vec2, Vec2> Camera::image_box(Vec2 low, Vec2 high) const {
     if (is_undistorted()) return {low, high};
     if (has_sides(lens)) {

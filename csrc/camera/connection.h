@@ -1,5 +1,4 @@
-// Where a camera has points of surfaces in its image, as far as nothing hides them: how light that is followed from its
-// source comes to pixels.
+// Finds where a camera shows surface points if nothing occludes them. Light tracing connects paths to pixels with it.
 #pragma once
 
 #include <cmath>
@@ -12,21 +11,20 @@
 namespace edgegrad {
 
 struct CameraConnection {
-    Vec2 x;             // the pixel position
-    double area_scale;  // px² of the image that an area of the surface fills, per unit
-    double spread[4];   // how barycentrics along the two sides change from a pixel to the next, to the right and down
+    Vec2 x;             // It is the pixel position.
+    double area_scale;  // It is the image's area, px², per unit area of the surface.
+    double spread[4];   // They are the changes of the barycentrics along the two sides per pixel to the right and down.
 };
 
 class CameraConnections {
    public:
-    // reach  how far beyond its borders, px, the image shows something: the pixel filter's
+    // The pixel filter widens the image by `reach` px beyond its borders.
     CameraConnections(const Camera& camera, double reach) {
         for (const Camera& sub_camera : sub_cameras_of(camera, reach))
             sub_cameras_.push_back({sub_camera, {sub_camera, reach}});
     }
 
-    // Calls body(CameraConnection) for each place of the image at which the point y of a face with the sides e1 and e2
-    // lies, world coordinates.
+    // Calls body(CameraConnection) for each image position of the point y of a face with the sides e1 and e2 (world).
     template <class Body>
     void each(Vec3 y, Vec3 e1, Vec3 e2, Body body) const {
         for (const SubCamera& sub_camera : sub_cameras_) {
@@ -37,7 +35,7 @@ class CameraConnections {
             if (!(distorted.area_scale != 0)) continue;
             const Vec2 u = project_jvp(c, q, c.R * e1, {}), v = project_jvp(c, q, c.R * e2, {});
             const double area = u.x * v.y - u.y * v.x;
-            if (!(std::fabs(area) > 0)) continue;  // seen edge-on
+            if (!(std::fabs(area) > 0)) continue;  // The face is edge-on.
             body(CameraConnection{distorted.x,
                                   std::fabs(area) / length(cross(e1, e2)),
                                   {v.y / area, -u.y / area, -v.x / area, u.x / area}});

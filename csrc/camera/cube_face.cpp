@@ -33,7 +33,7 @@ Box2 sector_box(double inner, double outer, double from, double to) {
     return out;
 }
 
-// Of two sides that share a border each computes the same numbers, but for their signs: so every direction has one.
+// Two faces that share a border compute the same numbers, except for signs, so every direction has one face.
 std::optional<Vec2> CubeFace::place(Vec3 d) const {
     const Vec3 q = turn * d;
     const bool inside =
@@ -57,14 +57,14 @@ Box2 CubeFace::angles(Box2 n) const {
         const double ahead = std::atan2(turn.row[2].x, turn.row[2].z);
         out.low.x += ahead, out.high.x += ahead;
         if (out.low.x >= M_PI) out.low.x -= 2 * M_PI, out.high.x -= 2 * M_PI;
-        if (out.high.x > M_PI) out.low.x = -M_PI, out.high.x = M_PI;  // on both sides of the seam
+        if (out.high.x > M_PI) out.low.x = -M_PI, out.high.x = M_PI;  // It lies on both sides of the seam.
         return out;
     }
     const double sign = turn.row[2].y, nearest = nearest_radius(n), farthest = farthest_radius(n);
     Box2 out{{-M_PI, 0}, {M_PI, 0}};
     const double outer = 0.5 * M_PI - std::atan(farthest), inner = 0.5 * M_PI - std::atan(nearest);
     out.low.y = sign > 0 ? outer : -inner, out.high.y = sign > 0 ? inner : -outer;
-    // Whether it reaches to the pole or over the seam, where d.x = 0 and d.z ≤ 0; d.z = −sign n.y.
+    // The box may reach to the pole or over the seam, where d.x = 0 and d.z ≤ 0; d.z = −sign n.y.
     if (low.x <= 0 && high.x >= 0 && (sign > 0 ? high.y >= 0 : low.y <= 0)) return out;
     out.low.x = infinite, out.high.x = -infinite;
     for (const Vec2 corner : {low, {high.x, low.y}, high, {low.x, high.y}}) {
@@ -75,14 +75,14 @@ Box2 CubeFace::angles(Box2 n) const {
 }
 
 std::optional<Box2> CubeFace::box(Vec2 from, Vec2 to) const {
-    constexpr double rounding = 1e-12;  // generous
+    constexpr double rounding = 1e-12;  // This is generous.
     Box2 out = Box2::empty();
     const auto slope = [](double angle) {
         return angle >= 0.5 * M_PI ? infinite : angle <= -0.5 * M_PI ? -infinite : std::tan(angle);
     };
     if (!pole()) {
         const double ahead = std::atan2(turn.row[2].x, turn.row[2].z);
-        for (const double around : {0.0, 2 * M_PI}) {  // what lies behind is seen at both ends
+        for (const double around : {0.0, 2 * M_PI}) {  // The face behind is seen at both ends.
             const double low = std::max(from.x - ahead + around, -0.25 * M_PI),
                          high = std::min(to.x - ahead + around, 0.25 * M_PI);
             if (!(low < high)) continue;
@@ -97,14 +97,14 @@ std::optional<Box2> CubeFace::box(Vec2 from, Vec2 to) const {
         }
     } else {
         const double sign = turn.row[2].y;
-        // Distances from the pole.
+        // These are distances from the pole.
         const double near = 0.5 * M_PI - (sign > 0 ? to.y : -from.y), far = 0.5 * M_PI - (sign > 0 ? from.y : -to.y);
         const double inner = std::max(0.0, slope(near)), outer = std::min(slope(far), 2.0);
         if (!(inner < outer)) return {};
         out = sector_box(inner, outer, from.x, to.x);
         if (sign > 0) out = {{out.low.x, -out.high.y}, {out.high.x, -out.low.y}};
     }
-    // Widened by the rounding of these functions.
+    // The box is widened by the rounding of these functions.
     out.low = {std::max(out.low.x - rounding, -1.0), std::max(out.low.y - rounding, -1.0)};
     out.high = {std::min(out.high.x + rounding, 1.0), std::min(out.high.y + rounding, 1.0)};
     if (!(out.low.x < out.high.x && out.low.y < out.high.y)) return {};

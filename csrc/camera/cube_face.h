@@ -1,5 +1,5 @@
-// A side of a cube around the eye, for lenses that see more than a half space: each has a frame of its own, in which it
-// is a pinhole with |n.x|, |n.y| ≤ 1, and each direction has one side.
+// Describes the faces of a cube around the eye, for lenses that see more than a half space. Each face has its own
+// frame, in which it is a pinhole with |n.x|, |n.y| ≤ 1. Each direction belongs to one face.
 #pragma once
 
 #include <limits>
@@ -9,7 +9,7 @@
 
 namespace edgegrad {
 
-// A box of two coordinates.
+// Holds a box of two coordinates.
 struct Box2 {
     Vec2 low, high;
 
@@ -20,31 +20,32 @@ struct Box2 {
     void add(Vec2 p);
 };
 
-// What r (sin λ, cos λ) takes up for radii and angles between two; there are no more than 2 π between these.
+// Returns the bounding box of r (sin λ, cos λ) for radii and angles between limits, at most 2 π apart.
 Box2 sector_box(double inner, double outer, double from, double to);
 
-// Directions d have a longitude λ = atan2(d.x, d.z) and a latitude φ = atan2(d.y, hypot(d.x, d.z)); two sides look at
-// the poles, where d.y is all.
+// Describes one cube face. Directions d have a longitude λ = atan2(d.x, d.z) and a latitude φ = atan2(d.y, hypot(d.x,
+// d.z)). Two faces look at the poles, where only d.y is not zero.
 struct CubeFace {
-    Mat3 turn{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};  // of directions to this side's frame
-    // Which of its borders are its own: all, or only that at the least n.x.
+    Mat3 turn{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};  // It rotates directions to this face's frame.
+    // Says whether all of its borders belong to it, or only that at the least n.x.
     bool closed = false;
 
     bool pole() const { return turn.row[2].y != 0; }
 
     Vec3 direction(Vec2 n) const { return transposed_times(turn, {n.x, n.y, 1}); }
-    // The n of a direction, if it belongs to this side.
+    // Returns the n of a direction, if it belongs to this face.
     std::optional<Vec2> place(Vec3 d) const;
-    // By how much a direction of length one lies outside: it changes by no more than twice what that turns by.
+    // Returns how far a unit direction lies outside. Rotating it changes this by at most twice the angle.
     double outside(Vec3 d) const;
 
-    // λ and φ over a box of n.
+    // Bounds λ and φ over a box of n.
     Box2 angles(Box2 n) const;
-    // The box of n of all directions of this side with λ and φ between two; none if there are none.
+    // Bounds n over this face's directions with λ and φ between two limits; none if there are none.
     std::optional<Box2> box(Vec2 from, Vec2 to) const;
 };
 
-// Ahead, right, behind, left; below, above. Signs and exchanges alone, so that sides agree on what lies between them.
+// The faces look ahead, right, behind, left, below and above. Their rotations only exchange and negate axes, so faces
+// agree on what lies between them.
 constexpr int most_sides = 6;
 constexpr CubeFace cube_faces[most_sides] = {
     {{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}}, false},   {{{{0, 0, -1}, {0, 1, 0}, {1, 0, 0}}}, false},
@@ -52,7 +53,7 @@ constexpr CubeFace cube_faces[most_sides] = {
     {{{{1, 0, 0}, {0, 0, -1}, {0, 1, 0}}}, true},   {{{{1, 0, 0}, {0, 0, 1}, {0, -1, 0}}}, true},
 };
 
-// Of the corner of a box that is farthest from the origin.
+// Returns the distance of a box's farthest corner from the origin.
 double farthest_radius(Box2 b);
 Vec2 middle(Box2 b);
 

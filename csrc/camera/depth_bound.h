@@ -1,5 +1,5 @@
-// How far away what is hit in a pixel lies: a bound for one face, kept for the backward pass as that of a pixel. What
-// lies behind it in every pixel that it touches is most likely occluded (occlusion.h).
+// Bounds the depth of what is hit in a pixel, one bound per face, which the backward pass keeps per pixel. Whatever
+// lies behind the bound in all pixels that it touches is most likely occluded (occlusion.h).
 #pragma once
 
 #include <algorithm>
@@ -10,14 +10,14 @@
 
 namespace edgegrad {
 
-// The depth of one face within a pixel. Along the plane of a face it is a function of an affine function of n.
+// Bounds the depth of one face within a pixel. In the plane of a face, depth is a function of an affine function of n.
 class DepthBound {
    public:
     void set(const Camera& camera, const Vec3 q[3], const FaceMap& map) {
         const double low = std::min({q[0].z, q[1].z, q[2].z}), high = camera.greatest_depth(q);
         camera_ = &camera, farthest_ = high;
-        // A face whose depth changes by no more than two pixels' width needs no plane: its corners will do. Through a
-        // lens that distorts, a pixel is no box in n.
+        // A face whose depth changes by at most two pixels' width needs no plane; its corners suffice. Through a
+        // distorting lens, a pixel is not a box in n.
         const double width = 2 / camera.pixels_per_unit;
         tilted_ = camera.is_undistorted() && !(high - low <= width * camera.unit_at_depth(low));
         if (!tilted_) return;
@@ -25,7 +25,7 @@ class DepthBound {
         plane_ = camera.projection([&](auto p) { return p.depth_plane(q, rows); });
     }
 
-    // Where |n − middle| ≤ half in either coordinate.
+    // Returns the bound where |n − middle| ≤ half in both coordinates.
     double farthest(Vec2 middle, Vec2 half) const {
         if (!tilted_) return farthest_;
         const double value = middle.x * plane_.x + middle.y * plane_.y + plane_.z;
@@ -37,10 +37,10 @@ class DepthBound {
     const Camera* camera_ = nullptr;
     bool tilted_ = false;
     double farthest_ = 0;
-    Vec3 plane_;  // that function of h
+    Vec3 plane_;  // It is that affine function of h = (n, 1).
 };
 
-// A depth as a float that is no smaller.
+// Returns the depth as a float, rounded up.
 inline float rounded_up(double depth) {
     const float f = float(depth);
     return double(f) >= depth ? f : std::nextafter(f, std::numeric_limits<float>::infinity());

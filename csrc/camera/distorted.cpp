@@ -1,4 +1,4 @@
-// What is seen through a lens that distorts, and all of forward mode.
+// Implements distorting lenses, and all of forward mode.
 
 #include "camera/camera.h"
 

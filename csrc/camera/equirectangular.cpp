@@ -18,7 +18,7 @@ Equirectangular::Equirectangular(const double* K, const CubeFace& side, const Pl
     std::copy(K, K + 6, k_);
     const double det = k_[0] * k_[4] - k_[1] * k_[3], size = std::sqrt(std::fabs(det));
     inverse_[0] = k_[4] / det, inverse_[1] = -k_[1] / det, inverse_[2] = -k_[3] / det, inverse_[3] = k_[0] / det;
-    // Over a pole the image is mirrored.
+    // The image is mirrored over a pole.
     scale_ = {size, (det < 0) != (place.over % 2 != 0) ? -size : size};
 }
 
@@ -38,8 +38,8 @@ Vec2 Equirectangular::distort(Vec2 n) const {
     return {(k_[0] * a.x + k_[1] * a.y + k_[2]) / scale_.x, (k_[3] * a.x + k_[4] * a.y + k_[5]) / scale_.y};
 }
 
-// ∂λ/∂d = (d.z, 0, −d.x) / h² and ∂φ/∂d = (−d.y d.x / h, h, −d.y d.z / h) / |d|². At the pole itself, where there is
-// none, zero.
+// Uses ∂λ/∂d = (d.z, 0, −d.x) / h² and ∂φ/∂d = (−d.y d.x / h, h, −d.y d.z / h) / |d|². At the pole, where these do not
+// exist, it returns zero.
 Mat2 Equirectangular::jacobian(Vec2 n) const {
     const Vec3 d = side_.direction(n);
     const double h2 = d.x * d.x + d.z * d.z, h = std::sqrt(h2), all = h2 + d.y * d.y;
@@ -47,7 +47,7 @@ Mat2 Equirectangular::jacobian(Vec2 n) const {
     const double sign = place_.over % 2 ? -1 : 1;
     const Vec3 longitude = (1 / h2) * Vec3{d.z, 0, -d.x},
                latitude = (sign / all) * Vec3{-d.y * d.x / h, h, -d.y * d.z / h};
-    const Vec3 along[2] = {side_.turn.row[0], side_.turn.row[1]};  // ∂d/∂n
+    const Vec3 along[2] = {side_.turn.row[0], side_.turn.row[1]};  // It is ∂d/∂n.
     double a[2][2];
     for (int i = 0; i < 2; ++i) a[0][i] = dot(longitude, along[i]), a[1][i] = dot(latitude, along[i]);
     const auto row = [&](int r, int i) { return k_[3 * r] * a[0][i] + k_[3 * r + 1] * a[1][i]; };
@@ -70,18 +70,18 @@ std::optional<Vec2> Equirectangular::undistort(Vec2 m) const {
 
 namespace {
 
-// Of the steps from the middle of a pixel to its samples, the greatest: beyond, the series below would lose digits.
+// Bounds the steps from a pixel's centre to its samples; larger ones would lose digits in the series below.
 constexpr double small_step = 0.06;
 
-// What all samples of a pixel share.
+// Holds what all samples of a pixel share.
 struct Near {
-    double to_angles[4];    // from m − m0
-    Vec2 m0, sine, cosine;  // of both angles at m0
-    Vec2 from, to;          // the angles, less those at m0, between which this place is
+    double to_angles[4];    // It maps m − m0 to angles.
+    Vec2 m0, sine, cosine;  // They belong to both angles at m0.
+    Vec2 from, to;          // They bound this position's angles, relative to those at m0.
     CubeFace side;
 };
 
-// sin δ and cos δ, by their series.
+// These return sin δ and cos δ by their series.
 [[gnu::always_inline]] inline double small_sine(double d) {
     const double s = d * d;
     return d * (1 - s * (1.0 / 6) * (1 - s * (1.0 / 20) * (1 - s * (1.0 / 42))));
@@ -107,7 +107,7 @@ EDGEGRAD_VECTORIZED void undistort_samples(const Near& p, int k, double* x, doub
         const double q0 = turn.row[0].x * d0 + turn.row[0].y * d1 + turn.row[0].z * d2;
         const double q1 = turn.row[1].x * d0 + turn.row[1].y * d1 + turn.row[1].z * d2;
         const double q2 = turn.row[2].x * d0 + turn.row[2].y * d1 + turn.row[2].z * d2;
-        // As CubeFace::place.
+        // The tests are those of CubeFace::place.
         const bool within = (q2 > 0) & (std::fabs(q0) <= q2) & (std::fabs(q1) <= q2);
         const bool foreign = (open > 0) & ((q0 == q2) | (std::fabs(q1) == q2));
         const bool here = (across >= l.from.x) & (across < l.to.x) & (over >= l.from.y) & (over < l.to.y);
@@ -144,7 +144,7 @@ void Equirectangular::undistort_near(Vec2 m0, int k, double* x, double* y) const
     undistort_samples(near, k, x, y);
 }
 
-// A step in the angles turns a direction by no more than its length.
+// A step in the angles rotates a direction by at most its length.
 bool Equirectangular::may_show(Vec2 x, double reach) const {
     const Vec2 a = angles_of_pixel(x), from = place_.from, to = place_.to;
     const Vec2 step{(std::fabs(inverse_[0]) + std::fabs(inverse_[1])) * reach,
@@ -177,9 +177,9 @@ Box2 Equirectangular::angles(const double* K, Box2 x) {
 }
 
 std::optional<Box2> Equirectangular::side_box(Box2 x) const {
-    constexpr double rounding = 1e-12;  // of angles, generous
+    constexpr double rounding = 1e-12;  // It is a generous bound for angles.
     const Box2 seen = angles(k_, x);
-    // λ and φ of what is seen.
+    // These are λ and φ of what is seen.
     Vec2 from{std::max(seen.low.x - M_PI * place_.across, -M_PI), seen.low.y - M_PI * place_.over};
     Vec2 to{std::min(seen.high.x - M_PI * place_.across, M_PI), seen.high.y - M_PI * place_.over};
     if (place_.over % 2) std::swap(from.y, to.y), from.y = -from.y, to.y = -to.y;
@@ -189,8 +189,8 @@ std::optional<Box2> Equirectangular::side_box(Box2 x) const {
     return side_.box(from, to);
 }
 
-// Parallels are drawn as long as the equator: 1 / cos φ, which is 1 / r next to a pole, and 2 / r in the mean over a
-// disc around it.
+// The image draws parallels as long as the equator, stretched by 1 / cos φ. This is 1 / r next to a pole, and 2 / r in
+// the mean over a disc around it.
 double Equirectangular::stretch(Box2 n) const {
     if (!side_.pole()) return 1;
     const double r = std::max(length(middle(n)), 0.5 * farthest_radius(n));

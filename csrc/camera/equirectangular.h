@@ -1,5 +1,5 @@
-// The lens of a panorama: longitude and latitude are the axes of the image (the equirectangular projection; see Snyder,
-// Map Projections: A Working Manual, 1987, § 12).
+// Implements the lens of a panorama, whose image axes are longitude and latitude: the equirectangular projection
+// (Snyder, Map Projections: A Working Manual, 1987, § 12).
 #pragma once
 
 #include <cmath>
@@ -11,59 +11,59 @@
 
 namespace edgegrad {
 
-// A panorama sees through the six sides of a cube around the eye (sub_cameras.h). Each has a frame of its own, in which
-// it is a pinhole with |n.x|, |n.y| ≤ 1; this lens takes n to the panorama. Of the direction d = turnᵀ (n, 1) in the
-// camera's frame, with h = hypot(d.x, d.z):
+// A panorama uses the six faces of a cube around the eye (sub_cameras.h). Each has its own frame, in which it is a
+// pinhole with |n.x|, |n.y| ≤ 1; this lens maps n to the panorama. For the direction d = turnᵀ (n, 1) in the camera's
+// frame, with h = hypot(d.x, d.z):
 //
 //     λ = atan2(d.x, d.z)    φ = atan2(d.y, h)    x = K (λ', φ', 1)
 //
-// A panorama may reach around more than once, or over a pole, where it goes on along the opposite meridian. So a
-// direction has many places: with any integers i and j of one parity λ' = λ + j π, φ' = i π + (−1)ⁱ φ. A lens has one
-// of these.
+// A panorama may reach around more than once, or over a pole, where it continues along the opposite meridian. A
+// direction therefore has many positions: for integers i and j of one parity, λ' = λ + j π and φ' = i π + (−1)ⁱ φ. A
+// lens has one of these.
 //
-// K stands here, in place of coefficients: the camera's own only scales the undistorted image, so that m = x / scale.
+// K takes the place of coefficients. The camera's own K only scales the undistorted image, so that m = x / scale.
 class Equirectangular {
    public:
-    static constexpr int coefficients = 6;  // the upper two rows of K
-    // One of the places, and the angles (λ', φ') that this lens is for: below `to`, and not below `from`.
+    static constexpr int coefficients = 6;  // These are the upper two rows of K.
+    // Selects one position (i, j), and the angles (λ', φ') that this lens serves: below `to`, and not below `from`.
     struct Place {
-        int across = 0, over = 0;  // j, i
+        int across = 0, over = 0;  // They are j and i.
         Vec2 from{-infinite, -infinite}, to{infinite, infinite};
     };
 
     Equirectangular(const double* K, const CubeFace& side, const Place& place);
 
-    // The focal lengths of the undistorted image, px: positive areas stay positive.
+    // Returns the focal lengths of the undistorted image, px; they keep positive areas positive.
     Vec2 scale() const { return scale_; }
     const double* K() const { return k_; }
     const CubeFace& side() const { return side_; }
-    Mat3 turn() const { return side_.turn; }  // from the camera's frame to the side's
-    // Whether there is a place around which areas grow as 1 / distance.
+    Mat3 turn() const { return side_.turn; }  // It rotates from the camera's frame to the face's.
+    // Returns whether areas grow as 1 / distance around some point.
     bool has_pole() const { return side_.pole(); }
 
     Vec2 distort(Vec2 n) const;
     Mat2 jacobian(Vec2 n) const;
     void distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) const;
 
-    // The n that is seen at m, if it belongs to this side and place.
+    // Returns the n that is seen at m, if it belongs to this face and position.
     std::optional<Vec2> undistort(Vec2 m) const;
 
-    // The same for k points near m0, in place; not numbers where there is none.
+    // Does the same for k points near m0, in place; points without n become NaN.
     void undistort_near(Vec2 m0, int k, double* x, double* y) const;
 
-    // False if no place within `reach` px of x belongs to this side and place.
+    // Returns false if no point within `reach` px of x belongs to this face and position.
     bool may_show(Vec2 x, double reach) const;
 
-    // A box of pixel positions in which all is seen that lies in a box of n.
+    // Returns a box of pixel positions that contains the image of a box of n.
     Box2 image_box(Box2 n) const;
-    // A box of n that holds all of this side and place that is seen in a box of pixel positions; none if nothing is.
+    // Returns a box of n of all that a box of pixel positions shows of this face and position; none if nothing.
     std::optional<Box2> side_box(Box2 x) const;
 
-    // How much longer what lies in a box of n is in the image than in the undistorted image, about and at most, and how
-    // much larger its area.
+    // Returns how much lengths grow from the undistorted image to the image in a box of n, approximately and at most.
+    // Areas grow by about the same factor.
     double stretch(Box2 n) const;
 
-    // λ' and φ' over a box of pixel positions, with those of its corners.
+    // Bounds λ' and φ' over a box of pixel positions, by its corners.
     static Box2 angles(const double* K, Box2 x);
 
    private:

@@ -1,4 +1,4 @@
-// Where a face is seen: perspective-correct barycentrics as a function of the place in the image, with their _vjp.
+// Computes perspective-correct barycentrics of a face as a function of the image position, and their _vjp.
 #pragma once
 
 #include <limits>
@@ -8,7 +8,7 @@
 
 namespace edgegrad {
 
-// The point is (1 − u − v) q0 + u q1 + v q2.
+// Refers to the point (1 − u − v) q0 + u q1 + v q2.
 struct Barycentrics {
     double u = 0, v = 0;
 
@@ -38,7 +38,7 @@ inline FaceMap face_map_jvp(const Camera& camera, const Vec3 q[3], const Vec3 q_
     return {{{U.x, V.x, D.x}, {U.y, V.y, D.y}, {U.z, V.z, D.z}}};
 }
 
-// False where the face is seen exactly edge-on or has no area.
+// Returns false where the face is exactly edge-on or has no area.
 inline bool barycentrics(const FaceMap& m, Vec2 n, Barycentrics& b) {
     const Vec3 p = m.times(n);
     const double inverse = 1.0 / p.z;
@@ -46,8 +46,8 @@ inline bool barycentrics(const FaceMap& m, Vec2 n, Barycentrics& b) {
     return std::isfinite(b.u + b.v);
 }
 
-// Whether the face covers n. One that doubles cannot distinguish from its boundary does: between two faces that share
-// an edge there must be no gap, and each computes that edge in its own way.
+// Returns whether the face covers n. Points that doubles cannot distinguish from its boundary count as covered.
+// Otherwise there might be gaps between adjacent faces, which compute their shared edge differently.
 inline bool covers(const FaceMap& m, Vec2 n) {
     const Vec3 p = m.times(n);
     const double eps = 16 * std::numeric_limits<double>::epsilon(), x = eps * std::fabs(n.x), y = eps * std::fabs(n.y);
@@ -58,7 +58,7 @@ inline bool covers(const FaceMap& m, Vec2 n) {
     return std::fabs(p.z) > ew && sign * p.x >= -eu && sign * p.y >= -ev && sign * (p.z - p.x - p.y) >= -(eu + ev + ew);
 }
 
-// δu = (δ(u w) − u δw) / w, and the same for v.
+// Uses δu = (δ(u w) − u δw) / w, and the same for v.
 inline void barycentrics_vjp(const FaceMap& m, Vec2 n, Barycentrics b, Barycentrics bar, FaceMap& m_bar, Vec2& n_bar) {
     const double inverse = 1.0 / m.times(n).z;
     const Vec3 p_bar{bar.u * inverse, bar.v * inverse, -(b.u * bar.u + b.v * bar.v) * inverse};
@@ -72,9 +72,8 @@ inline Barycentrics barycentrics_jvp(const FaceMap& m, Vec2 n, Barycentrics b, c
     return {(p_dot.x - b.u * p_dot.z) * inverse, (p_dot.y - b.v * p_dot.z) * inverse};
 }
 
-// Embree decides in float which triangle is hit, so the exact ray may pass just outside it. What was seen is the
-// triangle's nearest boundary: without this, a triangle seen almost edge-on would extrapolate its colours without
-// bound.
+// Returns the nearest boundary point, if b lies outside. Embree decides hits in float, so the exact ray may pass just
+// outside the triangle. Otherwise an almost edge-on triangle would extrapolate its colours without bound.
 inline Barycentrics inside(Barycentrics b) {
     b.u = b.u > 0 ? b.u : 0;
     b.v = b.v > 0 ? b.v : 0;
@@ -83,7 +82,7 @@ inline Barycentrics inside(Barycentrics b) {
     return b;
 }
 
-// Where a ray that hit the face was seen to hit it. Edge-on, any point will do.
+// Returns the barycentrics of a ray's hit. Edge-on, any point will do.
 inline Barycentrics barycentrics_of_hit(const FaceMap& m, Vec2 n) {
     Barycentrics b;
     const bool met = barycentrics(m, n, b);

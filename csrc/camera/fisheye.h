@@ -1,5 +1,4 @@
-// OpenCV's fisheye (Kannala and Brandt 2006): how far from the middle of the image something is seen is a polynomial of
-// its angle to the axis.
+// Implements OpenCV's fisheye lens (Kannala and Brandt 2006). The radius is a polynomial of the angle to the axis.
 #pragma once
 
 #include <cmath>
@@ -10,7 +9,7 @@
 
 namespace edgegrad {
 
-// With θ = atan |n| and θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸): m = θ' n / |n|.
+// Distorts n to m = θ' n / |n|, with θ = atan |n| and θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸).
 struct Fisheye {
     static constexpr int coefficients = 4;
     double k[4];
@@ -22,7 +21,7 @@ struct Fisheye {
         return (r > tiny ? radius(r) / r : 1) * n;
     }
 
-    // g I + (g'/r) n nᵀ with g = θ'/r.
+    // Returns g I + (g'/r) n nᵀ with g = θ'/r.
     Mat2 jacobian(Vec2 n) const {
         const double r = length(n), g = r > tiny ? radius(r) / r : 1;
         const double h = r > tiny ? (radius_slope(r) - g) / (r * r) : 0;
@@ -45,7 +44,7 @@ struct Fisheye {
         return out;
     }
 
-    // θ', its derivative by θ, and where that changes its sign.
+    // These return θ', its derivative with respect to θ, and where that changes its sign.
     double at_angle(double angle) const {
         const double s = angle * angle;
         return angle * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))));
@@ -61,7 +60,7 @@ struct Fisheye {
     }
 
    private:
-    static constexpr double tiny = 1e-9;  // below it θ' is r, to the precision of doubles
+    static constexpr double tiny = 1e-9;  // At a smaller r, θ' is r to double precision.
 };
 
 }  // namespace edgegrad

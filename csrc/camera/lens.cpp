@@ -9,14 +9,14 @@ namespace edgegrad {
 
 namespace {
 
-// Places on the circle |n| = r.
+// Returns points on the circle |n| = r.
 constexpr int angles = 16;
 Vec2 on_circle(double r, int i) {
     const double a = 2 * M_PI * i / angles;
     return {r * std::cos(a), r * std::sin(a)};
 }
 
-// Least det ∂m/∂n there; what is not a number counts as a fold.
+// Returns the least det ∂m/∂n on the circle. NaN counts as a fold.
 template <RadialLens L>
 double least_area_scale(const L& lens, double r) {
     double least = std::numeric_limits<double>::infinity();
@@ -28,13 +28,13 @@ double least_area_scale(const L& lens, double r) {
     return least;
 }
 
-// r in [0, fold] with lens.radius(r) = m, or the fold: Newton's steps, with bisection where they leave the bracket.
+// Returns r in [0, fold] with lens.radius(r) = m, or the fold. Newton steps are bisected where they leave the bracket.
 template <RadialLens L>
 double undistorted_radius(const L& lens, double fold, double m) {
     double low = 0, high = fold, r = std::min(m, fold);
     for (int i = 0; i < 64; ++i) {
         const double error = lens.radius(r) - m;
-        if (error == 0) return r;  // a bracket that ends there would be halved
+        if (error == 0) return r;  // Otherwise the loop would bisect a bracket that ends there.
         (error < 0 ? low : high) = r;
         const double next = r - error / lens.radius_slope(r);
         const double step = next > low && next < high ? next : 0.5 * (low + high);
@@ -44,7 +44,7 @@ double undistorted_radius(const L& lens, double fold, double m) {
     return r;
 }
 
-// The solution without what is not radial.
+// Returns the solution without the part that is not radial.
 template <RadialLens L>
 Vec2 undistort_radial(const L& lens, const LensDisc& disc, Vec2 m) {
     Vec2 n = m;
@@ -53,7 +53,7 @@ Vec2 undistort_radial(const L& lens, const LensDisc& disc, Vec2 m) {
     return size > 0 ? (undistorted_radius(lens, disc.fold, size) / size) * m : m;
 }
 
-// Newton's steps from there.
+// Refines it by Newton steps.
 template <RadialLens L>
 std::optional<Vec2> undistort(const L& lens, const LensDisc& disc, Vec2 m) {
     const double size = length(m);
@@ -68,21 +68,21 @@ std::optional<Vec2> undistort(const L& lens, const LensDisc& disc, Vec2 m) {
         n += std::min(1.0, most / std::max(far, 1e-300)) * step;
         if (far <= 1e-14 * (1 + length(n))) break;
     }
-    // What has not converged by then lies on the fold, where it is seen infinitely small.
+    // Otherwise the point lies on the fold, where it is seen infinitely small.
     if (!(length(lens.distort(n) - m) <= 1e-10 * (1 + size)) || !(length(n) < disc.fold)) return {};
     return n;
 }
 
-// Points of one pixel: where they are seen, m, and where they come from, n.
+// Holds points of one pixel: where they are seen, m, and where they come from, n.
 struct Points {
     static constexpr int size = 64;
     int count = 0;
     double m_x[size], m_y[size], n_x[size], n_y[size], error[size];
 };
 
-// A step n + J⁻¹ (m − bend(n)) of all, with J where the pixel's middle is: over a pixel it changes by a hundredth or
-// less, and so much smaller is each error than the last. Returns whether all errors were small before the step: the
-// last one but for a hundredth is taken away.
+// Takes a step n + J⁻¹ (m − distort(n)) for all points, with J at the pixel's centre. J changes by at most a hundredth
+// over a pixel, and each error shrinks by that factor. Returns whether all errors were small before the step, which
+// leaves a hundredth of the last one.
 constexpr double small_error = 1e-10;
 template <RadialLens L>
 [[gnu::always_inline]] inline bool chord_step(const L lens, const Mat2 inverse, Points& p) {
@@ -104,8 +104,8 @@ EDGEGRAD_VECTORIZED bool chord_step(const AnyLens& lens, Mat2 inverse, Points& p
 
 double radius_of_fold(const AnyLens& lens) {
     return with_radial_lens(lens, [](const auto& l) {
-        // Equal angles, and below the first of these a geometric row: a telephoto lens may fold at a thousandth. And
-        // between the radii where the radial part turns, however near these are to one another.
+        // Radii are at equal angles, and geometric below the first of these, because a telephoto lens may fold at a
+        // thousandth. Others lie between the turning radii of the radial part, however close these are.
         constexpr int radii = 256, small_radii = 96;
         const double step = std::atan(greatest_radius) / radii;
         std::vector<double> tested = l.turning_radii(greatest_radius);
@@ -132,8 +132,8 @@ double radius_of_fold(const AnyLens& lens) {
 
 }  // namespace
 
-// The disc is taken one to one, so the lens boundary of its image is that of the disc; and a hundredth for what lies
-// between points of it.
+// The lens maps the disc one to one, so the boundary of the disc's image is the image of its boundary. A hundredth
+// allows for what lies between the points.
 LensDisc disc_of(const AnyLens& lens) {
     LensDisc disc{radius_of_fold(lens), 0};
     constexpr int points = 64;

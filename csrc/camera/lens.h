@@ -1,6 +1,6 @@
-// What a lens does to the undistorted image of a pinhole: it bends normalised image coordinates n to m, and K takes m
-// to pixels. What is straight in n is a curve in m; an area grows by det ∂m/∂n. So all that is made of straight lines
-// (faces, edges, the view volume) is worked on in the undistorted image, K n, and samples alone are bent.
+// Defines lenses. A lens distorts normalised image coordinates n to m, and K maps m to pixels. Straight lines in n
+// become curves in m, and areas grow by det ∂m/∂n. Faces, edges and the view volume are therefore handled in the
+// undistorted image, K n; only samples are distorted.
 #pragma once
 
 #include <cmath>
@@ -19,18 +19,18 @@
 
 namespace edgegrad {
 
-// A pinhole.
+// Distorts nothing.
 struct PinholeLens {};
 
 template <class L>
 concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_bar) {
     { L::coefficients } -> std::convertible_to<int>;
     { lens.distort(n) } -> std::same_as<Vec2>;
-    { lens.jacobian(n) } -> std::same_as<Mat2>;  // ∂m/∂n
+    { lens.jacobian(n) } -> std::same_as<Mat2>;  // It returns ∂m/∂n.
     lens.distort_vjp(n, n, n_bar, coefficients_bar);
 };
 
-// One that sees through the sides of a cube (cube_face.h), each of which is a sub-camera (sub_cameras.h).
+// Names a lens that sees through a face of a cube (cube_face.h). Each face is a sub-camera (sub_cameras.h).
 template <class L>
 concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 box) {
     { lens.scale() } -> std::same_as<Vec2>;
@@ -45,8 +45,8 @@ concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 
 };
 static_assert(SideLens<Equirectangular> && SideLens<WideFisheye>);
 
-// One that is radial, nearly: |m| at |n| = r but for what is not, its derivative, and the radii up to a greatest at
-// which one of these changes its sign. And whether it is radial altogether.
+// Names a radial or nearly radial lens. Its functions give the radial part of |m| at |n| = r, its derivative, and the
+// radii up to r where either changes its sign. is_radial() says whether no other part exists.
 template <class L>
 concept RadialLens = Lens<L> && requires(const L lens, double r) {
     { lens.radius(r) } -> std::same_as<double>;
@@ -58,14 +58,14 @@ static_assert(RadialLens<BrownConrady> && RadialLens<Fisheye>);
 
 // A new lens is a file of its own, and a place in this list.
 using AnyLens = std::variant<PinholeLens, BrownConrady, Fisheye, Equirectangular, WideFisheye>;
-constexpr int most_coefficients = 8;  // that a camera is given
+constexpr int most_coefficients = 8;  // A camera is given at most these.
 static_assert(BrownConrady::coefficients <= most_coefficients && Fisheye::coefficients <= most_coefficients);
-constexpr int most_parameters = 10;  // of a lens: where it sees through a side, K comes first
+constexpr int most_parameters = 10;  // Lens parameters begin with K where a lens sees through a cube face.
 static_assert(most_coefficients <= most_parameters && Equirectangular::coefficients <= most_parameters &&
               WideFisheye::coefficients <= most_parameters);
 
-// f(lens), of one that is nearly radial; of one that sees through a side, or something else; of any that is not
-// straight.
+// These call f(lens) for a nearly radial lens; for one that sees through a cube face, or else return `otherwise`; and
+// for any lens that distorts.
 template <class F>
 auto with_radial_lens(const AnyLens& lens, F f) {
     if (const auto* l = std::get_if<BrownConrady>(&lens)) return f(*l);
@@ -89,25 +89,26 @@ inline bool has_sides(const AnyLens& lens) {
 
 class RadialInverse;
 
-// The disc in which every m of a radial lens has one n: what lies beyond is not seen.
+// Describes the disc in which every m of a radial lens has one n. Nothing beyond it is visible.
 struct LensDisc {
-    double fold = std::numeric_limits<double>::infinity();  // the least |n| with det ∂m/∂n ≤ 0; or greatest_radius
-    double reach = fold;                                    // no |m| from within is greater
-    // The table of the lens's radial part (radial_inverse.h); null where there is none.
+    // It is the least |n| with det ∂m/∂n ≤ 0, or greatest_radius.
+    double fold = std::numeric_limits<double>::infinity();
+    double reach = fold;  // It bounds |m| within the disc.
+    // It tabulates the inverse of the lens's radial part (radial_inverse.h); it may be null.
     std::shared_ptr<const RadialInverse> inverse = {};
 };
 LensDisc disc_of(const AnyLens& lens);
-// The n with |n| = fold at which det ∂m/∂n is least, of those by which the fold was found.
+// Returns the n with |n| = fold of least det ∂m/∂n, among those that determined the fold.
 Vec2 folding_place(const BrownConrady& lens, const LensDisc& disc);
-constexpr double greatest_radius = 30;  // 88° from the axis; what shows more sees through sides
+constexpr double greatest_radius = 30;  // This is 88° from the axis; lenses that show more see through cube faces.
 
-// The r in [0, fold] that the radial part of a lens takes to m, or the fold.
+// Returns the r in [0, fold] that the radial part of a lens maps to m, or the fold.
 double undistorted_radius(const AnyLens& lens, double fold, double m);
 
-// The n in the disc that is bent to m; none if there is none.
+// Returns the n in the disc that is distorted to m, if there is one.
 std::optional<Vec2> undistort(const AnyLens& lens, const LensDisc& disc, Vec2 m);
 
-// The same for k points near m0, in place; not numbers where there is none.
+// Does the same for k points near m0, in place; points without n become NaN.
 void undistort_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y);
 
 }  // namespace edgegrad

@@ -11,7 +11,7 @@ Vec2 direction(double angle) { return {std::cos(angle), std::sin(angle)}; }
 Vec2 turned(Vec2 e) { return {-e.y, e.x}; }
 double dot(Vec2 a, Vec2 b) { return a.x * b.x + a.y * b.y; }
 
-// ∂m/∂c at n.
+// Returns ∂m/∂c at n.
 template <RadialLens L>
 std::array<Vec2, most_coefficients> by_coefficients(const L& lens, Vec2 n) {
     double x[most_coefficients] = {}, y[most_coefficients] = {};
@@ -22,7 +22,7 @@ std::array<Vec2, most_coefficients> by_coefficients(const L& lens, Vec2 n) {
     return out;
 }
 
-// ∂ρ/∂c. Derivatives of ∂m/∂n are differences over a millionth of ρ, right to 1e-9 or so.
+// Returns ∂ρ/∂c. Differences over a millionth of ρ approximate derivatives of ∂m/∂n, with errors of about 1e-9.
 template <RadialLens L>
 std::array<double, most_coefficients> fold_by_coefficients(const L& lens, const LensDisc& disc) {
     const Vec2 n = folding_place(lens, disc), e = (1 / disc.fold) * n;
@@ -78,12 +78,12 @@ std::optional<LensBoundary::Point> LensBoundary::at(double angle) const {
     return p;
 }
 
-// Between two points a curve leaves the chord by no more than |d²x/dθ²| Δ² / 8; of an ellipse that is half the box, and
-// four times as much is generous for what decentring makes of it.
+// Between two points a curve leaves the chord by at most |d²x/dθ²| Δ² / 8. For an ellipse that is half the box; four
+// times as much allows generously for decentring.
 bool LensBoundary::box(Arc arc, Vec2& low, Vec2& high) const {
     const double turn = arc.to - arc.from;
     if (const auto* wide = std::get_if<WideFisheye>(&camera_.lens)) {
-        // Half the arc is the farthest that directions lie from the middle one.
+        // Directions lie at most half the arc from the middle one.
         const Vec3 middle = wide->lens_boundary_direction(direction(0.5 * (arc.from + arc.to)));
         if (wide->side().outside(middle) > turn + 1e-9) return false;
     }

@@ -1,4 +1,4 @@
-// The part of a face that is inside the view, and points on it.
+// Clips a face to the view, and samples points on it.
 #pragma once
 
 #include <algorithm>
@@ -14,17 +14,18 @@
 
 namespace edgegrad {
 
-// A convex polygon in the image.
+// Holds a convex polygon in the image.
 struct VisiblePolygon {
     Vec2 corner[ViewVolume::most_corners + 2];
     int n = 0;
-    bool starred = false;  // the first corner is the point nearest to the pole of the camera, which may lie within
-    double area = 0;       // px²
-    double longest = 0;    // px
-    double nearest = 0;    // depth
+    // The first corner is then the polygon's nearest point to the camera's pole, which may lie within.
+    bool starred = false;
+    double area = 0;     // px²
+    double longest = 0;  // px
+    double nearest = 0;  // It is a depth.
     Vec2 low, high;
 
-    // Of the face with the vertices v; false when there is none.
+    // Sets the polygon of the face with the vertices v. Returns false when nothing is visible.
     bool set(const Camera& camera, const ViewVolume& volume, const VertexView& p, const int32_t* v) {
         const uint8_t c0 = p.outcode[v[0]], c1 = p.outcode[v[1]], c2 = p.outcode[v[2]];
         if (c0 & c1 & c2) return false;
@@ -40,15 +41,15 @@ struct VisiblePolygon {
             nearest = least;
             for (int i = 0; i < n; ++i) {
                 nearest = std::min(nearest, polygon[i].z);
-                // Only a triangle through the eye itself has a corner there; it has no image to sample.
+                // Only a triangle through the eye has a corner there; it has no image to sample.
                 least = std::min(least, camera.depth_weight(polygon[i]));
                 if (!(least > 0)) return false;
                 corner[i] = volume.inside(project(camera, polygon[i]));
             }
             if (n < 3) return false;
             for (int i = 0; i < 3; ++i) farthest = std::max(farthest, length(p.q[v[i]]));
-            // A point between corners that lie very far away is rounded as they are. If that shows, the whole view is
-            // taken: samples that miss the face find nothing.
+            // A point between very distant corners is rounded as they are. If that shows, the polygon becomes the whole
+            // view; samples that miss the face find nothing.
             if (!(std::numeric_limits<double>::epsilon() * farthest / least * camera.pixels_per_unit < 0.1)) {
                 const Vec2 a = volume.low, b = volume.high, view[4] = {a, {b.x, a.y}, b, {a.x, b.y}};
                 n = std::copy(view, view + 4, corner) - corner;
@@ -97,17 +98,17 @@ struct VisiblePolygon {
     }
 };
 
-// Points uniform over a polygon, along a curve that fills its triangles one after the other; of one that is starred,
-// with a density of 1 / distance to its first corner in each triangle, as areas grow there. No point of a convex
-// polygon is nearer to the pole than to the point of it that is nearest to the pole.
+// Samples points uniformly over a polygon, along a curve that fills one triangle after the other. A starred polygon has
+// a density of 1 / distance to its first corner in each triangle, as areas grow there. No point of a convex polygon is
+// nearer to the pole than to its own nearest point to the pole.
 class PolygonSampler {
    public:
-    // About n points will be drawn.
+    // Prepares for about n points.
     void set(const VisiblePolygon& polygon, double n) {
         polygon_ = &polygon, n_ = n, triangle_ = 0, end_ = 0, weight_ = 1;
     }
 
-    // s in [0, 1) goes along the curve, u is a point of the unit square. Fast where s ascends.
+    // Returns a point: s in [0, 1) runs along the curve, and u is a point of the unit square. Ascending s is fast.
     Vec2 operator()(double s, Vec2 u) {
         const Vec2* corner = polygon_->corner;
         while (triangle_ < 2 || (s >= end_ && triangle_ + 1 < polygon_->n)) {
@@ -116,7 +117,7 @@ class PolygonSampler {
             const double area =
                 0.5 * std::fabs(wedge(corner[triangle_ - 1] - corner[0], corner[triangle_] - corner[0]));
             share_ = area / polygon_->area, end_ = begin_ + share_;
-            // Two to four cells a point, so that each has one of its own.
+            // Two to four cells per point give each point its own cell.
             const double cells = std::clamp(2 * n_ * share_, 1.0, double(1u << SierpinskiCurve::most_levels));
             levels_ = std::bit_width(uint32_t(std::ceil(cells)) - 1);
             curve_.set({1, 0}, {0, 0}, {0, 1}, levels_);
@@ -124,8 +125,8 @@ class PolygonSampler {
         const double t = share_ > 0 ? std::clamp((s - begin_) / share_, 0.0, 1 - 0x1p-53) : 0;
         const Vec2 p = curve_.point(uint32_t(t * (1u << levels_)), u);
         lambda_ = {p.x, p.y};
-        // The triangle is scaled from its first corner: of a point uniform over it the share ρ = x + y of the way to
-        // the far side has a density of 2 ρ, and its square is uniform.
+        // The triangle is scaled from its first corner. Let ρ = x + y be the fraction of the way to the far side. For a
+        // uniform point, ρ has a density of 2 ρ, and its square is uniform.
         const Vec2 e1 = corner[triangle_ - 1] - corner[0], e2 = corner[triangle_] - corner[0];
         if (!polygon_->starred) return corner[0] + p.x * e1 + p.y * e2;
         const double rho = p.x + p.y;
@@ -133,9 +134,9 @@ class PolygonSampler {
         return corner[0] + rho * (p.x * e1 + p.y * e2);
     }
 
-    // Where the last point lies in its triangle, if the polygon is not starred.
+    // Returns the last point's barycentrics in its triangle, if the polygon is not starred.
     Barycentrics lambda() const { return lambda_; }
-    // The mean density of points over that at the last one.
+    // Returns the mean density of points over the density at the last one.
     double weight() const { return weight_; }
 
    private:

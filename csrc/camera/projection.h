@@ -1,5 +1,5 @@
-// From camera coordinates q to normalised image coordinates n, along straight rays: a projection says how, and its
-// models stand below. Which it is, a camera decides once (Camera::projection); nobody else asks, but by what it means.
+// Projects camera coordinates q to normalised image coordinates n along straight rays. A camera selects its projection
+// once (Camera::projection); other code does not ask for it.
 #pragma once
 
 #include <cmath>
@@ -10,22 +10,22 @@
 
 namespace edgegrad {
 
-// The barycentrics of a face are a projective map of normalised image coordinates: with h = (n.x, n.y, 1),
+// Holds the projective map from normalised image coordinates to barycentrics. With h = (n.x, n.y, 1),
 //
 //     (u w, v w, w) = M h.
 //
-// This is the test of Möller and Trumbore 1997, s = o − q0, u = s·(d × e2) / e1·(d × e2), v = d·(s × e1) / e1·(d × e2),
-// with the ray taken out of the products, so that what belongs to the face is computed once for all of its samples.
-// Written with edges, not with positions seen from the eye, it loses only distance / size of the spacing of doubles.
+// This is the test of Möller and Trumbore 1997, s = o − q0, u = s·(d × e2) / e1·(d × e2), v = d·(s × e1) / e1·(d × e2).
+// The ray is taken out of the products, so that the face's part is computed once for all of its samples. Edges instead
+// of positions relative to the eye limit the loss to distance / size times the spacing of doubles.
 struct FaceMap {
-    Vec3 column[3];  // of M
+    Vec3 column[3];  // These are the columns of M.
 
     Vec3 times(Vec2 n) const { return n.x * column[0] + n.y * column[1] + column[2]; }
     Vec3 row(double Vec3::* r) const { return {column[0].*r, column[1].*r, column[2].*r}; }
 };
 
-// The rows of a FaceMap, (u w, v w, w) = (U · h, V · h, D · h); of a face with the sides e1 = q1 − q0 and e2 = q2 − q0,
-// and s = −q0.
+// Holds the rows of a FaceMap, (u w, v w, w) = (U · h, V · h, D · h). A face has the sides e1 = q1 − q0 and e2 = q2 −
+// q0, and s = −q0.
 struct FaceRows {
     Vec3 U, V, D;
 };
@@ -33,21 +33,21 @@ struct FaceSides {
     Vec3 e1, e2, s;
 };
 
-// All rays meet in the eye: n = (X/Z, Y/Z), the ray at n has o = 0 and d = h.
+// All rays meet in the eye: n = (X/Z, Y/Z), and the ray at n has o = 0 and d = h.
 struct Perspective {
-    // The denominator of the projection; its cotangent turned into that of Z; and its tangent.
+    // These return the denominator of the projection, its cotangent as one of Z, and its tangent.
     static double weight(Vec3 q) { return q.z; }
     static double weight_vjp(double bar) { return bar; }
     static double weight_jvp(Vec3 q_dot) { return q_dot.z; }
 
-    // Direction from the viewer to q.
+    // Returns the direction from the viewer to q.
     static Vec3 view_direction(Vec3 q) { return q; }
 
-    // World units that one of n spans at a depth.
+    // Returns the world units per unit of n at a depth.
     static double unit_at_depth(double z) { return z; }
 
-    // Whether the plane of a face holds the eye, to the precision of doubles. It is then seen edge-on and covers
-    // nothing, though every ray meets the plane, in the eye.
+    // Returns whether the plane of a face contains the eye, to double precision. The face is then edge-on and covers
+    // nothing, though every ray meets its plane in the eye.
     static bool passes_through_eye(const Vec3 q[3]) {
         const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0];
         return std::fabs(dot(q[0], cross(e1, e2))) <= rounding_of_triple_product(q[0], e1, e2);
@@ -65,23 +65,23 @@ struct Perspective {
                 cross(dot.e2, f.e1) + cross(f.e2, dot.e1)};
     }
 
-    // What is affine in n along a plane, 1/z: its slope by z; and by n, on the plane with this normal through q, where
-    // 1/z = N · (n, 1) / N · q.
+    // 1/z is affine in n along a plane. These return its slope with respect to z, and with respect to n on the plane
+    // with the normal N through q: 1/z = N · (n, 1) / N · q.
     static double affine_depth_slope(double z) { return -1 / (z * z); }
     static Vec2 affine_depth_gradient(Vec3 N, Vec3 q) { return (1 / dot(N, q)) * Vec2{N.x, N.y}; }
 
-    // N · dq/dz along the ray at n, q = z (n, 1).
+    // Returns N · dq/dz along the ray at n, q = z (n, 1).
     static double along_ray(Vec3 N, Vec2 n) { return N.x * n.x + N.y * n.y + N.z; }
 
-    // Along the plane of a face 1/z is affine in n, for D · (z h) = D · q0: its coefficients, and the greatest depth
-    // where it is value ± change. Beyond the horizon, or with NaN, it is no bound.
+    // In the plane of a face 1/z is affine in n, because D · (z h) = D · q0. These return its coefficients, and the
+    // greatest depth where 1/z is value ± change. Beyond the horizon, or with NaN, `most` is the bound.
     static Vec3 depth_plane(const Vec3 q[3], FaceRows m) { return (1 / dot(q[0], m.D)) * m.D; }
     static double farthest(double value, double change, double most) {
         return value > change ? std::fmin(most, 1 / (value - change)) : most;
     }
 };
 
-// All rays run along the axis: n = (X, Y), the ray at n has o = (n.x, n.y, 0) and d = (0, 0, 1).
+// All rays run along the axis: n = (X, Y), and the ray at n has o = (n.x, n.y, 0) and d = (0, 0, 1).
 struct Orthographic {
     static double weight(Vec3) { return 1; }
     static double weight_vjp(double) { return 0; }
@@ -109,7 +109,7 @@ struct Orthographic {
         return {{-dot.e2.y, dot.e2.x, U.z}, {dot.e1.y, -dot.e1.x, V.z}, {0, 0, D.z}};
     }
 
-    // −z = (N_x n_x + N_y n_y − N · q) / N_z, and q = (n, z).
+    // Uses −z = (N_x n_x + N_y n_y − N · q) / N_z, and q = (n, z).
     static double affine_depth_slope(double) { return -1; }
     static Vec2 affine_depth_gradient(Vec3 N, Vec3) { return (1 / N.z) * Vec2{N.x, N.y}; }
     static double along_ray(Vec3 N, Vec2) { return N.z; }

@@ -14,7 +14,7 @@ RadialInverse::RadialInverse(const AnyLens& lens, double fold, double farthest) 
     const auto place = [&](int cell, double t) { return std::sqrt((cell + 0.5 * (t + 1)) / cells_per_square_); };
     const auto h = [&](double m) { return undistorted_radius(lens, fold, m) / m; };
     std::array<double, terms> node;
-    for (int j = 0; j < terms; ++j) node[j] = std::cos(M_PI * (j + 0.5) / terms);  // Chebyshev's
+    for (int j = 0; j < terms; ++j) node[j] = std::cos(M_PI * (j + 0.5) / terms);  // These are Chebyshev's nodes.
     rows_.back().fill(nan);
     for (int cell = 0; cell < cells; ++cell) {
         auto& row = rows_[cell];
@@ -22,13 +22,13 @@ RadialInverse::RadialInverse(const AnyLens& lens, double fold, double farthest) 
             row.fill(nan);
             continue;
         }
-        // Newton's divided differences, and then powers of t.
+        // Newton's divided differences are converted to powers of t.
         for (int j = 0; j < terms; ++j) row[j] = h(place(cell, node[j]));
         for (int order = 1; order < terms; ++order)
             for (int j = terms - 1; j >= order; --j) row[j] = (row[j] - row[j - 1]) / (node[j] - node[j - order]);
         for (int i = terms - 2; i >= 0; --i)
             for (int j = i; j < terms - 1; ++j) row[j] -= node[i] * row[j + 1];
-        // The error of the interpolation is greatest at the ends of a cell. At the axis h is 0 / 0.
+        // The interpolation error is greatest at the ends of a cell. At the axis h is 0 / 0.
         for (const double t : {cell ? -1.0 : -0.999, 1.0}) {
             double value = 0;
             for (int j = terms - 1; j >= 0; --j) value = row[j] + t * value;

@@ -1,4 +1,4 @@
-// Which place of the undistorted image a radial lens shows, by a table.
+// Tabulates the inverse of a radial lens.
 #pragma once
 
 #include <array>
@@ -7,21 +7,22 @@
 
 namespace edgegrad {
 
-// A radial lens shows n = h(|m|²) m at the place m. Polynomials of |m|² interpolate h in equal cells, to the last
-// digits of doubles. The table depends on the coefficients and on how far the image reaches, and takes 8 KiB.
+// A radial lens shows n = h(|m|²) m at the position m. Polynomials of |m|² interpolate h in equal cells, to double
+// precision. The table depends on the coefficients and on the reach of the image, and takes 8 KiB.
 class RadialInverse {
    public:
-    // It covers |m| ≤ farthest, as far as the disc reaches.
+    // Covers |m| ≤ farthest, as far as the disc reaches.
     RadialInverse(const AnyLens& lens, double fold, double farthest);
 
-    // Replaces k places m by n. False: some lie outside the table, or near the fold, where h is no polynomial.
+    // Replaces k positions m by n. Returns false if some lie outside the table, or near the fold, where h is not
+    // smooth.
     bool undistort(int k, double* x, double* y) const;
 
    private:
     static constexpr int cells = 128, terms = 8;
 
     double cells_per_square_;
-    // The coefficients of each cell, by powers of t, which runs from −1 to 1. The last row holds NaN.
+    // Each cell has coefficients of powers of t, which runs from −1 to 1. The last row holds NaN.
     std::array<std::array<double, terms>, cells + 1> rows_;
 };
 

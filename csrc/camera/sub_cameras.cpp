@@ -9,7 +9,7 @@ namespace {
 
 const Equirectangular* panorama(const Camera& camera) { return std::get_if<Equirectangular>(&camera.lens); }
 
-// The image, widened.
+// Returns the image, widened.
 Box2 frame(const Camera& camera, double reach) {
     return {{-reach, -reach}, {camera.width + reach, camera.height + reach}};
 }
@@ -33,8 +33,8 @@ Camera sub_camera(const Camera& camera, const L& lens, Box2 n) {
     return out;
 }
 
-// The integers k with an interval [π (k − half), π (k + half)] of more than nothing, here a millionth of a pixel,
-// within [low, high]; at least one.
+// Returns the integers k whose intervals [π (k − half), π (k + half)] meet [low, high] in more than a millionth of a
+// pixel; at least one.
 struct Range {
     int first, last;
 };
@@ -58,7 +58,8 @@ std::vector<Camera> sides_of(const Camera& camera) {
         for (const auto& side : cube_faces)
             if (const WideFisheye lens = fisheye->through(side); lens.side_box(frame(camera, 1)))
                 out.push_back(sub_camera(camera, lens, whole));
-        if (out.empty()) out.push_back(sub_camera(camera, *fisheye, whole));  // the image lies beyond the lens boundary
+        // The image lies beyond the lens boundary.
+        if (out.empty()) out.push_back(sub_camera(camera, *fisheye, whole));
         return out;
     }
     return {camera};
@@ -81,7 +82,7 @@ std::vector<Camera> sub_cameras_of(const Camera& camera, double reach) {
     const double least = 1e-6 / std::fabs(lens->scale().x);
     const auto [over_first, over_last] = covering(angles.low.y, angles.high.y, 0.5, least);
     for (int over = over_first; over <= over_last; ++over) {
-        // Of those that go around, which λ' = λ + j π has for j of the parity of `over`.
+        // λ' = λ + j π goes around for j of the parity of `over`.
         auto [first, last] = covering(angles.low.x, angles.high.x, 1, least);
         if ((first - over) % 2) ++first;
         if ((last - over) % 2) --last;

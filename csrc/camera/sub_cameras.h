@@ -1,6 +1,6 @@
-// What a camera sees through: one image plane, or, for a panorama or a wide fisheye, the sides of a cube around its
-// eye. Each is a camera with a frame of its own and a lens that takes its undistorted image to the one image; together
-// they see each direction once. Who draws an image or differentiates it goes from sub-camera to sub-camera.
+// Splits a camera into sub-cameras: one image plane, or the faces of a cube around the eye of a panorama or wide
+// fisheye. Each has its own frame, and a lens that maps its undistorted image to the one image. Together they see each
+// direction once. Rendering and differentiation loop over sub-cameras.
 #pragma once
 
 #include <vector>
@@ -9,19 +9,19 @@
 
 namespace edgegrad {
 
-// For rays: each pixel position is seen through one of them.
+// Returns sub-cameras for rays: each pixel position is seen through one of them.
 std::vector<Camera> sides_of(const Camera& camera);
 
-// For points: each has one place in the image through one of them, as often as the image, widened by `reach` px, shows
-// it. The rectangle of each holds no more than what the image shows.
+// Returns sub-cameras for points. Each point has one position in the image through one of them, as often as the image,
+// widened by `reach` px, shows it. Their rectangles hold no more than the image shows.
 std::vector<Camera> sub_cameras_of(const Camera& camera, double reach);
 
-// The widest panorama: how often it may reach around, either way.
+// A panorama may reach around this often, either way.
 constexpr int most_turns = 4;
 bool is_too_wide(const Camera& camera);
 
-// Cotangents of K (2, 3) and the coefficients (8,) from those of a sub-camera's intrinsics, added; null: not wanted.
-// And tangents.
+// These add the cotangents of K (2, 3) and the coefficients (8,) from those of a sub-camera's intrinsics (null: not
+// wanted), and return the tangents.
 void add_intrinsics(const Camera& sub_camera, const IntrinsicsGrad& bar, double* K, double* distortion);
 IntrinsicsGrad sub_camera_intrinsics(const Camera& sub_camera, const double* K, const double* distortion);
 

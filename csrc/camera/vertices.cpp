@@ -4,14 +4,14 @@ namespace edgegrad {
 
 namespace {
 
-// Vertices side by side, so that loops over them become vectors.
+// Holds vertices in lanes, so that loops over them are vectorised.
 struct VertexLanes {
     static constexpr int size = 32;
     double p[3][size] = {}, q[3][size], x[2][size];
     int32_t outcode[size];
 };
 
-// As Camera::to_camera, ViewVolume::outcode and project() have it, in the same order of operations.
+// Does what Camera::to_camera, ViewVolume::outcode and project() do, in the same order of operations.
 EDGEGRAD_VECTORIZED void view_lanes(VertexLanes& l, const Camera& camera, const ViewVolume& volume) {
     constexpr int lanes = VertexLanes::size;
     const double t[3] = {camera.t.x, camera.t.y, camera.t.z};
@@ -21,7 +21,7 @@ EDGEGRAD_VECTORIZED void view_lanes(VertexLanes& l, const Camera& camera, const 
         EDGEGRAD_ROLLED
         for (int i = 0; i < lanes; ++i) l.q[k][i] = (r.x * l.p[0][i] + r.y * l.p[1][i] + r.z * l.p[2][i]) + shift;
     }
-    // At the eye itself every plane is met and the projection is undefined: call it outside all.
+    // At the eye itself, every plane is met and the projection is undefined; it counts as outside.
     const double eye = camera.perspective ? 0 : -std::numeric_limits<double>::infinity();
     EDGEGRAD_ROLLED
     for (int i = 0; i < lanes; ++i) l.outcode[i] = l.q[2][i] <= eye ? 16 : 0;

@@ -1,4 +1,4 @@
-// The vertices of a scene before one camera.
+// Transforms the vertices of a scene to one camera.
 #pragma once
 
 #include <cstdint>
@@ -10,8 +10,8 @@
 
 namespace edgegrad {
 
-// Everything about the vertices that one camera needs: camera coordinates, pixel position, and on which side of the
-// view volume. The pixel position holds only where the outcode is zero.
+// Holds what a camera needs of the vertices: camera coordinates, pixel positions, and outcodes of the view volume. A
+// pixel position is valid only where the outcode is zero.
 struct VertexView {
     Array<Vec3> q;
     Array<Vec2> x;
@@ -20,7 +20,7 @@ struct VertexView {
     static constexpr int64_t bytes_per_vertex = sizeof(Vec3) + sizeof(Vec2) + sizeof(uint8_t);
 };
 
-// Vertex v of `verts` (V, 3) in camera coordinates.
+// Returns vertex v of `verts` (V, 3) in camera coordinates.
 inline Vec3 camera_vertex(const Camera& camera, const double* verts, int64_t v) {
     return camera.to_camera({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
 }

@@ -1,4 +1,4 @@
-// What of the scene lies in view: planes through the borders of the image, and clipping against them.
+// Bounds the visible part of the scene by planes through the borders of the image, and clips against them.
 #pragma once
 
 #include <algorithm>
@@ -10,14 +10,14 @@
 
 namespace edgegrad {
 
-// The rectangle of the undistorted image that holds all that is visible, the image widened by the radius of the pixel
-// filter, as four planes n · q + d ≥ 0 through the camera and the rectangle's sides. Whatever lies inside all four is
-// in front of the camera (adding opposite planes gives Z · width ≥ 0), so no near plane is needed.
+// Bounds the visible rectangle of the undistorted image, widened by the radius of the pixel filter. Its four planes n ·
+// q + d ≥ 0 pass through the camera and the rectangle's sides. Whatever lies inside all of them is in front of the
+// camera, because adding opposite planes gives Z · width ≥ 0. No near plane is needed.
 struct ViewVolume {
     Vec3 normal[4];
     double offset[4];
-    Vec2 low, high;   // of the rectangle
-    double least[4];  // of the distance to each plane: zero, or what is greater, where the plane belongs to a neighbour
+    Vec2 low, high;   // They bound the rectangle.
+    double least[4];  // It bounds the distance to each plane: zero, or more where the plane belongs to a neighbour.
 
     ViewVolume(const Camera& c, double margin) : low{-margin, -margin}, high{c.width + margin, c.height + margin} {
         if (!c.is_undistorted()) low = c.lens_view.low, high = c.lens_view.high;
@@ -33,17 +33,17 @@ struct ViewVolume {
 
     double distance(int plane, Vec3 q) const { return dot(normal[plane], q) + offset[plane]; }
 
-    // Bit i set: outside plane i.
+    // Returns a code whose bit i is set outside plane i.
     uint8_t outcode(Vec3 q) const {
         uint8_t code = 0;
         for (int i = 0; i < 4; ++i) code |= (distance(i, q) < least[i]) << i;
         return code;
     }
 
-    // The nearest point in the rectangle: rounding may leave what was clipped outside.
+    // Returns the nearest point in the rectangle, because rounding may leave clipped points outside.
     Vec2 inside(Vec2 x) const { return {std::clamp(x.x, low.x, high.x), std::clamp(x.y, low.y, high.y)}; }
 
-    // The part [t0, t1] of the segment (1 − t) a + t b that lies inside; false when there is none.
+    // Finds the part [t0, t1] of the segment (1 − t) a + t b that lies inside. Returns false when there is none.
     bool clip_segment(Vec3 a, Vec3 b, double& t0, double& t1) const {
         t0 = 0, t1 = 1;
         for (int i = 0; i < 4; ++i) {
@@ -56,8 +56,8 @@ struct ViewVolume {
     }
 
     // Clips a triangle in place (Sutherland and Hodgman 1974). Returns the number of corners. A plane adds one corner
-    // to a convex polygon; but where corners lie on a plane up to rounding, their signs may alternate, and then it can
-    // double the number. Such a polygon is convex up to rounding too, so there is nothing to mend, but room to leave.
+    // to a convex polygon. Where corners lie on a plane up to rounding, their signs may alternate, and the number may
+    // double. Such a polygon is convex up to rounding, too, so it only needs space.
     static constexpr int most_corners = 3 << 4;
     int clip_triangle(Vec3* polygon) const {
         int n = 3;

@@ -14,8 +14,8 @@ double lens_boundary_of(const Fisheye& fisheye) {
     return turns.empty() ? M_PI : turns.front();
 }
 
-// θ in [low, high] with θ' = m: Newton's steps, with bisection where they leave the bracket. Each has twice the digits
-// of the one before.
+// Returns θ in [low, high] with θ' = m. It takes Newton steps, each of which doubles the digits, and bisects where they
+// leave the bracket.
 double angle_between(const Fisheye& fisheye, double low, double high, double m) {
     double angle = 0.5 * (low + high);
     for (int i = 0; i < 64; ++i) {
@@ -88,8 +88,8 @@ Vec2 WideFisheye::distort(Vec2 n) const {
     return scaled(fisheye_.at_angle(p.angle) * p.along) + Vec2{k_[2] / scale_.x, k_[5] / scale_.y};
 }
 
-// With e = m / |m| and ρ = |(d.x, d.z)|: δm = e ∂θ'/∂θ δθ + θ'/ρ (1 − e eᵀ) (δd.x, δd.z), where
-// δθ = (ρ δd.y − d.y e · (δd.x, δd.z)) / |d|². On the axis δm = (δd.x, δd.z) / −d.y.
+// Uses e = m / |m| and ρ = |(d.x, d.z)|: δm = e ∂θ'/∂θ δθ + θ'/ρ (1 − e eᵀ) (δd.x, δd.z), where δθ = (ρ δd.y − d.y e ·
+// (δd.x, δd.z)) / |d|². On the axis δm = (δd.x, δd.z) / −d.y.
 Mat2 WideFisheye::jacobian(Vec2 n) const {
     const Vec3 d = side_.direction(n);
     const Polar p = polar(d);
@@ -102,7 +102,7 @@ Mat2 WideFisheye::jacobian(Vec2 n) const {
         return scaled((fisheye_.slope_at_angle(p.angle) * angle_dot) * p.along +
                       (fisheye_.at_angle(p.angle) / p.sine) * (across - outwards * p.along));
     };
-    const Vec2 x = column(side_.turn.row[0]), y = column(side_.turn.row[1]);  // ∂d/∂n
+    const Vec2 x = column(side_.turn.row[0]), y = column(side_.turn.row[1]);  // It is ∂d/∂n.
     return {x.x, y.x, x.y, y.y};
 }
 
@@ -136,8 +136,7 @@ std::optional<Vec2> WideFisheye::undistort(Vec2 m) const {
     return side_.place(direction_of(angle(size), size > 0 ? (1 / size) * at : Vec2{}));
 }
 
-// No direction within the circle is farther from the one between its nearest and its farthest angle than half of what
-// lies between these, and the arc around the axis.
+// Directions within the circle are at most half the range of angles plus the arc from the middle one.
 bool WideFisheye::may_show(Vec2 x, double reach) const {
     const Vec2 m = m_of_pixel(x);
     const double size = length(m), step = reach * length(Vec2{std::fabs(inverse_[0]) + std::fabs(inverse_[1]),
@@ -166,7 +165,7 @@ std::optional<Box2> WideFisheye::side_box(Box2 x) const {
     const Vec2 corner[4] = {m_of_pixel(x.low), m_of_pixel({x.high.x, x.low.y}), m_of_pixel(x.high),
                             m_of_pixel({x.low.x, x.high.y})};
     const bool around = k_[2] >= x.low.x && k_[2] <= x.high.x && k_[5] >= x.low.y && k_[5] <= x.high.y;
-    // |m|, and λ from that of the first corner on.
+    // The loop bounds |m|, and λ relative to the first corner's.
     double nearest = std::numeric_limits<double>::infinity(), farthest = 0, before = 0, after = 0;
     const double first = std::atan2(corner[0].x, corner[0].y);
     for (int i = 0; i < 4; ++i) {
@@ -178,13 +177,13 @@ std::optional<Box2> WideFisheye::side_box(Box2 x) const {
     }
     if (around) nearest = 0;
     if (!(nearest < reach_)) return {};
-    constexpr double rounding = 1e-12;  // of angles, generous
+    constexpr double rounding = 1e-12;  // It is a generous bound for angles.
     Vec2 from{first + before, angle_below(nearest) - 0.5 * M_PI}, to{first + after, angle_above(farthest) - 0.5 * M_PI};
     if (around || from.x <= -M_PI || to.x >= M_PI) from.x = -M_PI, to.x = M_PI;
     return side_.box({from.x - rounding, from.y - rounding}, {to.x + rounding, to.y + rounding});
 }
 
-// Of an arc around the axis, as far from the antipode as half of what the box holds.
+// Returns the stretch of an arc around the axis, at half the box's size from the antipode or farther.
 double WideFisheye::stretch(Box2 n) const {
     const Polar p = polar(side_.direction(middle(n)));
     const double least = has_pole() ? 0.5 * farthest_radius(n) : 1e-9;

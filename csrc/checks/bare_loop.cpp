@@ -1,4 +1,4 @@
-// The yardstick of the benchmarks: the rays of the forward pass, made beforehand, cast and nothing else.
+// Provides the benchmarks' reference: it casts the forward pass's rays, made beforehand, and does nothing else.
 
 #include <algorithm>
 #include <numeric>

@@ -1,4 +1,4 @@
-// Faults on purpose, built as the kernel is, so that a test can show that the sanitizers report them.
+// Contains deliberate faults, built like the kernel, so that a test can show that the sanitizers report them.
 
 #include <cstdint>
 #include <vector>

@@ -1,5 +1,4 @@
-// Laid open for the tests: any rays, and what one interior sample does, the radiance at a point whose face is known and
-// its derivative.
+// Exposes internals to tests: any rays, and the radiance of an interior sample on a known face with its derivative.
 
 #include "checks/probe.h"
 

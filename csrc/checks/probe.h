@@ -1,4 +1,4 @@
-// What serves tests and benchmarks alone: single samples laid open, and the rays of an image with nothing else.
+// Serves tests and benchmarks alone: it exposes single samples, and the rays of an image without anything else.
 #pragma once
 
 #include <cstdint>
@@ -8,7 +8,7 @@
 
 namespace edgegrad {
 
-// Radiance (N, C) at pixel positions (N, 2) on the given faces, and its derivative.
+// These write the radiance (N, C) at pixel positions (N, 2) on the given faces, and its derivative.
 template <class T>
 void shade_at(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces, const double* points,
               double* radiance);
@@ -16,7 +16,7 @@ template <class T>
 void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces,
                   const double* points, const double* radiance_bar, const Gradients& grad);
 
-// Rays as arrays: origins and directions (N, 3), ends (N,); and the faces that each ignores, one list after the other.
+// Holds rays: origins and directions (N, 3), ends (N,). The lists of faces that each ignores are concatenated.
 struct RayArrays {
     const double *origins, *directions, *ends;
     int64_t size;
@@ -26,11 +26,11 @@ struct IgnoredArrays {
     const int64_t* first;  // (N + 1,)
 };
 
-// The face that each ray hits, −1 for none, and whether it meets any.
+// Writes the face that each ray hits, −1 for none, and whether it hits any.
 void cast_rays(const RayCaster& caster, const RayArrays& rays, const IgnoredArrays& ignored, int32_t* face,
                uint8_t* hidden);
 
-// Seconds that the rays of the forward pass take when they are cast and nothing else is done.
+// Returns the seconds that casting the rays of the forward pass takes, without anything else.
 double bare_loop(const Camera& camera, const RayCaster& caster, const ImageOptions& options, int packet_width,
                  ThreadTeam& team);
 

@@ -1,5 +1,5 @@
-// The kernel without Python under ThreadSanitizer: two threads of the program render at once, each as one of four that
-// share its work, the same and different geometry, while vertices move and calls are interrupted.
+// Runs the kernel without Python under ThreadSanitizer. Two threads of the program render at once, each with a thread
+// team of four. They use the same and different geometry, while vertices move and calls are interrupted.
 //
 //     threads PATH_OF_LIBEMBREE4 [race]
 //
@@ -28,7 +28,7 @@ const Spacing spacing{{0}, {1e-7}};
 
 constexpr int width = 96, height = 64, channels = 3, team_size = 4, rounds = 6;
 
-// The arrays of a scene: meshes with colours of vertices, and one with a texture, among them.
+// Holds the arrays of a scene whose meshes have vertex colours, or, for one of them, a texture.
 template <class T>
 struct Scene {
     std::vector<double> verts;
@@ -45,7 +45,7 @@ struct Scene {
     void add_vertex(Vec3 p) {
         for (const double x : {p.x, p.y, p.z}) verts.push_back(x), colors.push_back(T(0.5 + 0.3 * std::sin(5 * x)));
     }
-    // A row of `corners` is one of colors, that of the vertex, or of uvs.
+    // A row of `corners` refers to colors by the vertex, or to uvs.
     void add_face(int32_t a, int32_t b, int32_t c, int32_t texture = -1, int32_t first = 0) {
         for (const int32_t v : {a, b, c}) faces.push_back(v), corners.push_back(v - first);
         face_texture.push_back(texture);
@@ -112,7 +112,7 @@ Camera camera(bool perspective) {
 
 thread_local bool stop = false;
 
-// The scene, of one material, before a point of light.
+// Holds the scene with one material and a point light.
 template <class T>
 struct Lit {
     double eye[3], position[3] = {1, 0.5, -2.5}, intensity = 7;
@@ -132,7 +132,7 @@ struct Lit {
     }
 };
 
-// Returns the image and all gradients, one after the other.
+// Returns the image and all gradients, concatenated.
 template <class T>
 std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKind filter, int spp, ThreadTeam& team) {
     const SceneView<T> view = scene.view();
@@ -183,14 +183,14 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     return all;
 }
 
-// Round k of either thread: another position every second round.
+// Runs round k of either thread; positions change every second round.
 template <class T>
 std::vector<double> round(Scene<T> scene, int k) {
     for (size_t i = 0; i < scene.verts.size(); i += 3) scene.verts[i] += 0.05 * (k / 2);
     return render(scene, camera(k % 2 == 0), FilterKind(k % 3), 8);
 }
 
-// A call that ends early, as by Ctrl-C; uninterrupted it would take seconds.
+// Makes a call that ends early, as with Ctrl-C; uninterrupted it would take seconds.
 template <class T>
 void interrupted_call(const Scene<T>& scene) {
     stop = true;
@@ -238,7 +238,7 @@ int main(int argc, char** argv) {
     if (argc > 2 && std::strcmp(argv[2], "race") == 0) {
         int sum = 0;
         ThreadTeam(team_size).parallel_for(100, [&](int64_t) {
-            std::this_thread::sleep_for(std::chrono::milliseconds(1));  // the others are awake by then
+            std::this_thread::sleep_for(std::chrono::milliseconds(1));  // The other threads are awake by then.
             ++sum;
         });
         return std::printf("%d\n", sum) < 0;

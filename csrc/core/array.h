@@ -1,4 +1,4 @@
-// Large arrays: how they come to memory, and from there.
+// Allocates large arrays, and prefetches from them.
 #pragma once
 
 #include <algorithm>
@@ -14,21 +14,21 @@
 
 namespace edgegrad {
 
-// Asks for what will be read soon.
+// Prefetches the cache line at p.
 inline void prefetch(const void* p) {
 #if defined(__GNUC__)
     __builtin_prefetch(p);
 #endif
 }
 
-// The same of n elements from p on, which may lie in two lines of the cache.
+// Prefetches n elements from p on, which may lie in two cache lines.
 template <class T>
 void prefetch_all(const T* p, int64_t n) {
     prefetch(p), prefetch(reinterpret_cast<const char*>(p + n) - 1);
 }
 
-// Asks Linux for large pages, as NumPy does: memory of this size is fetched from the system anew each time, and by
-// small pages that takes as long as all that is then written to it.
+// Asks Linux for large pages, as NumPy does. Each allocation of this size fetches memory from the system anew. With
+// small pages, that takes as long as all that is written to it later.
 inline void prefer_large_pages([[maybe_unused]] void* p, [[maybe_unused]] size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
     constexpr uintptr_t page = 1 << 12, least = 1 << 22;
@@ -38,9 +38,8 @@ inline void prefer_large_pages([[maybe_unused]] void* p, [[maybe_unused]] size_t
 #endif
 }
 
-// An array of which every element will be written before it is read, by several threads. Unlike std::vector it sets
-// nothing to zero: one thread would do that, and fetch the pages from the system, while the others wait. Memory comes
-// from the one that writes it first.
+// Holds elements that several threads write before anything reads them. Unlike std::vector, it sets nothing to zero.
+// One thread would do that, and fetch all pages, while the others wait. The first writer of a page fetches it.
 template <class T>
 class Array {
    public:

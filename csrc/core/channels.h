@@ -1,15 +1,16 @@
-// Code is compiled for the numbers of channels that matter, and once more for any number.
+// Dispatches to code compiled for the common numbers of channels, or for any number.
 #pragma once
 
 namespace edgegrad {
 
-// N > 0: so many channels, all of radiance. N < 0: −N channels, some of them attributes (shading/attributes.h). 0: any.
+// N > 0 means N channels, all of radiance. N < 0 means −N channels, with attributes (shading/attributes.h). 0 means any
+// number.
 template <int N>
 inline constexpr int all_channels = N < 0 ? -N : N;
 template <int N>
-inline constexpr int radiance_channels = N < 0 ? 0 : N;  // 0: not known
+inline constexpr int radiance_channels = N < 0 ? 0 : N;  // 0 means unknown.
 
-// What f.template operator()<N>() returns with the N that code is compiled for.
+// Returns f.template operator()<N>() for the N that code is compiled for.
 template <class F>
 auto dispatch_channels(int channels, bool attributes, F f) {
     if (attributes) return channels == 4 ? f.template operator()<-4>() : f.template operator()<0>();
@@ -25,7 +26,7 @@ auto dispatch_channels(int channels, bool attributes, F f) {
     }
 }
 
-// Of those numbers, for explicit instantiations.
+// Applies X to each N, for explicit instantiations.
 #define EDGEGRAD_FOR_CHANNELS(X) X(0) X(1) X(3) X(4) X(-4)
 
 }  // namespace edgegrad

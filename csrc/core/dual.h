@@ -1,5 +1,5 @@
-// Numbers and vectors with a derivative in one direction (forward-mode automatic differentiation). What is written for
-// S = double gives with S = Dual its _jvp.
+// Implements numbers and vectors with a derivative in one direction (forward-mode automatic differentiation). Code
+// written for S = double computes its _jvp with S = Dual.
 #pragma once
 
 #include <cmath>
@@ -8,7 +8,7 @@
 
 namespace edgegrad {
 
-// Overloads next to those of Dual.
+// Dual overloads these.
 using std::cos;
 using std::log2;
 using std::sqrt;
@@ -55,13 +55,13 @@ inline DualVec3 cross(DualVec3 a, DualVec3 b) {
 }
 inline DualVec3 unit(DualVec3 m) { return {unit(m.value), unit_vjp(m.value, m.dot)}; }
 
-// The value alone.
+// These return the value alone.
 inline double plain(double a) { return a; }
 inline double plain(Dual a) { return a.value; }
 inline Vec3 plain(Vec3 a) { return a; }
 inline Vec3 plain(DualVec3 a) { return a.value; }
 
-// Vectors of numbers S.
+// Maps a number type S to its vectors.
 template <class S>
 struct VectorOf;
 template <>
@@ -78,7 +78,7 @@ using Vector = typename VectorOf<S>::type;
 inline Vec3 vector(double x, double y, double z) { return {x, y, z}; }
 inline DualVec3 vector(Dual x, Dual y, Dual z) { return {{x.value, y.value, z.value}, {x.dot, y.dot, z.dot}}; }
 
-// Within bounds; beyond them it has no derivative.
+// These clamp to bounds; the derivative is zero beyond them.
 inline double clamped(double a, double low, double high) { return a < low ? low : a > high ? high : a; }
 inline Dual clamped(Dual a, double low, double high) {
     return a.value < low ? Dual(low) : a.value > high ? Dual(high) : a;

@@ -10,7 +10,7 @@ namespace edgegrad {
 
 void end_waiting_threads() {
 #ifdef __linux__
-    // It is looked up by name, for torch may bring a runtime that does not have it.
+    // The function is looked up by name, because torch may bring a runtime without it.
     constexpr int omp_pause_hard = 2;
     if (void* pause = dlsym(RTLD_DEFAULT, "omp_pause_resource_all"))
         reinterpret_cast<int (*)(int)>(pause)(omp_pause_hard);

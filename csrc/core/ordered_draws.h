@@ -1,6 +1,6 @@
-// The samples of a systematic draw in an order in which neighbours are near one another in the image, so that their
-// rays pass the same boxes and what is asked of their primitives is in the cache. Meshes come in any order: that of a
-// subdivision visits distant faces by turns.
+// Orders the samples of a systematic draw so that neighbours are close in the image. Their rays then pass the same
+// boxes, and their primitives' data is in the cache. Meshes come in any order: subdivisions alternate between distant
+// faces.
 #pragma once
 
 #include <algorithm>
@@ -16,8 +16,8 @@ namespace edgegrad {
 
 class OrderedDraws {
    public:
-    // n samples, kind after kind: `ends` says up to which primitive each kind goes. Within a kind they are in the order
-    // of key(k) of their primitive k, a number of 16 bits, and those of one primitive side by side.
+    // Orders n samples by kinds; kind i ends at the primitive ends[i]. Samples of a kind follow the 16-bit key(k) of
+    // their primitive k. Those of one primitive are adjacent.
     template <class Key>
     OrderedDraws(const Systematic& systematic, int64_t n, const std::vector<int64_t>& ends, Key key, ThreadTeam& team)
         : systematic_(systematic) {
@@ -46,10 +46,10 @@ class OrderedDraws {
         }
     }
 
-    // In this order the samples of a kind end at this place.
+    // Returns where the samples of a kind end in this order.
     int64_t end_of_kind(int kind) const { return ends_[kind]; }
 
-    // Calls body(k, i) for the samples at the places first … last − 1: i, on the primitive k.
+    // Calls body(k, i) for the samples at the positions first … last − 1, where sample i lies on the primitive k.
     template <class Body>
     void each(int64_t first, int64_t last, Body body) const {
         auto run = std::partition_point(runs_.begin(), runs_.end(), [&](const Run& r) { return r.place <= first; }) - 1;
@@ -60,21 +60,21 @@ class OrderedDraws {
 
     const Systematic& systematic() const { return systematic_; }
 
-    // At most, of so many samples on so many primitives.
+    // Bounds the memory for these numbers of samples and primitives.
     static int64_t bytes(int64_t samples, int64_t primitives) {
         const int64_t runs = std::min(samples, primitives + samples / part + 1);
         return 3 * runs * int64_t(sizeof(Run));
     }
 
    private:
-    // Samples sample … sample + count − 1 are on one primitive; in the order they begin at `place`.
+    // Groups the samples sample … sample + count − 1 of one primitive; in the order they begin at `place`.
     struct Run {
         int64_t primitive, sample, count, place;
         uint16_t key;
     };
-    static constexpr int64_t part = 1 << 10;  // samples of a thread's; a run ends with it
+    static constexpr int64_t part = 1 << 10;  // A thread takes this many samples, and a run ends with them.
 
-    // By the lower and then by the upper byte of the key.
+    // Sorts by the lower, then by the upper byte of the key.
     void sort(size_t first, size_t last) {
         std::vector<Run> sorted(last - first);
         for (const int shift : {0, 8}) {

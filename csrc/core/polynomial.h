@@ -1,4 +1,4 @@
-// Polynomials of one variable, Σ cᵢ xⁱ.
+// Evaluates polynomials of one variable, Σ cᵢ xⁱ.
 #pragma once
 
 #include <vector>
@@ -26,8 +26,7 @@ inline Polynomial product(const Polynomial& a, const Polynomial& b) {
     return out;
 }
 
-// Where c changes its sign in [low, high], ascending: between two zeros of its derivative, where it is monotone, by
-// bisection.
+// Returns where c changes its sign in [low, high], ascending. It bisects between the derivative's zeros.
 inline std::vector<double> sign_changes(const Polynomial& c, double low, double high) {
     if (c.size() < 2) return {};
     std::vector<double> stops = sign_changes(derivative(c), low, high), out;

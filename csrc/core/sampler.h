@@ -1,4 +1,4 @@
-// Stateless sample points: a function of seed, stream and index, so that no thread keeps a generator.
+// Generates sample points without state, as a function of seed, stream and index, so that no thread keeps a generator.
 #pragma once
 
 #include <bit>
@@ -8,14 +8,14 @@
 
 namespace edgegrad {
 
-// Finaliser of splitmix64 (Steele, Lea and Flood 2014): a bijection whose output bits are well mixed.
+// Mixes bits bijectively, by the finaliser of splitmix64 (Steele, Lea and Flood 2014).
 inline uint64_t mix(uint64_t x) {
     x ^= x >> 30, x *= 0xbf58476d1ce4e5b9ull;
     x ^= x >> 27, x *= 0x94d049bb133111ebull;
     return x ^ (x >> 31);
 }
 
-// Of two numbers and any third, of which many are asked.
+// Hashes two fixed numbers with many third ones.
 class Hash {
    public:
     Hash(uint64_t seed, uint64_t a) : before_(mix(mix(seed + odd) + a + odd)) {}
@@ -27,21 +27,21 @@ class Hash {
 };
 inline uint64_t hash(uint64_t seed, uint64_t a, uint64_t b = 0) { return Hash(seed, a)(b); }
 
-// Second argument of the hashes for the gradient's samples, so that they never meet those of a pixel of the image.
+// Separates the hashes of the gradient's samples from those of the image's pixels, as their second argument.
 constexpr uint64_t gradient_stream = 1;
 
-// The middle of one of 2⁵² equal cells of (0, 1): the bits as the fraction of a number between 1 and 2.
+// Returns the middle of one of 2⁵² equal cells of (0, 1). The bits become the fraction of a number between 1 and 2.
 inline double to_unit(uint64_t bits) {
     return std::bit_cast<double>(bits >> 12 | 0x3ff0000000000000ull) - (1 - 0x1p-53);
 }
 
-// n points in the unit square: the golden-ratio lattice (i / n, i φ⁻¹) moved by a random shift (Cranley and Patterson
-// 1976), each point by itself uniform, so any mean over them is unbiased.
+// Generates n points in the unit square: the golden-ratio lattice (i / n, i φ⁻¹) moved by a random shift (Cranley and
+// Patterson 1976). Each point is uniform by itself, so any mean over them is unbiased.
 class ShiftedLattice {
    public:
     explicit ShiftedLattice(int n) : step_(~0ull / n) {}
 
-    // Points first … first + n − 1 of the lattice whose shift is given by a random number.
+    // Writes points first … first + n − 1 of the lattice that `random` shifts.
     void fill(uint64_t random, int first, int n, double* x, double* y) const {
         uint64_t a = random + first * step_, b = mix(random) + first * golden;
         for (int i = 0; i < n; ++i, a += step_, b += golden) x[i] = to_unit(a), y[i] = to_unit(b);
@@ -52,7 +52,7 @@ class ShiftedLattice {
     uint64_t step_;
 };
 
-// A sequence of points whose every run of consecutive ones is spread evenly: i (1/p, 1/p²) with p³ = p + 1 (Roberts
+// Generates a sequence whose runs of consecutive points are all spread evenly: i (1/p, 1/p²) with p³ = p + 1 (Roberts
 // 2018, "R2"), moved by a random shift.
 class ShiftedSequence {
    public:

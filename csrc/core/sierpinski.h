@@ -1,7 +1,7 @@
-// Sierpiński's space-filling curve through a triangle: equal steps along it cover equal areas, and what is near on it
-// is near in the triangle. Equally spaced points on it, each moved at random within its cell, have an error that falls
-// as 1/n where the integrand is smooth (He and Owen 2016, "Extensible grids: uniform sampling on a space filling
-// curve"), and consecutive rays, texels and adjoints lie side by side.
+// Implements Sierpiński's space-filling curve through a triangle. Equal steps along it cover equal areas, and close
+// points on it are close in the triangle. The error of equally spaced points, jittered within their cells, falls as 1/n
+// for smooth integrands (He and Owen 2016, "Extensible grids: uniform sampling on a space filling curve"). Consecutive
+// rays, texels and adjoints are also close in memory.
 #pragma once
 
 #include <bit>
@@ -15,15 +15,15 @@ class SierpinskiCurve {
    public:
     static constexpr int most_levels = 30;
 
-    // The curve runs from p to r; q is the apex. It is cut into 2^levels cells of the same area.
+    // Sets the curve from p to r with the apex q, cut into 2^levels cells of equal area.
     void set(Vec2 p, Vec2 q, Vec2 r, int levels) {
         triangle_[0] = {p, q, r};
         levels_ = levels, known_ = false;
     }
 
-    // The point u of the unit square, mapped uniformly to cell k.
+    // Maps the point u of the unit square uniformly to cell k.
     Vec2 point(uint32_t k, Vec2 u) {
-        // The halves above the highest bit that changed are those of the last cell: two steps on average.
+        // The halves above the highest changed bit are those of the last cell, so this takes two steps on average.
         for (int l = known_ ? levels_ - std::bit_width(k ^ cell_) : 0; l < levels_; ++l) {
             const auto& [p, q, r] = triangle_[l];
             const Vec2 middle = 0.5 * (p + r);

@@ -1,10 +1,10 @@
-// Sobol's points in the plane, scrambled, for pixels that share them: neighbours' samples complement one another.
+// Generates scrambled Sobol points in the plane, which pixels share so that neighbours' samples complement each other.
 //
-// Of the (0,2)-sequence (Sobol 1967), every run of consecutive points that begins at a multiple of its length 2^m puts
-// as many of them into each of the boxes 2^−a × 2^(a−m) of the unit square. Pixels in the order of a space-filling
-// curve take runs one after another, so that the samples of one pixel are spread evenly, and so are the offsets in
+// The points form a (0,2)-sequence (Sobol 1967). Every run of consecutive points that begins at a multiple of its
+// length 2^m is stratified: each box 2^−a × 2^(a−m) of the unit square gets equally many. Pixels in the order of a
+// space-filling curve take consecutive runs. The samples of one pixel are then spread evenly, and so are the offsets in
 // blocks of 2 × 2, 4 × 4, … pixels (Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling
-// error via hierarchical ordering of pixels"). What they miss in one pixel is found in the next.
+// error via hierarchical ordering of pixels"). Neighbouring pixels find what one pixel misses.
 #pragma once
 
 #include <cstdint>
@@ -22,7 +22,7 @@ inline uint32_t reversed_bits(uint32_t x) {
     return x >> 16 | x << 16;
 }
 
-// Bit c of x becomes bit 2 c.
+// Moves bit c of x to bit 2 c.
 inline uint64_t spread_bits(uint32_t x) {
     uint64_t s = x;
     s = (s | s << 16) & 0x0000ffff0000ffffull;
@@ -32,14 +32,14 @@ inline uint64_t spread_bits(uint32_t x) {
     return (s | s << 1) & 0x5555555555555555ull;
 }
 
-// The place of a pixel on the Z-order curve (Morton 1966): the bits of x and y by turns.
+// Returns the position of a pixel on the Z-order curve (Morton 1966), which alternates the bits of x and y.
 inline uint64_t z_order(uint32_t x, uint32_t y) { return spread_bits(x) | spread_bits(y) << 1; }
 
 class ScrambledSobol {
    public:
     explicit ScrambledSobol(uint64_t random) : x_(random), y_(mix(random)) {}
 
-    // Points first … first + n − 1. They repeat after 2³².
+    // Writes points first … first + n − 1. They repeat after 2³².
     void fill(uint64_t first, int n, double* x, double* y) const {
         for (int k = 0; k < n; ++k) {
             const Vec2 point = (*this)(uint32_t(first) + k);
@@ -50,10 +50,10 @@ class ScrambledSobol {
 
    private:
     friend class ShuffledSobol;
-    // Both coordinates are held with the first binary digit in the lowest bit, where the first is i itself.
+    // Both coordinates store the first binary digit in the lowest bit. In this form, the first coordinate is i itself.
 
-    // The second coordinate: digit r is the sum of the digits c of i for which the binomial C(c, r) is odd, that is, of
-    // those c whose bits contain the bits of r.
+    // Returns the second coordinate. Its digit r is the sum of the digits c of i for which the binomial C(c, r) is odd.
+    // These are the c whose bits contain the bits of r.
     static uint32_t pascal(uint32_t i) {
         i ^= (i & 0xaaaaaaaau) >> 1;
         i ^= (i & 0xccccccccu) >> 2;
@@ -61,9 +61,9 @@ class ScrambledSobol {
         i ^= (i & 0xff00ff00u) >> 8;
         return i ^ i >> 16;
     }
-    // Owen's scrambling: each digit is flipped or not by a hash of those before it, which keeps the boxes' counts and
-    // makes each point uniform. Sums and products carry from low bits to high ones alone, so they are such hashes
-    // (Laine and Karras 2011; constants by Vegdahl 2021).
+    // Applies Owen's scrambling: a hash of the digits before it decides whether each digit is flipped. This keeps the
+    // boxes' counts and makes each point uniform. Sums and products carry only from low bits to high ones, so they are
+    // such hashes (Laine and Karras 2011; constants by Vegdahl 2021).
     struct Scramble {
         explicit Scramble(uint64_t random) : shift(uint32_t(random)), factor(uint32_t(random >> 32) | 1) {}
         uint32_t operator()(uint32_t x) const {
@@ -80,8 +80,8 @@ class ScrambledSobol {
     Scramble x_, y_;
 };
 
-// The same points in another order, in which runs that begin at a multiple of their length 2^m stay together (Burley
-// 2020, "Practical hash-based Owen scrambling"): so that several sequences of the same i know nothing of each other.
+// Generates the same points in another order, which keeps together runs that begin at a multiple of their length 2^m
+// (Burley 2020, "Practical hash-based Owen scrambling"). Several sequences of the same i are thereby independent.
 class ShuffledSobol {
    public:
     explicit ShuffledSobol(uint64_t random) : points_(random), order_(mix(random + 1)) {}

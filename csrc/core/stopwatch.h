@@ -1,4 +1,4 @@
-// Seconds between two readings.
+// Measures the seconds between two readings.
 #pragma once
 
 #include <chrono>

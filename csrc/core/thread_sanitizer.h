@@ -1,5 +1,5 @@
-// What ThreadSanitizer is told: it does not see how OpenMP's runtime, which is not built with it, hands work over. What
-// one thread did before it released an address comes before what another one does after it acquired that.
+// Informs ThreadSanitizer about synchronisation. It does not see how OpenMP's runtime, which is not built with it,
+// hands work over. What a thread does before it releases an address precedes what others do after they acquire it.
 #pragma once
 
 #ifdef __SANITIZE_THREAD__

@@ -1,7 +1,7 @@
-// The pixel filter k, separable: its weight, a sampler for it, and the adjoint image seen through it.
+// Implements the separable pixel filter k: its weight, its sampler, and the filtered adjoint.
 //
-// A pixel is I = ∫ k(x − c) L(x) dx with ∫ k = 1. The forward pass draws x − c in proportion to k and takes the mean;
-// the backward pass needs the filtered adjoint Ã(x) = Σ_pixels k(x − c) A.
+// A pixel is I = ∫ k(x − c) L(x) dx with ∫ k = 1. The forward pass samples x − c in proportion to k and takes the mean.
+// The backward pass needs the filtered adjoint Ã(x) = Σ_pixels k(x − c) A.
 #pragma once
 
 #include <algorithm>
@@ -20,10 +20,10 @@ class Filter {
    public:
     explicit Filter(FilterKind kind) : kind_(kind) {}
 
-    // Half the width of the support, in pixels.
+    // Returns half the width of the support, in pixels.
     double radius() const { return kind_ == FilterKind::box ? 0.5 : kind_ == FilterKind::tent ? 1.0 : 1.5; }
 
-    // Density at the offset d from the pixel's centre, along one axis.
+    // Returns the density at the offset d from the pixel's centre, along one axis.
     double weight(double d) const {
         d = std::fabs(d);
         if (d > radius()) return 0;
@@ -32,19 +32,20 @@ class Filter {
         return std::exp(-d * d / (2 * sigma * sigma)) / (inside * std::sqrt(2 * M_PI) * sigma);
     }
 
-    // Offset from u uniform in (0, 1): the inverse of the cumulative weight.
+    // Returns an offset for u uniform in (0, 1), by the inverse of the cumulative weight.
     double sample(double u) const {
         if (kind_ == FilterKind::box) return u - 0.5;
         if (kind_ == FilterKind::tent) return u < 0.5 ? std::sqrt(2 * u) - 1 : 1 - std::sqrt(2 - 2 * u);
-        // Gaussian: Winitzki's (2008) closed form of erf⁻¹ (2 · 10⁻³), then Newton steps on erf itself (10⁻¹⁴).
+        // The Gaussian uses Winitzki's (2008) closed form of erf⁻¹ (2 · 10⁻³), then Newton steps on erf itself (10⁻¹⁴).
         const double y = (2 * u - 1) * inside, a = 0.147;
         const double l = std::log1p(-y * y), h = 2 / (M_PI * a) + 0.5 * l;
-        double z = std::copysign(std::sqrt(std::fmax(0.0, std::sqrt(h * h - l / a) - h)), y);  // rounding at y ≈ 0
+        // fmax guards against rounding at y ≈ 0.
+        double z = std::copysign(std::sqrt(std::fmax(0.0, std::sqrt(h * h - l / a) - h)), y);
         for (int i = 0; i < 3; ++i) z -= (std::erf(z) - y) * 0.5 * std::sqrt(M_PI) * std::exp(z * z);
         return std::clamp(z * std::sqrt(2.0) * sigma, -1.5, 1.5);
     }
 
-    // The same for n numbers in place.
+    // Does the same for n numbers in place.
     void sample(int n, double* u) const {
         if (kind_ == FilterKind::box)
             for (int i = 0; i < n; ++i) u[i] -= 0.5;
@@ -55,27 +56,27 @@ class Filter {
     bool is_box() const { return kind_ == FilterKind::box; }
 
    private:
-    static constexpr double sigma = 0.5;                   // pixels
-    static constexpr double inside = 0.99730020393673979;  // of a Gaussian within 3 σ: erf(3 / √2)
+    static constexpr double sigma = 0.5;                   // It is in pixels.
+    static constexpr double inside = 0.99730020393673979;  // It is the part of a Gaussian within 3 σ: erf(3 / √2).
     FilterKind kind_;
 };
 
 struct ImageOptions {
-    int spp;  // samples a pixel
+    int spp;  // It counts samples per pixel.
     Filter filter;
     uint64_t seed;
 };
 
-// The pixels of an image with their filter.
+// Applies the filter to the pixels of an image.
 class FilteredPixels {
    public:
     FilteredPixels(Filter filter, int width, int height) : filter_(filter), width_(width), height_(height) {}
 
-    // Calls visit(pixel, k(x − c)) for those whose filter reaches x.
+    // Calls visit(pixel, k(x − c)) for the pixels whose filter reaches x.
     template <class Visit>
     void around(Vec2 x, Visit visit) const {
         const double r = filter_.radius();
-        // Pixels whose centre lies within r. The box takes floor(x) alone, so that a point on a border counts once.
+        // These pixels have a centre within r. The box takes floor(x) alone, so that a point on a border counts once.
         const bool box = filter_.is_box();
         const int i0 = std::max(0, int(box ? std::floor(x.x) : std::ceil(x.x - r - 0.5)));
         const int j0 = std::max(0, int(box ? std::floor(x.y) : std::ceil(x.y - r - 0.5)));
@@ -93,23 +94,23 @@ class FilteredPixels {
     int width_, height_;
 };
 
-// The adjoint image seen through the filter. T is the type of images.
+// Filters the adjoint image. T is the type of images.
 template <class T>
 class FilteredAdjoint {
    public:
     FilteredAdjoint(const T* adjoint, const SceneView<T>& scene, Filter filter, int width, int height)
         : A_(adjoint), scene_(scene), pixels_(filter, width, height) {}
 
-    // A of a pixel, C numbers.
+    // Returns A of a pixel, C numbers.
     const T* of(int64_t pixel) const { return A_ + pixel * scene_.channels; }
 
-    // Ã(x) = Σ k A: calls visit(A, k) for the pixels that it is made of, A being C numbers.
+    // Calls visit(A, k) for the pixels that make up Ã(x) = Σ k A, where A has C numbers.
     template <class Visit>
     void around(Vec2 x, Visit visit) const {
         pixels_.around(x, [&](int64_t pixel, double weight) { visit(of(pixel), weight); });
     }
 
-    // Ã(x), C numbers; false where it is zero in all channels.
+    // Writes Ã(x), C numbers. Returns false where it is zero in all channels.
     template <int N>
     bool at(Vec2 x, double* out) const {
         const int C = N ? all_channels<N> : scene_.channels;
@@ -123,8 +124,8 @@ class FilteredAdjoint {
         return any;
     }
 
-    // Σ_pixels k(x − c) A · background: what the background at x contributes. Each pixel has a background of its own,
-    // so this is not Ã(x) times something.
+    // Returns Σ_pixels k(x − c) A · background, the contribution of the background at x. Each pixel has its own
+    // background, so this is not Ã(x) times something.
     template <int N>
     double times_background(Vec2 x) const {
         const int C = N ? all_channels<N> : scene_.channels;

@@ -1,4 +1,4 @@
-// The importance of a region of the image: the mean size of the adjoint over a rectangle, in constant time.
+// Computes the importance of a region of the image: the mean size of the adjoint over a rectangle, in constant time.
 #pragma once
 
 #include <algorithm>
@@ -13,13 +13,13 @@
 
 namespace edgegrad {
 
-// A summed-area table (Crow 1984) over integers, so that differences are exact: a rectangle gives zero if and only if
-// every adjoint in it is zero, and then leaving it out is no bias. A pixel with an adjoint counts 1 + 8 |A| / mean, the
-// one being the defensive lower bound that bounds the weight of what is small but not zero.
+// Holds a summed-area table (Crow 1984) over integers, so that differences are exact. A rectangle gives zero if and
+// only if every adjoint in it is zero; omitting it is then no bias. A pixel with an adjoint counts 1 + 8 |A| / mean.
+// The 1 is the defensive lower bound that limits the weight of small adjoints.
 class Importance {
    public:
-    // Without an adjoint all pixels count the same, and there is no table. What stands for one that is not known yet
-    // says nothing of how rough it is.
+    // Without an adjoint, all pixels count the same, and there is no table. A placeholder for an unknown adjoint
+    // (`known` = false) has no roughness.
     template <class T>
     Importance(const T* adjoint, int width, int height, int channels, double radius, ThreadTeam& team,
                bool known = true)
@@ -30,7 +30,7 @@ class Importance {
             for (int c = 0; c < channels; ++c) a += std::fabs(double(adjoint[pixel * channels + c]));
             return a;
         };
-        // Strips of rows, and of columns, that are worth a thread.
+        // These strips of rows, and of columns, are large enough for a thread.
         const int rows = std::max(1, (1 << 14) / width), strips = (height + rows - 1) / rows;
         std::vector<double> row_sum(height, 0.0), row_change(height, 0.0);
         std::vector<int64_t> row_nonzero(height, 0);
@@ -56,7 +56,7 @@ class Importance {
         each_row([&](int j) {
             int64_t row = table_[index(0, j + 1)] = 0;
             for (int i = 0; i < width; ++i) {
-                // The cap keeps the conversion defined; only an adjoint 2²⁰ times the mean meets it.
+                // The cap keeps the conversion defined; only an adjoint 2²⁰ times the mean reaches it.
                 const double a = size(int64_t(j) * width + i);
                 if (a > 0) row += unit + int64_t(std::min(scale * a, 0x1p32));
                 table_[index(i + 1, j + 1)] = row;
@@ -71,38 +71,38 @@ class Importance {
         });
     }
 
-    // Mean over the pixels i0 … i1 − 1, j0 … j1 − 1 of an image; 0 if no adjoint is there.
+    // Returns the mean over the pixels i0 … i1 − 1, j0 … j1 − 1 of an image; 0 if no adjoint is there.
     double mean(int i0, int i1, int j0, int j1) const {
         if (i0 >= i1 || j0 >= j1) return 0;
         if (table_.empty()) return of(1);
         const int64_t *above = &table_[index(0, j0)], *to = &table_[index(0, j1)];
         return double(to[i1] - to[i0] - above[i1] + above[i0]) / (double(unit) * (double(i1 - i0) * double(j1 - j0)));
     }
-    // Asks for what that will read.
+    // Prefetches what mean() will read.
     void prefetch(int i0, int i1, int j0, int j1) const {
         if (table_.empty()) return;
         for (const int j : {j0, j1})
             for (const int i : {i0, i1}) edgegrad::prefetch(&table_[index(i, j)]);
     }
 
-    // The same for a place of the image.
+    // Does the same for a point of the image.
     void prefetch(Vec2 x) const {
         const int i = clamp(x.x, width_), j = clamp(x.y, height_);
         prefetch(i, i, j, std::min(j + 1, height_));
     }
 
-    // Mean over the pixels that the filter reaches from a box.
+    // Returns the mean over the pixels that the filter reaches from a box.
     double mean(Vec2 low, Vec2 high) const {
         return mean(clamp(std::floor(low.x - radius_), width_), clamp(std::floor(high.x + radius_) + 1, width_),
                     clamp(std::floor(low.y - radius_), height_), clamp(std::floor(high.y + radius_) + 1, height_));
     }
 
-    double radius() const { return radius_; }  // of the filter, less ½
+    double radius() const { return radius_; }  // It is the filter's radius, less ½.
 
-    // Mean difference of neighbouring pixels over the mean size: small for a smooth adjoint, √2 for white noise.
+    // Returns the mean difference of neighbouring pixels over the mean size: small if smooth, √2 for white noise.
     double roughness() const { return roughness_; }
 
-    // Of a pixel whose adjoint has this size.
+    // Returns the importance of a pixel whose adjoint has this size.
     double of(double size) const { return size > 0 ? 1 + per_adjoint_ * size : 0; }
 
    private:

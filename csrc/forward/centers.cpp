@@ -12,7 +12,7 @@ void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const Ray
     const ImageOptions one{.spp = 1, .filter = Filter(FilterKind::box), .seed = 0};
     std::fill(face, face + int64_t(camera.width) * camera.height, -1);
     for (const Side& side : make_sides(scene, camera, caster, one, team)) {
-        // A face whose plane holds the eye is not seen; the image shows what is behind it, too.
+        // A face whose plane contains the eye is invisible; the image shows what is behind it, too.
         const auto is_seen = [&](int32_t f) {
             const int32_t* v = scene.faces + 3 * int64_t(f);
             const Vec3 corner[3] = {side.q[v[0]], side.q[v[1]], side.q[v[2]]};

@@ -1,4 +1,4 @@
-// What is seen through the centre of each pixel.
+// Finds the faces at pixel centres.
 #pragma once
 
 #include <cstdint>

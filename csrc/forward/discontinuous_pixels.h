@@ -1,9 +1,10 @@
-// Pixels that borders run through, where one point of a face is a poor guess at the whole pixel: of shadows of punctual
-// lights, and of nearest texels; and where paths are traced of what emits, which is brighter than all that it lights.
+// Finds pixels that contain discontinuities, where one point of a face represents the pixel poorly. These are shadows
+// of punctual lights, and edges of nearest texels. With path tracing, they are also the borders of emitters, which are
+// brighter than all that they light.
 //
-// A pixel is one of them where the pixels around it are on both sides. What was found in the pixel itself is not asked:
-// whether it is shaded again, with other points, must not depend on the points that it then does without, or the mean
-// over seeds would be off. edgegrad/points/borders.py has the same rule for shaders.
+// A pixel is marked where the pixels around it are on both sides. The pixel's own result is not used: whether it is
+// shaded again, at other points, must not depend on the points that this discards. Otherwise the mean over seeds would
+// be biased. edgegrad/points/borders.py has the same rule for shaders.
 #pragma once
 
 #include <algorithm>
@@ -17,12 +18,12 @@
 
 namespace edgegrad {
 
-constexpr int most_again = 8;   // times the points of a face in a pixel, where it is shaded again
-constexpr int share_again = 4;  // times the points of the first pass, in all
-// With paths, of which each pixel has many: times the points of a face, and the rays of the camera.
+constexpr int most_again = 8;   // It limits the factor on the points per face and pixel where it is shaded again.
+constexpr int share_again = 4;  // It limits the factor on the points of the first pass, in total.
+// Path tracing follows many paths per pixel. These are its factors on the points per face, and on the camera's rays.
 constexpr int points_again = 2, rays_again = 4;
 
-// An image of values with a pixel around it, of which nothing is known.
+// Holds an image of values with a border of one pixel, where nothing is known.
 template <class V>
 class PaddedImage {
    public:
@@ -40,7 +41,7 @@ class PaddedImage {
     std::vector<V> values_;
 };
 
-// What is seen of punctual lights.
+// Records which punctual lights pixels see.
 class LightVisibility {
    public:
     LightVisibility(int width, int height, const LitScene& lit, const LitOptions& options)
@@ -48,14 +49,14 @@ class LightVisibility {
 
     bool empty() const { return columns_.empty(); }
 
-    // Of one point.
+    // Adds one point.
     void add(int x, int y, const int8_t* seen) {
         uint8_t* here = seen_.at(x, y);
         for (size_t l = 0; l < columns_.size(); ++l)
             if (const int8_t s = seen[columns_[l]]; s != not_asked) here[l] |= s ? visible : hidden;
     }
 
-    // Marks those of a row of pixels.
+    // Marks such pixels in a row.
     void mark(int y, uint8_t* pixels) const {
         const size_t L = columns_.size(), n = L * width_;
         const uint8_t *above = seen_.at(0, y - 1), *row = seen_.at(0, y), *below = seen_.at(0, y + 1);
@@ -70,7 +71,7 @@ class LightVisibility {
    private:
     enum : uint8_t { hidden = 1, visible = 2 };
 
-    // Of light samples, those of punctual lights.
+    // Selects the light samples of punctual lights.
     static std::vector<size_t> columns(const LitScene& lit, const LitOptions& options) {
         std::vector<size_t> out;
         if (!options.shadows) return out;
@@ -85,7 +86,7 @@ class LightVisibility {
     PaddedImage<uint8_t> seen_;
 };
 
-// Which texels are looked up where textures give the nearest one.
+// Records the texels that nearest lookups use.
 class NearestTexels {
    public:
     NearestTexels(int width, int height, const LitScene& lit)
@@ -97,7 +98,7 @@ class NearestTexels {
         return std::all_of(lit.meshes.begin(), lit.meshes.end(), [](const LitMesh& m) { return nearest(m).empty(); });
     }
 
-    // A point of a face.
+    // Adds a point of a face.
     void add(int x, int y, int64_t face, const double* b) {
         const LitMesh& mesh = lit_.mesh_of(face);
         const int32_t number = int32_t(&mesh - lit_.meshes.data());
@@ -113,11 +114,11 @@ class NearestTexels {
                 value = hash(value, std::bit_cast<uint64_t>(table.at<double>(texel, c)));
         }
         Texels& here = *seen_.at(x, y);
-        // Of several meshes in a pixel the last one counts.
+        // If a pixel shows several meshes, the last one counts.
         here = {number, here.mesh == number && (here.several || here.value != value), value};
     }
 
-    // Marks those of a row of pixels.
+    // Marks such pixels in a row.
     void mark(int y, uint8_t* pixels) const {
         for (int x = 0; x < width_; ++x) {
             const Texels* around[8];
@@ -138,8 +139,8 @@ class NearestTexels {
    private:
     struct Texels {
         int32_t mesh = -1;
-        bool several = false;  // points in the pixel see different ones
-        uint64_t value = 0;    // a hash
+        bool several = false;  // Points in the pixel see different texels.
+        uint64_t value = 0;    // It is a hash.
     };
 
     static std::vector<const Source*> nearest(const LitMesh& mesh) {
@@ -153,11 +154,11 @@ class NearestTexels {
 
     int width_;
     const LitScene& lit_;
-    std::vector<std::vector<const Source*>> sources_;  // of each mesh
+    std::vector<std::vector<const Source*>> sources_;  // Each mesh has a list.
     PaddedImage<Texels> seen_;
 };
 
-// What emits.
+// Records which pixels show emitters.
 class SeenEmitters {
    public:
     SeenEmitters(int width, int height, const LitScene& lit, const LitOptions& options)
@@ -168,10 +169,10 @@ class SeenEmitters {
                                                     [](const LitMesh& mesh) { return mesh.emission.exists(); });
     }
 
-    // A point of a face.
+    // Adds a point of a face.
     void add(int x, int y, int64_t face) { *seen_.at(x, y) |= lit_.mesh_of(face).emission.exists() ? emits : dark; }
 
-    // Marks those of a row of pixels. Where nothing is seen it is dark.
+    // Marks such pixels in a row. The background counts as dark.
     void mark(int y, uint8_t* pixels) const {
         for (int x = 0; x < width_; ++x) {
             uint8_t around = 0;
@@ -203,7 +204,7 @@ class ImageBorders {
           emitters_(width, height, lit, options),
           has_emitters_(!SeenEmitters::is_empty(lit, options)) {}
 
-    // A point that was shaded, and what it sees of light samples.
+    // Adds a point that was shaded, and the visibility of its light samples.
     void add(int32_t pixel, int32_t face, const double* b, const int8_t* seen) {
         ++points_[pixel];
         lights_.add(pixel % width_, pixel / width_, seen);
@@ -211,7 +212,7 @@ class ImageBorders {
         if (has_emitters_) emitters_.add(pixel % width_, pixel / width_, face);
     }
 
-    // How many times as many points of each face are to be shaded in those pixels, 0: there are none.
+    // Marks the pixels. Returns by which factor to increase the points of each face in them, 0: none are marked.
     int find(std::vector<uint8_t>& pixels, ThreadTeam& team) const {
         pixels.assign(points_.size(), 0);
         if (lights_.empty() && !has_texels_ && !has_emitters_) return 0;

@@ -1,4 +1,4 @@
-// The pixel loop. The samples of a pixel are drawn in proportion to the filter and cast together.
+// Contains the pixel loop. The samples of a pixel are drawn in proportion to the filter and cast together.
 
 #include "forward/forward.h"
 
@@ -26,7 +26,7 @@ namespace {
 
 constexpr int lanes = 8;
 
-// Which of the lanes hit the face, as bits.
+// Returns a mask of the lanes that hit the face.
 inline unsigned on_face(const int32_t* hit, int32_t face) {
     static constexpr unsigned bit[lanes] = {1, 2, 4, 8, 16, 32, 64, 128};
     unsigned bits = 0;
@@ -34,8 +34,8 @@ inline unsigned on_face(const int32_t* hit, int32_t face) {
     return bits;
 }
 
-// The sum of the barycentrics of all lanes that hit the face; false if one of them lies outside of it. All lanes are
-// worked on, without branches, so that they fill vectors; and summed in one order, however wide these are.
+// Adds the barycentrics of all lanes that hit the face. Returns false if one of them lies outside of it. All lanes are
+// computed without branches, so that they fill vectors. The order of the sum does not depend on the vectors' width.
 EDGEGRAD_VECTORIZED bool add_barycentrics(const FaceMap& map, const double* x, const double* y, const int32_t* hit,
                                           int32_t face, Barycentrics& sum) {
     const Vec3 a = map.column[0], b = map.column[1], c = map.column[2];
@@ -55,7 +55,7 @@ EDGEGRAD_VECTORIZED bool add_barycentrics(const FaceMap& map, const double* x, c
 
 constexpr int tile = 16;
 
-// The pixels of one row of a tile.
+// Renders the pixels of one row of a tile.
 template <int N, class T>
 class PixelRow {
    public:
@@ -94,7 +94,7 @@ class PixelRow {
         }
     }
 
-    // The same where no ray can hit anything.
+    // Does the same where no ray can hit anything.
     void leave_out(int x0, int x1, int y) {
         for (int x = x0; x < x1; ++x) {
             const int64_t pixel = pixel_at(x, y);
@@ -107,8 +107,7 @@ class PixelRow {
     }
 
    private:
-    // What the samples on one face have in common. Some faces are kept, for those in a pixel take turns and come again
-    // in the next one.
+    // Holds what the samples on one face share. Some are kept, as faces alternate in a pixel and recur in the next.
     struct alignas(N ? 256 : 8) Shaded {
         int32_t face = -1;
         bool textured = false, indirect = false;
@@ -120,7 +119,7 @@ class PixelRow {
 
     int64_t pixel_at(int x, int y) const { return int64_t(y) * side_->camera.width + x; }
 
-    // What the pixels of the row see through one side.
+    // Adds what the pixels of the row see through one side.
     void add_side(const Side& side, int x0, int x1) {
         const Camera& camera = side.camera;
         if (!camera.may_show({0.5 * (x0 + x1), y_ + 0.5}, 0.5 * (x1 - x0) + radius_)) return;
@@ -189,14 +188,14 @@ class PixelRow {
         rays_.count = parts_ = 0;
     }
 
-    // What a pixel hits, and how far away.
+    // Records that a pixel hits a face, and its depth.
     void note_hit(const Shaded& s, int column) {
         first_[column] = std::min(first_[column], s.face), last_[column] = std::max(last_[column], s.face);
         const Vec2 middle = normalised(side_->camera, {x0_ + column + 0.5, y_ + 0.5});
         farthest_[column] = std::max(farthest_[column], s.depth.farthest(middle, side_->reach));
     }
 
-    // Adds what ray i, of a pixel in this column, sees to the sum: one sample.
+    // Adds the sample of ray i, of a pixel in this column, to the sum.
     int add(int i, int column, typename AffineRadiance<N>::Sum& sum) {
         const int32_t face = rays_.face[i];
         const Shaded& s = shaded(face);
@@ -223,7 +222,7 @@ class PixelRow {
         return s;
     }
 
-    // Faces that are smaller than the distance of the samples are met once each, and their arrays are then waited for.
+    // Faces smaller than the spacing of samples are hit once each, so their arrays are prefetched.
     static constexpr int64_t in_cache = 1 << 18;
     void prefetch_faces() const {
         for (int i = 0; i < rays_.count; ++i)
@@ -240,7 +239,7 @@ class PixelRow {
                 }
     }
 
-    // Casts the rays again, through the faces whose plane holds the eye. What the others hit stays the same.
+    // Casts the rays again, through faces whose plane contains the eye. Other hits stay the same.
     void cast_beyond() {
         rays_.prepare();
         side_->frame.cast_with_alpha_test(rays_, nullptr, [&](int32_t face) { return !is_indirect(face); });
@@ -265,7 +264,7 @@ class PixelRow {
         if (s.indirect) return;
         s.depth.set(camera, corner, s.map);
         if (!s.textured) s.radiance.set(scene_, face);
-        // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
+        // Threads may write the same byte, always with the same value. Reading first keeps its cache line shared.
         std::atomic_ref<uint8_t> seen(out_.seen[face]);
         if (!seen.load(std::memory_order_relaxed))
             seen.store(camera.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
@@ -273,26 +272,26 @@ class PixelRow {
 
     const SceneView<T>& scene_;
     const std::deque<Side>& sides_;
-    const Side* side_;  // of the rays
+    const Side* side_;  // The rays pass through this side.
     const int spp_;
-    const double radius_;  // of the filter
+    const double radius_;  // It is the filter's radius.
     ThreadTeam& team_;
     T* const image_;  // (H, W, C)
     const HitBuffers<T>& out_;
     const int C_;
-    const int direction_;  // the channel where a direction begins; −1: there is none
+    const int direction_;  // A direction begins at this channel; −1: there is none.
 
     struct Part {
         int column, n;
     };
     CameraRays rays_;
-    Part part_[RayBatch::size];  // of which pixels the rays are
+    Part part_[RayBatch::size];  // They map rays to pixels.
     int parts_ = 0;
     unsigned traced_ = 0;
     Shaded kept_[n_kept];
-    int x0_ = 0, y_ = 0;  // the first pixel of the row
+    int x0_ = 0, y_ = 0;  // They are the first pixel of the row.
     int hits_[tile];
-    int32_t first_[tile], last_[tile];  // faces
+    int32_t first_[tile], last_[tile];  // They are faces.
     double farthest_[tile];
     std::vector<double> sum_, radiance_;
 };
@@ -304,7 +303,7 @@ void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, con
     // Tiles are lower where a pixel has many samples, so that the threads end together.
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
-    // Whole batches: also how sums are rounded depends on which rays lie in one.
+    // Only whole batches are skipped, because the rays of a batch also determine how sums are rounded.
     const int unit = std::min(tile, pixels_of_batches(o.spp));
     const ReachablePixels reachable(camera, caster, sides.front().q, o.filter.radius() - 0.5, team);
     team.parallel_for_with_state(

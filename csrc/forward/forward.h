@@ -1,4 +1,4 @@
-// The image.
+// Renders the image.
 #pragma once
 
 #include <cstdint>

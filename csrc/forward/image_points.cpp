@@ -16,7 +16,7 @@ namespace {
 
 constexpr Vec2 nowhere{std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::quiet_NaN()};
 
-// Where a place lies in the image plane of a side, in normalised coordinates; not numbers where it does not show it.
+// Returns a point of the image in normalised coordinates of a side, or NaN where the side does not show it.
 Vec2 through(const Camera& side, Vec2 x) {
     return side.may_show(x, 0) ? normalised(side, undistort(side, x)) : nowhere;
 }
@@ -36,7 +36,7 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
             const int32_t* v = scene.faces + 3 * int64_t(face);
             return std::array<Vec3, 3>{q[v[0]], q[v[1]], q[v[2]]};
         };
-        // A face whose plane holds the eye is not seen; the image shows what is behind it, too.
+        // A face whose plane contains the eye is invisible; the image shows what is behind it, too.
         const auto is_seen = [&](int32_t face) { return !side.passes_through_eye(corners(face).data()); };
         team.parallel_for_blocks(places.size, [&](int64_t, int64_t first, int64_t last) {
             team.check();

@@ -1,4 +1,4 @@
-// What is seen at any places in the image, and the rays that go there, for shaders written in PyTorch.
+// Finds what is seen at any points of the image, and the rays to them, for shaders written in PyTorch.
 #pragma once
 
 #include <cstdint>
@@ -12,7 +12,7 @@
 
 namespace edgegrad {
 
-// Positions x (N, 2) in the image, px.
+// Holds positions x (N, 2) in the image, px.
 struct Places {
     const double* x;
     int64_t size;
@@ -22,16 +22,16 @@ struct Places {
 
 struct PlaceHits {
     std::vector<int32_t> face;  // (N,) −1: none
-    std::vector<int32_t> part;  // (N,) of the surface that is connected, −1: none
-    std::vector<double> b;      // (N, 2) where on the face
+    std::vector<int32_t> part;  // (N,) the connected part (Parts), −1: none
+    std::vector<double> b;      // (N, 2) last two barycentrics
 };
 
-// The geometry must have its parts.
+// Requires geometry with its parts.
 template <class T>
 PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry, const Places& places,
                   ThreadTeam& team);
 
-// Where the lens shows nothing, a ray holds NaN. Without `intrinsics` their derivatives are left out.
+// Where the lens shows nothing, a ray is NaN. Derivatives need `intrinsics`.
 RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, ThreadTeam& team);
 
 }  // namespace edgegrad

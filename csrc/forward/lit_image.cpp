@@ -15,7 +15,7 @@ namespace edgegrad {
 
 namespace {
 
-// What rows have in common.
+// Holds what rows share.
 template <class T>
 struct RowInput {
     const LitScene& lit;
@@ -24,10 +24,10 @@ struct RowInput {
     const LitOptions& options;
     int width, points;
     uint64_t seed;
-    const uint8_t* only;  // pixels, null: all
+    const uint8_t* only;  // It selects pixels; null: all.
     LitImage<T>& to;
-    ImageBorders* borders;  // null: not wanted
-    SkyGuide* guide;        // null: not wanted
+    ImageBorders* borders;  // Null means not wanted.
+    SkyGuide* guide;        // Null means not wanted.
     ThreadTeam& team;
 };
 
@@ -47,7 +47,7 @@ class LitRow : public RowVisitor {
         among_ = 0;
         const size_t at_once = paths_ ? shaded_at_once / paths_of_point : shaded_at_once;
         for (size_t first = 0; first < hits.size(); first += at_once) {
-            in_.team.check();  // with many points of lights a row takes long
+            in_.team.check();  // A row with many points of lights takes long.
             shade(hits, first, std::min(hits.size() - first, at_once));
         }
         const int C = in_.lit.channels;
@@ -97,18 +97,18 @@ class LitRow : public RowVisitor {
     const RowInput<T>& in_;
     std::vector<LightSample> lights_;
     std::shared_ptr<ShadeBuffers> buffers_;
-    std::shared_ptr<Paths> paths_;  // null: of direct light alone
-    std::vector<double> sums_;      // of the row
+    std::shared_ptr<Paths> paths_;  // Null means direct light alone.
+    std::vector<double> sums_;      // They are the row's.
     bool filtered_;
-    uint64_t among_ = 0;  // the hits of one pixel, which this is
+    uint64_t among_ = 0;  // It is the index of the current hit among those of its pixel.
     std::vector<int64_t> face_, seed_;
     std::vector<double> b_, spread_, radiance_;
     std::vector<int8_t> seen_;
 };
 
-constexpr uint64_t pilot = 0x70696c6f74;  // its random numbers
+constexpr uint64_t pilot = 0x70696c6f74;  // It separates the pilot's random numbers.
 
-// Every second pixel of every second row, or fewer of large images.
+// Selects every second pixel of every second row, or fewer in large images.
 std::vector<uint8_t> sparse_pixels(const Camera& camera) {
     constexpr double enough = 4096;
     const int step = std::max(2, int(std::sqrt(double(camera.width) * camera.height / enough)));
@@ -140,7 +140,7 @@ LitImage<T> render_lit(const LitScene& given, const SceneView<T>& scene, const C
     SkyGuide guide(given);
     const bool guides = options.bounces > 1 && options.samples == 1 && options.shadows && guide.has_sky();
     if (guides) {
-        // With numbers that the image does not use, for else where it draws points would depend on what it finds.
+        // The pilot's random numbers differ from the image's, or its results would correlate with the guided samples.
         const std::vector<uint8_t> pixels = sparse_pixels(camera);
         const ImageOptions few{1, image.filter, hash(image.seed, pilot)};
         shade_pixels(given, few, {0, camera.height, 1, pixels.data(), spread}, hash(sampling.again, pilot), &guide);

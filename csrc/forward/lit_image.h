@@ -1,4 +1,4 @@
-// The image of a scene with materials in light, at one point for each face in a pixel, or several.
+// Renders the image of a lit scene with materials, at one or several points for each face in a pixel.
 #pragma once
 
 #include <cstdint>
@@ -10,22 +10,21 @@
 
 namespace edgegrad {
 
-// Random numbers of what is shaded, those of a pixel its own whatever the others see, so that the images of a scene and
-// of one that is moved a little differ by little.
+// Controls sampling. The random numbers of a pixel do not depend on what others see, so images of slightly different
+// scenes differ slightly.
 struct LitSampling {
-    int points;            // of the samples of a pixel on one face, that are shaded
-    uint64_t seed, again;  // of the first pass, and of pixels that are shaded again
+    int points;            // It counts the shaded points per face and pixel.
+    uint64_t seed, again;  // They serve the first pass, and pixels that are shaded again.
 };
 
-// (H · W, C) before what lies behind the surfaces, and for each light whether a point asked for its shadow.
+// Holds the radiance (H · W, C) without the background, and whether some point asked for each light's shadow.
 template <class T>
 struct LitImage {
     Array<T> radiance;
     std::vector<uint8_t> asked;
 };
 
-// Pixels that borders of shadows or of nearest texels run through are shaded again, at several points
-// (discontinuous_pixels.h).
+// Shades pixels with shadow boundaries or texel edges again, at several points (discontinuous_pixels.h).
 template <class T>
 LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                        const ImageOptions& image, const LitOptions& options, const LitSampling& sampling,

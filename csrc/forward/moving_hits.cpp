@@ -22,7 +22,7 @@ Vector<S> row(const double* value, const double* tangent, int64_t i) {
                   number<S>(value, tangent, 3 * i + 2));
 }
 
-// The rotation and translation of world_to_camera.
+// Holds the rotation and translation of world_to_camera.
 template <class S>
 struct Pose {
     Vector<S> R[3];
@@ -37,7 +37,7 @@ struct Pose {
     Vector<S> in_camera(Vector<S> p) const { return vector(dot(R[0], p), dot(R[1], p), dot(R[2], p)) + t; }
 };
 
-// A ray and a face in camera coordinates (Möller and Trumbore 1997).
+// Intersects a ray and a face in camera coordinates (Möller and Trumbore 1997).
 template <class S>
 struct Crossing {
     Vector<S> e1, e2, s, d, p, q;
@@ -53,7 +53,7 @@ struct Crossing {
     }
     bool exists() const { return std::isfinite(plain(u) + plain(v)); }
 };
-// Adds to the cotangents of the corners; returns that of `along`.
+// Adds to the cotangents of the corners, and returns the cotangent of `along`.
 Vec3 crossing_vjp(const Crossing<double>& c, bool perspective, const double* b_bar, Vec3* corner_bar) {
     const double u_bar = b_bar[1] - b_bar[0], v_bar = b_bar[2] - b_bar[0];
     Vec3 e1_bar, e2_bar, s_bar, d_bar, p_bar, q_bar;
@@ -66,7 +66,7 @@ Vec3 crossing_vjp(const Crossing<double>& c, bool perspective, const double* b_b
     return perspective ? d_bar : s_bar;
 }
 
-// A face in world and in camera coordinates.
+// Holds a face in world and in camera coordinates.
 template <class S>
 struct Corners {
     Vector<S> world[3], corner[3];
@@ -78,7 +78,7 @@ struct Corners {
             world[k] = row<S>(at.verts, tangents.verts, v[k]), corner[k] = pose.in_camera(world[k]);
     }
 };
-// Calls body(number of the ray, crossing) for all rays of hits.
+// Calls body(index of the ray, crossing) for all rays of hits.
 template <class S, class Body>
 void each_crossing(const MovingHits& hits, const Pose<S>& pose, const MovingArrays<const double>& at,
                    const MovingArrays<const double>& tangents, int64_t first, int64_t last, Body body) {
@@ -89,10 +89,10 @@ void each_crossing(const MovingHits& hits, const Pose<S>& pose, const MovingArra
     }
 }
 
-// What the hits of one chunk give.
+// Holds the gradients of one chunk of hits.
 struct ChunkOfHits {
     RowBuffer verts;
-    double pose[12] = {};  // R in rows, then t
+    double pose[12] = {};  // They are R in rows, then t.
 };
 
 }  // namespace
@@ -171,7 +171,7 @@ void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at
 }
 
 void form_vjp(const LinearForm& form, const double* bar, double* table_bar, ThreadTeam& team) {
-    // Each thread owns some rows, runs of them, and adds to them in order: so the sums are the same for any number.
+    // Each thread owns runs of rows, and adds to them in order. The sums are thus the same for any number of threads.
     constexpr int64_t run = 64;
     const int owners = team.threads();
     team.parallel_for(owners, [&](int64_t owner) {

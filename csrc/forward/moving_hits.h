@@ -1,4 +1,4 @@
-// Where rays of a camera meet the planes of faces, as functions of the vertices, of the camera's place and of the rays.
+// Computes where camera rays hit the planes of faces, as functions of the vertices, of the camera pose and of the rays.
 #pragma once
 
 #include <cstdint>
@@ -7,13 +7,13 @@
 
 namespace edgegrad {
 
-// Arrays of what it depends on, or of its derivatives; null: zero.
+// Points to the inputs, or to their derivatives; null: zero.
 template <class Number>
 struct MovingArrays {
     Number* verts = nullptr;            // (V, 3) world coordinates
     Number* world_to_camera = nullptr;  // (4, 4)
-    // (N, rays, 3), in camera coordinates: directions of rays from the eye, or, in an orthographic view, points that
-    // rays along the axis go through.
+    // (N, rays, 3) in camera coordinates: directions of rays from the eye, or points that rays along the axis pass in
+    // an orthographic view.
     Number* along = nullptr;
 };
 
@@ -22,10 +22,10 @@ struct MovingHits {
     const int64_t* face;   // (N,)
     int64_t size;
     bool perspective;
-    int rays = 1;  // that meet the plane of each face
+    int rays = 1;  // It counts the rays per face.
 };
 
-// Barycentrics (N, rays, 3). Of a face without area, or seen edge-on, those of its first corner, without derivatives.
+// Writes barycentrics (N, rays, 3). Degenerate or edge-on faces get those of the first corner, without derivatives.
 void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team);
 // Adds to the cotangents of vertices and camera, and writes those of `along`.
 void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
@@ -33,7 +33,7 @@ void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at
 void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
                     const MovingArrays<const double>& tangents, double* b_dot, ThreadTeam& team);
 
-// How numbers of samples move with rows of a table: each is the sum over its rows of by · moved row.
+// Describes how numbers of samples move with rows of a table: each is the sum over its rows of by · moved row.
 struct LinearForm {
     const int64_t *sample, *row;  // (N,)
     const double* by;             // (N, width)

@@ -15,7 +15,7 @@ namespace edgegrad {
 
 namespace {
 
-// As edgegrad/points/footprints.py has it: differences over so little that texture coordinates are nearly affine there.
+// Does what edgegrad/points/footprints.py does, with differences so small that texture coordinates are nearly affine.
 Spread spread_at(const Camera& camera, const FaceMap& map, Vec2 n) {
     constexpr double aside = 1.0 / 64;  // px
     const auto difference = [&](Vec2 by_pixel) {
@@ -23,11 +23,11 @@ Spread spread_at(const Camera& camera, const FaceMap& map, Vec2 n) {
         barycentrics(map, n + aside * by_pixel, ahead), barycentrics(map, n - aside * by_pixel, behind);
         return Barycentrics{(ahead.u - behind.u) / (2 * aside), (ahead.v - behind.v) / (2 * aside)};
     };
-    const Vec2 x = pixel_vjp(camera, n, {1, 0}), y = pixel_vjp(camera, n, {0, 1});  // rows of ∂n/∂x
+    const Vec2 x = pixel_vjp(camera, n, {1, 0}), y = pixel_vjp(camera, n, {0, 1});  // They are rows of ∂n/∂x.
     return {difference({x.x, y.x}), difference({x.y, y.y})};
 }
 
-// The pixels of one row.
+// Finds the hits of one row of pixels.
 template <class T>
 class HitRow {
    public:
@@ -42,7 +42,7 @@ class HitRow {
           team_(team),
           rays_(side_->frame) {}
 
-    // Hits in pixels first … end − 1 of row y: in the others there are none.
+    // Finds the hits in pixels first … end − 1 of row y; the others have none.
     void find(int y, int first, int end, std::vector<PixelHit>& to) {
         to.reserve(expected_);
         const int width = side_->camera.width;
@@ -80,14 +80,14 @@ class HitRow {
         uint64_t key;
         Vec2 n;
     };
-    // Samples of a pixel on one face, at some of them: those with the least keys, a heap.
+    // Collects a pixel's samples on one face, and some of them: those with the least keys, as a heap.
     struct Group {
         int32_t face;
         int count;
         std::vector<Drawn> drawn;
     };
     static bool is_less(const Drawn& a, const Drawn& b) { return a.key < b.key; }
-    // What pixels on one face have in common. Some faces are kept, for they come again in the next pixel.
+    // Holds what pixels on one face share. Some faces are kept, because they recur in the next pixel.
     struct Kept {
         int32_t face = -1;
         bool indirect = false;
@@ -116,7 +116,7 @@ class HitRow {
             const int end = i + part_[p].n;
             for (int k = i; k < end; ++k) {
                 if (rays_.face[k] < 0) continue;
-                // A face whose plane holds the eye shows nothing.
+                // A face whose plane contains the eye shows nothing.
                 if (kept(rays_.face[k]).indirect) [[unlikely]] {
                     rays_.prepare();
                     side_->frame.cast_with_alpha_test(rays_, nullptr,
@@ -137,8 +137,8 @@ class HitRow {
         key_ = Hash(options_.seed, hash(stream, uint64_t(y_) * side_->camera.width + x));
     }
 
-    // The samples with the least random numbers stand for all. So where one more or one less hits the face, they mostly
-    // stay the same, and images of scenes that differ a little do.
+    // Adds a sample. The samples with the least random numbers represent all. They mostly stay the same if one sample
+    // more or less hits the face, and so do images of slightly different scenes.
     void add(int32_t face, int sample, Vec2 n) {
         int g = 0;
         while (g < count_ && groups_[g].face != face) ++g;
@@ -158,7 +158,7 @@ class HitRow {
         std::push_heap(drawn.begin(), drawn.end(), is_less);
     }
 
-    // Hands over what a pixel shows through this side.
+    // Appends the hits of a pixel through this side.
     void finish(std::vector<PixelHit>& to) {
         const Camera& camera = side_->camera;
         const Vec2 middle = normalised(camera, {x_ + 0.5, y_ + 0.5});
@@ -201,7 +201,7 @@ class HitRow {
 
     const SceneView<T>& scene_;
     const std::deque<Side>& sides_;
-    const Side* side_;  // the one that is looked through
+    const Side* side_;  // The rays pass through this side.
     const ImageOptions& options_;
     const PixelChoice& choice_;
     const HitBuffers<T>& out_;
@@ -211,19 +211,19 @@ class HitRow {
         int x, n;
     };
     CameraRays rays_;
-    Part part_[RayBatch::size];  // of which pixels the rays are
+    Part part_[RayBatch::size];  // They map rays to pixels.
     int parts_ = 0;
     std::vector<Pixel> row_;
     int y_ = 0;
-    size_t expected_ = 0;  // hits in the next row
+    size_t expected_ = 0;  // It estimates the hits in the next row.
     Kept kept_[n_kept];
     std::vector<Group> groups_;
-    int count_ = 0;             // of them, in use
-    int x_ = -1, samples_ = 0;  // the pixel that they are of, and how many of its samples came
-    Hash key_{0, 0};            // of its samples
+    int count_ = 0;             // It counts the groups in use.
+    int x_ = -1, samples_ = 0;  // They are the current pixel, and the number of its samples so far.
+    Hash key_{0, 0};            // It belongs to the pixel's samples.
 };
 
-// Keeps them.
+// Keeps the hits of all rows.
 class KeepRows : public RowVisitor {
    public:
     KeepRows(std::vector<std::vector<PixelHit>>& rows, int first) : rows_(rows), first_(first) {}

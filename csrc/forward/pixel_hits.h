@@ -1,8 +1,7 @@
-// What the samples of an image hit, for shaders written in PyTorch.
+// Lists what the samples of an image hit, for shaders written in PyTorch.
 //
-// All samples of a pixel that hit the same face are one hit: it stands for them all, at one of them drawn at random, so
-// that a shader is asked once for each face in a pixel and the mean over samples keeps its expected value. Where more
-// are wanted, several of them stand for all.
+// All samples of a pixel that hit the same face are one hit, at one of them drawn at random. A shader runs once for
+// each face in a pixel, and the mean over samples keeps its expected value. On request, several samples represent all.
 #pragma once
 
 #include <cstdint>
@@ -16,20 +15,20 @@
 
 namespace edgegrad {
 
-// How far barycentrics are apart one pixel to the right, and one down.
+// Holds the change of barycentrics one pixel to the right, and one down.
 struct Spread {
     Barycentrics right, down;
 };
 
 struct PixelHit {
     int32_t pixel, face;
-    Barycentrics b;  // where on the face
-    Vec2 x;          // pixel position
-    double weight;   // the share of the pixel's samples
-    Spread spread;   // where it is wanted
+    Barycentrics b;  // They locate the hit on the face.
+    Vec2 x;          // It is the pixel position.
+    double weight;   // It is the fraction of the pixel's samples.
+    Spread spread;   // It is set on request.
 };
 
-// Arrays side by side, one entry or row for each hit.
+// Holds arrays with one entry or row per hit.
 struct PixelHits {
     explicit PixelHits(int64_t size) : pixel(size), face(size), b(2 * size), x(2 * size), weight(size) {}
 
@@ -38,31 +37,31 @@ struct PixelHits {
     Array<double> weight;
 };
 
-// Which hits, of the rows first … end − 1 of an image.
+// Selects hits in the rows first … end − 1 of an image.
 struct PixelChoice {
     int first, end;
-    int most = 1;                   // of the samples of a pixel on one face that stand for all of them
-    const uint8_t* only = nullptr;  // (H, W): the pixels; null: all
-    bool spread = false;            // whether it is wanted
+    int most = 1;                   // This many samples per pixel and face represent all of them.
+    const uint8_t* only = nullptr;  // (H, W) selects pixels; null: all.
+    bool spread = false;            // It requests the spread.
 };
 
-// Is given the hits of rows, one row after another. Those of one pixel follow one another, but where a lens is looked
-// through side by side they may come in several parts.
+// Receives the hits of rows, one row after another. Hits of one pixel are consecutive, but may come in several parts
+// where a lens has several sides.
 class RowVisitor {
    public:
     virtual ~RowVisitor() = default;
     virtual void visit(int y, std::vector<PixelHit>& hits) = 0;
 };
-using MakeVisitor = std::function<std::unique_ptr<RowVisitor>()>;  // one for each thread
+using MakeVisitor = std::function<std::unique_ptr<RowVisitor>()>;  // Each thread calls it once.
 
-// Of all pixels; writes their rows of `out`, and marks the faces in it. Of some pixels it writes nothing, and which of
-// their samples stand for all is drawn independently of the draw for all pixels.
+// Visits the hits of all pixels, writes their rows of `out`, and marks the faces in it. For selected pixels, it writes
+// nothing, and draws the representative samples independently of the draw for all pixels.
 template <class T>
 void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                       const ImageOptions& options, const PixelChoice& choice, ThreadTeam& team,
                       const HitBuffers<T>& out, const MakeVisitor& make);
 
-// The same, as arrays.
+// Does the same, and returns arrays.
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                           const ImageOptions& options, const PixelChoice& choice, ThreadTeam& team,

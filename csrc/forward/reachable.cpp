@@ -19,7 +19,7 @@ ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, 
                 break;
             }
             b.add(0, x.x), b.add(1, x.y);
-            // Of what lies far outside, floats do not say where its sides pass the picture.
+            // For distant vertices, floats do not determine where the octagon's sides pass the image.
             if (far < 1e5) b.add(2, x.x + x.y), b.add(3, x.x - x.y);
             else b.low[2] = b.low[3] = -infinite, b.high[2] = b.high[3] = infinite;
         }
@@ -49,9 +49,9 @@ std::vector<Vec2> ReachablePixels::polygon(const Bounds& bounds, Vec2 low, Vec2 
     return corners;
 }
 
-// Within its disc a lens takes the octagon one to one, so that the image of its border surrounds its own.
+// Within its disc, a lens maps the octagon one to one, so the image of its border surrounds its own image.
 void ReachablePixels::distort_bounds(const Camera& camera) {
-    constexpr int pieces = 64;  // of a side
+    constexpr int pieces = 64;  // Each side has this many.
     const Vec2 widen{margin_, margin_};
     const std::vector<Vec2> corners = polygon(bounds_, camera.lens_view.low - widen, camera.lens_view.high + widen);
     spans_.assign(camera.height, {});
@@ -64,7 +64,7 @@ void ReachablePixels::distort_bounds(const Camera& camera) {
         }
         for (int j = 0; j < 2 * pieces; j += 2) {
             const Vec2 a = distorted[j].x, b = distorted[j + 2].x;
-            // Twice as far as its middle lies from the chord, no piece leaves it.
+            // A margin of twice the distance of a piece's middle from its chord contains the piece.
             const double more = margin_ + 2 * length(distorted[j + 1].x - 0.5 * (a + b));
             const auto row = [&](double y) { return int(std::clamp(y, 0.0, double(camera.height))); };
             const Span piece{std::min(a.x, b.x) - more, std::max(a.x, b.x) + more};

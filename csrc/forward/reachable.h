@@ -1,4 +1,4 @@
-// Where in an image rays may hit something.
+// Bounds where rays of an image may hit something.
 #pragma once
 
 #include <algorithm>
@@ -13,20 +13,20 @@
 
 namespace edgegrad {
 
-// So many pixels fill batches of rays. Only whole batches are left out: which rays lie in a packet decides which of two
-// faces at one depth wins.
+// Returns the number of pixels that fill batches of rays. Only whole batches are skipped, because the rays of a packet
+// decide which of two faces at one depth wins.
 inline int pixels_of_batches(int spp) { return RayBatch::size / std::gcd(RayBatch::size, spp); }
 
-// The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these
-// lie before the eye. With a pixel more on each side, for Embree sees positions rounded to floats. Through a lens the
-// octagon of the undistorted image is bent, and each row reaches from its first place there to its last.
+// Finds the pixels whose samples may hit something. They lie in an octagon around the images of all vertices of faces,
+// if these are in front of the eye. A margin of one pixel allows for Embree's positions rounded to floats. A lens
+// distorts the octagon of the undistorted image; each row reaches from its first to its last point in it.
 class ReachablePixels {
    public:
-    // `q` are the vertices in the camera's frame.
+    // `q` holds the vertices in the camera's frame.
     ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius,
                     ThreadTeam& team);
 
-    // In row y, half open.
+    // Holds a half-open range of pixels in row y.
     struct Range {
         int first, end;
     };
@@ -34,7 +34,7 @@ class ReachablePixels {
 
    private:
     static constexpr double infinite = std::numeric_limits<double>::infinity();
-    // Of x, y, x + y and x − y, px.
+    // Bounds x, y, x + y and x − y, px.
     struct Bounds {
         double low[4], high[4];
 
@@ -46,7 +46,7 @@ class ReachablePixels {
         }
         void add(int k, double x) { low[k] = std::min(low[k], x), high[k] = std::max(high[k], x); }
     };
-    // The part of the octagon in a box.
+    // Returns the part of the octagon in a box.
     static std::vector<Vec2> polygon(const Bounds& bounds, Vec2 low, Vec2 high);
     void distort_bounds(const Camera& camera);
 

@@ -1,9 +1,9 @@
-// Where points of a scene see its sky from: few paths of an image find it out, before the others draw points of the
-// sky.
+// Learns from which directions points of a scene see the environment. A few pilot paths measure it, before the others
+// sample the environment.
 //
-// Drawn by how bright it is alone, most points of a sky that falls through an opening are hidden. For one pdf q for
-// all points, whose variance is least at q ∝ L √E[V (n·l)²] with the sky's radiance L and visibility V, the mean is
-// taken over cells of the sky. It only has a say in where points are drawn: all of them may be.
+// If only brightness guides the samples, most samples of an environment behind an opening are occluded. One pdf q for
+// all points has the least variance at q ∝ L √E[V (n·l)²], with the radiance L and visibility V. The mean is taken over
+// cells of directions. It affects only where samples are drawn; all directions stay possible.
 #pragma once
 
 #include <algorithm>
@@ -26,7 +26,7 @@ class SkyGuide {
 
     bool has_sky() const { return light_ >= 0; }
 
-    // What the points of paths 0 … n − 1 saw.
+    // Adds the visibility that the points of paths 0 … n − 1 found.
     void add(const Paths& paths, int64_t n) {
         const std::vector<LightSample>& lights = paths.lights();
         for (int64_t i = 0; i < n; ++i) {
@@ -37,7 +37,7 @@ class SkyGuide {
         }
     }
 
-    // The scene with the sky's points drawn by what was added; it refers to this.
+    // Returns the scene with an environment whose pdf uses what was added; it refers to this object.
     LitScene guided() {
         const Light& light = lit_.lights[light_];
         double total_sum = 0, total = 0, mass = 0, before = 0;
@@ -60,8 +60,8 @@ class SkyGuide {
 
    private:
     static constexpr int64_t rows = 12, columns = 24;
-    static constexpr double few = 4;       // points, that stand for the mean of all
-    static constexpr double least = 0.02;  // of the mean
+    static constexpr double few = 4;       // This many points represent the mean of all.
+    static constexpr double least = 0.02;  // It is relative to the mean.
     static constexpr double unit = 1 << 20;
 
     size_t cell(int64_t texel) const {
@@ -69,7 +69,7 @@ class SkyGuide {
         return size_t(texel / light.width * rows / light.height * columns +
                       texel % light.width * columns / light.width);
     }
-    // Sums of whole numbers do not depend on their order.
+    // Integer sums do not depend on their order.
     void add(const LightPoint& p, int8_t seen, Vec3 n) {
         if (seen == not_asked) return;
         const double cosine = dot(n, place(lit_, lit_.lights[light_], p));

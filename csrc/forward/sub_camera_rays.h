@@ -1,4 +1,4 @@
-// One of the sides that a camera's rays go through (sub_cameras.h).
+// Holds the sides through which a camera's rays pass (sub_cameras.h).
 #pragma once
 
 #include <deque>
@@ -11,12 +11,12 @@
 
 namespace edgegrad {
 
-// What a side of the camera has of its own: the vertices in its frame, and its rays.
+// Holds a side's own vertices in its frame, and its rays.
 struct Side {
     template <class T>
     Side(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
          ThreadTeam& team);
-    Side(const Side&) = delete;  // its parts point to its camera
+    Side(const Side&) = delete;  // Its parts point to its camera.
     ~Side();
 
     const Camera camera;
@@ -24,7 +24,7 @@ struct Side {
     std::variant<std::monostate, AlphaMasks<float>, AlphaMasks<double>> alpha_masks;
     const CameraFrame frame;
     const PixelRays pixel_rays;
-    const Vec2 reach;  // of the filter around a pixel, in normalised image coordinates
+    const Vec2 reach;  // It is the filter's reach around a pixel, in normalised image coordinates.
 
    private:
     template <class T>

@@ -9,7 +9,7 @@ namespace edgegrad {
 
 namespace {
 
-// From pairs of numbers: a vertex, and the spacing from there on.
+// Takes pairs of numbers: a vertex, and the spacing from there on.
 Spacing make_spacing(const std::vector<double>& pairs) {
     Spacing spacing{{}, {}};
     for (size_t i = 0; i + 1 < pairs.size(); i += 2)
@@ -173,7 +173,8 @@ template <class T>
 SceneView<T> SceneArrays<T>::view_of(const Attributes& attributes) const {
     if (background.shape(2) != colors.shape(1) + attributes.channels())
         refuse("background: expected one number for each channel");
-    const int32_t* of_corners = by_vertex ? faces.data() : corners.data();  // one array: neighbours agree (may_jump)
+    // Neighbours then agree (may_jump).
+    const int32_t* of_corners = by_vertex ? faces.data() : corners.data();
     return {verts.data(),
             int64_t(verts.shape(0)),
             faces.data(),

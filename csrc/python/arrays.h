@@ -1,4 +1,4 @@
-// The arrays of a scene, of a camera and of what the image hit, kept alive, checked, and seen as the kernel sees them.
+// Keeps alive and checks the arrays of scenes, cameras and image hits, and gives the kernel its views.
 #pragma once
 
 #include <memory>
@@ -14,7 +14,7 @@
 
 namespace edgegrad {
 
-// What is rendered besides the radiance, for one camera.
+// Holds what is rendered besides the radiance, for one camera.
 struct ChannelArrays {
     In<double, 2> vertex, face;  // (V, Kv), (F, Kf)
     Attributes view;
@@ -22,7 +22,7 @@ struct ChannelArrays {
     ChannelArrays(In<double, 2> vertex, In<double, 2> face, bool alpha, bool barycentrics, bool uv, int unit);
 };
 
-// The arrays of a scene, kept alive, checked, and seen as the kernel sees them.
+// Holds the arrays of a scene.
 template <class T>
 struct SceneArrays {
     In<double, 2> verts;
@@ -76,7 +76,7 @@ void check_image(const char* name, const Out<T, 3>& image, const Camera& camera,
         refuse(std::string(name) + ": expected an image of the camera's size and the scene's channels");
 }
 
-// A number for each face; see BackwardInput::detailed and transparent faces.
+// Returns a number for each face; see BackwardInput::detailed and transparent faces.
 template <class T>
 const uint8_t* marked_faces(const char* name, const SceneArrays<T>& scene,
                             const std::optional<In<uint8_t, 1>>& marked) {
@@ -85,7 +85,7 @@ const uint8_t* marked_faces(const char* name, const SceneArrays<T>& scene,
     return marked->data();
 }
 
-// Geometry as the terms of a derivative want it.
+// Calls work with the geometry that the terms of a derivative need.
 template <class T, class Work>
 void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Work work) {
     unlocked(threads, [&](ThreadTeam& team) {
@@ -94,8 +94,8 @@ void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Wor
     });
 }
 
-// `by_distortion`: whether derivatives by the coefficients are asked for. Without them a lens that distorts nothing is
-// a pinhole, as far as it shows all of the image.
+// Makes a camera. `by_distortion` requests derivatives with respect to the coefficients. Without them, a lens that
+// distorts nothing becomes a pinhole, as far as it shows all of the image.
 Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, In<double, 1> distortion, bool perspective,
                    const std::string& lens, int width, int height, bool by_distortion);
 Filter make_filter(const std::string& name);

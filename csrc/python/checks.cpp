@@ -40,7 +40,7 @@ std::string text(double number) {
 template <class T>
 constexpr T largest = T(std::numeric_limits<float>::max());
 
-// Whether all are numbers up to the largest. Several counts, for one would wait for each addition.
+// Returns whether all values are finite and at most the largest float. Several counters add in parallel.
 constexpr int counts = 16;
 template <class T>
 EDGEGRAD_VECTORIZED bool are_finite(const T* values, int64_t n) {
@@ -53,7 +53,7 @@ EDGEGRAD_VECTORIZED bool are_finite(const T* values, int64_t n) {
     return bad[0] == 0;
 }
 
-// Whether all are from 0 to count − 1: else one of v and count − 1 − v has its sign bit set.
+// Returns whether all are from 0 to count − 1. Otherwise one of v and count − 1 − v has its sign bit set.
 template <class T>
 EDGEGRAD_VECTORIZED bool are_below(const T* values, int64_t n, T count) {
     using U = std::make_unsigned_t<T>;

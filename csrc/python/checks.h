@@ -1,4 +1,4 @@
-// Arrays of Python as views without a copy, and what the kernel refuses in them, as errors that name the place.
+// Views Python arrays without a copy, and raises errors that name the position of bad values.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -20,25 +20,24 @@ using Out = nb::ndarray<T, nb::numpy, nb::ndim<Dimensions>, nb::c_contig, nb::de
 // Throws what becomes a ValueError.
 [[noreturn]] void refuse(const std::string& text);
 
-// A place in rows of this width, as Python writes it.
+// Returns a position in rows of this width, as Python writes it.
 std::string at(int64_t index, int64_t width);
 
-// Checks blocks of the numbers first … last − 1, on several threads where these save more than they cost: whether all
-// pass.
+// Returns whether all blocks of the numbers first … last − 1 pass. It uses threads where they save more than they cost.
 bool all_pass(int64_t n, int threads, const std::function<bool(int64_t first, int64_t last)>& pass);
 
-// Refuses all but numbers up to the largest float, of float or double: squares and products of larger ones would leave
-// the range of doubles.
+// Rejects values beyond the largest float, and NaN, in float or double arrays. Squares and products of larger ones
+// would leave the range of doubles.
 template <class T>
 void check_finite(const char* name, const T* values, int64_t n, int64_t width, int threads);
 template <class T>
 bool all_finite(nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu> array, int threads);
 
-// Whether all are from 0 to count − 1; of int32_t or int64_t.
+// Returns whether all are from 0 to count − 1, for int32_t or int64_t.
 template <class T>
 bool all_below(nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu> array, T count, int threads);
 
-// `n` indices, in rows of three, of which the first is number `first`.
+// Checks `n` indices in rows of three; the first one has the index `first`.
 void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of, int threads,
                    int64_t first = 0);
 

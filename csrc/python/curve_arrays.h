@@ -1,4 +1,4 @@
-// Records of samples on curves, handed to Python.
+// Hands records of samples on curves to Python.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -11,8 +11,8 @@ namespace edgegrad {
 
 namespace nb = nanobind;
 
-// The fields of CurveRecords in edgegrad/points/records.py. Barycentrics are no less than `least`; `one`: of each
-// sample the first point alone (curve_hits.h).
+// Returns the fields of CurveRecords in edgegrad/points/records.py. Barycentrics are at least `least`. `one` selects
+// the first point of each sample (curve_hits.h).
 nb::dict curve_arrays(const std::vector<CurveRecords>& parts, double least, bool one, int threads);
 
 }  // namespace edgegrad

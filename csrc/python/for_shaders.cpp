@@ -1,4 +1,4 @@
-// What shaders written in PyTorch are made of: samples as records of arrays, what is seen at places and along rays.
+// Serves shaders written in PyTorch: records of samples, and what is seen at image points and along rays.
 
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
@@ -46,7 +46,7 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
     return out;
 }
 
-// The samples of the terms inside faces and on curves, as records of arrays.
+// Returns the samples of the terms inside faces and on curves, as records of arrays.
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
                   const GradientOptions& options, double least, int threads, const HitArrays<T>& hits,
@@ -80,7 +80,7 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     return nb::make_tuple(surface, curve_arrays(found.curves, least, false, threads));
 }
 
-// A light as edges cast shadows of it.
+// Holds a light for which edges cast shadows.
 struct LightArrays {
     In<double, 3> corner;
     In<double, 1> chance;
@@ -103,8 +103,8 @@ struct LightArrays {
     }
 };
 
-// The samples on the borders of shadows of `casters`: the same faces as light meets them. `seen`: by the camera; else
-// on surfaces, whether it sees them or not.
+// Returns the samples on shadow boundaries of `casters`, the same faces as light sees them. `seen` limits them to
+// surfaces that the camera sees; otherwise they lie on all surfaces.
 template <class T>
 nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const Camera& camera,
                         const ImageOptions& image, const GradientOptions& options, const LightArrays& light,
@@ -125,7 +125,7 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
     return curve_arrays(found, least, one, threads);
 }
 
-// Whether faces pass through each other anywhere.
+// Returns whether faces pass through each other anywhere.
 template <class T>
 bool has_intersections(const SceneArrays<T>& arrays, int threads) {
     bool found = false;
@@ -141,7 +141,7 @@ Places places_of(const In<double, 2>& x) {
     return {x.data(), int64_t(x.shape(0))};
 }
 
-// Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c: (H · W, C).
+// Returns Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c: (H · W, C).
 nb::object splat(In<double, 2> x, In<double, 2> values, const std::string& filter, int width, int height) {
     const size_t n = places_of(x).size, C = values.shape(1);
     if (values.shape(0) != n) refuse("values: expected a row for each point");
@@ -154,8 +154,8 @@ nb::object splat(In<double, 2> x, In<double, 2> values, const std::string& filte
     return rows(std::move(out), {C});
 }
 
-// Its adjoint: Σ k(x − c) · image over the pixels (H · W, C), for points x, times their weights (S,) if there are any:
-// (S, C).
+// Returns the adjoint, (S, C): Σ k(x − c) · image over the pixels (H · W, C), for points x, times their optional
+// weights (S,).
 template <class T>
 nb::object splat_vjp(In<double, 2> x, In<T, 2> image, const std::string& filter, int width, int height, int threads,
                      const std::optional<In<double, 1>>& weight) {
@@ -206,7 +206,7 @@ nb::dict rays_of(const Camera& camera, In<double, 2> x, bool intrinsics, int thr
     return out;
 }
 
-// Of images (h, w, K): (M, K), and from its cotangent back.
+// Binds pyramids of images (h, w, K): (M, K), and the cotangents back.
 template <class T>
 void bind_pyramid(nb::module_& m) {
     const auto shape = [](int64_t height, int64_t width, int64_t channels) {

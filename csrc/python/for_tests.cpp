@@ -1,6 +1,6 @@
-// The module of what only tests and benchmarks call: small functions with their _vjp and the parts of topology and
-// sampling, each to be compared with its definition; samples of one pass without the rest; the yardstick of the image's
-// rays.
+// Defines the module of what only tests and benchmarks call. These are small functions with their _vjp, and parts of
+// topology and sampling for comparison with their definitions. Others are samples of one pass alone, and the reference
+// loop of rays.
 
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
@@ -35,7 +35,7 @@ using namespace nanobind::literals;
 
 namespace edgegrad {
 
-void bind_paths_for_tests(nb::module_& m);  // paths_for_tests.cpp
+void bind_paths_for_tests(nb::module_& m);  // paths_for_tests.cpp defines it.
 
 namespace {
 
@@ -52,7 +52,7 @@ template <size_t N>
 std::array<double, N> array(const double (&a)[N]) {
     return std::to_array(a);
 }
-// Tangents of K and of the coefficients, one after the other; and cotangents, side by side.
+// These convert tangents of K and of the coefficients from one array, and cotangents to two arrays.
 IntrinsicsGrad intrinsics(const Camera& c, const std::array<double, 6 + most_coefficients>& dot) {
     return sub_camera_intrinsics(c, dot.data(), dot.data() + 6);
 }
@@ -69,7 +69,7 @@ FilterKind kind(const std::string& name) {
     return name == "box" ? FilterKind::box : name == "tent" ? FilterKind::tent : FilterKind::gaussian;
 }
 
-// Functions of a whole scene.
+// Binds functions of a whole scene.
 template <class T>
 void bind_scene_functions(nb::module_& m) {
     using Scene = SceneArrays<T>;
@@ -82,7 +82,7 @@ void bind_scene_functions(nb::module_& m) {
             });
         },
         "scene"_a, "camera"_a, "options"_a, "packet_width"_a, "threads"_a);
-    // Any rays: ray i ignores the faces ignored[first[i]] … ignored[first[i + 1] − 1].
+    // Casts any rays; ray i ignores the faces ignored[first[i]] … ignored[first[i + 1] − 1].
     m.def(
         "cast_rays",
         [](const Scene& scene, In<double, 2> origins, In<double, 2> directions, In<double, 1> ends,
@@ -96,7 +96,7 @@ void bind_scene_functions(nb::module_& m) {
         },
         "scene"_a, "origins"_a.noconvert(), "directions"_a.noconvert(), "ends"_a.noconvert(), "ignored"_a.noconvert(),
         "first"_a.noconvert(), "face"_a.noconvert(), "hidden"_a.noconvert());
-    // The interior term from samples of the pixels.
+    // Computes the interior term from samples of the pixels.
     m.def(
         "pixel_backward",
         [](const Scene& scene, const Camera& camera, const ImageOptions& image, int threads, Out<T, 3> adjoint,
@@ -167,7 +167,7 @@ NB_MODULE(_core_tests, p) {
         normalised_vjp(c, normalised(c, undistort(c, vec(x))), vec(bar), grad);
         return of_camera(c, grad);
     });
-    // Where the rays through places (N, 2) of the unit square of pixel (x, y) go.
+    // Returns where the rays through points (N, 2) of the unit square of pixel (x, y) go.
     p.def("place_in_pixel", [](const Camera& c, int x, int y, const std::vector<A2>& places) {
         std::vector<double> n_x, n_y;
         for (const A2& u : places) n_x.push_back(u[0]), n_y.push_back(u[1]);
@@ -176,8 +176,7 @@ NB_MODULE(_core_tests, p) {
         for (size_t i = 0; i < places.size(); ++i) out.push_back({n_x[i], n_y[i]});
         return out;
     });
-    // By the distortion of the undistorted image: where a place is seen, the area scale, and what becomes of a tangent
-    // there.
+    // Distorts a point of the undistorted image. Returns its position, the area scale, and the distorted tangent.
     p.def("distort", [](const Camera& c, A2 u, A2 tangent) {
         const Distorted b = distort(c, vec(u));
         return std::tuple(array(b.x), b.area_scale, array(distort_jvp(c, normalised(c, vec(u)), vec(tangent))));
@@ -186,16 +185,16 @@ NB_MODULE(_core_tests, p) {
         const auto [a, b] = c.image_box(vec(low), vec(high));
         return std::tuple(array(a), array(b));
     });
-    // What a camera sees through, with the turn into its frame.
+    // Returns the sub-cameras, with the rotations into their frames.
     p.def("sub_cameras", [](const Camera& c, double reach) {
         std::vector<std::tuple<Camera, A33>> out;
         for (const Camera& w : sub_cameras_of(c, reach))
             out.emplace_back(w, A33{array(w.turn.row[0]), array(w.turn.row[1]), array(w.turn.row[2])});
         return out;
     });
-    // The box of its undistorted image.
+    // Returns the box of its undistorted image.
     p.def("view_box", [](const Camera& c) { return std::tuple(array(c.lens_view.low), array(c.lens_view.high)); });
-    // In forward mode.
+    // These are in forward mode.
     p.def("project_jvp", [](const Camera& c, A3 q, A3 q_dot, std::array<double, 6 + most_coefficients> k_dot) {
         return array(project_jvp(c, vec(q), vec(q_dot), intrinsics(c, k_dot)));
     });
@@ -225,7 +224,7 @@ NB_MODULE(_core_tests, p) {
         dot_vjp(vec(a), vec(b), bar, a_bar, b_bar);
         return std::tuple(array(a_bar), array(b_bar));
     });
-    // A FaceMap by its columns.
+    // Returns the columns of a FaceMap.
     p.def("face_map", [](const Camera& c, A33 q) {
         const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])};
         return array(face_map(c, corner));
@@ -305,7 +304,7 @@ NB_MODULE(_core_tests, p) {
         std::copy(measure.begin(), measure.end(), ends.begin());
         Systematic systematic(ends, team);
         systematic.draw(n, shift);
-        std::vector<std::tuple<int64_t, double>> out;  // primitive, weight
+        std::vector<std::tuple<int64_t, double>> out;  // Its entries are primitive and weight.
         for (int64_t i = 0; i < n; ++i) {
             const int64_t k = systematic.primitive(systematic.position(i));
             out.emplace_back(k, systematic.weight(k));
@@ -322,7 +321,7 @@ NB_MODULE(_core_tests, p) {
 
     using Verts = nb::ndarray<const double, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
     using Faces = nb::ndarray<const int32_t, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-    // The faces of each edge, as (face, corner, backwards); the vertices from first[i] on have spacing[i].
+    // Returns the faces of each edge, as (face, corner, backwards); the vertices from first[i] on have spacing[i].
     p.def("edges", [](Verts verts, Faces faces, std::vector<int32_t> first, std::vector<double> spacing) {
         ThreadTeam team(1);
         Topology topology(faces.data(), faces.shape(0), verts.shape(0), team);
@@ -332,9 +331,8 @@ NB_MODULE(_core_tests, p) {
             for (const HalfEdge& h : topology.half_edges(e)) out[e].emplace_back(h.face, h.corner, h.backwards);
         return out;
     });
-    // Where faces pass through each other, as (face, face, end, end, for how many it stands), and whether they are
-    // drawn: by these shares (F,). How the surface goes on is told from `windings`, the same faces as they are or
-    // turned round.
+    // Returns intersections as (face, face, end, end, weight), and whether they are drawn with the probabilities
+    // `shares` (F,). `windings` defines the surface's continuation: the same faces, possibly with reversed orientation.
     p.def("intersections", [](Verts verts, Faces faces, Faces windings, double spacing, In<float, 1> shares,
                               uint64_t seed, int threads) {
         ThreadTeam team(threads);

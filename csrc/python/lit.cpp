@@ -1,4 +1,4 @@
-// Lit scenes shaded: values, cotangents and tangents at points, images, and the light on flat faces.
+// Binds the shading of lit scenes: values, cotangents and tangents at points, images, and the light on flat faces.
 
 #include "shading/lit/lit.h"
 
@@ -22,7 +22,7 @@ using namespace nanobind::literals;
 
 namespace edgegrad {
 
-void bind_lit_arrays(nb::module_& m);  // lit_arrays.cpp
+void bind_lit_arrays(nb::module_& m);  // lit_arrays.cpp defines it.
 
 namespace {
 
@@ -46,7 +46,7 @@ nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const
                           shaped(std::move(seen), {n, lights}));
 }
 
-// (F, 3, L); see flat_light.h. Places (L, 3) of lights of so much power.
+// Returns (F, 3, L); see flat_light.h. The lights have positions (L, 3) and powers.
 nb::object light_on_faces(In<double, 2> verts, Rows faces, In<double, 1> eye, bool perspective, In<double, 2> place,
                           const std::vector<bool>& infinite, const std::vector<double>& power, int threads) {
     const size_t L = infinite.size(), V = verts.shape(0), F = faces.shape(0);
@@ -64,7 +64,7 @@ nb::object light_on_faces(In<double, 2> verts, Rows faces, In<double, 1> eye, bo
     return shaped(std::move(found), {F, 3, L});
 }
 
-// The image before what lies behind the surfaces, (H · W, C), and which lights' shadows were asked for.
+// Returns the image without what lies behind the surfaces, (H · W, C), and which lights' shadows were requested.
 template <class T>
 nb::tuple lit_image(const SceneArrays<T>& arrays, const LitArrays& lit, const Camera& camera, const ImageOptions& image,
                     const LitOptions& options, int points, uint64_t seed, uint64_t again, int threads,
@@ -90,8 +90,8 @@ void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions&
 }
 int64_t faces_of(const LitArrays& lit) { return lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces; }
 
-// The cotangent of a table, in its type. Of a table in float the sums are floats too if it is large, for then few
-// samples go to each row, and the doubles of a texture would take longer to come to memory than to be added to.
+// Holds the cotangent of a table, in its type. Large float tables are summed in float, because few samples go to each
+// row. Fetching memory for the doubles of a texture would then take longer than the additions.
 class Cotangent {
    public:
     Cotangent(const Table& table, bool wanted, ThreadTeam& team) : table_(table) {
@@ -116,8 +116,8 @@ class Cotangent {
     Array<float> narrow_{0};
 };
 
-// Cotangents of the tables (None where they are not wanted), of b, and of its spread, if it is known: compute(to,
-// places, team) adds and writes them.
+// Returns the cotangents of the tables (None where not wanted), of b, and of its spread, if known. compute(to, places,
+// team) adds and writes them.
 template <class Compute>
 nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<double, 2>& bar,
                      const std::vector<bool>& wanted, int threads, Compute compute) {
@@ -151,7 +151,7 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, cons
     });
 }
 
-// The same of what casts rays in the scene: compute(geometry's caster, points, to, places, team).
+// Does the same for functions that cast rays in the scene: compute(geometry's caster, points, to, places, team).
 template <class T, class Compute>
 nb::tuple traced_cotangents(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
                             const In<double, 2>& bar, const std::vector<bool>& wanted, int threads, Compute compute) {
@@ -175,7 +175,7 @@ nb::tuple trace_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArra
         });
 }
 
-// Tangents of the tables, of b and of its spread; None: zero.
+// Reads the tangents of the tables, of b and of its spread; None: zero.
 using Tangents2 = std::optional<In<double, 2>>;
 using Tangents3 = std::optional<In<double, 3>>;
 LitScene with_tangents(const LitScene& scene, const std::vector<Tangents2>& tangents) {
@@ -212,7 +212,7 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
     return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
 }
 
-// (N, C): what reaches points by way of other surfaces.
+// Returns the indirect light at points, (N, C).
 template <class T>
 nb::object indirect_points(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
                            const LitOptions& options, int threads) {
@@ -255,8 +255,8 @@ nb::object indirect_points_jvp(const SceneArrays<T>& arrays, const LitArrays& li
     return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
 }
 
-// What comes to the image of light that has come to points, after `first`, …, `last` further steps: which point it is
-// of (M,), where (M, 2), and its radiance times px² (M, C).
+// Returns how light at points reaches the image after `first`, …, `last` further steps. The arrays are the point (M,),
+// the image position (M, 2), and the radiance times px² (M, C).
 template <class T>
 nb::tuple points_towards_camera(const SceneArrays<T>& arrays, const LitArrays& lit, const Camera& camera,
                                 const ImageOptions& image, In<int64_t, 1> face, In<double, 2> b, In<int64_t, 1> seed,
@@ -286,7 +286,7 @@ nb::tuple points_towards_camera(const SceneArrays<T>& arrays, const LitArrays& l
                           shaped(std::move(radiance), {m, C}));
 }
 
-// Index, uv and density, (N, samples) of each.
+// Returns index, uv and pdf, (N, samples) of each.
 nb::tuple drawn_light_points(const LitArrays& lit, const PointArrays& points, const LitOptions& options, int light,
                              int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));

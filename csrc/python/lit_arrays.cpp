@@ -21,7 +21,7 @@ namespace edgegrad {
 
 namespace {
 
-// A number out of a list of names. Raises ValueError.
+// Returns the index of a name in a list. Raises ValueError.
 template <class Kind>
 Kind kind_of(const char* argument, const std::string& name, const std::vector<std::string>& names) {
     for (size_t i = 0; i < names.size(); ++i)
@@ -99,8 +99,8 @@ std::shared_ptr<EmissiveFaceTree> make_tree(In<double, 2> verts, Rows faces) {
                                               int64_t(faces.shape(0)));
 }
 
-// What rays (N, 3) cross between `start` and `end` (N,), in lengths of their directions: ray and face (M, 2), and
-// barycentrics and distance (M, 3), ray after ray.
+// Returns what rays (N, 3) cross between `start` and `end` (N,), in lengths of their directions. The arrays are ray and
+// face (M, 2), and barycentrics and distance (M, 3), ray after ray.
 nb::tuple crossings(const EmissiveFaceTree& tree, In<double, 2> origins, In<double, 2> directions, In<double, 1> start,
                     In<double, 1> end) {
     const size_t n = origins.shape(0);

@@ -1,5 +1,5 @@
-// Lit scenes as Python hands them over (edgegrad/light/layout.py): tables, and meshes and lights that refer to them
-// by number; kept alive, and checked.
+// Receives lit scenes from Python (edgegrad/light/layout.py): tables, and meshes and lights that refer to them by
+// number. It keeps them alive, and checks them.
 #pragma once
 
 #include <cstdint>
@@ -30,11 +30,11 @@ struct MeshArrays {
 
 struct LightArrays {
     Light view;
-    std::vector<std::optional<In<double, 1>>> arrays;  // that it refers to
+    std::vector<std::optional<In<double, 1>>> arrays;  // `view` refers to these.
     std::shared_ptr<EmissiveFaceTree> tree;
 };
 
-// All of it, checked: what indexes what exists.
+// Holds all of it, and checks that every index exists.
 class LitArrays {
    public:
     LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LightArrays> lights, Rows faces,
@@ -57,7 +57,7 @@ class LitArrays {
     Rows faces_;
 };
 
-// Refuses what is not made of the faces of a scene.
+// Rejects lit scenes of other faces than the scene's.
 template <class T>
 void check_faces(const SceneArrays<T>& arrays, const LitArrays& lit) {
     if (arrays.faces.shape(0) == 0 ||
@@ -65,7 +65,7 @@ void check_faces(const SceneArrays<T>& arrays, const LitArrays& lit) {
         refuse("lit: expected the faces of the scene");
 }
 
-// Points, and what is forced of one light at them.
+// Holds points, and what is fixed for one light at them.
 struct PointArrays {
     In<int64_t, 1> face;
     In<double, 2> b;

@@ -1,4 +1,4 @@
-// What the passes take in memory, in bytes by part and at most, each as its owner tells: asked before they allocate.
+// Bounds the memory of the passes, in bytes by part, by their owners' formulas, before anything is allocated.
 
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/map.h>
@@ -30,17 +30,17 @@ namespace {
 
 using Bytes = std::map<std::string, int64_t>;
 
-// Rows of the arrays of a scene, the image of one camera, and who works.
+// Holds the sizes of a scene's arrays, of one camera's image, and the number of threads.
 struct PassSize {
     int64_t verts, faces, colors, uvs, texels, alphas, pixels;
-    int radiance, vertex_attributes, face_attributes;  // widths
-    int channels, number;                              // of the image; bytes of one number
+    int radiance, vertex_attributes, face_attributes;  // They are widths.
+    int channels, number;                              // They are the image's channels, and the bytes of one number.
     bool textured;
-    bool jumps;  // whether neighbouring faces may differ where they meet
+    bool jumps;  // It says whether adjacent faces may differ where they meet.
     int threads;
-    int sides;  // of the camera (sub_cameras.h)
+    int sides;  // It counts the camera's sides (sub_cameras.h).
 
-    // Of a closed mesh.
+    // Returns the number of edges of a closed mesh.
     int64_t edges() const { return 3 * faces / 2; }
 };
 
@@ -55,10 +55,10 @@ Bytes image_bytes(const PassSize& s, int64_t cameras) {
             {"ray structure", RayCaster::bytes(s.faces, s.verts)}};
 }
 
-// What of the gradient is wanted: that of what moves inside faces and at edges, and of the arrays of colours.
+// Selects the wanted parts of the gradient: what moves inside faces and at edges, and the arrays of colours.
 struct GradientWork {
     bool motion, boundary, steps, colors, uvs, texels, alphas, vertex_attributes, face_attributes;
-    int64_t surface_samples, edge_samples, curves, intersections, step_lines;  // −1: not known
+    int64_t surface_samples, edge_samples, curves, intersections, step_lines;  // −1 means unknown.
 };
 
 Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
@@ -74,7 +74,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         bytes["ray structure"] = RayCaster::bytes(s.faces, s.verts);
     }
     if (interior) {
-        // The measure, and with the controls what they need of each vertex; large textured faces are left to pixels.
+        // First come the measure, and what controls need per vertex. Large textured faces are left to pixels.
         const int64_t per_vertex = ImageHits::bytes_per_vertex + s.channels * s.number + 2 * word * w.motion;
         bytes["faces in view"] = (word + 1) * s.faces + per_vertex * s.verts + (s.faces + word * s.pixels) * s.textured;
         bytes["controls"] = w.motion ? rows(s.faces, s.faces, 3, 2, s.verts) : 0;
@@ -82,7 +82,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         int64_t& samples = bytes["surface samples"];
         samples = OrderedDraws::bytes(w.surface_samples < 0 ? s.faces : w.surface_samples, s.faces);
         if (w.motion) samples += rows(n, s.faces, 3, 3, s.verts);
-        // A face has a texture or colours: a run of samples leaves rows of one kind.
+        // A face has a texture or colours, so a run of samples adds rows of one kind.
         if (w.colors) samples += rows(n, s.faces, 3, s.radiance, s.colors);
         else if (w.uvs) samples += rows(n, s.faces, 3, 2, s.uvs);
         if (w.texels) samples += rows(n, -1, 4, s.radiance, s.texels);
@@ -90,7 +90,8 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         if (w.face_attributes) samples += rows(n, s.faces, 1, s.face_attributes, s.faces);
     }
     if (w.steps) {
-        // A line meets a step in a few points; each moves three vertices, three texture coordinates and four alphas.
+        // A line crosses a discontinuity at few points. Each moves three vertices, three texture coordinates and four
+        // alphas.
         constexpr int64_t points = 4;
         const int64_t lines = w.step_lines < 0 ? many / points : w.step_lines;
         int64_t& steps = bytes["steps"];
@@ -100,7 +101,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         if (w.alphas) steps += points * rows(lines, -1, 4, 1, s.alphas);
     }
     if (w.boundary) {
-        // Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a tangled mesh.
+        // If all attributes are indexed like vertices, curves are silhouettes: a quarter of a tangled mesh's edges.
         const int64_t curves = w.curves < 0 ? s.edges() / (s.jumps ? 1 : 4) : w.curves;
         bytes["edges in view"] = s.faces + curves * bytes_per_curve();
         bytes["creases"] = s.jumps ? 2 * word * s.verts + int64_t(sizeof(CreaseFace)) * s.faces +
@@ -143,7 +144,7 @@ void bind_memory(nb::module_& m) {
         },
         "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "steps"_a, "wanted"_a, "surface_samples"_a = -1,
         "edge_samples"_a = -1, "curves"_a = -1, "intersections"_a = -1, "step_lines"_a = -1);
-    // What samples leave in the pixels around them: at most nine, of a Gaussian.
+    // Bounds the rows that samples add to the pixels around them: at most nine, for a Gaussian.
     m.def(
         "pixel_row_bytes",
         [](const PassSize& size, int64_t samples, int width) {

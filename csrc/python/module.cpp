@@ -1,5 +1,5 @@
-// The kernel's module: records of options, and the two passes. Tensors come as NumPy views without a copy, outputs are
-// arrays that the caller made, and the interpreter's lock is released while the kernel works.
+// Defines the kernel's module: records of options, and the two passes. Tensors arrive as NumPy views without a copy,
+// and callers allocate the outputs. The interpreter's lock is released while the kernel works.
 
 #include <nanobind/stl/map.h>
 #include <nanobind/stl/optional.h>
@@ -47,7 +47,7 @@ void check_background(const SceneArrays<T>& scene, const Camera& camera) {
                std::to_string(b.shape(1)));
 }
 
-// What a pass did, by name: counts, and seconds.
+// Reports what a pass did, by name: counts, and seconds.
 using Profile = std::map<std::string, double>;
 
 template <class T>
@@ -79,7 +79,7 @@ void find_faces(const SceneArrays<T>& scene, const Camera& camera, const Channel
     });
 }
 
-// Arrays by the names of the slots that they are for.
+// Maps the names of slots to arrays.
 using GradientArrays = std::map<std::string, nb::ndarray<double, nb::numpy, nb::c_contig, nb::device::cpu>>;
 
 template <class T>
@@ -144,7 +144,7 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Chann
             {"world", p.world}};
 }
 
-// Of several directions: what each moves, by slot.
+// Computes the derivatives in several directions, each given by slots.
 template <class T>
 void jvp(const SceneArrays<T>& arrays, const Camera& camera, const ChannelArrays& channels, const ImageOptions& image,
          const GradientOptions& options, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits,
@@ -218,12 +218,12 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
 
 NB_MODULE(_core, m) {
     m.doc() = "The edgegrad kernel. Use it through the edgegrad package.";
-    nb::set_leak_warnings(false);  // of a process that ends while a thread of it renders
+    nb::set_leak_warnings(false);  // A process may end while one of its threads renders.
     m.def("open_embree", &open_embree, "path"_a, "options"_a, nb::call_guard<Unlocked>());
     m.def("embree_version", &embree_version);
     m.def("packet_width", &packet_width);
     m.def("openmp_runtime", &openmp_runtime);
-    // Without the interpreter's lock, for which a thread that holds the kernel's may wait.
+    // These release the interpreter's lock, because a thread that holds the kernel's lock may wait for it.
     m.def("all_finite", &all_finite<float>, "array"_a.noconvert(), "threads"_a = 1);
     m.def("all_finite", &all_finite<double>, "array"_a.noconvert(), "threads"_a = 1);
     m.def("all_below", &all_below<int32_t>, "array"_a.noconvert(), "count"_a, "threads"_a = 1);
@@ -241,9 +241,9 @@ NB_MODULE(_core, m) {
     nb::class_<Camera>(m, "Camera")
         .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "distortion"_a.noconvert(),
              "perspective"_a, "lens"_a, "width"_a, "height"_a, "by_distortion"_a = true)
-        // Where the lens folds over or ends in the image: the angle to the axis; none if it does not.
+        // Returns the angle to the axis where the lens folds over or ends in the image, if it does.
         .def_prop_ro("end", [](const Camera& c) { return c.lens_view.end; })
-        // How many pinholes it sees through.
+        // Returns how many pinholes it sees through.
         .def_prop_ro("sides", [](const Camera& c) { return sides_of(c).size(); });
     nb::class_<ChannelArrays>(m, "Channels")
         .def(nb::init<In<double, 2>, In<double, 2>, bool, bool, bool, int>(), "vertex_attributes"_a.noconvert(),

@@ -1,4 +1,4 @@
-// Barycentrics of hits as functions of vertices, camera and rays, for edgegrad/points/moving.py.
+// Binds barycentrics of hits as functions of vertices, camera and rays, for edgegrad/points/moving.py.
 
 #include "forward/moving_hits.h"
 
@@ -26,7 +26,7 @@ struct HitFaces {
     In<int64_t, 1> face;
     bool perspective;
 
-    // With some rays for each, one after another.
+    // Views hits with several consecutive rays each.
     MovingHits view(const Doubles& along) const {
         const size_t n = face.size();
         return {faces.data(), face.data(), int64_t(n), perspective, n ? int(along.shape(0) / n) : 1};
@@ -56,7 +56,7 @@ nb::object meet(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Do
     return rows(std::move(b), {3});
 }
 
-// Cotangents of those of verts, world_to_camera and along that are wanted; of the others nothing.
+// Returns the wanted cotangents of verts, world_to_camera and along, and None for the others.
 nb::tuple meet_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, Doubles bar,
                    std::array<bool, 3> wanted, int threads) {
     check(hits, verts, world_to_camera, along);
@@ -94,7 +94,7 @@ nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera
     return rows(std::move(b_dot), {3});
 }
 
-// Of the rows of the table that the form is of, (R, K).
+// Returns the cotangent of the form's table, (R, K).
 nb::object form_vjp_by_rows(In<int64_t, 1> sample, In<int64_t, 1> row, Doubles by, In<double, 1> bar, int64_t table,
                             int threads) {
     const size_t n = row.size(), K = by.shape(1);

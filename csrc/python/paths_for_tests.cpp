@@ -1,4 +1,4 @@
-// Paths of light as they were found, for tests that compute what they carry by themselves.
+// Exposes the sampled light paths, for tests that evaluate them independently.
 
 #include <algorithm>
 #include <vector>
@@ -15,8 +15,8 @@ namespace edgegrad {
 
 namespace {
 
-// A dict of arrays (N, …): `points` of each path; (N, bounces, …) of its points face, b and density; (N, bounces,
-// lights, …) of points of lights index, uv, light_pdf and seen.
+// Returns a dict of arrays (N, …): `points` of each path; (N, bounces, …) with face, b and pdf of its points; (N,
+// bounces, lights, …) with index, uv, light_pdf and seen of points of lights.
 template <class T>
 nb::dict find_paths(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& from,
                     const LitOptions& options, int threads) {

@@ -1,4 +1,4 @@
-// Triangles in clip space, rasterized, interpolated, textured and antialiased, for edgegrad/raster.
+// Binds edgegrad/raster's operators on clip-space triangles: rasterize, interpolate, sample textures, antialias.
 
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
@@ -26,7 +26,7 @@ namespace edgegrad {
 
 namespace {
 
-// Positions (1 or images, vertices, 4) with triangles; ranges where the images have different ones.
+// Holds positions (1 or images, vertices, 4) with triangles, and ranges where the images have different ones.
 template <class T>
 struct ClipMesh {
     In<T, 3> pos;
@@ -76,7 +76,7 @@ void check_shape(const char* name, const In<T, 4>& image, const Frames& f, int64
         refuse(std::string(name) + ": expected a number for each pixel and channel of rast");
 }
 
-// The triangles of each pixel are those of its image; ranges of (first, end).
+// Checks that the triangles of each pixel belong to its image; ranges are (first, end).
 template <class T, class Range>
 void check_triangles(const In<T, 4>& rast, Range range, int threads) {
     const Frames f = frames_of(rast);
@@ -154,7 +154,7 @@ void bind_rasterize(nb::module_& m) {
         "rast_bar"_a.noconvert(), "db_bar"_a.noconvert().none(), "threads"_a);
 }
 
-// Attributes (1 or images, vertices, width) at the points of a rasterizer's output.
+// Holds attributes (1 or images, vertices, width) and the rasterizer's output at which they are interpolated.
 template <class T>
 struct Interpolation {
     In<T, 3> attr;
@@ -229,7 +229,7 @@ int index_of(const char* argument, const char* const (&names)[4], const std::str
     return int(found - std::begin(names));
 }
 
-// Images, height, width, channels and levels of the texels, and how they are looked up.
+// Holds images, height, width, channels and levels of the texels, and how they are sampled.
 struct TextureOptions {
     TextureShape shape;
     LookUp look_up;
@@ -295,7 +295,7 @@ void bind_texture(nb::module_& m) {
         "bias"_a.noconvert().none(), "bar"_a.noconvert(), "wanted"_a, "threads"_a);
 }
 
-// Which half-edges have the same vertices.
+// Groups the half-edges with the same vertices.
 struct EdgeArrays {
     In<int32_t, 1> group, start, member;
 

@@ -1,4 +1,4 @@
-// Borders of what surfaces of paths of light see of one another, for images that are made in PyTorch.
+// Binds samples on secondary edges, the edges seen from the surface points of light paths, for images made in PyTorch.
 
 #include "secondary/secondary_edges.h"
 
@@ -27,7 +27,7 @@ nb::object joined_rows(const std::vector<std::vector<double>>& parts, size_t wid
     return rows(std::move(out), {width});
 }
 
-// What both kinds of samples are recorded of. `casters`: the same faces as light meets them.
+// Holds the input of both kinds of samples. `casters` are the same faces as light sees them.
 template <class T>
 struct Asked {
     const SceneArrays<T>&arrays, &casters;
@@ -39,8 +39,9 @@ struct Asked {
     double least;
     int threads;
 
-    // As records of arrays with their first point alone, and of SecondaryEdgeSamples the jumps (S, channels) and
-    // origins (S, 3), of which there are none where the camera sees the points. record(input, casters, team, samples)
+    // Returns records of arrays with their first point alone. Where the camera does not see the points,
+    // SecondaryEdgeSamples adds the jumps (S, channels) and origins (S, 3). It calls record(input, casters, team,
+    // samples).
     template <class Record>
     nb::tuple samples(const LitOptions& options, int further, GeometryWanted wanted, Record record) const {
         hits.check(arrays, camera), check_faces(arrays, lit);

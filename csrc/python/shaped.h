@@ -1,4 +1,4 @@
-// Results handed to Python.
+// Hands results to Python.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -12,17 +12,17 @@ namespace edgegrad {
 
 namespace nb = nanobind;
 
-// A vector or an Array as an array of this shape, without a copy.
+// Returns a vector or an Array as an array of this shape, without a copy.
 template <class Values>
 nb::object shaped(Values&& values, const std::vector<size_t>& shape) {
-    static_assert(!std::is_reference_v<Values>);  // it is moved from
+    static_assert(!std::is_reference_v<Values>);  // It is moved from.
     using X = std::remove_pointer_t<decltype(values.data())>;
     auto* kept = new Values(std::move(values));
     const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<Values*>(p); });
     return nb::cast(nb::ndarray<nb::numpy, X>(kept->data(), shape.size(), shape.data(), owner));
 }
 
-// As rows of this shape.
+// Returns it as rows of this shape.
 template <class Values>
 nb::object rows(Values&& values, std::vector<size_t> row = {}) {
     size_t width = 1;

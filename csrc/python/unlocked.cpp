@@ -8,7 +8,7 @@ namespace edgegrad {
 
 namespace {
 
-// Threads that called the kernel and still run, and those of them that wait for the end of the process.
+// These count threads that called the kernel and still run, and those that wait for the end of the process.
 std::atomic<int> callers{0}, waiting_callers{0};
 std::atomic<bool> ending{false};
 thread_local bool ends_the_process = false;
@@ -25,7 +25,7 @@ struct Caller {
 
 void count_caller() { thread_local const Caller caller; }
 
-// Whether a signal handler of Python raised, as that of Ctrl-C does.
+// Returns whether a Python signal handler raised, for example that of Ctrl-C.
 bool interrupted() {
     nb::gil_scoped_acquire acquire;
     return PyErr_CheckSignals() != 0;
@@ -54,7 +54,7 @@ Unlocked::Unlocked() : state_(PyEval_SaveThread()) { count_caller(); }
 
 Unlocked::~Unlocked() {
     if (ending && !ends_the_process) {
-        // Not for ever: a handler called later may wait for this very thread.
+        // The wait is limited, because a handler called later may wait for this very thread.
         ++waiting_callers;
         news.release();
         never.try_acquire_for(std::chrono::seconds(1));
@@ -62,7 +62,7 @@ Unlocked::~Unlocked() {
     }
     try {
         PyEval_RestoreThread(state_);
-    } catch (...) {  // the unwinding; if this were left, the process would be ended
+    } catch (...) {  // This catches the unwinding; leaving the frame would end the process.
         never.acquire();
     }
 }
@@ -74,7 +74,7 @@ void run_unlocked(int threads, const std::function<void(ThreadTeam&)>& f) {
         ThreadTeam team(threads, ask);
         team.run([&] { f(team); });
     } catch (const Interrupted&) {
-        throw nb::python_error();  // that of the handler
+        throw nb::python_error();  // It is the handler's error.
     }
 }
 

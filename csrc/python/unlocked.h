@@ -1,11 +1,11 @@
-// Work without the interpreter's lock, and the end of the process meanwhile.
+// Runs work without the interpreter's lock, and handles the end of the process meanwhile.
 //
-// Once the interpreter shuts down, no thread but the main one gets its lock any more. Before 3.14 Python ends a thread
-// that asks, by an unwinding of its stack; a C++ frame that lets nothing through, in nanobind or in torch, then calls
-// std::terminate(). Two things keep threads that render in a loop from this:
-//   - where the kernel asks, the unwinding is caught, and the thread sleeps for as long as there is a process;
-//   - a handler of Python's `atexit` first gives such threads time to come into the kernel and to wait there, so that
-//     the lock is not asked for by an operator of torch just then.
+// Once the interpreter shuts down, only the main thread still gets its lock. Before 3.14, Python ends a thread that
+// asks for it by unwinding its stack. A C++ frame that lets nothing through, in nanobind or in torch, then calls
+// std::terminate(). Two things protect threads that render in a loop from this:
+//   - where the kernel asks, the unwinding is caught, and the thread sleeps as long as the process lives;
+//   - a handler of Python's `atexit` first gives such threads time to enter the kernel and to wait there; no operator
+//     of torch then asks for the lock.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -21,11 +21,11 @@ namespace edgegrad {
 
 namespace nb = nanobind;
 
-// In the child of a fork() the thread that called it, through here, is the only one.
+// Marks the thread that called fork() as the only caller; the child calls it.
 void forget_other_callers();
 
-// Called by `atexit`, without the lock. A thread that rendered once and now waits for something else is not waited for
-// any longer than half a second.
+// Waits for other callers; `atexit` calls it without the lock. It waits at most half a second for a thread that
+// rendered once and now waits for something else.
 void await_callers();
 
 // Releases the interpreter's lock, and takes it again at the end.
@@ -42,7 +42,7 @@ class Unlocked {
 // Calls f(team) without the interpreter's lock.
 void run_unlocked(int threads, const std::function<void(ThreadTeam&)>& f);
 
-// What it returns.
+// Does the same, and returns the result of f.
 template <class F>
 auto unlocked(int threads, F f) {
     using Result = std::invoke_result_t<F, ThreadTeam&>;

@@ -10,9 +10,9 @@ namespace edgegrad {
 
 namespace {
 
-// A side of a triangle as a line n · p = 0 of the image.
+// Holds a side of a triangle as a line n · p = 0 of the image.
 struct SideLine {
-    Vec3 a, b, n;  // x, y, w
+    Vec3 a, b, n;  // Their components are x, y, w.
 
     template <class T>
     SideLine(const Triangles<T>& mesh, int64_t item, int64_t half_edge) {
@@ -22,10 +22,11 @@ struct SideLine {
     }
 };
 
-// Whether the surface folds over, or ends, at a side of a triangle: no other triangle goes on beyond it.
+// Returns whether the surface folds over or ends at a side of a triangle; no other continues beyond it.
 template <class T>
 bool is_silhouette(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t item, int64_t half_edge) {
-    const auto corner = [&](int64_t h) { return mesh.in_image(item, mesh.tri[h]); };  // opposite to it
+    // It returns the corner opposite to a half-edge.
+    const auto corner = [&](int64_t h) { return mesh.in_image(item, mesh.tri[h]); };
     const Vec3 n = SideLine(mesh, item, half_edge).n;
     const double own = dot(n, corner(half_edge));
     const int32_t group = edges.group[half_edge];
@@ -36,7 +37,7 @@ bool is_silhouette(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t it
     return true;
 }
 
-// Of images with vertices of their own, or of all of them, a bit for each side of each triangle: (images, triangles).
+// Returns a bit for each side of each triangle: (images, triangles). There is one image if all share their vertices.
 template <class T>
 std::vector<uint8_t> silhouettes(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t images, ThreadTeam& team) {
     std::vector<uint8_t> out(images * mesh.triangles);
@@ -48,18 +49,18 @@ std::vector<uint8_t> silhouettes(const Triangles<T>& mesh, const EdgeGroups& edg
     return out;
 }
 
-// Two neighbours in the image, along x (axis 0) or y (axis 1).
+// Holds two neighbours in the image, along x (axis 0) or y (axis 1).
 struct Neighbours {
-    int64_t column, row;  // of the near pixel
+    int64_t column, row;  // They locate the near pixel.
     int axis;
-    int step;  // 1: the far one is to the right or above
+    int step;  // 1 means that the far one is to the right or above.
 
     Vec3 center(const Frames& frames) const { return {frames.x(column), frames.y(row), 1}; }
     double size(const Frames& frames) const { return 2 / double(axis == 0 ? frames.width : frames.height); }
 };
 
-// Where the line of a side passes the line through two centres, in shares of the way from the near to the far one;
-// none where the side does not reach it, is behind the eye, or runs more along it than across.
+// Returns where the line of a side crosses the line through two centres, as a fraction of the way from near to far.
+// Returns none where the side does not reach it, is behind the eye, or is more parallel to it than across.
 template <class T>
 std::optional<double> share_at(const SideLine& side, const Neighbours& at, const Frames& frames) {
     const Vec3 p = at.center(frames);
@@ -83,7 +84,7 @@ class PairFinder {
     PairFinder(const Triangles<T>& mesh, const Frames& frames, const uint8_t* silhouette, int64_t item, const T* rast)
         : mesh_(mesh), frames_(frames), silhouette_(silhouette), item_(item), rast_(rast) {}
 
-    // Of the pixel and its neighbour to the right or above.
+    // Handles the pixel and its neighbour to the right or above.
     void visit(int64_t column, int64_t row, int axis, std::vector<Crossing>& out) const {
         const int64_t here = (item_ * frames_.height + row) * frames_.width + column,
                       there = here + (axis == 0 ? 1 : frames_.width);
@@ -100,7 +101,7 @@ class PairFinder {
             if (const auto share = share_at<T>(side, at, frames_)) {
                 out.push_back(
                     {first ? here : there, first ? there : here, int32_t(triangle), int8_t(i), int8_t(axis), *share});
-                return;  // a triangle has one side where it ends
+                return;  // A triangle ends at one side.
             }
         }
     }
@@ -113,7 +114,7 @@ class PairFinder {
     const T* rast_;
 };
 
-// The pixel that is blended, and how much of the other it gets.
+// Selects the pixel that is blended, and the weight of the other.
 struct Blend {
     int64_t to, from;
     double weight;
@@ -124,7 +125,7 @@ struct Blend {
     }
 };
 
-// Calls body(first, last) for the crossings of each image.
+// Calls body(image, crossing) for the crossings of each image.
 template <class Body>
 void each_image(const std::vector<Crossing>& crossings, const Frames& frames, ThreadTeam& team, Body body) {
     const int64_t pixels = frames.height * frames.width;
@@ -153,14 +154,15 @@ std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& fra
                                      const T* rast, ThreadTeam& team) {
     const std::vector<uint8_t> sides =
         silhouettes(mesh, edges, mesh.shared ? std::min<int64_t>(1, frames.count) : frames.count, team);
-    // Bands of rows, so that threads end at the same time; crossings come in order all the same.
+    // Bands of rows let threads end at the same time, and keep crossings in order.
     constexpr int64_t rows = 32;
     const int64_t H = frames.height, bands = (H + rows - 1) / rows;
     std::vector<std::vector<Crossing>> found(frames.count * bands);
     team.parallel_for(frames.count * bands, [&](int64_t k) {
         const int64_t item = k / bands, band = k % bands;
         const PairFinder<T> pairs(mesh, frames, sides.data() + (mesh.shared ? 0 : item * mesh.triangles), item, rast);
-        std::vector<Crossing> own;  // threads that write next to one another wait for each other's caches
+        // A local vector avoids cache conflicts between threads that write close to each other.
+        std::vector<Crossing> own;
         for (int64_t y = band * rows; y < std::min(H, (band + 1) * rows); ++y)
             for (int64_t x = 0; x < frames.width; ++x) {
                 if (x + 1 < frames.width) pairs.visit(x, y, 0, own);
@@ -202,7 +204,7 @@ AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Tri
     }
     if (!wanted.pos) return out;
     const Targets to{mesh.vertices, 4, mesh.shared};
-    // An image's crossings are few: one share for each.
+    // An image has few crossings, so it is one share.
     const std::vector<Share> shares = shares_of({frames.count, 1, 1}, to);
     const int64_t pixels = frames.height * frames.width;
     out.pos = sums_over<T>(shares, frames, to, team, [&](const Share& share, double* sums) {
@@ -220,7 +222,7 @@ AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Tri
             const int axis = c->axis;
             const Neighbours pair{at % frames.width, at / frames.width, axis, step > 0 ? 1 : -1};
             const SideLine side(mesh, c->near / pixels, 3 * int64_t(c->triangle) + c->side);
-            // The place p* on the line n · p* = 0 moves along the axis by δx = −(δn · p*) / n.x, and with y likewise.
+            // The point p* on the line n · p* = 0 moves along the axis by δx = −(δn · p*) / n.x, and likewise with y.
             Vec3 p = pair.center(frames);
             const double moved = pair.step * c->share * pair.size(frames);
             (axis == 0 ? p.x : p.y) += moved;

@@ -5,7 +5,7 @@ namespace edgegrad {
 namespace {
 
 struct Pair {
-    double high, low;  // their sum is exact
+    double high, low;  // Their sum is exact.
 };
 Pair two_sum(double a, double b) {
     const double s = a + b, bb = s - a;
@@ -16,7 +16,7 @@ Pair two_product(double a, double b) {
     return {p, std::fma(a, b, -p)};
 }
 
-// A sum of doubles without rounding: parts that do not overlap, the smallest first.
+// Sums doubles without rounding. Its parts do not overlap, the smallest first.
 class Expansion {
    public:
     void add(double x) {
@@ -26,12 +26,12 @@ class Expansion {
         }
         part_[size_++] = x;
     }
-    // a b c
+    // Adds a b c.
     void add_product(double a, double b, double c) {
         const Pair ab = two_product(a, b), high = two_product(ab.high, c), low = two_product(ab.low, c);
         add(low.low), add(high.low), add(low.high), add(high.high);
     }
-    // That of the largest part.
+    // Returns the sign of the largest part.
     int sign() const {
         for (int i = size_; i-- > 0;)
             if (part_[i] != 0) return part_[i] > 0 ? 1 : -1;
@@ -39,7 +39,7 @@ class Expansion {
     }
 
    private:
-    double part_[24];  // six products of three numbers
+    double part_[24];  // Six products of three numbers fit.
     int size_ = 0;
 };
 

@@ -1,22 +1,22 @@
-// Signs of determinants, right whatever rounding does (Shewchuk 1997): first in floating point with a bound of its
-// error, then, where that leaves the sign open, exactly.
+// Computes signs of determinants that are correct despite rounding (Shewchuk 1997). It tries floating point with an
+// error bound first, and exact arithmetic where that is undecided.
 #pragma once
 
 #include "core/math.h"
 
 namespace edgegrad {
 
-// x · (a × b) of which the sign is 1, 0 or −1; rows of finite doubles.
+// Returns the sign, 1, 0 or −1, of x · (a × b), rows of finite doubles.
 int exact_sign(Vec3 x, Vec3 a, Vec3 b);
 
-// u x − v y
+// Returns the sign of u x − v y.
 int exact_sign(double u, double x, double v, double y);
 
-// The line through a and b in the image, homogeneous: the sign of n · p says on which side p lies. With a and b
-// exchanged all is negated to the bit.
+// Holds the line through a and b in the image, homogeneous. The sign of n · p says on which side p lies. Exchanging a
+// and b negates everything to the bit.
 struct ImageLine {
     Vec3 n;
-    double doubt;  // n · p has the right sign where it is larger, for |p.x|, |p.y| and p.z up to 1
+    double doubt;  // n · p has the right sign where it exceeds this, for |p.x|, |p.y| and p.z up to 1.
 };
 
 inline ImageLine image_line(Vec3 a, Vec3 b) {
@@ -27,9 +27,9 @@ inline ImageLine image_line(Vec3 a, Vec3 b) {
     return {{yz - zy, zx - xz, xy - yx}, bound * size};
 }
 
-// The side of the line through a and b on which the point p lies, both in homogeneous coordinates; if it lies on the
-// line, the side of p moved by an infinitesimal to the right and a smaller one up (simulation of simplicity,
-// Edelsbrunner and Mücke 1990). 0 if a and b are one point of the image.
+// Returns the side of the line through a and b on which the point p lies, all in homogeneous coordinates. A point on
+// the line is moved by an infinitesimal to the right and a smaller one up (simulation of simplicity, Edelsbrunner and
+// Mücke 1990). Returns 0 if a and b are one point of the image.
 int side_of_line(Vec3 p, Vec3 a, Vec3 b);
 
 }  // namespace edgegrad

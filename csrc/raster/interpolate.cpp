@@ -9,7 +9,7 @@ namespace edgegrad {
 
 namespace {
 
-// What of one triangle is interpolated: a = u a₀ + v a₁ + (1 − u − v) a₂.
+// Holds the corners of one triangle for interpolation: a = u a₀ + v a₁ + (1 − u − v) a₂.
 template <class T>
 struct Corners {
     const T* row[3];
@@ -44,7 +44,7 @@ void interpolate_row(const VertexAttributes<T>& attr, const RasterView<T>& at, c
     }
 }
 
-// Of one pixel: cotangents of by_u and by_v are added to the corners' rows in `sums`.
+// Adds the cotangents of by_u and by_v at one pixel to the corners' rows in `sums`.
 template <int N, class T>
 void add_to_corners(const VertexAttributes<T>& attr, const RasterView<T>& at, const std::vector<int>& chosen, int64_t p,
                     const Corners<T>& corners, const T* bar, const T* da_bar, double* sums) {
@@ -94,7 +94,7 @@ InterpolateGrad<T> interpolate_vjp(const VertexAttributes<T>& attr, const Raster
     InterpolateGrad<T> out;
     if (wanted.attr) {
         const Targets to{attr.vertices, A, attr.shared};
-        // In range mode the vertices that an image uses are not known here from ranges: only from what it shows.
+        // Even in range mode, only the image shows which vertices it uses.
         const auto shares = shares_of(frames, to);
         out.attr = sums_over<T>(shares, frames, to, team, [&](const Share& share, double* sums) {
             dispatch_channels(A, false, [&]<int N>() {

@@ -1,4 +1,4 @@
-// Attributes of vertices at the surface points that a rasterizer found.
+// Interpolates vertex attributes at the surface points that a rasterizer found.
 #pragma once
 
 #include <optional>
@@ -15,7 +15,7 @@ struct VertexAttributes {
     const T* values;  // (vertices, width), or (images, vertices, width)
     int64_t vertices;
     int width;
-    bool shared;  // by all images
+    bool shared;  // All images share them.
 
     const T* row(int64_t item, int64_t v) const { return values + (v + (shared ? 0 : item * vertices)) * width; }
 };
@@ -26,7 +26,7 @@ struct RasterView {
     const int32_t* tri;  // (triangles, 3)
     int64_t triangles;
     const T* rast;     // (count, height, width, 4)
-    const T* rast_db;  // the same; null where there is none
+    const T* rast_db;  // (count, height, width, 4), or null
 };
 
 template <class T>
@@ -35,7 +35,7 @@ struct Interpolated {
     Array<T> da;      // (count, height, width, 2 × chosen): ∂a/∂X, ∂a/∂Y of each
 };
 
-// `chosen`: of which attributes derivatives in the image are wanted.
+// Interpolates attributes; `chosen` lists those that also need derivatives in the image.
 template <class T>
 Interpolated<T> interpolate(const VertexAttributes<T>& attr, const RasterView<T>& at, const std::vector<int>& chosen,
                             ThreadTeam& team);
@@ -48,7 +48,7 @@ struct InterpolateWanted {
     bool attr, rast, rast_db;
 };
 
-// The cotangents that are wanted, each of the shape of what it belongs to. `da_bar` may be null.
+// Returns the requested cotangents, each with the shape of its input. `da_bar` may be null.
 template <class T>
 InterpolateGrad<T> interpolate_vjp(const VertexAttributes<T>& attr, const RasterView<T>& at,
                                    const std::vector<int>& chosen, const T* bar, const T* da_bar,

@@ -13,12 +13,12 @@ namespace edgegrad {
 
 namespace {
 
-// A triangle in one image.
+// Holds a triangle in one image.
 struct Facet {
-    Vec3 corner[3];     // x, y, w
-    double depth[3];    // z
-    ImageLine side[3];  // opposite to the corners
-    double facing;      // the sign of the determinant of the corners; 0: seen from its edge, or degenerate
+    Vec3 corner[3];     // Their components are x, y, w.
+    double depth[3];    // It is z.
+    ImageLine side[3];  // They are opposite to the corners.
+    double facing;      // It is the sign of the corners' determinant; 0: edge-on or degenerate.
 
     template <class T>
     Facet(const Triangles<T>& mesh, int64_t item, int64_t triangle) {
@@ -37,14 +37,15 @@ struct Facet {
     }
 };
 
-// The pixels whose centres it may cover: [left, right) × [bottom, top).
+// Bounds the pixels whose centres it may cover: [left, right) × [bottom, top).
 struct Box {
     int64_t left, right, bottom, top;
 
     bool empty() const { return left >= right || bottom >= top; }
 };
 
-// Around the part of the triangle beyond the near plane, z ≥ −w. Where that reaches behind the eye: all pixels.
+// Returns the box around the part of the triangle beyond the near plane, z ≥ −w. It has all pixels where that part
+// reaches behind the eye.
 Box box_of(const Facet& f, const Frames& frames) {
     constexpr double inf = std::numeric_limits<double>::infinity();
     double low[2] = {inf, inf}, high[2] = {-inf, -inf};
@@ -69,8 +70,8 @@ Box box_of(const Facet& f, const Frames& frames) {
     }
     if (unbounded) return {0, frames.width, 0, frames.height};
     if (!(low[0] <= high[0])) return {0, 0, 0, 0};
-    const auto first = [](double x,
-                          int64_t n) {  // the first pixel whose centre is not left of x, with room for rounding
+    // first() returns the first pixel whose centre is not left of x, with a margin for rounding.
+    const auto first = [](double x, int64_t n) {
         return int64_t(std::clamp(std::ceil((x + 1) / 2 * double(n) - 0.501), 0.0, double(n)));
     };
     const auto end = [](double x, int64_t n) {
@@ -80,17 +81,17 @@ Box box_of(const Facet& f, const Frames& frames) {
             end(high[1], frames.height)};
 }
 
-// How a pixel's centre lies to a triangle that covers it.
+// Holds the weights of a triangle's corners at a pixel centre that it covers.
 struct Weights {
     double e[3];
 
-    // A centre that is covered by the exact signs may lie a rounding outside.
+    // Clamps the weights, because a centre covered by exact signs may lie a rounding outside.
     explicit Weights(const double (&signed_)[3]) {
         for (int i = 0; i < 3; ++i) e[i] = std::max(0.0, signed_[i]);
-        if (!(sum() > 0)) std::fill_n(e, 3, 1.0);  // a triangle so thin that nothing else is known
+        if (!(sum() > 0)) std::fill_n(e, 3, 1.0);  // The triangle is so thin that nothing else is known.
     }
     double sum() const { return e[0] + e[1] + e[2]; }
-    // z / w, a mean of the corners'.
+    // Returns z / w, a mean of the corners'.
     double depth(const Facet& f) const {
         const double w = e[0] * f.corner[0].z + e[1] * f.corner[1].z + e[2] * f.corner[2].z;
         return (e[0] * f.depth[0] + e[1] * f.depth[1] + e[2] * f.depth[2]) / w;
@@ -103,12 +104,12 @@ Weights weights_at(const Facet& f, double x, double y) {
     return Weights(e);
 }
 
-// A rectangle of one image.
+// Selects a rectangle of one image.
 struct Window {
     int64_t item, row, end_row;
 };
 
-// The nearest triangle at each pixel of a window, −1 where there is none, and its depth.
+// Holds the nearest triangle at each pixel of a window, −1 where there is none, and its depth.
 struct Nearest {
     std::vector<double> depth;
     std::vector<int32_t> triangle;
@@ -159,12 +160,12 @@ void find_nearest(const Triangles<T>& mesh, const Frames& frames, const Window& 
     }
 }
 
-// u and v at a pixel and how they change a pixel to the right and up, with what they are made of.
+// Holds u and v at a pixel, their changes one pixel to the right and up, and intermediate results.
 struct Barycentrics {
     double sum, u, v;
-    double dx, dy;  // of a pixel
+    double dx, dy;  // They are the size of a pixel.
     double u_x, u_y, v_x, v_y;
-    Vec3 total;  // of the lines of the sides, which `sum` is the product of with the centre
+    Vec3 total;  // It is the sum of the sides' lines; its product with the centre is `sum`.
 
     Barycentrics(const Facet& f, const Weights& w, const Frames& frames)
         : sum(w.sum()), u(w.e[0] / sum), v(w.e[1] / sum), dx(2 / double(frames.width)), dy(2 / double(frames.height)) {
@@ -182,7 +183,7 @@ RasterImages<T> rasterize(const Triangles<T>& mesh, const Frames& frames, const 
                           ThreadTeam& team) {
     RasterImages<T> out{Array<T>(4 * frames.pixels()), Array<T>(derivatives ? 4 * frames.pixels() : 0)};
     const int64_t H = frames.height, W = frames.width;
-    // Of one image several windows where there are fewer images than threads.
+    // An image has several windows where there are fewer images than threads.
     const int64_t windows = std::clamp<int64_t>(2 * team.threads() / std::max<int64_t>(1, frames.count), 1, H);
     const auto scratch = [] { return std::make_unique<Nearest>(); };
     team.parallel_for_with_state(frames.count * windows, scratch, [&](Nearest& found, int64_t k) {
@@ -227,7 +228,7 @@ Array<T> rasterize_vjp(const Triangles<T>& mesh, const Frames& frames, const T* 
                 if (bar[0] == 0 && bar[1] == 0 && (!d || (d[0] == 0 && d[1] == 0 && d[2] == 0 && d[3] == 0))) continue;
                 Facet f(mesh, item, seen.triangle);
                 f.orient();
-                if (f.facing == 0) continue;  // of other positions than were rasterized
+                if (f.facing == 0) continue;  // The positions differ from those that were rasterized.
                 const Vec3 p{frames.x(x), frames.y(y), 1};
                 const Barycentrics b(f, weights_at(f, p.x, p.y), frames);
                 // u = e₀ / s and ∂u/∂X = dx (n₀.x − u N.x) / s, where s = p · N and N = n₀ + n₁ + n₂; v likewise.

@@ -12,7 +12,7 @@ namespace edgegrad {
 
 namespace {
 
-// What one pixel takes of a pyramid: the share of the second of two levels, and whether that moves.
+// Holds which levels of a pyramid one pixel uses: two of them, the second one's weight, and whether that moves.
 struct Levels {
     int below = 0, above = 0;
     double share = 0;
@@ -35,7 +35,7 @@ class PixelLookUp {
         if (in.bias) level += double(in.bias[pixel]);
         const double top = in.shape.levels - 1;
         const bool inside = level > 0 && level < top;
-        level = level >= top ? top : level > 0 ? level : 0;  // −∞ and what is no number: the texture itself
+        level = level >= top ? top : level > 0 ? level : 0;  // −∞ and NaN select the texture itself.
         if (in.look_up == LookUp::linear_nearest_level) {
             levels_.below = levels_.above = int(std::floor(level + 0.5));
             return;
@@ -45,7 +45,7 @@ class PixelLookUp {
     }
     bool valid() const { return valid_; }
 
-    // visit(level, weight) of those that count; of both where the level moves.
+    // Calls visit(level, weight) for the levels that count; for both where the weight has a derivative.
     template <class Visit>
     void each_level(Visit visit) const {
         visit(levels_.below, 1 - levels_.share);
@@ -54,7 +54,7 @@ class PixelLookUp {
     int64_t nearest(const TexelPlane& plane) const { return nearest_texel(plane, place_, in_.shape.border); }
     Taps taps(const TexelPlane& plane) const { return linear_taps(plane, place_, in_.shape.border); }
 
-    // From the cotangents of s and t and of the level.
+    // Adds the cotangents, given those of s and t and of the level.
     void vjp(Vec2 place_bar, double level_bar, TextureCoordinates& uv_bar) const {
         place_vjp(uv_, in_.shape.border, place_, place_bar, uv_bar);
         if (!levels_.moves || !in_.uv_da || level_bar == 0) return;
@@ -72,7 +72,7 @@ class PixelLookUp {
     Levels levels_;
 };
 
-// Levels of the texture of one image.
+// Returns the levels of one image's texture.
 std::vector<TexelPlane> planes_of(const TextureShape& shape, int64_t image) {
     std::vector<TexelPlane> out;
     for (int level = 0; level < shape.levels; ++level) out.emplace_back(shape, image, level);
@@ -116,7 +116,7 @@ void coordinates_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& p
     const PixelLookUp<T> at(in, pixel);
     if (at.valid() && in.look_up != LookUp::nearest) {
         Vec2 place_bar;
-        double value[2] = {};  // bar · what each level shows
+        double value[2] = {};  // They are bar · what each level shows.
         int index = 0;
         at.each_level([&](int level, double weight) {
             const TexelPlane& plane = planes[level];
@@ -142,7 +142,7 @@ void coordinates_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& p
     if (wanted.bias) (*out.bias)[pixel] = T(level_bar);
 }
 
-// Adds to `sums`, of all levels of one image's texture: `offset` is where each level begins there.
+// Adds to `sums`, which covers all levels of one image's texture.
 template <class T, int N>
 void texels_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& planes, int64_t pixel, const T* bar,
                 double* sums) {
@@ -163,7 +163,7 @@ void texels_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& planes
     });
 }
 
-// The cotangent of the texels: sums for each image of a texture of its own, put where its levels are among all images'.
+// Returns the cotangent of the texels. It sums per image, then moves the levels to their places among all images'.
 template <class T>
 Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, ThreadTeam& team) {
     TextureShape one = in.shape;

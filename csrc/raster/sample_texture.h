@@ -1,4 +1,4 @@
-// Look-ups in textures at the coordinates of pixels: nearest, bilinear, and of pyramids.
+// Samples textures at the coordinates of pixels: nearest, bilinear, and from mipmap pyramids.
 #pragma once
 
 #include <optional>
@@ -12,7 +12,7 @@ namespace edgegrad {
 
 enum class LookUp { nearest, linear, linear_nearest_level, linear_between_levels };
 
-// Null where there is none.
+// Optional arrays may be null.
 template <class T>
 struct TextureInput {
     TextureShape shape;
@@ -21,12 +21,12 @@ struct TextureInput {
     const T* texels;
     const T* uv;     // (pixels, 2), or 3 for a cube
     const T* uv_da;  // (pixels, 4), or 6: their derivatives in the image
-    const T* bias;   // (pixels,): added to the level; the level itself if uv_da is null
+    const T* bias;   // (pixels,) added to the level, or the level itself if uv_da is null
 
     int coordinates() const { return shape.border == Border::cube ? 3 : 2; }
 };
 
-// (pixels, channels)
+// Returns (pixels, channels).
 template <class T>
 Array<T> sample_texture(const TextureInput<T>& in, ThreadTeam& team);
 
@@ -40,7 +40,7 @@ struct TextureWanted {
     bool coordinates() const { return uv || uv_da || bias; }
 };
 
-// The cotangents that are wanted.
+// Returns the requested cotangents.
 template <class T>
 TextureGrad<T> sample_texture_vjp(const TextureInput<T>& in, const T* bar, TextureWanted wanted, ThreadTeam& team);
 

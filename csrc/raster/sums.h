@@ -1,6 +1,6 @@
-// Sums over the pixels of a batch into rows that pixels share, with the same bits at any number of threads: the images
-// are cut into shares whose number depends on sizes alone; each share has one thread and buffers of its own, and these
-// are added in order.
+// Sums over the pixels of a batch into rows that pixels share, with the same bits at any number of threads. Images are
+// split into shares, whose number depends on sizes alone. Each share has one thread and its own buffers, and these are
+// added in order.
 #pragma once
 
 #include <algorithm>
@@ -13,13 +13,13 @@
 
 namespace edgegrad {
 
-// Rows of some images.
+// Selects rows of some images.
 struct Share {
-    int64_t item, end_item;  // images; of several all rows
+    int64_t item, end_item;  // They are images; several images have all their rows.
     int64_t row, end_row;
-    int64_t first_target, targets;  // the rows of numbers that they may add to
+    int64_t first_target, targets;  // They are the rows of numbers to which they may add.
 
-    // visit(item, row)
+    // Calls visit(item, row) for each row.
     template <class Visit>
     void each_row(Visit visit) const {
         for (int64_t b = item; b < end_item; ++b)
@@ -27,7 +27,7 @@ struct Share {
     }
 };
 
-// The rows of numbers: `count` for each image, or for all of them together.
+// Describes the rows of numbers: `count` for each image, or for all of them together.
 struct Targets {
     int64_t count;
     int width;
@@ -35,10 +35,10 @@ struct Targets {
 };
 
 inline std::vector<Share> shares_of(const Frames& frames, const Targets& to) {
-    constexpr int64_t most = 8;  // beyond that, threads gain less than the buffers take
+    constexpr int64_t most = 8;  // Beyond this, threads gain less than the buffers cost.
     std::vector<Share> out;
     if (to.shared) {
-        // No more buffers than there is work to fill them.
+        // Buffers are at most as many as there is work to fill them.
         const int64_t n =
             std::clamp<int64_t>(4 * frames.pixels() / std::max<int64_t>(1, to.count), 1, std::min(most, frames.count));
         for (int64_t k = 0; k < n; ++k)
@@ -53,8 +53,8 @@ inline std::vector<Share> shares_of(const Frames& frames, const Targets& to) {
     return out;
 }
 
-// Calls body(share, sums) for each share, where sums are (targets, width) doubles, zero at first; the sums of all, as
-// T: (count, width), or (images, count, width) where they are not shared.
+// Calls body(share, sums) for each share, where sums are (targets, width) doubles, zero at first. Returns the total as
+// T: (count, width), or (images, count, width) where it is not shared.
 template <class T, class Body>
 Array<T> sums_over(const std::vector<Share>& shares, const Frames& frames, const Targets& to, ThreadTeam& team,
                    Body body) {
@@ -67,7 +67,7 @@ Array<T> sums_over(const std::vector<Share>& shares, const Frames& frames, const
     });
     const int64_t images = to.shared ? 1 : frames.count, stride = to.count * to.width;
     Array<T> out(images * stride);
-    // Blocks of rows, each added by one thread in the order of the shares.
+    // One thread adds each block of rows in the order of the shares.
     constexpr int64_t block = 1 << 14;
     const int64_t blocks = std::max<int64_t>(1, (stride + block - 1) / block);
     team.parallel_for(images * blocks, [&](int64_t k) {
@@ -84,8 +84,8 @@ Array<T> sums_over(const std::vector<Share>& shares, const Frames& frames, const
     return out;
 }
 
-// Where the targets are vertices: of an image with a range of triangles, only those between the first and the last that
-// it uses.
+// Returns shares whose targets are vertices. An image with a range of triangles only has those between the first and
+// the last that it uses.
 template <class T>
 std::vector<Share> shares_of_vertices(const Frames& frames, const Triangles<T>& mesh, const Targets& to) {
     if (!mesh.ranges) return shares_of(frames, to);

@@ -1,5 +1,5 @@
-// Which texels of a texture or a cube map a look-up takes, with their weights. Texel (0, 0) is at the origin of texture
-// coordinates, texel centres at +0.5; the sides of a cube and their axes are OpenGL's.
+// Finds the texels and weights of a lookup in a texture or a cube map. Texel (0, 0) is at the origin of texture
+// coordinates, and texel centres are at +0.5. The sides of a cube and their axes are OpenGL's.
 #pragma once
 
 #include <algorithm>
@@ -12,9 +12,9 @@ namespace edgegrad {
 
 enum class Border { wrap, clamp, zero, cube };
 
-// Levels of halves, one after the other; each with all images' textures, each texture with its sides, row by row.
+// Describes levels of halves, one after the other. Each has all images' textures with their sides, row by row.
 struct TextureShape {
-    int64_t images;  // 1: the same texture for all
+    int64_t images;  // 1 means that all images share the texture.
     int64_t height, width;
     int channels, levels;
     Border border;
@@ -31,7 +31,7 @@ struct TextureShape {
     int64_t all_texels() const { return first(levels); }
 };
 
-// Of one image's texture in one level.
+// Locates one image's texture in one level.
 struct TexelPlane {
     int64_t first, height, width;
 
@@ -42,19 +42,19 @@ struct TexelPlane {
     int64_t at(int side, int64_t x, int64_t y) const { return first + (side * height + y) * width + x; }
 };
 
-// A place in a texture: of a cube, on one of its sides; s and t as fractions of its width and height.
+// Locates a point in a texture, or on a side of a cube; s and t are fractions of its width and height.
 struct TexturePlace {
     int side = 0;
     double s, t;
 };
 
-// Up to four texels, −1 where there is none, with weights and what these change by for a texel to the right and up.
+// Holds up to four texels, −1 where there is none, with weights and their changes per texel to the right and up.
 struct Taps {
     int64_t texel[4];
     double weight[4], by_x[4], by_y[4];
 };
 
-// Axes of a cube's sides: the major one with its sign, and those that s and t run along.
+// Holds the axes of a cube's sides: the major one with its sign, and those along which s and t run.
 struct CubeFace {
     int major, s, t;
     double sign, s_sign, t_sign;
@@ -62,7 +62,7 @@ struct CubeFace {
 inline constexpr CubeFace cube_faces[6] = {{0, 2, 1, 1, -1, -1}, {0, 2, 1, -1, 1, -1}, {1, 0, 2, 1, 1, 1},
                                            {1, 0, 2, -1, 1, -1}, {2, 0, 1, 1, 1, -1},  {2, 0, 1, -1, -1, -1}};
 
-// −1 where a direction has none: zero, or not finite.
+// Returns the side of a direction, or −1 for directions that are zero or not finite.
 inline int cube_face_of(const double (&d)[3]) {
     int axis = 0;
     for (int k = 0; k < 3; ++k) {
@@ -73,9 +73,9 @@ inline int cube_face_of(const double (&d)[3]) {
     return 2 * axis + (d[axis] < 0);
 }
 
-// The texel (x, y) of a side of n by n, or beyond one of its edges the one next to it on the next side. Centres are at
-// odd numbers in a cube from −n to n: a coordinate that leaves it becomes that of the next side, and what was the
-// side's becomes that of its outermost texels. −1 beyond a corner, where three sides meet.
+// Returns the texel (x, y) of a side of n by n, or beyond an edge, the adjacent texel on the next side. Centres are at
+// odd numbers in a cube from −n to n. A coordinate that leaves the cube becomes that of the next side, and the side's
+// own coordinate that of its outermost texels. Returns −1 beyond a corner, where three sides meet.
 inline int64_t cube_texel(const TexelPlane& plane, int side, int64_t x, int64_t y) {
     const int64_t n = plane.width;
     const bool over_x = x < 0 || x >= n, over_y = y < 0 || y >= n;
@@ -92,16 +92,16 @@ inline int64_t cube_texel(const TexelPlane& plane, int side, int64_t x, int64_t 
                     (int64_t(to.t_sign) * place[to.t] + n - 1) / 2);
 }
 
-// One coordinate as texels: the first of two, the share of the second, and how that changes with the coordinate.
+// Holds one coordinate as two texels, the weight of the second, and its derivative by the coordinate.
 struct Steps {
-    int64_t i0, i1;  // −1: outside
+    int64_t i0, i1;  // −1 means outside.
     double share, slope;
 };
 inline Steps steps(double s, int64_t n, Border border) {
     if (border == Border::wrap) s -= std::floor(s);
     double x = s * double(n) - 0.5, slope = 1;
     if (border == Border::clamp && !(x >= 0 && x <= double(n - 1))) x = std::clamp(x, 0.0, double(n - 1)), slope = 0;
-    x = std::clamp(x, -2.0, double(n) + 1);  // beyond that an integer might overflow, and nothing is there
+    x = std::clamp(x, -2.0, double(n) + 1);  // An integer might overflow beyond this, and nothing is there.
     const double floor = std::floor(x);
     Steps out{int64_t(floor), int64_t(floor) + 1, x - floor, slope};
     if (border == Border::wrap) {
@@ -137,7 +137,7 @@ inline Taps linear_taps(const TexelPlane& plane, const TexturePlace& at, Border 
         if (out.texel[k] < 0) corner = k;
     }
     if (corner < 0) return out;
-    // The missing texel is the mean of the three that meet there, from whichever side.
+    // The missing texel is the mean of the three that meet there, seen from any side.
     for (int k = 0; k < 4; ++k) {
         if (k == corner) continue;
         out.weight[k] += out.weight[corner] / 3;
@@ -146,7 +146,7 @@ inline Taps linear_taps(const TexelPlane& plane, const TexturePlace& at, Border 
     return out;
 }
 
-// The texel that holds a place, or −1.
+// Returns the texel that contains a point, or −1.
 inline int64_t nearest_texel(const TexelPlane& plane, const TexturePlace& at, Border border) {
     const auto cell = [&](double s, int64_t n) {
         if (border == Border::wrap) s -= std::floor(s);

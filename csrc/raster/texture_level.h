@@ -1,5 +1,4 @@
-// Places in textures from texture coordinates, and levels of pyramids from how these change in the image, each with its
-// _vjp.
+// Computes texture positions from coordinates, and pyramid levels from their image derivatives, each with its _vjp.
 #pragma once
 
 #include <cmath>
@@ -10,13 +9,13 @@
 
 namespace edgegrad {
 
-// The coordinates of one pixel and their derivatives in the image: (u, v), or for a cube the direction (x, y, z);
-// ∂/∂X and ∂/∂Y of each in turn.
+// Holds the coordinates of one pixel and their derivatives in the image: (u, v), or the direction (x, y, z) for a cube.
+// ∂/∂X and ∂/∂Y of each alternate.
 struct TextureCoordinates {
     double at[3] = {}, by_pixel[6] = {};
 };
 
-// False where a cube has no such direction.
+// Returns false where a cube has no such direction.
 inline bool place_of(const TextureCoordinates& uv, Border border, TexturePlace& out) {
     if (border != Border::cube) {
         out = {0, uv.at[0], uv.at[1]};
@@ -41,11 +40,11 @@ inline void place_vjp(const TextureCoordinates& uv, Border border, const Texture
     uv_bar.at[axes.major] -= 0.5 * axes.sign * (bar.x * s + bar.y * t) / m;
 }
 
-// How (s, t) in texels change for a pixel to the right (X) and up (Y): rows of s and of t.
+// Returns how (s, t) in texels change for a pixel to the right (X) and up (Y): rows of s and of t.
 inline Mat2 texels_a_pixel(const TextureCoordinates& uv, const TextureShape& t, const TexturePlace& place) {
     const double w = double(t.width), h = double(t.height), *d = uv.by_pixel;
     if (t.border != Border::cube) return {w * d[0], w * d[1], h * d[2], h * d[3]};
-    // s = (±x_s / m + 1) / 2: ∂s = (±∂x_s − (2 s − 1) ∂m) / (2 m).
+    // s = (±x_s / m + 1) / 2 gives ∂s = (±∂x_s − (2 s − 1) ∂m) / (2 m).
     const CubeFace& axes = cube_faces[place.side];
     const double scale = 0.5 * w / std::fabs(uv.at[axes.major]), s = 2 * place.s - 1, r = 2 * place.t - 1;
     const auto of = [&](int axis, int k) { return d[2 * axis + k]; };
@@ -64,7 +63,7 @@ inline void texels_a_pixel_vjp(const TextureCoordinates& uv, const TextureShape&
     const CubeFace& axes = cube_faces[place.side];
     const double size = std::fabs(uv.at[axes.major]), scale = 0.5 * w / size, s = 2 * place.s - 1, r = 2 * place.t - 1;
     const double s_bar[2] = {scale * bar.xx, scale * bar.xy}, t_bar[2] = {scale * bar.yx, scale * bar.yy};
-    double by_s = 0, by_t = 0;  // cotangents of 2 s − 1 and 2 t − 1
+    double by_s = 0, by_t = 0;  // They are cotangents of 2 s − 1 and 2 t − 1.
     for (int k = 0; k < 2; ++k) {
         const double m = axes.sign * uv.by_pixel[2 * axes.major + k];
         d[2 * axes.s + k] += axes.s_sign * s_bar[k], d[2 * axes.t + k] += axes.t_sign * t_bar[k];
@@ -72,18 +71,18 @@ inline void texels_a_pixel_vjp(const TextureCoordinates& uv, const TextureShape&
         by_s -= m * s_bar[k], by_t -= m * t_bar[k];
     }
     place_vjp(uv, t.border, place, {2 * by_s, 2 * by_t}, uv_bar);
-    // And of 1 / m.
+    // This adds the cotangent of 1 / m.
     const Mat2 jacobian = texels_a_pixel(uv, t, place);
     const double along = jacobian.xx * bar.xx + jacobian.xy * bar.xy + jacobian.yx * bar.yx + jacobian.yy * bar.yy;
     uv_bar.at[axes.major] -= axes.sign * along / size;
 }
 
-// log2 of the longer axis of the ellipse of texels that a pixel's circle becomes: half that of the larger eigenvalue
-// of JᵀJ. −∞ where J is zero.
+// Computes log2 of the longer axis of the ellipse of texels that a pixel's circle maps to. It is half that of the
+// larger eigenvalue of JᵀJ, or −∞ where J is zero.
 struct LongAxis {
     double level;
-    Vec2 direction;  // the eigenvector, of length 1
-    double square;   // the eigenvalue
+    Vec2 direction;  // It is the unit eigenvector.
+    double square;   // It is the eigenvalue.
 
     explicit LongAxis(const Mat2& j) {
         const double a = j.xx * j.xx + j.yx * j.yx, b = j.xx * j.xy + j.yx * j.yy, c = j.xy * j.xy + j.yy * j.yy;
@@ -95,7 +94,7 @@ struct LongAxis {
         direction = size > 0 ? 1 / size * v : Vec2{1, 0};
     }
 };
-// δ square = 2 (J v) · (δJ v)
+// Uses δ square = 2 (J v) · (δJ v).
 inline Mat2 long_axis_vjp(const Mat2& j, const LongAxis& axis, double level_bar) {
     const double scale = level_bar / (std::numbers::ln2 * axis.square);
     const Vec2 v = axis.direction, jv = scale * (j * v);

@@ -1,5 +1,5 @@
-// Faces that are alpha-tested: a point of one is there where an alpha texture, at its texture coordinates, is at least
-// a cutoff. Elsewhere rays pass through.
+// Tests alpha-tested faces. A point of one exists where an alpha texture, at its texture coordinates, is at least a
+// cutoff. Rays pass through elsewhere.
 #pragma once
 
 #include "camera/face_map.h"
@@ -17,7 +17,7 @@ Vec2 interpolated_uv(const SceneView<T>& scene, int64_t face, Barycentrics b) {
     return uv0 + b.u * (uv(1) - uv0) + b.v * (uv(2) - uv0);
 }
 
-// Of a face that may be alpha-tested.
+// Returns the alpha texture of an alpha-tested face.
 template <class T>
 Texture<T> alpha_of(const SceneView<T>& scene, int64_t face) {
     return texture_at(scene.alpha_masks.alphas, scene.alpha_masks.textures, scene.alpha_masks.face[face]);
@@ -27,7 +27,7 @@ double cutoff_of(const SceneView<T>& scene, int64_t face) {
     return scene.alpha_masks.cutoffs[scene.alpha_masks.face[face]];
 }
 
-// Whether a face is there at a point of it.
+// Returns whether a face exists at a point of it.
 template <class T>
 bool shows(const SceneView<T>& scene, int64_t face, Barycentrics b) {
     if (!scene.alpha_masks.on(face)) return true;
@@ -37,11 +37,11 @@ bool shows(const SceneView<T>& scene, int64_t face, Barycentrics b) {
     return value >= cutoff_of(scene, face);
 }
 
-// What a camera's rays pass through.
+// Implements the alpha test for a camera's rays.
 template <class T>
 class AlphaMasks final : public AlphaTest {
    public:
-    // `q` (V,): the vertices in camera coordinates.
+    // `q` (V,) holds the vertices in camera coordinates.
     AlphaMasks(const SceneView<T>& scene, const Camera& camera, const Vec3* q)
         : scene_(scene), camera_(camera), q_(q) {}
 

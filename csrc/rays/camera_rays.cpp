@@ -23,7 +23,7 @@ void CameraFrame::cast(CameraRays& rays, const RayCaster::Ignored* ignored) cons
 }
 
 double CameraFrame::error(Vec3 p) const {
-    // Positions are rounded as far from the centre as they are; rays where they start: see prepare().
+    // Positions are rounded by their distance from the centre; rays by where they start (see prepare()).
     const double start = frame_.unit * (far_ ? 2 * frame_.radius : length(eye_));
     return 4 * std::numeric_limits<float>::epsilon() * (length(p - frame_.centre) + start);
 }
@@ -43,7 +43,7 @@ void CameraRays::look_through(const CameraFrame& frame) {
         packets_);
 }
 
-// Always inlined, so that it is compiled for each of the processors that prepare() below is for.
+// Always inlined, so it is compiled for each processor of prepare() below.
 template <int W>
 [[gnu::always_inline]] inline void CameraRays::prepare(Packets<W>& packets) const {
     const CameraFrame& camera = *camera_;
@@ -53,7 +53,7 @@ template <int W>
         const double *x = n_x + k, *y = n_y + k;
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.t_far[i] = std::numeric_limits<float>::infinity();
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.geometry[i] = RayPacket<W>::nothing;
-        // Where a lens shows nothing, there is no ray: one that ends before it starts.
+        // Where a lens shows nothing, the ray ends before it starts.
         if (!camera.undistorted_)
             for (int i = 0; i < W; ++i)
                 if (!std::isfinite(x[i])) p.t_far[i] = -1;
@@ -68,8 +68,8 @@ template <int W>
             Vec3 o = camera.eye_, d = Z;
             if (camera.perspective_) d += across;
             else o += (1 / camera.frame_.unit) * across;
-            // Float positions of a far origin would be coarser than the scene, so the ray starts just before it,
-            // computed here in double; never behind the eye.
+            // Float positions of a far origin would be coarser than the scene. The ray therefore starts just before the
+            // scene, computed here in double, and never behind the eye.
             const double start = camera.frame_.start(o, d);
             o += (camera.perspective_ && start < 0 ? 0 : start) * d;
             p.origin_x[i] = float(o.x), p.origin_y[i] = float(o.y), p.origin_z[i] = float(o.z);

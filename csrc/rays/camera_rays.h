@@ -1,4 +1,4 @@
-// The rays of a camera: where they start, and where they go.
+// Generates the rays of a camera.
 #pragma once
 
 #include <limits>
@@ -9,7 +9,7 @@
 
 namespace edgegrad {
 
-// What rays pass through: faces that are not there where the ray at n meets them (rays/alpha_mask.h).
+// Tells which faces are transparent where the ray at n hits them (rays/alpha_mask.h).
 class AlphaTest {
    public:
     virtual bool shows(int32_t face, Vec2 n) const = 0;
@@ -20,25 +20,25 @@ class AlphaTest {
 
 class CameraRays;
 
-// A camera in the frame of a ray structure.
+// Holds a camera in the frame of a ray structure.
 class CameraFrame {
    public:
-    // `through`: null if all faces are there everywhere.
+    // `alpha_test` is null if no face is alpha-tested.
     CameraFrame(const RayCaster& caster, const Camera& camera, const AlphaTest* alpha_test);
 
-    // The nearest face along each ray that is there, of those that the ray does not ignore.
+    // Finds the nearest face along each ray that exists there and that the ray does not ignore.
     void cast(CameraRays& rays, const RayCaster::Ignored* ignored = nullptr) const;
 
-    // The same through what `meets(face)` refuses.
+    // Does the same, and passes through faces that `meets(face)` rejects.
     template <class Meets>
     void cast_with_alpha_test(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const;
 
-    // World units by which a ray may miss a point p that it was aimed at: a few roundings of what Embree is given.
+    // Returns the world units by which a ray may miss a point p that it aims at: a few roundings of Embree's inputs.
     double error(Vec3 p) const;
 
-    // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its border a face
-    // may be hit that the ray misses: at a silhouette of a fine mesh that is a neighbour which is seen less wide than
-    // floats are apart. `meets(face)` decides, in double where that matters; what it refuses is passed through.
+    // Returns what one ray truly hits, where `face` is what the cast found. Embree decides in float, so it may hit a
+    // face near its border that the ray misses. At a silhouette of a fine mesh, that is a neighbour narrower than the
+    // spacing of floats. `meets(face)` decides, in double where that matters; the ray passes through rejected faces.
     template <class Meets>
     int32_t beyond_float(Vec2 n, int32_t face, RayCaster::Ignored ignored, Meets meets) const;
 
@@ -47,20 +47,20 @@ class CameraFrame {
     const RayCaster& caster_;
     const AlphaTest* alpha_test_;
     RayFrame frame_;
-    Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
+    Vec3 axis_x_, axis_y_, axis_z_;  // They are the camera's axes in world coordinates, times any scale.
     Vec3 eye_;
     bool perspective_, far_, undistorted_;
 };
 
-// Rays by where they go in the image.
+// Holds rays by their image positions.
 class CameraRays : public RayBatch {
    public:
     explicit CameraRays(const CameraFrame& frame, int width = packet_width());
 
-    // From now on.
+    // Uses this camera from now on.
     void look_through(const CameraFrame& frame);
 
-    // Normalised image coordinates; the caller fills them from `count` on.
+    // They are normalised image coordinates; the caller fills them from `count` on.
     double n_x[size] = {}, n_y[size] = {};
 
     Vec2 n(int i) const { return {n_x[i], n_y[i]}; }

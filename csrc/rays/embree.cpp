@@ -31,7 +31,7 @@ namespace embree {
 
 Library rtc;
 
-// Embree keeps one error a thread and device; asking clears it.
+// Embree keeps one error per thread and device; asking clears it.
 void throw_on_error(const char* doing) {
     const int error = rtc.rtcGetDeviceError(rtc.device);
     if (error == ERROR_OUT_OF_MEMORY) throw std::bad_alloc();
@@ -94,16 +94,16 @@ std::mutex embree_mutex;
 
 namespace {
 
-std::chrono::steady_clock::time_point last_build;  // guarded by embree_mutex
+std::chrono::steady_clock::time_point last_build;  // embree_mutex guards it.
 
 #if defined(__linux__)
 constexpr char worker_name[] = "embree";
 
-// Whether one of these threads runs, or waits for a processor.
+// Returns whether one of these threads runs, or waits for a processor.
 bool a_worker_is_awake() {
     std::error_code error;
     for (const auto& task : std::filesystem::directory_iterator("/proc/self/task", error)) {
-        std::string line;  // number (name) state …
+        std::string line;  // It has the form: number (name) state ….
         std::getline(std::ifstream(task.path() / "stat"), line);
         const size_t name = line.find('('), state = line.rfind(')') + 2;
         if (name == std::string::npos || state >= line.size()) continue;
@@ -117,11 +117,11 @@ bool a_worker_is_awake() { return false; }
 
 }  // namespace
 
-// A build is over when its work is done, not when the threads that helped have gone: on their way they take locks of
-// TBB, and a child that is forked just then would wait for these for ever. They look for more work for much less than a
-// millisecond, but a busy machine may keep one from running for long. Linux tells; elsewhere, and for threads that
-// another user of TBB started, all one can do is wait a while. Twice asleep, for the last one awake may have woken one
-// that was looked at before.
+// Waits until Embree's threads sleep. A build ends with its work, while its helpers still take locks of TBB on their
+// way out. A child forked just then would wait for these locks forever. Helpers look for more work for much less than a
+// millisecond, but a busy machine may delay one. Linux tells their state. Elsewhere, and for threads that another user
+// of TBB started, only waiting helps. Two checks are needed, because the last one awake may have woken one that was
+// checked before.
 void let_embree_sleep() {
     using std::chrono::milliseconds;
     std::this_thread::sleep_until(last_build + milliseconds(20));
@@ -135,7 +135,7 @@ namespace embree {
 void note_build() { last_build = std::chrono::steady_clock::now(); }
 
 #if defined(__linux__)
-// They inherit its name.
+// New threads inherit its name.
 NamedWorkers::NamedWorkers() { prctl(PR_GET_NAME, own_), prctl(PR_SET_NAME, worker_name); }
 NamedWorkers::~NamedWorkers() { prctl(PR_SET_NAME, own_); }
 #else
@@ -151,7 +151,7 @@ void open_embree(const std::string& path, const std::string& options) {
         if (rtc.device) return;
         open_device(path, options);
     }
-    // The first scene starts Embree's threads: a millisecond that would be missed in the first render.
+    // The first scene starts Embree's threads, so the first render does not lose a millisecond.
     const int32_t face[3] = {0, 1, 2};
     const double verts[9] = {0, 0, 0, 1, 0, 0, 0, 1, 0};
     ThreadTeam team(1);

@@ -1,5 +1,5 @@
-// The part of Embree's C interface (version 4, https://www.embree.org/api.html) that raycast.cpp uses. The library
-// comes with the embreex wheel, which carries no headers; it is opened at run time.
+// Declares the part of Embree's C interface (version 4, https://www.embree.org/api.html) that raycast.cpp uses. The
+// library comes with the embreex wheel, which carries no headers; it is opened at run time.
 #pragma once
 
 #include <cstddef>
@@ -32,22 +32,22 @@ struct FilterArguments {
     int* valid;
     void* geometryUserPtr;
     RayQueryContext* context;
-    void* ray;  // structure of arrays of length N, in the order of RayPacket
+    void* ray;  // It is a structure of arrays of length N, in the order of RayPacket.
     void* hit;
     unsigned N;
 };
 
-// RTCIntersectArguments and RTCOccludedArguments, which are of one layout.
+// Matches RTCIntersectArguments and RTCOccludedArguments, which have the same layout.
 struct IntersectArguments {
     int flags;
     unsigned feature_mask;
     RayQueryContext* context;
     void (*filter)(const FilterArguments*);
     void* intersect;
-    float min_width_distance_factor;  // present in some builds only; last, so harmless elsewhere
+    float min_width_distance_factor;  // Only some builds have it; it is last, so harmless elsewhere.
 };
 
-// One member for each function: name, result, parameters.
+// Lists one member per function: name, result, parameters.
 #define EDGEGRAD_EMBREE_FUNCTIONS(X)                                                                         \
     X(rtcNewDevice, Device, (const char*))                                                                   \
     X(rtcGetDeviceProperty, ptrdiff_t, (Device, int))                                                        \

@@ -1,4 +1,4 @@
-// The opened library, for the sources of this folder alone.
+// Gives the opened library to the sources of this folder alone.
 #pragma once
 
 #include "rays/embree_api.h"
@@ -15,7 +15,7 @@ struct Library {
 };
 extern Library rtc;
 
-// Throws what went wrong in this thread since it last asked.
+// Throws the error of this thread since the last call, if any.
 void throw_on_error(const char* doing);
 
 // While it lives, threads that this one starts count as Embree's: see let_embree_sleep().
@@ -28,7 +28,7 @@ class NamedWorkers {
     [[maybe_unused]] char own_[16] = {};
 };
 
-// To be said with embree_mutex held.
+// Records a build, with embree_mutex held.
 void note_build();
 
 }  // namespace edgegrad::embree

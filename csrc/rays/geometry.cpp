@@ -15,7 +15,7 @@ Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
 namespace {
 
 std::mutex mutex;
-// The most recently used first. Never destroyed: another thread may render while the process ends.
+// The most recently used is first. The list is never destroyed, as threads may render while the process ends.
 std::list<std::shared_ptr<Geometry>>& kept = *new std::list<std::shared_ptr<Geometry>>;
 constexpr size_t most_kept = 8;
 
@@ -26,7 +26,7 @@ bool same(const std::vector<T>& kept_values, const T* values, int64_t n) {
 
 }  // namespace
 
-// One request for geometry: what is found in the list and what is put there, each under the lock.
+// Handles one request for geometry: it searches the list and extends it, each under the lock.
 class KeptGeometry {
    public:
     KeptGeometry(const int32_t* faces, int64_t n_faces, const double* verts, int64_t n_verts, const Spacing& spacing)
@@ -59,8 +59,7 @@ class KeptGeometry {
     }
 
    private:
-    // Whether there is geometry at these positions. If not, takes one to be moved out of the list, where there is one
-    // that nobody uses.
+    // Returns whether there is geometry at these positions. If not, takes an unused one out of the list, if any.
     bool find(GeometryWanted wanted) {
         const std::lock_guard lock(mutex);
         auto found = kept.end();
@@ -78,12 +77,12 @@ class KeptGeometry {
         find_intersections_ = wanted.intersections && !(geometry_ && geometry_->intersections_);
         if (find_intersections_ && geometry_) order_ = std::move(geometry_->order_);
         make_parts_ = wanted.parts && !(geometry_ && geometry_->parts_);
-        // Edges of other positions, which nobody reads: taken, so that nobody else welds them at the same time.
+        // Edges of other positions have no readers. Taking them keeps other threads from welding them at the same time.
         if (weld_ && geometry_) topology_ = std::move(geometry_->topology_);
         return here;
     }
 
-    // Puts what was made into the geometry, and that into the list, unless another thread has done so meanwhile.
+    // Stores the results in the geometry, and that in the list, unless another thread has done so meanwhile.
     void keep(bool moved) {
         const std::lock_guard lock(mutex);
         if (topology_ && !geometry_->welded_) geometry_->topology_ = std::move(topology_), geometry_->welded_ = true;
@@ -126,7 +125,7 @@ void clear_geometry() {
 
 namespace {
 
-// Calls of before_fork() that this thread has open: Python registers them anew when the package is imported again.
+// Counts this thread's open calls of before_fork(), which Python registers again with each import of the package.
 thread_local int forks = 0;
 
 }  // namespace
@@ -135,7 +134,7 @@ void before_fork() {
     if (forks++) return;
     mutex.lock();
     embree_mutex.lock();
-    // Embree's threads are not missed in the child, where the one that builds can do all of the work.
+    // The child does not need Embree's threads, because the building thread can do all of the work.
     let_embree_sleep();
     end_waiting_threads();
 }

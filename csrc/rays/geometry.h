@@ -1,5 +1,4 @@
-// What depends on faces and positions alone, kept between calls: the ray structure, the edges, and where
-// faces pass through each other.
+// Keeps what depends on faces and positions alone between calls: ray structure, edges, and intersections of faces.
 #pragma once
 
 #include <cstdint>
@@ -12,16 +11,16 @@
 
 namespace edgegrad {
 
-// What acquire_geometry is to have ready besides the ray structure.
+// Says what acquire_geometry must provide besides the ray structure.
 struct GeometryWanted {
     bool topology = false, parts = false, intersections = false;
 };
 
-// What it had to do.
+// Says what it had to do.
 struct GeometryWork {
-    bool rays = false;           // built or updated the ray structure
-    bool edges = false;          // found or welded the edges
-    bool intersections = false;  // found where faces pass through each other
+    bool rays = false;           // It built or updated the ray structure.
+    bool edges = false;          // It found or welded the edges.
+    bool intersections = false;  // It found the intersections of faces.
 };
 
 class Geometry {
@@ -30,8 +29,7 @@ class Geometry {
 
     const RayCaster& caster() const { return caster_; }
 
-    // These are there if acquire_geometry was asked for them; edges and intersections are those at the current
-    // positions.
+    // These exist if acquire_geometry was asked for them; edges and intersections are those at the current positions.
     const Topology& topology() const { return *topology_; }
     const Parts& parts() const { return *parts_; }
     const Intersections& intersections() const { return *intersections_; }
@@ -44,27 +42,27 @@ class Geometry {
     RayCaster caster_;
     std::unique_ptr<Topology> topology_;
     std::unique_ptr<Parts> parts_;
-    std::unique_ptr<Intersections> intersections_;  // null: not found yet at the current positions
-    FaceOrder order_;                               // that they were found in
-    Spacing spacing_;                               // decides what is welded
-    bool welded_ = false;                           // at the current positions
+    std::unique_ptr<Intersections> intersections_;  // Null means not found yet at the current positions.
+    FaceOrder order_;                               // The intersections were found in this order.
+    Spacing spacing_;                               // It decides which vertices are welded.
+    bool welded_ = false;                           // It refers to the current positions.
 };
 
-// The geometry of these faces at these positions, with what is wanted. One that is still in memory is used
-// again: as it is when the positions are the same, updated when they moved and nobody else uses it. What is compared is
-// the content of the arrays, so tensors may be copied, changed in place or freed without harm. What can take long is
-// done without a lock: a signal handler may render, or wait for a thread that does. So two threads that ask for the
-// same new geometry at once both make it, and one is kept. Throws Interrupted where the call is to stop.
+// Returns the geometry of these faces at these positions, with what is wanted. It reuses geometry in memory: unchanged
+// at the same positions, or updated if nobody else uses it. Comparing the contents of arrays lets tensors be copied,
+// changed in place or freed. Slow work needs no lock, because a signal handler may render, or wait for a thread that
+// does. Two threads that request the same new geometry at once therefore both make it, and one is kept. Throws
+// Interrupted where the call is to stop.
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
                                                  int64_t n_verts, const Spacing& spacing, GeometryWanted wanted,
                                                  ThreadTeam& team, GeometryWork& work);
 
-// Forgets all kept geometry that is not in use.
+// Releases all kept geometry that is not in use.
 void clear_geometry();
 
-// To be called around fork(), so that the child can render. Only the thread that forks lives on there. Before, wait
-// until no thread changes kept geometry or builds a ray structure, since the child would find their locks taken.
+// These surround fork(), so that the child can render. Only the forking thread survives there. before_fork() waits
+// until no thread changes kept geometry or builds a ray structure, because the child would find their locks taken.
 void before_fork();
-void after_fork();  // in the parent and in the child
+void after_fork();  // The parent and the child both call it.
 
 }  // namespace edgegrad

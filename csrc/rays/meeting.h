@@ -1,4 +1,4 @@
-// What a ray truly meets, decided in double: Embree says in float which faces may be it.
+// Decides in double what a ray truly hits; Embree proposes faces in float.
 #pragma once
 
 #include <algorithm>
@@ -13,24 +13,24 @@ namespace edgegrad {
 
 inline Vec3 vec(const double* v) { return {v[0], v[1], v[2]}; }
 
-// In world coordinates.
+// Returns a corner in world coordinates.
 template <class T>
 Vec3 corner(const SceneView<T>& scene, int64_t face, int i) {
     return vec(scene.verts + 3 * int64_t(scene.faces[3 * face + i]));
 }
 
-// Where a ray meets the plane of a face: barycentrics, and the distance in lengths of its direction (Möller and
-// Trumbore 1997). Not numbers where it runs along the plane.
+// Holds where a ray meets the plane of a face: barycentrics, and the distance in lengths of its direction (Möller and
+// Trumbore 1997). They are NaN or infinite where the ray runs along the plane.
 struct Meeting {
     double u, v, t;
 
-    // What doubles cannot distinguish from the border of a face.
+    // Doubles cannot distinguish less than this from the border of a face.
     static constexpr double rounding = 1e-12;
 
     bool exists() const { return std::isfinite(u + v + t); }
-    // The least barycentric: below zero outside of the face.
+    // Returns the least barycentric, which is negative outside of the face.
     double margin() const { return std::min({u, v, 1 - u - v}); }
-    // Within the face, to the precision of doubles.
+    // Returns whether the point lies within the face, to double precision.
     bool inside() const { return margin() >= -rounding; }
 };
 template <class T>
@@ -42,9 +42,9 @@ Meeting meet(const SceneView<T>& scene, int64_t face, const Ray& ray) {
     return {dot(s, p) * scale, dot(ray.direction, q) * scale, dot(e2, q) * scale};
 }
 
-// Casts n rays, at most a batch, each again and again without the faces that `accept(i, face)` refuses, until it
-// accepts one or there is none: then `face` is −1. `without[i]` holds the faces that ray i ignores, ascending; those
-// that were refused are put among them.
+// Casts n rays, at most a batch. It casts each again without the faces that `accept(i, face)` rejects, until it accepts
+// one or none is left, when `face` is −1. `without[i]` holds the faces that ray i ignores, ascending, and receives the
+// rejected ones.
 template <class MakeRay, class Accept>
 void cast_each(const RayCaster& caster, int n, int32_t* face, std::vector<int32_t>* without, MakeRay make,
                Accept accept) {

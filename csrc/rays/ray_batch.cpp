@@ -41,7 +41,7 @@ void RayBatch::set(int i, const RayFrame& frame, const Ray& ray) {
     else write(std::get<Packets<8>>(packets_)[i / 8], i % 8);
 }
 
-// Always inlined, so that it is compiled for each of the processors that read_faces() below is for.
+// Always inlined, so it is compiled for each processor of read_faces() below.
 template <int W>
 [[gnu::always_inline]] inline void RayBatch::read_faces(const Packets<W>& packets) {
     for (int k = 0; k < count; k += W) {

@@ -1,4 +1,4 @@
-// Rays that are cast together, in packets as Embree takes them.
+// Batches rays in packets for Embree.
 #pragma once
 
 #include <array>
@@ -12,8 +12,7 @@
 
 namespace edgegrad {
 
-// W rays and what they hit, in the layout of Embree's RTCRayHit8 and RTCRayHit16, so that nothing is copied to cast
-// them.
+// Holds W rays and their hits in the layout of Embree's RTCRayHit8 and RTCRayHit16, so that a cast copies nothing.
 template <int W>
 struct alignas(4 * W) RayPacket {
     float origin_x[W] = {}, origin_y[W] = {}, origin_z[W] = {}, t_near[W] = {};
@@ -23,18 +22,18 @@ struct alignas(4 * W) RayPacket {
     float normal_x[W] = {}, normal_y[W] = {}, normal_z[W] = {}, u[W] = {}, v[W] = {};
     unsigned triangle[W] = {}, geometry[W] = {}, instance[W] = {}, instance_primitive[W] = {};
 
-    static constexpr unsigned nothing = ~0u;  // what `geometry` is before a cast, and if nothing is hit
+    static constexpr unsigned nothing = ~0u;  // `geometry` has this before a cast, and if nothing is hit.
     RayPacket();
 };
 
-// In world units; it ends at origin + end · direction.
+// A ray in world units ends at origin + end · direction.
 struct Ray {
     Vec3 origin, direction;
     double end = std::numeric_limits<double>::infinity();
 };
 
-// Rays that wait to be cast together, and what they met. They are all made before the first packet is cast: Embree
-// loads whole vectors, and one that was just written piece by piece is not there yet.
+// Holds rays that are cast together, and their hits. All rays are made before the first packet is cast: Embree loads
+// whole vectors, and one just written piece by piece is not available yet.
 class RayBatch {
    public:
     static constexpr int size = 64;
@@ -42,11 +41,11 @@ class RayBatch {
 
     int count = 0;
 
-    // Makes ray i. It is cast once: a cast leaves what it met in its place.
+    // Makes ray i. It is cast once, because a cast overwrites it with its hit.
     void set(int i, const RayFrame& frame, const Ray& ray);
 
-    int32_t face[size];    // after cast(): the one that each ray hit, −1 for nothing
-    uint8_t hidden[size];  // after cast_occluded(): whether there is one
+    int32_t face[size];    // cast() writes the face that each ray hit, −1 for nothing.
+    uint8_t hidden[size];  // cast_occluded() writes whether there is one.
 
    protected:
     template <int W>

@@ -11,15 +11,15 @@
 
 namespace edgegrad {
 
-// The frame in which Embree sees the scene.
+// Returns the frame in which Embree sees the scene.
 //
-// Its origin is where the detail is: the mean of the faces' centroids weighted with 1 / (longest side)². Floats are as
-// fine as their distance to the origin is short, so a small object on a wide ground plane keeps its shape.
+// Its origin is where the detail is: the mean of the faces' centroids weighted with 1 / (longest side)². Floats are
+// finest near the origin, so a small object on a wide ground plane keeps its shape.
 //
-// Its unit matters only where the scene spans many powers of ten, for floats round equally at any scale: but Embree
-// takes products of three lengths, which must not leave the range of floats, 1e-38 … 1e38. So where the farthest vertex
-// lies very many times the size of a face away, that size (its geometric mean) lies as far below the unit as that
-// vertex lies above it.
+// Its unit matters only where the scene spans many powers of ten, because floats round equally at any scale. Embree
+// takes products of three lengths, which must not leave the range of floats, 1e-38 … 1e38. If the farthest vertex lies
+// very many face sizes away, the unit is chosen between. The face size (the geometric mean) then lies as far below the
+// unit as that vertex lies above it.
 RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
     const auto& [faces, n_faces, verts, n_verts, used] = triangles;
     const auto vertex = [&](int64_t v) { return Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]}; };
@@ -27,7 +27,7 @@ RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
     struct Block {
         Vec3 sum;
         double weight = 0;
-        int64_t faces = 0, powers = 0;  // those that have a side; log₂ of its square, summed
+        int64_t faces = 0, powers = 0;  // They count faces with a side, and sum log₂ of the sides' squares.
     };
     const auto of_faces = team.map_blocks(n_faces, [&](int64_t first, int64_t last) {
         Block block;
@@ -38,7 +38,7 @@ RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
             const double side = std::max({dot(b - a, b - a), dot(c - b, c - b), dot(a - c, a - c)});
             if (side > 0) ++block.faces, block.powers += int64_t(std::bit_cast<uint64_t>(side) >> 52) - 1023;
             double w = 1 / side;
-            if (!(w <= std::numeric_limits<double>::max())) w = 0;  // a single point
+            if (!(w <= std::numeric_limits<double>::max())) w = 0;  // The face is a single point.
             block.weight += w;
             block.sum += w * (a - base + (b - base) + (c - base));
         }
@@ -64,9 +64,9 @@ RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
         return most;
     });
     unit = std::sqrt(*std::max_element(farthest.begin(), farthest.end())), radius = 1;
-    if (!(unit > 0)) unit = 1;  // a single point
+    if (!(unit > 0)) unit = 1;  // The scene is a single point.
     if (!all.faces) return frame;
-    constexpr int ordinary = 20, most = 70, most_of_radius = 36;  // powers of two
+    constexpr int ordinary = 20, most = 70, most_of_radius = 36;  // They are powers of two.
     const double size = double(all.powers) / (2 * double(all.faces)), span = std::log2(unit) - size;
     if (span > most) {
         char text[256];

@@ -1,4 +1,4 @@
-// Where Embree's floats lie in the world.
+// Places Embree's floats in the world.
 #pragma once
 
 #include <cstdint>
@@ -9,22 +9,22 @@
 
 namespace edgegrad {
 
-// The frame in which Embree sees the scene: (p − centre) / unit, where all of it lies within `radius` of the origin.
+// Maps the world to Embree's frame: (p − centre) / unit, where all of the scene lies within `radius` of the origin.
 struct RayFrame {
     Vec3 centre;
     double unit = 1, radius = 1;
 
     Vec3 position(Vec3 p) const { return (1 / unit) * (p - centre); }
 
-    // Whether floats around o, a position in the frame, would be coarser than the scene.
+    // Returns whether floats around o, a position in the frame, would be coarser than the scene.
     bool is_far(Vec3 o) const { return length(o) > 4 * radius; }
 
-    // How far along o + t d a ray may start instead: just before the ball in which everything lies.
+    // Returns how far along o + t d a ray may start instead: just before the bounding sphere of the scene.
     double start(Vec3 o, Vec3 d) const { return -dot(o, d) / dot(d, d) - 2 * radius; }
 };
 
-// That of the faces (F, 3) with vertices (V, 3), of which `used` (V,) says whether a face has them; all have one if it
-// is empty. Throws std::invalid_argument if floats cannot hold the faces together.
+// Holds the faces (F, 3) with vertices (V, 3). `used` (V,) says whether a face has a vertex; empty means all.
+// frame_of() throws std::invalid_argument if floats cannot hold the faces together.
 struct PlacedTriangles {
     const int32_t* faces;
     int64_t n_faces;

@@ -18,7 +18,7 @@ RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
       n_faces_(n_faces),
       n_verts_(n_verts),
       used_(n_verts, 0),
-      positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex
+      positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex.
     for (int64_t i = 0; i < 3 * n_faces; ++i) used_[faces[i]] = 1;
     if (std::find(used_.begin(), used_.end(), 0) == used_.end()) used_ = {};
     const std::lock_guard lock(embree_mutex);
@@ -29,8 +29,8 @@ RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
     rtc.rtcSetGeometryEnableFilterFunctionFromArguments(geometry, true);
     Scene scene = rtc.rtcNewScene(rtc.device);
     geometry_ = geometry, scene_ = scene;
-    // Low quality and dynamic at every build: fast, and which of two faces at the same depth wins does then not depend
-    // on what was rendered before.
+    // Low quality and dynamic builds are fast. They also make the winner of two faces at the same depth independent of
+    // earlier renders.
     rtc.rtcSetGeometryBuildQuality(geometry, BUILD_QUALITY_LOW);
     rtc.rtcSetSceneBuildQuality(scene, BUILD_QUALITY_LOW);
     rtc.rtcSetSceneFlags(scene, SCENE_FLAG_DYNAMIC | SCENE_FLAG_ROBUST | SCENE_FLAG_FILTER_FUNCTION_IN_ARGUMENTS);
@@ -50,14 +50,14 @@ void RayCaster::update(const double* verts, ThreadTeam& team) {
     frame_ = frame_of({faces_, n_faces_, verts, n_verts_, used_}, team);
     team.parallel_for_blocks(n_verts_, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
-            if (!uses(v)) continue;  // may be farther than floats reach
+            if (!uses(v)) continue;  // An unused vertex may be farther than floats reach.
             const Vec3 p = frame_.position({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
             positions_[3 * v] = float(p.x), positions_[3 * v + 1] = float(p.y), positions_[3 * v + 2] = float(p.z);
         }
     });
-    stop_ = false;  // what Embree's threads read comes after this, also for ThreadSanitizer, which cannot watch Embree
-    // Embree asks from any of its threads and holds locks of its own meanwhile. So that this one can ask the caller,
-    // whose signal handlers may render, another one builds what takes long.
+    stop_ = false;  // Embree's threads read after this, also for ThreadSanitizer, which cannot watch Embree.
+    // Embree calls back from any of its threads and holds locks meanwhile. Another thread therefore builds what takes
+    // long. This one can then ask the caller, whose signal handlers may render.
     if (n_faces_ < int64_t(1) << 18) return build();
     auto built = std::async(std::launch::async, [&] { build(); });
     try {
@@ -85,7 +85,7 @@ void RayCaster::build() {
 
 namespace {
 
-// valid_lanes.first[n]: the first n of 16 lanes are on. Embree wants them aligned as its vectors are.
+// valid_lanes.first[n] enables the first n of 16 lanes. Embree wants them aligned like its vectors.
 struct ValidLanes {
     alignas(64) int first[17][16] = {};
     constexpr ValidLanes() {
@@ -95,11 +95,12 @@ struct ValidLanes {
 } constexpr valid_lanes;
 
 struct RejectContext {
-    RayQueryContext query;                                   // first, so that a pointer to it is a pointer to this
-    const RayCaster::Ignored* ignored;                       // by ray, or null
-    bool (*meets)(const void* data, int ray, int32_t face);  // or null
+    // It is first, so that a pointer to it is a pointer to this.
+    RayQueryContext query;
+    const RayCaster::Ignored* ignored;                       // It is indexed by ray, or null.
+    bool (*meets)(const void* data, int ray, int32_t face);  // It may be null.
     const void* data;
-    int first = 0;  // of the packet's rays in the batch
+    int first = 0;  // It is the index of the packet's first ray in the batch.
 };
 
 void reject(const FilterArguments* a) {
@@ -108,14 +109,14 @@ void reject(const FilterArguments* a) {
     const auto* face = static_cast<const unsigned*>(a->hit) + 5 * a->N;
     for (unsigned i = 0; i < a->N; ++i) {
         if (i % 4 == 0 && i + 4 <= a->N && !(a->valid[i] | a->valid[i + 1] | a->valid[i + 2] | a->valid[i + 3])) {
-            i += 3;  // a packet has rays in antithetic sets, of which most did not meet the face
+            i += 3;  // Four lanes are skipped at once, because most rays of a packet miss the face.
             continue;
         }
         if (!a->valid[i]) continue;
         const int32_t f = int32_t(face[i]);
         bool found = false;
         if (context->ignored) {
-            // Most are the two faces of an edge; longer lists come sorted.
+            // Most lists are the two faces of an edge; longer ones are sorted.
             const auto& ignored = context->ignored[id[i]];
             found = ignored.size() > 16 ? std::binary_search(ignored.begin(), ignored.end(), f)
                                         : std::find(ignored.begin(), ignored.end(), f) != ignored.end();
@@ -159,7 +160,7 @@ void RayCaster::cast(RayBatch& batch, const Ignored* ignored, const Decision& me
 
 void RayCaster::cast_occluded(RayBatch& batch, const Ignored* ignored) const { cast_occluded(batch, ignored, nullptr); }
 
-// Embree moves the end of a ray that met something to −∞.
+// Embree sets the end of a ray that hit something to −∞.
 void RayCaster::cast_occluded(RayBatch& batch, const Ignored* ignored, const Decision* meets) const {
     trace(batch, Query::any, ignored, meets);
     std::visit(

@@ -15,49 +15,49 @@ namespace edgegrad {
 
 class RayCaster {
    public:
-    // The faces (F, 3) must outlive the caster.
+    // Keeps a reference to the faces (F, 3), which must outlive the caster.
     RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts);
     ~RayCaster();
     RayCaster(const RayCaster&) = delete;
     RayCaster& operator=(const RayCaster&) = delete;
 
-    // New positions (V, 3), world units. Throws std::invalid_argument if floats cannot hold the faces together, and
-    // Interrupted, after which the caster is of no more use.
+    // Sets new positions (V, 3), world units. Throws std::invalid_argument if floats cannot hold the faces together,
+    // and Interrupted, after which the caster is unusable.
     void update(const double* verts, ThreadTeam& team);
 
-    // Of Embree's structure, and of the copies of faces and vertices that it is made from. Resident memory grew by 74.4
-    // bytes a face between spheres of 327,680 and 1,310,720 faces, of which 12 are the faces, 18 the vertices and 1
-    // says which were seen.
+    // Bounds the memory of Embree's structure, and of the copies of faces and vertices from which it is made. Resident
+    // memory grew by 74.4 bytes a face between spheres of 327,680 and 1,310,720 faces. Of these, the faces take 12, the
+    // vertices 18, and the marks of seen faces 1.
     static int64_t bytes(int64_t faces, int64_t verts) { return faces * (44 + 12) + 36 * verts; }
 
-    // Whether a face has this vertex.
+    // Returns whether a face has this vertex.
     bool uses(int64_t vertex) const { return used_.empty() || used_[vertex]; }
 
     const RayFrame& frame() const { return frame_; }
 
-    // The faces that each ray of a batch ignores, if given. Those of a ray ascend if they are more than 16.
+    // Lists the faces that each ray of a batch ignores. A list of more than 16 ascends.
     using Ignored = std::span<const int32_t>;
 
-    // The nearest face along each ray.
+    // Finds the nearest face along each ray.
     void cast(RayBatch& batch, const Ignored* ignored = nullptr) const;
 
-    // The same through what `meets(ray, face)` refuses; `ray` counts those of the batch.
+    // Does the same, and passes through faces that `meets(ray, face)` rejects; `ray` is an index in the batch.
     template <class Meets>
     void cast_with_alpha_test(RayBatch& batch, const Ignored* ignored, const Meets& meets) const;
 
-    // Whether a ray meets any face.
+    // Finds whether each ray hits any face.
     void cast_occluded(RayBatch& batch, const Ignored* ignored = nullptr) const;
 
-    // The same of the faces that `meets(ray, face)` does not refuse.
+    // Does the same, and passes through faces that `meets(ray, face)` rejects.
     template <class Meets>
     void cast_occluded_with_alpha_test(RayBatch& batch, const Meets& meets) const;
 
-    // Embree's part of cast() alone, to be timed.
+    // Runs Embree's part of cast() alone, for timing.
     void trace(RayBatch& batch) const { trace(batch, Query::closest, nullptr, nullptr); }
 
    private:
     enum class Query { closest, any };
-    // What `call(data, ray, face)` says of each face that a ray might hit.
+    // Wraps `call(data, ray, face)`, which decides about each face that a ray might hit.
     struct Decision {
         bool (*call)(const void* data, int ray, int32_t face);
         const void* data;
@@ -72,13 +72,13 @@ class RayCaster {
 
     const int32_t* faces_;
     int64_t n_faces_, n_verts_;
-    std::vector<uint8_t> used_;  // (V,) by faces; empty: all are
-    // A scene keeps its float precision wherever it lies and whatever its unit.
+    std::vector<uint8_t> used_;  // (V,) whether faces use a vertex; empty: all are
+    // The frame keeps a scene's float precision at any position and in any unit.
     RayFrame frame_;
     std::vector<float> positions_;
     void *scene_ = nullptr, *geometry_ = nullptr;
     bool committed_ = false;
-    std::atomic<bool> stop_{false};  // asks a build to end
+    std::atomic<bool> stop_{false};  // It asks a build to end.
 };
 
 template <class Meets>

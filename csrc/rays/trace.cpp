@@ -26,16 +26,16 @@ Vec3 point_on(const SceneView<T>& scene, int64_t face, const double* b) {
     return (1 - u - v) * corner(scene, face, 0) + u * corner(scene, face, 1) + v * corner(scene, face, 2);
 }
 
-// At its border a face may be hit in float that the ray misses by a rounding: then it is hit at the border, for its
-// neighbour may be missed as well.
+// Returns the hit moved onto the face. Float may hit a face at its border that the ray misses by a rounding; the border
+// counts as hit, because the neighbour may be missed as well.
 Barycentrics onto_face(const Meeting& m) {
     double u = std::max(m.u, 0.0), v = std::max(m.v, 0.0);
     if (u + v > 1) u /= u + v, v = 1 - u;
     return {u, v};
 }
 
-// Whether a distance is beyond `contact`, or, for faces that share a vertex, beyond `rounding`. Few are so near that
-// this is asked.
+// Returns whether a distance exceeds `contact`, or `rounding` for faces that share a vertex. Few are so close that
+// shares() is called.
 template <class Shares>
 bool lies_beyond(double t, double contact, double rounding, Shares shares) {
     return t > std::max(contact, rounding) || (t > std::min(contact, rounding) && t > (shares() ? rounding : contact));
@@ -88,7 +88,7 @@ void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& l
             if (face == own) return false;
             const Meeting m = meet(scene, face, ray[i]);
             if (!(m.exists() && m.inside() && m.t < 1 - contact[i])) return false;
-            // How faces that share a vertex with the point's own lie to it is exact, however near they are.
+            // The position of faces that share a vertex with the point's own face is exact, however close they are.
             if (!lies_beyond(m.t, contact[i], Meeting::rounding, [&] { return share_vertex(scene, face, own); }))
                 return false;
             return shows(scene, face, inside({m.u, m.v}));
@@ -124,7 +124,7 @@ void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures
             [&](int i, int32_t hit) {
                 const int64_t k = first + i;
                 const Meeting m = meet(scene, hit, ray[i]);
-                // As in see(): how faces that share a vertex lie to one another is exact.
+                // The position of faces that share a vertex is exact, as in see().
                 if (!m.exists() || !lies_beyond(m.t, rays.contact[k], Meeting::rounding * extent(ray[i].origin),
                                                 [&] { return share_vertex(scene, hit, rays.face[k]); }))
                     return false;

@@ -1,5 +1,5 @@
-// Any rays through a scene, from where a user says: what they hit, and whether a point sees another. Embree says in
-// float which face a ray may meet, double decides whether it does, and whether the face is there or masked by alpha.
+// Traces rays of any origin through a scene, and tests the visibility between points. Embree proposes hits in float;
+// double decides about them, and about alpha-tested faces.
 #pragma once
 
 #include <cstdint>
@@ -11,44 +11,44 @@
 
 namespace edgegrad {
 
-// Origins and directions (N, 3).
+// Holds origins and directions (N, 3).
 struct TracedRays {
     const double *origins, *directions;
     int64_t size;
-    const int32_t* ignored = nullptr;  // (N,) a face that each passes through, −1: none; null: none at all
+    const int32_t* ignored = nullptr;  // (N,) a face that each ray ignores, −1: none; null: none at all
 };
 
 struct RayHits {
-    std::vector<int32_t> face;  // (N,) the nearest, −1: none
-    std::vector<double> b;      // (N, 2) where on it
+    std::vector<int32_t> face;  // (N,) the nearest face, −1: none
+    std::vector<double> b;      // (N, 2) last two barycentrics
 };
 template <class T>
 RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRays& rays, ThreadTeam& team);
 
-// N points on faces, and the points (N, 3) that they may see.
+// Holds N points on faces, and the points (N, 3) that they may see.
 struct Sightlines {
     const int32_t* face;
     const double *b, *to;
-    const double* contact;  // (N,) world units: what is nearer than this to either end hides nothing
+    const double* contact;  // (N,) world units: anything nearer than this to either end does not occlude
     int64_t size;
 };
-// (N,): 1 where nothing lies between the two. The face of the point itself hides nothing.
+// Returns (N,): 1 where nothing occludes the two points from each other. The point's own face does not occlude.
 template <class T>
 std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines,
                              ThreadTeam& team);
-// The same on one thread.
+// Does the same on one thread.
 template <class T>
 void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out);
 
-// N rays from points on faces (barycentrics (N, 2)) in unit directions (N, 3).
+// Holds N rays from points on faces (barycentrics (N, 2)) in unit directions (N, 3).
 struct Departures {
     const int32_t* face;
     const double *b, *directions;
-    const double* contact;  // (N,) world units: what is nearer than this to the point is not met
+    const double* contact;  // (N,) world units: anything nearer than this to the point is not hit
     int64_t size;
 };
-// The nearest face that each meets, −1: none, and where on it, (N, 2); on one thread. A ray does not meet the face that
-// it leaves.
+// Finds the nearest face that each ray hits, −1: none, and its barycentrics (N, 2), on one thread. A ray does not hit
+// the face that it leaves.
 template <class T>
 void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures& rays, int32_t* face, double* b);
 

@@ -1,12 +1,12 @@
-// Where two triangles pass through each other: a segment of the line that their planes share.
+// Intersects two triangles: the intersection is a segment of the line that their planes share.
 //
-// Each triangle cuts that line in an interval, whose ends lie on sides of the triangle that pass through the other
-// plane; the segment is where both overlap (Möller 1997, "A fast triangle-triangle intersection test").
+// Each triangle cuts an interval out of that line, whose ends lie on sides that pass through the other plane. The
+// segment is where both intervals overlap (Möller 1997, "A fast triangle-triangle intersection test").
 //
-// Only what truly crosses counts: of either triangle a vertex lies before the other's plane and one behind it. A vertex
-// that lies on the plane up to the rounding of the input (contact.h) is on it, and so is one that both share. So faces
-// that share an edge, by index or by place, or that touch, have no segment; nor have coplanar ones. Where a side of one
-// lies in the plane of the other, its surface may pass through there with the next face; that is told apart.
+// Only true crossings count: each triangle needs a vertex before the other's plane and one behind it. A vertex within
+// the rounding of the input (contact.h) lies on the plane, and so does a shared vertex. Faces that share an edge, by
+// index or by position, that touch, or that are coplanar, therefore have no segment. Where a side of one face lies in
+// the other's plane, its surface may pass through there with the next face. That case has its own kind.
 #pragma once
 
 #include <algorithm>
@@ -18,14 +18,14 @@
 
 namespace edgegrad {
 
-// A face in the world, and what a pair with it needs.
+// Holds a face in the world, and what its pairs need.
 struct PlacedFace {
-    const int32_t* vertex;  // 3
+    const int32_t* vertex;  // It has 3 elements.
     Vec3 p[3];
-    Vec3 e1, e2, normal;  // not normalised
+    Vec3 e1, e2, normal;  // They are not normalised.
     double normal_length;
-    double coordinate;  // the largest of its coordinates
-    double spacing;     // relative, of the input's numbers
+    double coordinate;  // It is the largest of the face's coordinates.
+    double spacing;     // It is the relative spacing of the input's numbers.
 
     void set(const double* verts, const int32_t* v, double spacing_) {
         vertex = v, spacing = spacing_, coordinate = 0;
@@ -42,12 +42,12 @@ struct PlacedFace {
 
 class FacePair {
    public:
-    Vec3 a, b;  // the ends of the segment
+    Vec3 a, b;  // They are the ends of the segment.
 
-    // `along`: a side of one face lies in the other one, and the face on one side of it.
+    // `along` means that a side of one face lies in the other one, with that face on one side of it.
     enum class Kind { none, through, along };
 
-    // Where `along`: which of the two, 0 or 1, lies on one side, the corner of it that does, and on which side.
+    // For `along`: the face (0 or 1) that lies on one side, its corner there, and which side that is.
     int lies_along = 0, corner = 0;
     bool before = false;
 
@@ -78,11 +78,12 @@ class FacePair {
     }
 
    private:
-    // Where the vertices of a face lie, seen from a plane: on both sides; on one side, but for a side of the face that
-    // lies in the plane; or else, all on one side or in the plane.
+    // Says where the vertices of a face lie relative to a plane. `both` means on both sides. `edge` means on one side,
+    // except a side of the face that lies in the plane. `one` means all others.
     enum class Side { both, edge, one };
 
-    // Of the vertices of g from the plane of f, with their distances times the length of its normal; 0 on the plane.
+    // Classifies the vertices of g relative to the plane of f. `distance` gets their distances times the length of the
+    // normal, or 0 on the plane.
     static Side side(const PlacedFace& f, const PlacedFace& g, const bool (&shared)[3], double tolerance,
                      double (&distance)[3]) {
         int before = 0, behind = 0;
@@ -100,7 +101,7 @@ class FacePair {
         return before && behind ? Side::both : before + behind == 1 ? Side::edge : Side::one;
     }
 
-    // Where the triangle meets the plane: its vertex there, or where a side passes through.
+    // Finds where the triangle meets the plane: at a vertex, or where a side passes through.
     static void interval(const PlacedFace& f, const double (&distance)[3], Vec3 (&end)[2]) {
         int n = 0;
         for (int i = 0; i < 3; ++i) {
@@ -108,7 +109,7 @@ class FacePair {
             if (distance[i] == 0) {
                 end[n++] = f.p[i];
             } else if ((distance[i] > 0 && distance[j] < 0) || (distance[i] < 0 && distance[j] > 0)) {
-                // From the lower vertex on, so that the faces on both sides of an edge find the same point.
+                // Starting at the lower vertex gives the faces on both sides of an edge the same point.
                 const bool low = f.vertex[i] < f.vertex[j];
                 const int k = low ? i : j, l = low ? j : i;
                 end[n++] = f.p[k] + (distance[k] / (distance[k] - distance[l])) * (f.p[l] - f.p[k]);
@@ -117,7 +118,7 @@ class FacePair {
     }
 
     bool overlap(const Vec3 (&first)[2], const Vec3 (&second)[2]) {
-        // Along the longer one: nearly parallel planes say little of the direction.
+        // The longer interval defines the direction, because nearly parallel planes determine it poorly.
         const Vec3 u = first[1] - first[0], v = second[1] - second[0];
         const Vec3 along = dot(u, u) > dot(v, v) ? u : v;
         const auto at = [&](Vec3 p) { return dot(p - first[0], along); };
@@ -129,8 +130,8 @@ class FacePair {
         return begin < end;
     }
 
-    bool shared_[2][3];      // whether a vertex is one of the other face
-    double distance_[2][3];  // of the vertices from the plane of the other face
+    bool shared_[2][3];      // They mark vertices of the other face.
+    double distance_[2][3];  // They are distances of the vertices from the other face's plane.
 };
 
 }  // namespace edgegrad

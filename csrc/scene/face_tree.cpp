@@ -13,14 +13,14 @@ namespace edgegrad {
 
 namespace {
 
-// Faces from which on a surface has nodes of its own.
+// A surface of at least this many faces has its own nodes.
 constexpr int32_t large_surface = 512;
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
 
-// Corners of eight faces side by side.
+// Holds the corners of eight faces in lanes.
 struct CornerLanes {
-    double p[3][3][BoxGroup::size];  // by corner and axis
+    double p[3][3][BoxGroup::size];  // Indices are corner and axis.
 
     void set(int lane, const double* verts, const int32_t* v) {
         for (int i = 0; i < 3; ++i)
@@ -28,9 +28,9 @@ struct CornerLanes {
     }
 };
 
-// Boxes in float that hold those in double: a float lies within half a spacing of the double that was rounded to it.
+// Sets float boxes that contain the double ones. A float lies within half a spacing of its double.
 EDGEGRAD_VECTORIZED void set_boxes(const CornerLanes& l, BoxGroup& boxes) {
-    constexpr double most = 0x1p127;  // the range of floats
+    constexpr double most = 0x1p127;  // It is the range of floats.
     for (int k = 0; k < 3; ++k) {
         EDGEGRAD_ROLLED
         for (int i = 0; i < BoxGroup::size; ++i) {
@@ -62,7 +62,7 @@ EDGEGRAD_VECTORIZED void set_corners(const CornerLanes& l, CornerGroup& g) {
 }
 
 struct FloatPlane {
-    float x, y, z, offset, error;  // of x p.x + y p.y + z p.z + offset
+    float x, y, z, offset, error;  // The plane is x p.x + y p.y + z p.z + offset.
     int32_t vertex[3];
 };
 
@@ -73,7 +73,7 @@ EDGEGRAD_VECTORIZED unsigned crossing_lanes(const CornerGroup& g, const FloatPla
     int32_t hit[lanes];
     EDGEGRAD_ROLLED
     for (int i = 0; i < lanes; ++i) {
-        // 1 where a corner is one of the other face, where it lies before the plane, and where behind.
+        // These are 1 where a corner belongs to the other face, where it lies before the plane, and where behind.
         const auto same = [&](int32_t v) { return int32_t(v == v0) | int32_t(v == v1) | int32_t(v == v2); };
         const auto at = [&](int c) { return x * g.p[c][0][i] + y * g.p[c][1][i] + z * g.p[c][2][i] + offset; };
         const int32_t s0 = same(g.vertex[0][i]), s1 = same(g.vertex[1][i]), s2 = same(g.vertex[2][i]);
@@ -96,7 +96,7 @@ double size_of(const FaceBox& box) {
     return size;
 }
 
-// The bits of x, of which there are 21, two places apart.
+// Moves the 21 bits of x three places apart.
 uint64_t spread_bits(uint64_t x) {
     x = (x | x << 32) & 0x001f00000000ffff, x = (x | x << 16) & 0x001f0000ff0000ff;
     x = (x | x << 8) & 0x100f00f00f00f00f, x = (x | x << 4) & 0x10c30c30c30c30c3;
@@ -122,7 +122,7 @@ EDGEGRAD_VECTORIZED unsigned overlapping_lanes(const BoxGroup& g, const AskewBox
     for (int j = 0; j < 3; ++j) {
         EDGEGRAD_ROLLED
         for (int i = 0; i < BoxGroup::size; ++i) {
-            // Halves first: the sum of the two may be too large for a float.
+            // Halving comes first, because the sum may overflow a float.
             const float low = 0.5f * g.low[j][i], high = 0.5f * g.high[j][i];
             middle[j][i] = (low + high) - box.middle[j], half[j][i] = high - low;
         }
@@ -137,7 +137,7 @@ EDGEGRAD_VECTORIZED unsigned overlapping_lanes(const BoxGroup& g, const AskewBox
         for (int i = 0; i < BoxGroup::size; ++i) {
             const float d = x * middle[0][i] + y * middle[1][i] + z * middle[2][i];
             const float reach = ax * half[0][i] + ay * half[1][i] + az * half[2][i] + most;
-            hit[i] = (d <= reach) & (-d <= reach) ? hit[i] : 0;  // of what is empty, both are NaN
+            hit[i] = (d <= reach) & (-d <= reach) ? hit[i] : 0;  // For an empty box, both are NaN.
         }
     }
     unsigned hits = 0;
@@ -180,8 +180,8 @@ unsigned CornerGroup::may_cross(const FacePlane& plane, double spacing) const {
                                   .y = float(N.y),
                                   .z = float(N.z),
                                   .offset = float(offset),
-                                  // Four products and sums of rounded numbers, each to half a spacing; twice that. What
-                                  // floats cannot hold tells nothing.
+                                  // Four products and sums of rounded numbers have half a spacing each; this is twice
+                                  // that. Overflow of floats rejects nothing.
                                   .error = float(0x1p-20 * size + touching) + std::numeric_limits<float>::min(),
                                   .vertex = {plane.vertex[0], plane.vertex[1], plane.vertex[2]}});
 }
@@ -197,10 +197,10 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, c
     if (int64_t(order.face.size()) == n_faces) {
         make_boxes(faces, verts, team);
         find_surfaces(topology, team);
-        // Half as large again, and more than twice the pairs overlap.
+        // If boxes are half as large again, more than twice the pairs overlap.
         if (spread() <= 1.5 * order.spread) return;
     }
-    // Where their middles lie.
+    // Returns the centroid of a face.
     const auto middle = [&](int64_t f) {
         const int32_t* v = faces + 3 * f;
         Vec3 m;
@@ -225,11 +225,11 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, c
         high = {std::max(high.x, h.x), std::max(high.y, h.y), std::max(high.z, h.z)};
     }
     struct Key {
-        int32_t surface;  // −1: a small one
+        int32_t surface;  // −1 means a small one.
         int32_t face;
         uint64_t code;
     };
-    std::vector<int32_t> size(n_faces, 0);  // of surfaces
+    std::vector<int32_t> size(n_faces, 0);  // It counts the faces of surfaces.
     for (int64_t f = 0; f < n_faces; ++f) ++size[topology.surface(int32_t(f))];
     std::vector<Key> keys(n_faces);
     team.parallel_for_blocks(n_faces, [&](int64_t, int64_t first, int64_t last) {
@@ -262,7 +262,7 @@ void FaceTree::make_boxes(const int32_t* faces, const double* verts, ThreadTeam&
             CornerGroup& corners = corners_[i];
             const int n = int(std::min<int64_t>(BoxGroup::size, n_faces - BoxGroup::size * i));
             for (int lane = 0; lane < BoxGroup::size; ++lane) {
-                // Where there are too few, the first one stands for them.
+                // The first face fills missing lanes.
                 const int32_t* v = faces + 3 * int64_t((*face_)[BoxGroup::size * i + (lane < n ? lane : 0)]);
                 lanes.set(lane, verts, v);
                 for (int c = 0; c < 3; ++c) corners.vertex[c][lane] = lane < n ? v[c] : -1;
@@ -306,7 +306,7 @@ void FaceTree::find_surfaces(const Topology& topology, ThreadTeam& team) {
         }
 }
 
-// Mean size of a leaf's box relative to that of all.
+// Returns the mean size of a leaf's box relative to the box of all.
 double FaceTree::spread() const {
     const double all = size_of(levels_.back()[0].bounds());
     if (levels_.size() == 1 || !(all > 0)) return 1;

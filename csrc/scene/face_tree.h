@@ -1,8 +1,8 @@
-// Boxes of faces in a tree, to find which of them overlap.
+// Holds a bounding volume hierarchy of faces, to find overlapping ones.
 //
-// Faces are sorted along a space-filling curve (Morton 1966), large surfaces one after the other; eight in a row are a
-// leaf, eight leaves in a row a node, and so on. The order is kept while the faces move, as long as it is nearly as
-// good as when it was made; boxes are made anew.
+// Faces are sorted along a space-filling curve (Morton 1966), large surfaces one after the other. Eight consecutive
+// faces are a leaf, eight leaves a node, and so on. The order persists while the faces move, as long as it is nearly as
+// good as initially. Boxes are always recomputed.
 #pragma once
 
 #include <algorithm>
@@ -17,10 +17,10 @@
 
 namespace edgegrad {
 
-// An order of faces in which neighbours lie near one another.
+// Orders faces so that neighbours are close in space.
 struct FaceOrder {
     std::vector<int32_t> face;
-    double spread = 0;  // mean size of a leaf's box relative to that of all, when it was made
+    double spread = 0;  // It was the mean size of a leaf's box relative to the box of all when the order was made.
 };
 
 struct FaceBox {
@@ -33,12 +33,12 @@ struct FaceBox {
     }
 };
 
-// A box that lies askew: those p for which axis[k] · (p − middle) is at most half[k].
+// An oriented box contains the points p for which |axis[k] · (p − middle)| is at most half[k].
 struct AskewBox {
     float middle[3], axis[3][3], half[3];
 };
 
-// Eight boxes side by side. Those that are missing are empty.
+// Holds eight boxes in lanes. Missing ones are empty.
 struct BoxGroup {
     static constexpr int size = 8;
     float low[3][size], high[3][size];
@@ -47,31 +47,31 @@ struct BoxGroup {
     FaceBox box(int lane) const;
     FaceBox bounds() const;
 
-    // Bit i: box i overlaps this one.
+    // Returns a mask whose bit i says that box i overlaps this one.
     unsigned overlapping(const FaceBox& box) const;
-    // … may overlap this one: what no face of it separates from box i.
+    // Returns a mask of boxes that may overlap this one: no face of the oriented box separates them.
     unsigned overlapping(const AskewBox& box) const;
 };
 
-// The plane of a face as its neighbours are compared with it.
+// Holds the plane of a face for comparison with its neighbours.
 struct FacePlane {
-    const int32_t* vertex;  // 3, of the face
+    const int32_t* vertex;  // It has the 3 vertices of the face.
     Vec3 origin, normal;
     double normal_length;
-    double coordinate;  // the largest of the face's coordinates
+    double coordinate;  // It is the largest of the face's coordinates.
 };
 
-// The corners of eight faces, relative to one of them, so that floats hold them well.
+// Holds the corners of eight faces relative to one of them, so that floats represent them well.
 struct CornerGroup {
     static constexpr int size = BoxGroup::size;
     Vec3 origin;
-    float reach;              // the largest of the numbers in p
-    float p[3][3][size];      // by corner and axis
-    int32_t vertex[3][size];  // −1: there is no face
+    float reach;              // It is the largest of the numbers in p.
+    float p[3][3][size];      // Indices are corner and axis.
+    int32_t vertex[3][size];  // −1 means that there is no face.
 
-    // Bit i: face i shares at most one vertex with a face, and its others lie neither all before the plane of that face
-    // nor all behind it, to the precision of floats, and by more than what touches may lie apart (contact.h) where no
-    // mesh is coarser than `spacing`. Of most neighbours this says all.
+    // Returns a mask of faces that may cross a plane's face. Face i shares at most one vertex with it, and its others
+    // lie neither all before the plane nor all behind it. Floats decide, with the margin of touching faces (contact.h)
+    // where no mesh is coarser than `spacing`. This rejects most neighbours.
     unsigned may_cross(const FacePlane& plane, double spacing) const;
 };
 
@@ -79,7 +79,7 @@ class FaceTree {
    public:
     static constexpr int leaf_size = BoxGroup::size;
 
-    // At these positions (V, 3). Makes the order where there is none, or one that fits no more.
+    // Builds the tree at the positions (V, 3). Makes an order if there is none, or the old one no longer fits.
     FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, const Topology& topology, FaceOrder& order,
              ThreadTeam& team);
 
@@ -90,23 +90,23 @@ class FaceTree {
                                    : levels_[1][leaf / BoxGroup::size].box(int(leaf % BoxGroup::size));
     }
     const CornerGroup& corners(int64_t leaf) const { return corners_[leaf]; }
-    // Of leaf and lane; −1: none.
+    // Returns the face at a leaf and lane, −1: none.
     int32_t face(int64_t leaf, int lane) const {
         const int64_t i = leaf * leaf_size + lane;
         return i < int64_t(face_->size()) ? (*face_)[i] : -1;
     }
 
-    // The surface (Topology) that all faces of a leaf belong to; −1: they are of several.
+    // Returns the surface (Topology) of all faces of a leaf, or −1 if they belong to several.
     int32_t surface(int64_t leaf) const { return surface_[0][leaf]; }
-    // … of the leaves first … first + span − 1, where `span` is a power of eight and `first` a multiple of it.
+    // Does the same for the leaves first … first + span − 1; `span` is a power of eight and divides `first`.
     int32_t surface(int64_t first, int64_t span) const {
         size_t level = 0;
         for (; span > 1 && level + 1 < surface_.size(); span /= BoxGroup::size) first /= BoxGroup::size, ++level;
         return surface_[level][first];
     }
 
-    // Calls found(leaf) for all leaves from `first` on that overlap the box, in their order, until it is false. Those
-    // of the surface `but`, if it is not −1, are left out.
+    // Calls found(leaf) in order for all leaves from `first` on that overlap the box, until it returns false. Leaves of
+    // the surface `but` are skipped unless it is −1.
     template <class Box, class Found>
     void each_leaf(const Box& box, int64_t first, int32_t but, Found found) const {
         if (levels_.size() > 1) visit(int(levels_.size()) - 1, 0, box, first, but, found);
@@ -124,11 +124,11 @@ class FaceTree {
     void find_surfaces(const Topology& topology, ThreadTeam& team);
     double spread() const;
 
-    // Group i of a level holds the boxes of groups 8 i … 8 i + 7 of the one below.
+    // Group i of a level holds the boxes of groups 8 i … 8 i + 7 of the level below.
     template <class Box, class Found>
     bool visit(int level, int64_t i, const Box& box, int64_t first, int32_t but, Found& found) const {
         const BoxGroup& group = levels_[level][i];
-        const int64_t span = int64_t(1) << 3 * (level - 1);  // leaves in one of its boxes
+        const int64_t span = int64_t(1) << 3 * (level - 1);  // It counts the leaves in one of the group's boxes.
         for (unsigned hits = group.overlapping(box); hits; hits &= hits - 1) {
             const int64_t child = BoxGroup::size * i + std::countr_zero(hits);
             if ((child + 1) * span <= first || (but >= 0 && surface_[level - 1][child] == but)) continue;
@@ -138,9 +138,9 @@ class FaceTree {
     }
 
     const std::vector<int32_t>* face_ = nullptr;
-    Array<CornerGroup> corners_{0};        // of each leaf
-    std::vector<Array<BoxGroup>> levels_;  // of faces, of leaves, …, the last one of one group
-    std::vector<Array<int32_t>> surface_;  // of leaves, of groups of leaves, …
+    Array<CornerGroup> corners_{0};        // Each leaf has a group.
+    std::vector<Array<BoxGroup>> levels_;  // They are those of faces, of leaves, …; the last level has one group.
+    std::vector<Array<int32_t>> surface_;  // They are those of leaves, of groups of leaves, ….
 };
 
 }  // namespace edgegrad

@@ -11,30 +11,31 @@ namespace edgegrad {
 
 namespace {
 
-constexpr int64_t most_leaves = 64, least_leaves = 8;  // of a prism
-constexpr float slab = 0.25;                           // how far it goes on beyond its faces, relative to its base
-constexpr double least_part = 0.1;  // of its base that its faces cover, or it reaches far beyond them
+constexpr int64_t most_leaves = 64, least_leaves = 8;  // They bound the leaves of a prism.
+constexpr float slab = 0.25;                           // It extends beyond its faces this far, relative to its base.
+// Its faces cover at least this part of its base, or it would reach far beyond them.
+constexpr double least_part = 0.1;
 
 constexpr int lanes = CornerGroup::size;
 constexpr float infinity = std::numeric_limits<float>::infinity();
 
-// Relative error of a coordinate: four products and sums of numbers in float, each to half a spacing; twice that.
+// Bounds the relative error of a coordinate: twice four products and sums of floats of half a spacing each.
 constexpr float rounding = 0x1p-20f;
 
 struct Interval {
     float low = infinity, high = -infinity;
 };
 
-// Coordinates u, v over the base of a prism and w along it, of which it holds the intervals.
+// Has coordinates u, v over its base and w along it, and holds their intervals.
 struct Prism {
-    float axis[3][3];  // by coordinate
+    float axis[3][3];  // The first index is the coordinate.
     Interval own[3];
-    float point[2];  // on the base: where the line runs that must meet one face
+    float point[2];  // The line through this point of the base must meet one face.
 };
 
-// The three coordinates of the corners of eight faces.
+// Holds the three coordinates of the corners of eight faces.
 struct Placed {
-    float x[3][3][lanes];  // by coordinate and corner
+    float x[3][3][lanes];  // Indices are coordinate and corner.
 };
 
 inline void place(const CornerGroup& g, const float (&axis)[3][3], const float (&offset)[3], Placed& out) {
@@ -50,7 +51,7 @@ inline void place(const CornerGroup& g, const float (&axis)[3][3], const float (
 inline float lesser(float a, float b) { return a < b ? a : b; }
 inline float greater(float a, float b) { return a > b ? a : b; }
 
-// Sum of the normals of eight faces, not normalised.
+// Adds the normals of eight faces, not normalised.
 EDGEGRAD_VECTORIZED void add_normals(const CornerGroup& g, float (&sum)[3]) {
     float n[3][lanes];
     EDGEGRAD_ROLLED
@@ -77,11 +78,11 @@ EDGEGRAD_VECTORIZED void widen(const CornerGroup& g, const float (&axis)[3][3], 
     }
 }
 
-// Of eight faces, as bits.
+// Holds masks of eight faces.
 struct Touching {
-    unsigned any = 0;   // those that touch the prism
-    unsigned fail = 0;  // … and do not face along it, or reach its top or bottom
-    unsigned met = 0;   // … and may be met by the line
+    unsigned any = 0;   // These touch the prism.
+    unsigned fail = 0;  // These touch it, but do not face along it, or reach its top or bottom.
+    unsigned met = 0;   // These touch it, and the line may meet them.
 };
 
 EDGEGRAD_VECTORIZED Touching touching_lanes(const CornerGroup& g, const Prism& prism, const float (&offset)[3],
@@ -103,10 +104,10 @@ EDGEGRAD_VECTORIZED Touching touching_lanes(const CornerGroup& g, const Prism& p
     for (int i = 0; i < lanes; ++i) {
         const float u0 = p.x[0][0][i] - pu, u1 = p.x[0][1][i] - pu, u2 = p.x[0][2][i] - pu;
         const float v0 = p.x[1][0][i] - pv, v1 = p.x[1][1][i] - pv, v2 = p.x[1][2][i] - pv;
-        // Twice the areas over the base: of the face, and of the triangles of its sides and the point.
+        // They are twice the areas over the base of the face, and of the triangles of its sides and the point.
         whole[i] = (u1 - u0) * (v2 - v0) - (v1 - v0) * (u2 - u0);
         least[i] = lesser(lesser(u0 * v1 - v0 * u1, u1 * v2 - v1 * u2), u2 * v0 - v2 * u0);
-        // What is left of them in doubt, where each coordinate may be off by e.
+        // The areas are uncertain by this where each coordinate may be off by e.
         doubt[i] = 8 * e * ((high[0][i] - low[0][i]) + (high[1][i] - low[1][i]) + 2 * e);
         far[i] = doubt[i] + 8 * e * (greater(u0, -u0) + greater(v0, -v0));
     }
@@ -129,7 +130,7 @@ EDGEGRAD_VECTORIZED Touching touching_lanes(const CornerGroup& g, const Prism& p
     return {.any = unsigned(all) & 0xff, .fail = unsigned(all) >> 8 & 0xff, .met = unsigned(all) >> 16};
 }
 
-// The prism around the leaves first … last − 1, and whether the surface is a height field in it.
+// Tests whether the surface is a height field in the prism around the leaves first … last − 1.
 class PrismTest {
    public:
     PrismTest(const FaceTree& tree, const std::vector<uint8_t>& closed) : tree_(tree), closed_(closed) {}
@@ -160,7 +161,7 @@ class PrismTest {
             holds = !(t.fail | (t.any & ~unsigned(closed_[leaf])));
             met += std::popcount(t.met);
         };
-        // What belongs to it first: there it mostly fails, if it does.
+        // Its own leaves come first, because most failures occur there.
         for (int64_t leaf = first; leaf < last && holds; ++leaf) touch(leaf);
         if (!holds || met != 1) return false;
         tree_.each_leaf(box(), 0, -1, [&](int64_t leaf) {
@@ -172,7 +173,7 @@ class PrismTest {
     }
 
    private:
-    // w along the mean normal, u and v across. Any three directions serve; those are the widest view of the surface.
+    // Sets w along the mean normal, and u and v across. Any three directions are valid; these see the surface widest.
     bool place_axes(int64_t first, int64_t last) {
         origin_ = tree_.corners(first).origin;
         float sum[3] = {0, 0, 0};
@@ -199,7 +200,7 @@ class PrismTest {
         for (int k = 0; k < 3; ++k) offset[k] = float(dot(axis_[k], g.origin - origin_));
     }
 
-    // Of a coordinate, and of an end of the prism.
+    // Bounds the error of a coordinate, and of an end of the prism.
     float error(const CornerGroup& g, const float (&offset)[3]) const {
         float size = 2 * g.reach;
         for (int k = 0; k < 3; ++k)
@@ -208,7 +209,7 @@ class PrismTest {
         return rounding * size + std::numeric_limits<float>::min();
     }
 
-    // Through the middle of a face in the middle.
+    // Places the line through the centre of a face in the middle.
     void place_line(int64_t first, int64_t last) {
         const CornerGroup& g = tree_.corners((first + last) / 2);
         float offset[3];
@@ -220,7 +221,7 @@ class PrismTest {
         }
     }
 
-    // The prism among the boxes of the tree, which are rounded to floats in the world.
+    // Returns the prism as an oriented box for the tree, whose boxes are rounded to floats in the world.
     AskewBox box() const {
         AskewBox box;
         Vec3 middle = origin_;
@@ -246,7 +247,7 @@ class PrismTest {
     const FaceTree& tree_;
     const std::vector<uint8_t>& closed_;
     Vec3 origin_, axis_[3];
-    double area_;  // of its own faces over the base
+    double area_;  // It is the area of its own faces over the base.
     Prism prism_;
 };
 
@@ -257,7 +258,7 @@ class HeightFields::Search {
     Search(const FaceTree& tree, const std::vector<uint8_t>& closed, std::vector<Crossed>& by)
         : tree_(tree), test_(tree, closed), by_(by) {}
 
-    // Marks the leaves of a node, or of the parts of it for which this can be told.
+    // Marks the leaves of a node, or those of its parts for which the test holds.
     void mark(int64_t first, int64_t span, bool holds = false) {
         const int64_t last = std::min(int64_t(by_.size()), first + span);
         const int32_t surface = tree_.surface(first, span);
@@ -269,7 +270,7 @@ class HeightFields::Search {
     }
 
    private:
-    // Whether its box overlaps that of a leaf with faces of another surface.
+    // Returns whether the leaves' box overlaps a leaf with faces of another surface.
     bool meets_other(int64_t first, int64_t last, int32_t surface) const {
         FaceBox box = tree_.leaf(first).bounds();
         for (int64_t leaf = first + 1; leaf < last; ++leaf) box = box.with(tree_.leaf(leaf).bounds());
@@ -286,7 +287,7 @@ class HeightFields::Search {
 HeightFields::HeightFields(const FaceTree& tree, const Topology& topology, ThreadTeam& team)
     : tree_(&tree), by_(tree.n_leaves(), Crossed::by_any) {
     const int64_t leaves = tree.n_leaves(), nodes = (leaves + most_leaves - 1) / most_leaves;
-    std::vector<uint8_t> closed(leaves, 0);  // a bit for each face
+    std::vector<uint8_t> closed(leaves, 0);  // Each face has a bit.
     team.parallel_for_blocks(leaves, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t leaf = first; leaf < last; ++leaf)
             for (int lane = 0; lane < FaceTree::leaf_size; ++lane)

@@ -16,12 +16,12 @@ namespace edgegrad {
 
 namespace {
 
-// A side of the face `next to` that lies in the face `through`, with that face itself on one side.
+// Records a side of the face `ending` that lies in the face `through`, with `ending` on one side of it.
 struct AlongEdge {
     int32_t through, ending;
-    int32_t edge[2];  // vertices, ascending
+    int32_t edge[2];  // They are vertices, ascending.
     bool before;
-    bool drawn;  // false: it is only known to be there
+    bool drawn;  // Otherwise it is only known to exist.
     Vec3 a, b;
 
     bool on_same_edge(const AlongEdge& o) const {
@@ -33,25 +33,25 @@ struct AlongEdge {
     }
 };
 
-// What was found among some faces.
+// Collects what was found among some faces.
 struct FoundIntersections {
     std::vector<Intersection> through;
     std::vector<AlongEdge> along;
 };
 
-// How many there are is estimated from so many leaves, if there are twice as many of these. Up to `few`, and one for
-// each of some faces, all are found; else so many are drawn.
+// A pilot of this many leaves estimates the number of intersections if there are twice as many leaves. All are found up
+// to `few` plus one for each of some faces; otherwise, samples are drawn.
 constexpr int64_t leaves_in_pilot = 128, most_in_pilot = 32;
 constexpr int64_t few = 1 << 12, faces_for_one_of_few = 8, many = 1 << 14, faces_for_one_of_many = 2;
 constexpr int64_t leaves_in_block = 16;
 
-// Among which faces intersections are looked for: among all, or, if there are bits for the faces of each leaf, among
-// those that are drawn, in pairs of leaves that are drawn too.
+// Selects the faces among which intersections are searched. They are all faces, or, if the leaves have masks, the drawn
+// faces in pairs of leaves that are drawn, too.
 struct DrawnPairs {
     std::vector<uint8_t> faces_of_leaf;
-    const float* share = nullptr;   // (F,): probability of each face
-    const float* copies = nullptr;  // (F,): 1 over how many copies of it there are
-    double leaves = 1;              // probability of a pair of leaves
+    const float* share = nullptr;   // (F,) probability of each face
+    const float* copies = nullptr;  // (F,) 1 over the number of copies of each face
+    double leaves = 1;              // It is the probability of a pair of leaves.
     uint64_t seed = 0;
 
     bool all() const { return faces_of_leaf.empty(); }
@@ -59,18 +59,18 @@ struct DrawnPairs {
     bool has(int64_t leaf, int64_t other) const {
         return in(other) && (leaves == 1 || to_unit(hash(seed, uint64_t(leaf), uint64_t(other))) < leaves);
     }
-    // For how many a pair of faces stands, divided among its copies, where that of `face` and `by` is drawn.
+    // Returns how many pairs a pair of faces represents, divided among its copies, if `face` and `by` were drawn.
     double weight(int32_t face, int32_t other, int32_t by) const {
         return all() ? 1 : double(copies[face]) * double(copies[other]) / (double(share[face]) * share[by] * leaves);
     }
     double weight(int32_t face, int32_t other) const { return weight(face, other, other); }
-    // Of two faces next to an edge, that which stands for both.
+    // Returns which of two faces at an edge represents both.
     const AlongEdge& likelier(const AlongEdge& a, const AlongEdge& b) const {
         return all() || share[a.ending] >= share[b.ending] ? a : b;
     }
 };
 
-// A face, and where it is.
+// Pairs a face with its geometry.
 struct Placed {
     const PlacedFace& placed;
     int32_t face;
@@ -83,9 +83,9 @@ PlacedFace placed(const PlacedFaces& faces, int32_t face) {
     return out;
 }
 
-// Adds what two faces have in common.
+// Adds the intersection of two faces.
 void add_pair(const Placed& one, const Placed& other, const DrawnPairs& drawn, FoundIntersections& out) {
-    // In the order of the faces, so that the same numbers are found whoever comes first.
+    // Ordering the faces gives the same numbers whichever comes first.
     const auto [f, g] = one.face < other.face ? std::tie(one, other) : std::tie(other, one);
     FacePair pair;
     const FacePair::Kind kind = pair.set(f.placed, g.placed);
@@ -110,8 +110,7 @@ class PairFinder {
     PairFinder(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces, const DrawnPairs& drawn)
         : tree_(tree), fields_(fields), faces_(faces), drawn_(drawn), coarsest_(faces.spacing.coarsest()) {}
 
-    // Calls found(other) for the leaves from this one on that overlap it, where drawn faces may pass through each
-    // other.
+    // Calls found(other) for leaves from this one on that overlap it, if drawn faces may pass through each other.
     template <class FoundIntersections>
     void each_overlapping(int64_t leaf, FoundIntersections found) const {
         if (!drawn_.in(leaf) || !fields_.crossed(leaf)) return;
@@ -121,11 +120,12 @@ class PairFinder {
         });
     }
 
-    // Adds the pairs with a face of either leaf.
+    // Adds the pairs of a face of either leaf.
     void add(int64_t leaf, int64_t other, FoundIntersections& out) {
         if (leaf != leaf_) place(leaf);
         const BoxGroup &own = tree_.leaf(leaf), &others = tree_.leaf(other);
-        unsigned any = 0, met_by[FaceTree::leaf_size];  // of the other leaf, each with those of this one
+        // They are masks over the other leaf; each entry is a mask over this one.
+        unsigned any = 0, met_by[FaceTree::leaf_size];
         for (unsigned hits = own.overlapping(tree_.bounds(other)) & drawn_.in(leaf); hits; hits &= hits - 1) {
             const int i = std::countr_zero(hits);
             unsigned met = others.overlapping(own.box(i)) & drawn_.in(other);
@@ -165,14 +165,14 @@ class PairFinder {
     const DrawnPairs& drawn_;
     const double coarsest_;
     int64_t leaf_ = -1;
-    PlacedFace placed_[FaceTree::leaf_size];  // its faces
-    FacePlane plane_[FaceTree::leaf_size];    // theirs
+    PlacedFace placed_[FaceTree::leaf_size];  // They are its faces.
+    FacePlane plane_[FaceTree::leaf_size];    // They are the planes of its faces.
 };
 
-// The faces at some edges, by the vertices of these.
+// Lists the faces at some edges, by the edges' vertices.
 using FacesAtEdges = std::map<std::array<int32_t, 2>, std::vector<int32_t>>;
 void find_faces(FacesAtEdges& at, const PlacedFaces& faces) {
-    std::vector<uint8_t> asked;  // of vertices
+    std::vector<uint8_t> asked;  // It marks vertices.
     for (const auto& [edge, none] : at) {
         asked.resize(std::max<size_t>(asked.size(), edge[1] + 1), 0);
         asked[edge[0]] = asked[edge[1]] = 1;
@@ -187,8 +187,8 @@ void find_faces(FacesAtEdges& at, const PlacedFaces& faces) {
         }
 }
 
-// Adds what else lies next to the same edges, whether it is drawn or not: one side tells of the surface that passes
-// through only together with the other, which is mostly hidden. So that which is drawn more often stands for both.
+// Adds the other faces at the same edges, drawn or not. One side shows that the surface passes through only together
+// with the other, which is mostly hidden. The one with the higher probability represents both.
 void add_other_sides(std::vector<AlongEdge>& along, const PlacedFaces& faces, const DrawnPairs& drawn) {
     std::sort(along.begin(), along.end());
     FacesAtEdges at;
@@ -211,7 +211,7 @@ void add_other_sides(std::vector<AlongEdge>& along, const PlacedFaces& faces, co
     along.insert(along.end(), others.begin(), others.end());
 }
 
-// Adds those at which a surface passes through: two faces of an edge, one on each side.
+// Adds the edges at which a surface passes through: two faces of an edge, one on each side.
 void add_along(std::vector<AlongEdge>& along, const DrawnPairs& drawn, std::vector<Intersection>& out) {
     std::sort(along.begin(), along.end());
     const auto add = [&](const AlongEdge& own, const AlongEdge& next, const AlongEdge& by) {
@@ -225,7 +225,7 @@ void add_along(std::vector<AlongEdge>& along, const DrawnPairs& drawn, std::vect
     };
     for (size_t i = 0, end; i < along.size(); i = end) {
         for (end = i + 1; end < along.size() && along[end].on_same_edge(along[i]);) ++end;
-        // Those behind come first. One of either, or copies of both.
+        // Edges behind come first. There is one of each, or copies of both.
         const size_t behind =
             std::count_if(along.begin() + i, along.begin() + end, [](const AlongEdge& e) { return !e.before; });
         if (2 * behind != end - i) continue;
@@ -236,7 +236,7 @@ void add_along(std::vector<AlongEdge>& along, const DrawnPairs& drawn, std::vect
     }
 }
 
-// Random bits of where a face lies, whatever the order of its corners.
+// Returns a hash of a face's position, independent of the order of its corners.
 uint64_t place_of(const PlacedFaces& faces, int32_t face) {
     uint64_t bits = 0;
     for (int i = 0; i < 3; ++i) {
@@ -251,7 +251,7 @@ uint64_t place_of(const PlacedFaces& faces, int32_t face) {
 template <class Body>
 void each_of_several(const Array<uint64_t>& key, Body body) {
     const int64_t n = key.size();
-    // Nearly all are alone: a table of bits finds those that may not be.
+    // Nearly all are unique; a table of bits finds those that may not be.
     const uint64_t bits = std::bit_ceil(uint64_t(std::max<int64_t>(n, 4)) * 16);
     std::vector<uint64_t> once(bits / 64, 0), again(bits / 64, 0);
     const auto word = [&](uint64_t k) { return (k & (bits - 1)) / 64; };
@@ -269,7 +269,7 @@ void each_of_several(const Array<uint64_t>& key, Body body) {
     }
 }
 
-// Divides what copies of faces have in common among them, if all are there.
+// Divides the intersections of copies of faces among them, if all are known.
 void share_among_copies(Array<Intersection>& all, const PlacedFaces& faces, ThreadTeam& team) {
     Array<uint64_t> key(all.size());
     team.parallel_for_blocks(all.size(), [&](int64_t, int64_t first, int64_t last) {
@@ -279,7 +279,7 @@ void share_among_copies(Array<Intersection>& all, const PlacedFaces& faces, Thre
     each_of_several(key, [&](int64_t i, size_t n) { all[i].weight /= double(n); });
 }
 
-// Of each face what it has of that, by how many of them there are.
+// Returns each face's share: 1 over the number of its copies.
 Array<float> shares_of_copies(const PlacedFaces& faces, ThreadTeam& team) {
     Array<uint64_t> key(faces.n_faces);
     Array<float> share(faces.n_faces);
@@ -290,13 +290,13 @@ Array<float> shares_of_copies(const PlacedFaces& faces, ThreadTeam& team) {
     return share;
 }
 
-// All parts by ascending faces: those of each lower face side by side, and these, which are few, in order.
+// Sorts all parts by faces: those of each lower face become adjacent, and these few are sorted.
 Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, int64_t n_faces, ThreadTeam& team) {
     size_t n = 0;
     for (const auto& part : parts) n += part.size();
     Array<Intersection> all{int64_t(n)};
     if (n == 0) return all;
-    std::vector<uint32_t> end(n_faces, 0);  // of each face, in `all`
+    std::vector<uint32_t> end(n_faces, 0);  // It is the end of each face's range in `all`.
     const auto each = [&](auto body) {
         team.parallel_for(int64_t(parts.size()), [&](int64_t k) {
             for (const Intersection& i : parts[k]) body(std::atomic_ref(end[i.face[0]]), i);
@@ -316,7 +316,7 @@ Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, 
     return all;
 }
 
-// Those of the drawn faces, by ascending faces.
+// Finds the intersections of the drawn faces, sorted by faces.
 Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces,
                           const DrawnPairs& drawn, ThreadTeam& team) {
     const int64_t leaves = tree.n_leaves(), blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
@@ -343,7 +343,7 @@ Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, cons
 
 }  // namespace
 
-// Pairs of some leaves, if there are many leaves.
+// Returns the pairs of a sample of leaves, if there are many leaves.
 std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& faces, ThreadTeam& team) const {
     const int64_t step = tree_->n_leaves() / leaves_in_pilot;
     if (step < 2) return {};
@@ -381,7 +381,7 @@ Intersections::Intersections(const PlacedFaces& faces, FaceOrder& order, ThreadT
     const double most = double(few + faces.n_faces / faces_for_one_of_few);
     const bool kept_order = !order_.face.empty();
     double n = expected();
-    // What is drawn, and whether, depends on the leaves, which must not depend on where the vertices were before.
+    // The leaves decide what is drawn; they must not depend on earlier positions of the vertices.
     if (kept_order && n > most / 2) order_ = {}, n = expected();
     const bool drawn = n > most;
     if (drawn) {

@@ -1,7 +1,7 @@
-// A light as edges see it: a point, or triangles that are drawn from evenly.
+// Describes a light for edge sampling: a point, or triangles that are sampled uniformly.
 //
-// The light's own density of points is p; `chance` is ∫ p over a part. So Σ chance · (mean over the part's area) is the
-// mean over points drawn with p, which is what the radiance of a sample, divided by p, is made for.
+// The light's own pdf of points is p; `chance` is ∫ p over a part. Σ chance · (mean over the part's area) is thus the
+// mean over points sampled with p. The radiance of a sample, divided by p, is meant for this mean.
 #pragma once
 
 #include <algorithm>
@@ -13,10 +13,10 @@
 namespace edgegrad {
 
 struct LightParts {
-    const double*
-        corner;  // (L, 3, 3) world coordinates, or, at infinity, directions towards it; of a point thrice the same
+    // (L, 3, 3) holds world coordinates, or directions towards a light at infinity; a point is given three times.
+    const double* corner;
     const double* chance;  // (L,) > 0
-    const int32_t* face;   // (L,) of the scene that the part is, −1: none
+    const int32_t* face;   // (L,) the part's face in the scene, −1: none
     int64_t count = 0;
     bool infinite = false, extended = false, two_sided = true;
 
@@ -24,13 +24,13 @@ struct LightParts {
         const double* c = corner + 9 * part + 3 * i;
         return {c[0], c[1], c[2]};
     }
-    // At the last two barycentrics; the direction at infinity is of unit length.
+    // Returns the point at the last two barycentrics, or the unit direction at infinity.
     Vec3 at(int64_t part, Vec2 uv) const {
         const Vec3 p = (1 - uv.x - uv.y) * at(part, 0) + uv.x * at(part, 1) + uv.y * at(part, 2);
         return infinite ? (1 / length(p)) * p : p;
     }
-    // What the light that leaves a point for another counts, for densities alone: L cos θ / r² over L, no less than a
-    // little of 1 / r² behind a face, for shaders that see shadows there too.
+    // Returns the weight of light that leaves a point for another, for pdfs only: L cos θ / r² over L. Behind a face,
+    // it keeps a small part of 1 / r², for shaders that see shadows there, too.
     double towards(int64_t part, Vec3 from, Vec3 to) const {
         if (infinite) return 1;
         const Vec3 d = to - from;

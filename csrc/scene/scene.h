@@ -1,4 +1,4 @@
-// Plain views of the arrays of a scene, as edgegrad/kernel/flat.py lays them out.
+// Holds plain views of a scene's arrays, as edgegrad/kernel/flat.py lays them out.
 #pragma once
 
 #include <algorithm>
@@ -9,8 +9,8 @@
 
 namespace edgegrad {
 
-// Relative spacing of the numbers in which the user gave the vertices, which may differ from mesh to mesh: value[i]
-// from vertex first[i] on.
+// Holds the relative spacing of the numbers in which the user gave the vertices. It may differ between meshes: value[i]
+// applies from vertex first[i] on.
 struct Spacing {
     std::vector<int32_t> first{0};
     std::vector<double> value{0};
@@ -25,23 +25,23 @@ struct Spacing {
     bool operator==(const Spacing&) const = default;
 };
 
-// What a face shows besides its radiance (shading/attributes.h), one number a channel, in this order.
+// Lists what a face shows besides its radiance (shading/attributes.h), in the order of the channels.
 struct Attributes {
-    bool alpha = false;              // 1 wherever a face is seen
+    bool alpha = false;              // It is 1 wherever a face is seen.
     const double* vertex = nullptr;  // (V, vertex_width) values at the vertices
     int vertex_width = 0;
-    int unit = -1;                 // the first of three columns of `vertex` that are a direction, of length 1; −1: none
+    int unit = -1;                 // It is the first of three columns of `vertex` with a unit direction, −1: none.
     const double* face = nullptr;  // (F, face_width) values of whole faces
-    int face_width = 0;            // at most most_of_face
-    bool barycentrics = false;     // 3
-    bool uv = false;               // 2, if all faces have texture coordinates
+    int face_width = 0;            // It is at most most_of_face.
+    bool barycentrics = false;     // It adds 3 channels.
+    bool uv = false;               // It adds 2 channels, if all faces have texture coordinates.
 
     static constexpr int most_of_face = 4;
 
     int channels() const { return alpha + vertex_width + face_width + 3 * barycentrics + 2 * uv; }
 };
 
-// How an image is looked up. Beyond its border it is repeated, its outermost texels go on, or it is mirrored.
+// Says how an image is sampled. Beyond its border it repeats, clamps to its outermost texels, or is mirrored.
 enum class Wrap { repeat, clamp, mirror };
 enum class TextureFilter { linear, nearest };
 constexpr const char* wrap_names[] = {"repeat", "clamp", "mirror"};
@@ -53,10 +53,10 @@ struct Sampler {
     bool operator==(const Sampler&) const = default;
 };
 
-// A row of a table of textures: first texel, height, width, and the sampler's three numbers.
+// A row of a table of textures has the first texel, height, width, and the sampler's three numbers.
 constexpr int texture_columns = 6;
 
-// Faces that are alpha-tested where an alpha texture is below a cutoff (rays/alpha_mask.h).
+// Describes alpha-tested faces, which are transparent where an alpha texture is below a cutoff (rays/alpha_mask.h).
 template <class T>
 struct AlphaMaskArrays {
     const T* alphas = nullptr;  // (Y,) all alpha textures, row by row
@@ -68,8 +68,8 @@ struct AlphaMaskArrays {
     bool on(int64_t f) const { return face && face[f] >= 0; }
 };
 
-// A corner of a face refers to a row of `colors`, or, where the face carries a texture, to a row of `uvs`.
-// Colours of vertices, faces and corners differ only in that index. T is float or double.
+// Views a scene whose T is float or double. A corner of a face refers to a row of `colors`, or of `uvs` where the face
+// is textured. Colours of vertices, faces and corners differ only in that index.
 template <class T>
 struct SceneView {
     const double* verts;  // (V, 3) world units
@@ -87,10 +87,10 @@ struct SceneView {
     const int32_t* face_texture;  // (F,) row of textures, −1 for none; null when the scene has no texture
     const T* background;          // (C,) or (H, W, C)
     bool background_is_image;
-    int channels;  // C of the image: R of radiance, then the attributes
+    int channels;  // It is C of the image: R of radiance, then the attributes.
     const Spacing* spacing;
     Attributes attributes = {};
-    int radiance = channels;              // R
+    int radiance = channels;              // It is R.
     const int32_t* uv_corners = corners;  // (F, 3) rows of uvs, for faces that have any
     AlphaMaskArrays<T> alpha_masks = {};
 
@@ -99,7 +99,7 @@ struct SceneView {
     }
 };
 
-// Whether two faces have a vertex in common, by index.
+// Returns whether two faces share a vertex, by index.
 template <class T>
 bool share_vertex(const SceneView<T>& scene, int64_t face, int64_t other) {
     const int32_t *v = scene.faces + 3 * face, *w = scene.faces + 3 * other;

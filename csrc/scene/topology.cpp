@@ -12,20 +12,20 @@ namespace edgegrad {
 
 namespace {
 
-// Items of a long loop after which it asks whether to go on.
+// A long loop checks for interruption after this many items.
 constexpr int64_t check_every = 1 << 14;
 
-// Places that were found so far, in a hash table of cells: one vertex for each place.
+// Stores the positions found so far, one vertex each, in a hash table of cells.
 //
-// Two copies that went through the same rotation and translation differ by a few roundings at most, so what lies within
-// a reach of 8 spacings of the largest coordinate is one place. No two places of one spacing lie within each other's
-// reach, so a cell of some reaches holds few of them, and finding one takes a constant time however many vertices
-// coincide. Spacings and magnitudes have cells of their own.
+// Two copies that went through the same rotation and translation differ by a few roundings at most. All within a reach
+// of 8 spacings of the largest coordinate is therefore one position. No two positions of one spacing lie within each
+// other's reach, so a cell of some reaches holds few of them. Finding one takes a constant time however many vertices
+// coincide. Spacings and magnitudes have their own cells.
 class PlaceGrid {
    public:
     explicit PlaceGrid(size_t vertices) : head_(std::bit_ceil(std::max<size_t>(64, vertices)), -1) {}
 
-    // The nearest place of this spacing within reach of the vertex; −1: none.
+    // Returns the nearest position of this spacing within reach of the vertex, −1: none.
     int32_t nearest(const double* verts, int32_t vertex, double spacing) const {
         const double *p = verts + 3 * int64_t(vertex), m = magnitude(p), reach = 8 * spacing * m;
         int32_t found = -1;
@@ -69,9 +69,9 @@ class PlaceGrid {
     };
 
     static double magnitude(const double* p) { return std::max({std::fabs(p[0]), std::fabs(p[1]), std::fabs(p[2])}); }
-    // Of what is far below the least float, all is taken for one, so that cells do not vanish.
+    // Magnitudes far below the least float count as one, so that cells do not vanish.
     static int binade(double magnitude) { return magnitude > 0x1p-900 ? std::ilogb(magnitude) : -900; }
-    // Four to eight reaches of the magnitudes in that binade, so that few cells lie within reach of a point.
+    // Returns four to eight reaches of the binade's magnitudes, so that few cells lie within reach of a point.
     static double cell_of(int binade, double spacing) { return std::ldexp(64 * std::max(spacing, 0x1p-52), binade); }
     static int64_t index(double x, double cell) { return int64_t(std::floor(x / cell)); }
     static uint64_t key_of(int binade, double spacing, int64_t x, int64_t y, int64_t z) {
@@ -82,7 +82,7 @@ class PlaceGrid {
     std::vector<Place> place_;
 };
 
-// Sets of 0 … n − 1 that are joined one by one, each named after its least member (Galler and Fischer 1964).
+// Joins the sets 0 … n − 1 one by one, and names each after its least member (Galler and Fischer 1964).
 class DisjointSets {
    public:
     explicit DisjointSets(int64_t n) : up_(n) { std::iota(up_.begin(), up_.end(), 0); }
@@ -138,8 +138,7 @@ Topology::Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Threa
 
 void Topology::weld(const double* verts, const Spacing& spacing, ThreadTeam& team) {
     if (candidates_.empty()) return;
-    // Copies that went through different roundings may lie between others of a coarser spacing, never the other way
-    // round: coarse ones come first.
+    // Copies may lie between others of a coarser spacing, never the reverse, so coarse ones come first.
     std::vector<double> spacings = spacing.value;
     std::sort(spacings.begin(), spacings.end(), std::greater<>());
     spacings.erase(std::unique(spacings.begin(), spacings.end()), spacings.end());
@@ -166,13 +165,13 @@ void Topology::weld(const double* verts, const Spacing& spacing, ThreadTeam& tea
 }
 
 void Topology::build(ThreadTeam& team) {
-    // Half-edges in buckets of their lower vertex, each bucket sorted by the upper one: linear in the number of faces.
+    // Buckets of half-edges by lower vertex, each sorted by the upper one, take time linear in the number of faces.
     struct Entry {
         int32_t upper;
         HalfEdge half_edge;
     };
-    // Vertices in the order in which faces come to them, so that edges that follow each other are near one another
-    // where faces are: a subdivision appends its new vertices to all others.
+    // Ranking vertices in the order of their faces keeps consecutive edges close to each other. A subdivision appends
+    // its new vertices to all others.
     std::vector<int32_t> rank(n_verts_, -1);
     const auto at = [&](int64_t face, int corner) {
         const int32_t v = faces_[3 * face + corner % 3];
@@ -184,7 +183,7 @@ void Topology::build(ThreadTeam& team) {
         const int32_t v = welded_.empty() ? faces_[i] : welded_[faces_[i]];
         if (rank[v] < 0) rank[v] = next++;
     }
-    // A face that uses a place twice has no area and no part in the surface.
+    // A face that uses a position twice has no area and no part in the surface.
     const auto degenerate = [&](int64_t f) {
         return at(f, 0) == at(f, 1) || at(f, 1) == at(f, 2) || at(f, 2) == at(f, 0);
     };
@@ -223,7 +222,7 @@ void Topology::build(ThreadTeam& team) {
     joins_two_.resize(n_edges());
     goes_on_.assign(n_faces_, 1);
     DisjointSets sets(n_faces_);
-    // The direction of an edge is that of its first half-edge.
+    // The first half-edge defines the direction of an edge.
     for (int64_t e = 0; e < n_edges(); ++e) {
         if (e % check_every == 0) team.check();
         const bool flip = half_edge_[offset_[e]].backwards;

@@ -1,6 +1,6 @@
-// What a face shows besides its radiance: alpha, values at its vertices or of all of it, barycentrics, texture
-// coordinates. All are affine in the barycentrics b, but for a direction m that is given the length 1 after it is
-// interpolated: n = m / |m|, δn = (δm − n (n · δm)) / |m|.
+// Computes what a face shows besides its radiance: alpha, attributes of vertices or faces, barycentrics and texture
+// coordinates. All are affine in the barycentrics b, except a direction m, which is normalised after interpolation: n =
+// m / |m|, δn = (δm − n (n · δm)) / |m|.
 #pragma once
 
 #include "accumulate/gradients.h"
@@ -10,8 +10,8 @@
 
 namespace edgegrad {
 
-// The arrays that attributes are read from, or their tangents: there null is zero, and `one`, which alpha and
-// barycentrics are made of, is zero too.
+// Holds the arrays that attributes are read from, or their tangents. Among tangents, null means zero, and `one`, from
+// which alpha and barycentrics are made, is zero.
 struct AttributeArrays {
     const double *vertex, *face, *uvs, one;
 };
@@ -52,7 +52,7 @@ void each_attribute(const SceneView<T>& scene, const AttributeArrays& from, int6
     }
 }
 
-// The place of the direction among the attributes; −1: there is none.
+// Returns the index of the direction's first channel among the attributes, or −1 if there is none.
 inline int direction_of(const Attributes& a) { return a.unit < 0 ? -1 : a.alpha + a.unit; }
 
 template <class T>
@@ -65,7 +65,7 @@ void shade_attributes(const SceneView<T>& scene, int64_t face, Barycentrics b, d
     }
 }
 
-// The direction before it is given the length 1.
+// Returns the interpolated direction before it is normalised.
 template <class T>
 Vec3 interpolated_direction(const SceneView<T>& scene, int64_t face, Barycentrics b) {
     const int32_t* v = scene.faces + 3 * face;
@@ -78,7 +78,7 @@ Vec3 interpolated_direction(const SceneView<T>& scene, int64_t face, Barycentric
     return m;
 }
 
-// Returns the cotangent of the barycentrics; adds those of the values at the corners to `rows` (3, attributes).
+// Returns the cotangent of the barycentrics, and adds the cotangents of the corner values to `rows` (3, attributes).
 template <class T>
 Barycentrics shade_attributes_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, const double* bar,
                                   double* rows) {
@@ -110,7 +110,7 @@ void shade_attributes_jvp(const SceneView<T>& scene, int64_t face, Barycentrics 
     }
 }
 
-// Adds cotangents of the values at the corners of a face, (3, attributes), to those of the arrays.
+// Adds the cotangents of a face's corner values, (3, attributes), to the gradients of the arrays.
 template <class T>
 void add_attribute_rows(const SceneView<T>& scene, int64_t face, const double* rows, const GradientSink& to,
                         LocalGradients& grad) {

@@ -1,6 +1,6 @@
-// Radiance of a face at given barycentrics, interpolated colours or a texture at interpolated coordinates; and after it
-// the face's attributes.
-// A new light or material is one more file here and one more line in shade and shade_vjp.
+// Evaluates the radiance of a face at given barycentrics, followed by its attributes. Radiance is an interpolated
+// colour, or a texture at interpolated coordinates. A new material is one more file here, and a line in shade and
+// shade_vjp.
 #pragma once
 
 #include <array>
@@ -28,14 +28,14 @@ Texture<T> texture_of(const SceneView<T>& scene, int64_t face) {
     return texture_at(scene.texels, scene.textures, scene.face_texture[face]);
 }
 
-// Whether the nearest texel is taken on a face, of its texture or of its alpha.
+// Returns whether the face's texture or alpha mask takes the nearest texel.
 template <class T>
 bool takes_nearest(const SceneView<T>& scene, int64_t face) {
     return (is_textured(scene, face) && texture_of(scene, face).sampler.filter == TextureFilter::nearest) ||
            (scene.alpha_masks.on(face) && alpha_of(scene, face).sampler.filter == TextureFilter::nearest);
 }
 
-// How many channels there are, and how many of radiance. N: see core/channels.h.
+// These functions return the number of all channels and of radiance channels. core/channels.h explains N.
 template <int N, class T>
 int channels_of(const SceneView<T>& scene) {
     return N ? all_channels<N> : scene.channels;
@@ -49,7 +49,7 @@ bool has_attributes(const SceneView<T>& scene) {
     return N < 0 || (N == 0 && scene.channels > scene.radiance);
 }
 
-// All channels.
+// Writes all channels.
 template <int N, class T>
 void shade(const SceneView<T>& scene, int64_t face, Barycentrics b, double* out) {
     const int C = radiance_of<N>(scene);
@@ -62,11 +62,11 @@ void shade(const SceneView<T>& scene, int64_t face, Barycentrics b, double* out)
     const int32_t* row = scene.corners + 3 * face;
     const T *c0 = scene.colors + int64_t(row[0]) * C, *c1 = scene.colors + int64_t(row[1]) * C,
             *c2 = scene.colors + int64_t(row[2]) * C;
-    // With differences, a face of one colour has exactly that colour, and its derivatives are exactly zero.
+    // Differences give a face of one colour exactly that colour, and derivatives of exactly zero.
     for (int c = 0; c < C; ++c) out[c] = c0[c] + b.u * (double(c1[c]) - c0[c]) + b.v * (double(c2[c]) - c0[c]);
 }
 
-// Calls visit(c, c0, c1, c2) for each channel c of a face without texture, with its values at the corners.
+// Calls visit(c, c0, c1, c2) for each channel c of an untextured face, with its values at the corners.
 template <int N, class T, class Visit>
 void each_corner_value(const SceneView<T>& scene, int64_t face, Visit visit) {
     const int C = radiance_of<N>(scene);
@@ -79,12 +79,12 @@ void each_corner_value(const SceneView<T>& scene, int64_t face, Visit visit) {
                        [&](int k, double c0, double c1, double c2) { visit(C + k, c0, c1, c2); });
 }
 
-// The channels of a face without texture that are affine in the barycentrics, kept for a run of points; zero for a
-// direction, which is not.
+// Keeps the channels of an untextured face that are affine in the barycentrics, for a run of points. A direction is not
+// affine; its channels are zero here.
 template <int N>
 class AffineRadiance {
    public:
-    // One number a channel; in pairs, which processors add at once.
+    // Holds one number per channel, in pairs because processors add pairs at once.
     struct Fixed : std::array<double, (all_channels<N> + 1) / 2 * 2> {
         explicit Fixed(int) { this->fill(0); }
     };
@@ -110,11 +110,10 @@ class AffineRadiance {
     Sum value_ = Sum(0), d_u_ = Sum(0), d_v_ = Sum(0);
 };
 
-// Cotangents of the three corners of one face (colours, or texture coordinates; attributes), summed over a run of
-// samples.
+// Sums cotangents of a face's corners (colours, or texture coordinates; attributes) over a run of samples.
 struct CornerGrad {
     int width = 0;
-    std::vector<double> value, attributes;  // (3, width), (3, attributes)
+    std::vector<double> value, attributes;  // Their shapes are (3, width) and (3, attributes).
 
     template <class T>
     void reset(const SceneView<T>& scene, int64_t face) {
@@ -131,7 +130,7 @@ struct CornerGrad {
     }
 };
 
-// Returns the cotangent of the barycentrics; adds those of the corners to `corners`, those of texels to `grad`.
+// Returns the cotangent of the barycentrics. Adds cotangents of corners to `corners`, and of texels to `grad`.
 template <int N, class T>
 Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, const double* bar, bool want_texels,
                        CornerGrad& corners, LocalGradients& grad) {
@@ -172,7 +171,7 @@ Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, 
     return b_bar;
 }
 
-// The derivative of all channels, for tangents of the barycentrics and of the arrays.
+// Writes the derivative of all channels for tangents of the barycentrics and of the arrays.
 template <class T>
 void shade_jvp(const SceneView<T>& scene, int64_t face, Barycentrics b, Barycentrics b_dot, const Tangents& tangents,
                double* out) {

@@ -12,10 +12,10 @@ namespace {
 
 struct Window {
     int64_t first, end;
-    double share;  // of one of them
+    double share;  // It is the weight of one of them.
 };
-// Which of `of` texels in a row each of `count` meets that span the same: of the finer ones those that it is a mean of,
-// and of the coarser ones those that it goes into.
+// Returns which of `of` texels in a row each of `count` texels over the same length meets. A coarser texel meets the
+// finer ones of its mean, and a finer one the coarser ones that contain it.
 std::vector<Window> windows(int64_t count, int64_t of) {
     std::vector<Window> out;
     for (int64_t i = 0; i < count; ++i) {
@@ -25,11 +25,11 @@ std::vector<Window> windows(int64_t count, int64_t of) {
     return out;
 }
 
-// How one level lies on the next finer one.
+// Describes how one level lies on the next finer one.
 struct Halving {
     TexelGrid fine, coarse;
-    std::vector<Window> down, across;       // of the coarser rows and columns
-    std::vector<Window> of_row, of_column;  // of the finer ones
+    std::vector<Window> down, across;       // They belong to the coarser rows and columns.
+    std::vector<Window> of_row, of_column;  // They belong to the finer ones.
 
     explicit Halving(const TexelGrid& fine_)
         : fine(fine_),
@@ -41,7 +41,8 @@ struct Halving {
     double share(int64_t row, int64_t column) const { return down[row].share * across[column].share; }
 };
 
-// Row y of the means, and its _vjp: what row y of the finer level gets. Pointers to first texels; N channels, 0: any.
+// Writes row y of the means; the _vjp writes row y of the finer level's cotangent. Pointers refer to first texels. N
+// counts the channels, 0: any.
 template <int N, class T>
 void mean_row(const Halving& at, int channels, int64_t y, const T* fine, T* to) {
     const int C = N ? N : channels;

@@ -1,5 +1,5 @@
-// An image and its means over squares of 2, 4, 8 … texels (Williams 1983), level after level, each row by row. A level
-// is half as high and wide as the one before, rounded down; where that was odd, means are over windows that overlap.
+// Builds mipmap pyramids: an image and its means over squares of 2, 4, 8 … texels (Williams 1983), level after level,
+// row by row. A level is half as high and wide as the one before, rounded down. Odd sizes use overlapping windows.
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@
 
 namespace edgegrad {
 
-// Of an image whose texels lie from the first row on.
+// Describes the pyramid of an image whose texels begin at the first row.
 struct PyramidShape {
     TexelGrid image;
     int channels;
@@ -19,10 +19,10 @@ struct PyramidShape {
     int64_t texels() const;
 };
 
-// (texels, channels)
+// Returns (texels, channels).
 template <class T>
 Array<T> pyramid(const PyramidShape& shape, const T* image, ThreadTeam& team);
-// The cotangent of the image, from that of the pyramid.
+// Returns the cotangent of the image from that of the pyramid.
 template <class T>
 Array<T> pyramid_vjp(const PyramidShape& shape, const T* bar, ThreadTeam& team);
 

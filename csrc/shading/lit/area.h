@@ -1,16 +1,17 @@
-// Faces that emit: E = L cos θ / r² over the pdf by area of a point that stays at its barycentrics while they move.
+// Evaluates emissive faces: E = L cos θ / r² over the pdf. The pdf is with respect to area, of a point that keeps its
+// barycentrics while faces move.
 #pragma once
 
 #include "shading/lit/light.h"
 
 namespace edgegrad {
 
-// The faces of a mesh that emits.
+// Refers to the faces of a mesh that emits.
 struct EmissiveFaces {
     const int32_t* faces;  // (F, 3) of the scene
-    int64_t first;         // of the mesh
+    int64_t first;         // It is the first face of the mesh.
     int32_t first_vertex;
-    int verts;  // table
+    int verts;  // It is the table of vertices.
     const Source& emission;
     bool two_sided;
 
@@ -19,8 +20,8 @@ struct EmissiveFaces {
 
 template <class S>
 struct Emitter {
-    Vector<S> corner[3], away;  // from its point to the surface
-    Vector<S> normal, along;    // as long as the area; the unit of `away`
+    Vector<S> corner[3], away;  // `away` points from the emitter's point to the surface.
+    Vector<S> normal, along;    // |normal| is the area; `along` is the unit vector of `away`.
     S squared, facing;
     double sign = 1, per_pdf = 0;
     S radiance[most_lit_channels];
@@ -47,7 +48,7 @@ Emitter<S> emitter(const std::vector<Table>& tables, const EmissiveFaces& from, 
     o.facing = dot(o.normal, o.along);
     if (plain(o.facing) < 0) o.sign = from.two_sided ? -1 : 0;
     o.facing = S(o.sign) * o.facing;
-    // Over its value, the normal as long as the area is the cosine times the Jacobian of the barycentrics.
+    // |normal| over its constant value is the Jacobian of the barycentrics, and `facing` brings the cosine.
     o.per_pdf = p.pdf * length(plain(o.normal));
     value(tables, from.emission, at, channels, o.radiance);
     return o;

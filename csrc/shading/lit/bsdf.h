@@ -1,5 +1,5 @@
-// How a surface scatters light: Lambert's law f = base / π, and the metallic-roughness model of glTF 2.0 (appendix B),
-// whose terms edgegrad/scene/material.py names. Value, and beneath it the _vjp.
+// Evaluates BSDFs and their _vjp: Lambert's law f = base / π, and the metallic-roughness model of glTF 2.0 (appendix
+// B). edgegrad/scene/material.py names its terms.
 #pragma once
 
 #include <algorithm>
@@ -17,7 +17,7 @@ struct Scattering {
     bool lambertian = true;
     S base[most_lit_channels], metallic = 0, roughness = 1;
 
-    // The share that is scattered evenly.
+    // Returns the diffuse albedo.
     S diffuse(int c) const { return lambertian ? base[c] : base[c] * (S(1) - metallic); }
 };
 inline void diffuse_vjp(const Scattering<double>& s, int c, double bar, Scattering<double>& s_bar) {
@@ -25,7 +25,7 @@ inline void diffuse_vjp(const Scattering<double>& s, int c, double bar, Scatteri
     if (!s.lambertian) s_bar.metallic -= bar * s.base[c];
 }
 
-// The lobe of microfacets for one pair of directions, and what it is made of.
+// Holds the lobe of microfacets for one pair of directions, and its factors.
 template <class S>
 struct Lobe {
     Vector<S> half, sine;
@@ -42,11 +42,12 @@ Lobe<S> lobe(S roughness, Vector<S> v, Vector<S> n, Vector<S> l) {
     const S squared = roughness * roughness;
     const S alpha = plain(squared) < least_alpha ? S(least_alpha) : squared;
     o.a2 = alpha * alpha;
-    // Walter et al. 2007. The sine is that of a cross product: 1 − cos² would round away what a small α depends on.
+    // Walter et al. 2007 define D. The sine comes from a cross product, as 1 − cos² would round away what a small α
+    // needs.
     o.sine = cross(n, o.half), o.nh = dot(n, o.half);
     o.d = dot(o.sine, o.sine) + o.a2 * o.nh * o.nh;
     o.D = o.a2 / (S(M_PI) * o.d * o.d);
-    // Heitz 2014, eq. 99.
+    // Heitz 2014, eq. 99, defines the masking.
     const S nv = dot(n, v);
     o.nv = plain(nv) < 0 ? S(0) : nv, o.nl = dot(n, l);
     o.towards = sqrt(o.a2 + (S(1) - o.a2) * o.nv * o.nv), o.back = sqrt(o.a2 + (S(1) - o.a2) * o.nl * o.nl);
@@ -57,7 +58,8 @@ Lobe<S> lobe(S roughness, Vector<S> v, Vector<S> n, Vector<S> l) {
     return o;
 }
 
-// f(v, l), 1/sr, (channels,), of unit directions to the viewer, of the normal and to the light, which is above.
+// Writes the BSDF f(v, l) (channels,) in 1/sr. The unit vectors point to the viewer, along the normal, and to the
+// light, which is above.
 template <class S>
 void scatter(const Scattering<S>& s, Vector<S> v, Vector<S> n, Vector<S> l, int channels, S* f) {
     if (s.lambertian) {
@@ -98,14 +100,14 @@ inline void scatter_vjp(const Scattering<double>& s, Vec3 v, Vec3 n, Vec3 l, int
         const double grazing4 = o.grazing5 / o.grazing;
         dot_vjp(v, o.half, -5 * grazing4 * grazing5_bar, v_bar, half_bar);
     }
-    // D = α² / (π d²)
+    // The next lines differentiate D = α² / (π d²).
     const double D_bar = specular_bar * o.masking, masking_bar = specular_bar * o.D;
     double a2_bar = D_bar * o.D / o.a2;
     const double d_bar = -2 * D_bar * o.D / o.d;
     cross_vjp(n, o.half, 2 * d_bar * o.sine, n_bar, half_bar);
     a2_bar += d_bar * o.nh * o.nh;
     dot_vjp(n, o.half, 2 * d_bar * o.a2 * o.nh, n_bar, half_bar);
-    // 1 / (2 sum), sum = nl √(α² + (1 − α²) nv²) + nv √(α² + (1 − α²) nl²)
+    // masking = 1 / (2 sum), sum = nl √(α² + (1 − α²) nv²) + nv √(α² + (1 − α²) nl²).
     const double sum_bar = -2 * masking_bar * o.masking * o.masking;
     const double towards2_bar = sum_bar * o.nl / (2 * o.towards), back2_bar = sum_bar * o.nv / (2 * o.back);
     a2_bar += towards2_bar * (1 - o.nv * o.nv) + back2_bar * (1 - o.nl * o.nl);
@@ -113,15 +115,15 @@ inline void scatter_vjp(const Scattering<double>& s, Vec3 v, Vec3 n, Vec3 l, int
     const double nl_bar = sum_bar * o.towards + 2 * back2_bar * (1 - o.a2) * o.nl;
     if (o.nv > 0) dot_vjp(n, v, nv_bar, n_bar, v_bar);
     dot_vjp(n, l, nl_bar, n_bar, l_bar);
-    // α² = roughness⁴
+    // The next lines differentiate α² = roughness⁴.
     const double squared = s.roughness * s.roughness;
     if (squared >= least_alpha) s_bar.roughness += 4 * a2_bar * squared * s.roughness;
     const Vec3 sum_of_directions_bar = unit_vjp(v + l, half_bar);
     v_bar += sum_of_directions_bar, l_bar += sum_of_directions_bar;
 }
 
-// Takes what light an interpolated normal n gives to zero where the light sinks behind the face, with the normal g
-// (Chiang, Li and Burley 2019, "Taming the Shadow Terminator"); both are on the light's side.
+// Fades light on an interpolated normal n to zero where it sets behind the face, whose normal is g. Both normals are on
+// the light's side (Chiang, Li and Burley 2019, "Taming the Shadow Terminator").
 constexpr double least_gn = 1e-6, least_nl = 1e-12;
 template <class S>
 S at_least(S a, double low) {

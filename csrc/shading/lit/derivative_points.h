@@ -1,5 +1,4 @@
-// The points of lights that surfaces are lit by; where only derivatives are wanted, on glossy surfaces in antithetic
-// sets.
+// Samples the points of lights for surfaces. Glossy surfaces get antithetic sets where only derivatives are wanted.
 #pragma once
 
 #include <algorithm>
@@ -10,8 +9,8 @@
 
 namespace edgegrad {
 
-// As Resampled, but what is drawn, weighted and kept are directions with their companions (antithetic.h): the target
-// of four is what all of them give, and each of them is lit.
+// Resamples as Resampled does, but draws, weights and keeps antithetic sets of directions (antithetic.h). The target is
+// the sum over the set, and all of its members are evaluated.
 class ResampledAntitheticSets {
    public:
     template <class S>
@@ -24,7 +23,7 @@ class ResampledAntitheticSets {
                         [&](const Candidate& c, bool of_lobe) { add(c.point, c.l, of_lobe); });
     }
 
-    // Writes `count` antithetic sets of points; ones that do not exist where nothing arrives.
+    // Writes `count` antithetic sets of points; they have pdf 0 where no light arrives.
     void keep(double u, int count, LightPoint* out) const {
         std::fill(out, out + AntitheticSet::most * count, LightPoint{0, 0, 0, 0});
         if (kept_.empty()) return;
@@ -42,13 +41,13 @@ class ResampledAntitheticSets {
     }
 
    private:
-    static constexpr int each = 8;  // candidates for four that are kept
+    static constexpr int each = 8;  // This many candidates are drawn for each set that is kept.
     struct AntitheticPoints {
         LightPoint point[AntitheticSet::most] = {{0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}};
-        double target = 0, running = 0;  // the pdf of a point is the measure that it stands for
+        double target = 0, running = 0;  // `pdf` of a point holds its measure.
     };
 
-    // The pdf of the lobe is known above the surface alone (bsdf_sampling.h): what it draws below is dropped.
+    // Adds a candidate. The lobe has no pdf below the surface (bsdf_sampling.h), so its samples there are dropped.
     void add(const LightPoint& p, Vec3 l, bool of_lobe) {
         if (of_lobe && !(dot(n_, l) > 0)) return;
         const AntitheticSet all(v_, n_, alpha_, l);
@@ -81,9 +80,9 @@ class ResampledAntitheticSets {
     std::vector<AntitheticPoints> kept_;
 };
 
-// How many antithetic sets stand for one sample of a light. Where a face is seen from aside and its normal differs from
-// the shading normal n by a part of that angle, light sets behind the face within the lobe (terminator()): all
-// derivatives are noisier there, and nearly all of the noise of how such surfaces move is theirs.
+// Returns how many antithetic sets replace one sample of a light. More are used at grazing angles, where the face's
+// normal differs from the shading normal n by a part of that angle. Light then sets behind the face within the lobe
+// (terminator()). All derivatives are noisier there; nearly all noise of such surfaces' motion comes from there.
 template <class S>
 int sets_of(const Surface<S>& o) {
     constexpr double aside = 0.2, part = 0.1;
@@ -92,14 +91,13 @@ int sets_of(const Surface<S>& o) {
     return nv < aside && dot(apart, apart) > part * part * nv * nv ? most_sets_for_one : sets_for_one;
 }
 
-// The first `drawn` of `count` points, as if they were all.
+// Rescales the first `drawn` of `count` points so that they replace all.
 inline void stand_for_all(LightPoint* points, int drawn, int count) {
     for (int s = 0; s < drawn; ++s) points[s].pdf *= double(drawn) / count;
     std::fill(points + drawn, points + count, LightPoint{0, 0, 0, 0});
 }
 
-// Points of a sky that is the same all around, for a surface that scatters evenly: by the cosine. Direct light alone
-// keeps its even draws.
+// Samples a constant environment for a Lambertian surface by the cosine. Direct light alone keeps its uniform samples.
 inline void draw_even_sky(const LitScene& lit, const Light& light, const RandomNumbers& numbers, Vec3 n, int count,
                           LightPoint* out) {
     const RandomNumbers::Parts of_light = numbers.of_light(count);
@@ -109,7 +107,7 @@ inline void draw_even_sky(const LitScene& lit, const Light& light, const RandomN
     }
 }
 
-// The points of all samples of lights.
+// Writes the points of all light samples.
 template <class S>
 void light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options,
                   const std::vector<LightSample>& lights, int64_t i, const Surface<S>& o, LightPoint* out) {

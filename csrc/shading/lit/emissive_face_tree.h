@@ -1,5 +1,5 @@
-// The faces of a mesh that emits, in a tree of boxes: which of them lie in a direction. In double and ray by ray, for
-// each point of a surface asks for a few directions of its own, and what it finds decides about pdfs.
+// Holds a bounding volume hierarchy of the faces of an emissive mesh, which finds the faces in a direction. It works in
+// double precision and ray by ray: each surface point asks for a few directions, and the answers decide about pdfs.
 #pragma once
 
 #include <algorithm>
@@ -15,9 +15,10 @@ namespace edgegrad {
 
 class EmissiveFaceTree {
    public:
-    static constexpr int64_t most_faces = 1 << 16;  // of which a tree is made: it is made anew when they move
+    // Larger meshes get no tree, because moving faces require a new one.
+    static constexpr int64_t most_faces = 1 << 16;
 
-    // Of faces (F, 3) with vertices (V, 3), world units.
+    // Builds the tree of faces (F, 3) with vertices (V, 3) in world units.
     EmissiveFaceTree(const double* verts, int64_t n_verts, const int32_t* faces, int64_t n_faces) {
         const auto vertex = [&](int32_t v) { return Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]}; };
         Vec3 low = vertex(faces[0]), high = low;
@@ -40,28 +41,28 @@ class EmissiveFaceTree {
     }
 
     int64_t n_faces() const { return int64_t(triangles_.size()); }
-    // A ball around all faces, and the largest coordinate.
+    // These describe a bounding sphere of all faces, and the largest coordinate.
     Vec3 center() const { return center_; }
     double radius() const { return radius_; }
     double size() const { return size_; }
     double area() const { return area_; }
-    // Whether all faces lie in one plane; whether they are the border of a convex body, and look outwards.
+    // These say whether all faces lie in one plane, or bound a convex body and face outwards.
     bool is_flat() const { return flat_; }
     bool is_convex() const { return convex_; }
-    // Whether most lines through the ball meet the faces: of lines that meet a convex body the share that meets one
-    // inside of it is that of their surfaces (Crofton).
+    // Returns whether most lines through the bounding sphere hit the faces. Of the lines that hit a convex body, the
+    // fraction that hits a convex body inside it is the ratio of their surface areas (Crofton).
     bool fills_ball() const { return convex_ && area_ >= least_filled * 4 * M_PI * radius_ * radius_; }
 
-    // Where origin + t direction meets a face.
+    // Records where origin + t direction hits a face.
     struct Crossing {
         int32_t face;
         double u, v, t;
     };
-    // Calls found(crossing) for those with t in (start, end), near ones about first. It returns a new `end`.
+    // Calls found(crossing) for hits with t in (start, end), near ones about first. It returns a new `end`.
     template <class Found>
     void each_crossing(Vec3 origin, Vec3 direction, double start, double end, Found found) const {
         const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
-        int32_t waiting[64], n = 0;  // a tree halves its faces at each level
+        int32_t waiting[64], n = 0;  // The tree halves its faces at each level.
         waiting[n++] = 0;
         while (n) {
             const Node& node = nodes_[waiting[--n]];
@@ -81,7 +82,7 @@ class EmissiveFaceTree {
    private:
     static constexpr int leaf = 4;
     static constexpr double least_filled = 0.5;
-    // Of the size: how far from a plane floats may put what lies in it.
+    // Float rounding may move vertices out of their plane by this part of the size.
     static constexpr double flatness = 1e-6;
 
     static Vec3 least(Vec3 a, Vec3 b) { return {std::min(a.x, b.x), std::min(a.y, b.y), std::min(a.z, b.z)}; }
@@ -93,7 +94,8 @@ class EmissiveFaceTree {
         int32_t face;
 
         Vec3 corner(int i) const { return i == 0 ? q0 : q0 + (i == 1 ? e1 : e2); }
-        // Möller and Trumbore 1997; a rounding next to the border is on it, for the neighbour may be missed as well.
+        // Möller and Trumbore 1997. A point within rounding of the edge counts as a hit, because the neighbour may be
+        // missed as well.
         bool meets(Vec3 origin, Vec3 direction, Crossing& c) const {
             constexpr double rounding = 1e-12;
             const Vec3 p = cross(direction, e2), s = origin - q0;
@@ -110,10 +112,11 @@ class EmissiveFaceTree {
     };
     struct Node {
         Vec3 low, high;
-        int32_t first = 0, count = 0;  // triangles of a leaf; of others the first of two nodes, and none
-        int axis = 0;                  // along which the two follow one another
+        // A leaf has triangles; an inner node has the index of its first child, and count 0.
+        int32_t first = 0, count = 0;
+        int axis = 0;  // The children follow one another along this axis.
 
-        // Kay and Kajiya 1986. A ray in the plane of a side gives no number.
+        // Kay and Kajiya 1986. A ray in the plane of a side gives NaN.
         bool meets(Vec3 origin, Vec3 inverse, double start, double end) const {
             for (int axis = 0; axis < 3; ++axis) {
                 const double i = along(inverse, axis), o = along(origin, axis);
@@ -121,7 +124,7 @@ class EmissiveFaceTree {
                 if (std::isnan(a) || std::isnan(b)) continue;
                 start = std::max(start, std::min(a, b)), end = std::min(end, std::max(a, b));
             }
-            // Rounded by a few spacings.
+            // The margin covers a few roundings.
             return start <= end + 1e-14 * (std::fabs(start) + std::fabs(end));
         }
     };
@@ -153,7 +156,7 @@ class EmissiveFaceTree {
 
     void find_shape(const double* verts, int64_t n_verts, const int32_t* faces) {
         const double near = flatness * radius_;
-        // Whether no vertex lies above a face.
+        // Returns whether no vertex lies above a face.
         const auto is_side = [&](const Triangle& t, double sign) {
             const Vec3 n = sign * cross(t.e1, t.e2);
             const double most = dot(n, t.q0) + near * length(n);
@@ -166,13 +169,13 @@ class EmissiveFaceTree {
         for (const Triangle& t : triangles_)
             if (area(t) > area(*largest)) largest = &t;
         flat_ = is_side(*largest, 1) && is_side(*largest, -1);
-        constexpr int64_t few = 1 << 22;  // pairs
+        constexpr int64_t few = 1 << 22;  // It counts pairs of vertices and faces.
         convex_ = !flat_ && n_verts * int64_t(triangles_.size()) <= few &&
                   std::all_of(triangles_.begin(), triangles_.end(), [&](const Triangle& t) { return is_side(t, 1); }) &&
                   is_closed(verts, faces);
     }
 
-    // Whether each edge is run along as often in one direction as in the other; vertices in one place are one.
+    // Returns whether each edge is run along equally often in both directions; vertices at one position count as one.
     bool is_closed(const double* verts, const int32_t* faces) const {
         std::map<std::array<double, 3>, int> number;
         std::map<std::array<int, 2>, int> runs;

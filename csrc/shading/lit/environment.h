@@ -1,4 +1,5 @@
-// Light from all around: the same, or an image of directions (edgegrad/scene/environment.py says which).
+// Evaluates environment light: constant radiance, or an image of directions as edgegrad/scene/environment.py defines
+// it. pdfs are with respect to solid angle.
 #pragma once
 
 #include <algorithm>
@@ -8,7 +9,7 @@
 
 namespace edgegrad {
 
-// The unit direction of a point, in the frame of the image.
+// Returns the unit direction of a point in the frame of the image.
 inline Vec3 own_direction(const Light& light, const LightPoint& p) {
     const int64_t row = p.index / light.width, column = p.index % light.width;
     const double top = light.cosines[row], bottom = light.cosines[row + 1];
@@ -17,7 +18,7 @@ inline Vec3 own_direction(const Light& light, const LightPoint& p) {
     return {across * std::sin(phi), y, -across * std::cos(phi)};
 }
 
-// The point at a unit direction of the world.
+// Returns the point at a unit direction of the world.
 inline LightPoint point_towards(const std::vector<Table>& tables, const Light& light, Vec3 direction) {
     const Vec3 d = unit(Rotation<double>::of(tables, light).from_world(direction));
     const auto cell = [](double x, int64_t n) { return std::clamp<int64_t>(int64_t(x), 0, n - 1); };
@@ -29,8 +30,7 @@ inline LightPoint point_towards(const std::vector<Table>& tables, const Light& l
             light.pdf[index]};
 }
 
-// The same direction, or, where it lies below a surface with the normal g, its mirror image above: each stands for
-// both.
+// Returns the point, or its mirror image if it lies below a surface with the normal g. Its pdf is the sum of both.
 inline LightPoint above(const std::vector<Table>& tables, const Light& light, const LightPoint& p, Vec3 g) {
     const Vec3 d = unit(Rotation<double>::of(tables, light).to_world(own_direction(light, p)));
     const double cosine = dot(d, g);
@@ -39,8 +39,8 @@ inline LightPoint above(const std::vector<Table>& tables, const Light& light, co
     return chosen;
 }
 
-// Calls visit(texel, its weight) for the texels around a place in the image, which counts texels: bilinear between
-// their centres, around the whole turn.
+// Calls visit(texel, its weight) for the texels around a position in texels. Weights are bilinear between texel
+// centres, and columns wrap around.
 template <class Visit>
 void each_texel(const Light& light, double column, double row, Visit visit) {
     column -= 0.5, row -= 0.5;
@@ -52,7 +52,7 @@ void each_texel(const Light& light, double column, double row, Visit visit) {
     }
 }
 
-// Those around a point.
+// Calls visit(texel, its weight) for the texels around a point.
 template <class Visit>
 void each_texel(const Light& light, const LightPoint& p, Vec3 own, Visit visit) {
     if (!light.is_image) return visit(0, 1.0);
@@ -60,7 +60,7 @@ void each_texel(const Light& light, const LightPoint& p, Vec3 own, Visit visit) 
     each_texel(light, double(p.index % light.width) + p.u, row, visit);
 }
 
-// About how bright the image is there, for the choice of points alone.
+// Returns the approximate brightness of the image, for sampling only.
 inline double brightness(const Light& light, const LightPoint& p) {
     if (!light.is_image) return light.brightness[0];
     double sum = 0;

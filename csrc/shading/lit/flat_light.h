@@ -1,4 +1,5 @@
-// What punctual lights give to flat faces, at their corners: numbers that differ at an edge where radiance may jump.
+// Computes the irradiance of flat faces from punctual lights at their corners. It differs at edges where radiance
+// jumps.
 #pragma once
 
 #include <algorithm>
@@ -12,21 +13,21 @@
 
 namespace edgegrad {
 
-// Faces as a viewer sees them.
+// Holds the faces and the viewer.
 struct FlatFaces {
     const double* verts;
     const int32_t* faces;
     int64_t n_verts, n_faces;
-    Vec3 eye;  // in an orthographic view, the unit direction towards it
+    Vec3 eye;  // In an orthographic view it is the unit direction towards the eye.
     bool perspective;
 };
 
 struct PunctualLight {
-    Vec3 place;  // at infinity, the unit direction towards it
+    Vec3 place;  // At infinity, it is the unit direction towards the light.
     bool infinite;
-    double power;  // W/sr, or at infinity W/m²
+    double power;  // Its unit is W/sr, or W/m² at infinity.
 
-    // The irradiance at normal incidence, over the distance |l|.
+    // Returns the irradiance at normal incidence, divided by the distance |l|.
     double arriving_over_distance(Vec3 at) const {
         if (infinite) return power;
         const double squared = dot(place - at, place - at);
@@ -34,12 +35,12 @@ struct PunctualLight {
     }
 };
 
-// Cosine, below which it is left open which side of a face is seen.
+// Below this cosine, the visible side of a face counts as unknown.
 constexpr double edge_on = 1e-3;
 
-// (F, 3, L): E max(0, n·l) for the normal n on the viewer's side, over the greatest of all. It is the same at both ends
-// of an edge only if it is along all of it, as n·l has the sign, and over 1/|l| the size, of a face's distance to the
-// light.
+// Returns (F, 3, L): E max(0, n·l) for the normal n on the viewer's side, divided by the largest of all. Two faces
+// agree at both ends of an edge only if they agree along all of it. The reason is that n·l is the distance of the light
+// from the face's plane, over |l|.
 inline Array<double> light_on_flat_faces(const FlatFaces& of, const std::vector<PunctualLight>& lights,
                                          ThreadTeam& team) {
     const auto at = [&](int32_t v) {

@@ -46,7 +46,7 @@ void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster
 
 namespace {
 
-// Of a path from the point at(0): the cotangent of its place on its face, as that of what does not come from nearby.
+// Removes the near part from the cotangent of the first point's position on its face.
 template <class At>
 void leave_out_near_field(const LitScene& lit, const LitOptions& options, const Path& path, At at,
                           const double* total_bar, const PathBuffers& found, FacePointBar& at_bar) {
@@ -147,7 +147,7 @@ void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
                 find(dot, total);
                 for (int c = 0; c < lit.channels; ++c) out[c] = total[c].dot;
                 if (!(options.near > 0) || !dot.b || path.points < 2) continue;
-                // Without what nearby gives as the point slides, as leave_out_near_field() has it.
+                // Removes the near part as the point slides, like leave_out_near_field().
                 const Vec3 d = paths.surface(i, 1).y - paths.surface(i, 0).y;
                 const NearField near(options.near);
                 Vec3 slid;

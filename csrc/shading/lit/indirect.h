@@ -1,6 +1,5 @@
-// Light that reaches surfaces by way of others, at the points that lit.h lights directly: radiance that is to be added,
-// by one path of at most options.bounces points for each. Their random numbers are those of the points' seeds, so that
-// the same paths are found again for derivatives.
+// Computes indirect light at the points that lit.h lights directly, as radiance to be added. It traces a path of at
+// most options.bounces points each. The points' seeds supply the random numbers, so derivatives retrace the same paths.
 #pragma once
 
 #include <memory>
@@ -14,27 +13,27 @@
 
 namespace edgegrad {
 
-// (N, channels).
+// Writes (N, channels).
 template <class T>
 void indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
               const LitOptions& options, double* radiance, ThreadTeam& team);
-// Adds that of few points, about shaded_at_once, on one thread, which keeps what it needs from one call to the next.
+// Adds the indirect light of about shaded_at_once points, on one thread, reusing memory between calls.
 class Paths;
 std::shared_ptr<Paths> path_buffers(const LitScene& lit, const LitOptions& options);
 template <class T>
 void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   Paths& paths, double* radiance);
-// All of their radiance, direct light as well, for an image: (N, channels), and (N, light samples) what was found of
-// lights, of each one sample.
+// Writes the whole radiance (N, channels) for an image, with direct light. `seen` (N, light samples) gets the
+// visibility of one sample of each light.
 template <class T>
 void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                  Paths& paths, double* radiance, int8_t* seen);
-// Adds to the cotangents of the tables, and writes those of the points.
+// Adds to the cotangents of the tables, and writes the cotangents of the points.
 template <class T>
 void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   const LitOptions& options, const double* bar, const std::vector<TableBar>& to,
                   LitPlaces<double> places, ThreadTeam& team);
-// For the tangents of the tables and of the points.
+// Writes the derivative for the tangents of the tables and of the points.
 template <class T>
 void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   const LitOptions& options, LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team);

@@ -1,5 +1,5 @@
-// A light, one of its points, and what all kinds have in common. The kinds stand in punctual.h, area.h, environment.h
-// and spherical_harmonics.h: what arrives from a point of the light at a surface, and the _vjp.
+// Defines a light, a point on it, and what all kinds of lights share. punctual.h, area.h, environment.h and
+// spherical_harmonics.h evaluate what arrives at a surface from a point of each kind, and the _vjp.
 #pragma once
 
 #include <algorithm>
@@ -14,26 +14,26 @@ class EmissiveFaceTree;
 struct Light {
     enum class Kind { directional, point, spot, mesh, environment, harmonics };
     Kind kind = Kind::point;
-    // Tables; of one row, but for the radiance of an environment: its texels.
+    // Each table has one row, except the radiance of an environment, whose rows are texels.
     int position = no_table, direction = no_table, intensity = no_table, color = no_table;
     int inner_angle = no_table, outer_angle = no_table, rotation = no_table, radiance = no_table;
-    int mesh = -1;                  // the one that emits
-    int64_t height = 1, width = 1;  // of the environment's image
-    bool is_image = false;          // else the environment is the same from all around
-    // Of lights with an extent: the running sum of the probabilities of faces or texels, and their pdfs.
+    int mesh = -1;                  // This mesh emits.
+    int64_t height = 1, width = 1;  // They are the size of the environment's image.
+    bool is_image = false;          // Without an image, radiance is the same in all directions.
+    // Lights with an extent have the running sum of the probabilities of their faces or texels, and the pdfs.
     const double *running = nullptr, *pdf = nullptr;
     int64_t size = 0;
-    // Of a mesh: its faces by where they lie, if glossy surfaces ask; whether none is alpha-tested, so that near ones
-    // hide far ones.
+    // A mesh has a tree of its faces if glossy surfaces sample it. `hides` says that no face is alpha-tested, so near
+    // faces occlude far ones.
     const EmissiveFaceTree* tree = nullptr;
     bool hides = true;
-    // Whether directions to a ball around it find it, and all of it emit about evenly.
+    // Says whether directions to a bounding sphere usually hit the light, and its emission is about even.
     bool is_round = false;
-    // Of an environment: how bright texels are, but none is black, and the cosines of where rows begin and end. Of a
-    // mesh one number, which is added to how bright it is, for the same reason.
+    // An environment has the brightness of its texels, none of it zero, and the cosines of its rows' borders. A mesh
+    // has one number that is added to its brightness, which keeps it above zero.
     const double *brightness = nullptr, *cosines = nullptr;
-    uint64_t stream[3] = {};  // of its random numbers: of the light, of lobes, and of the choice
-    double eps = 0;           // relative spacing of places of its points
+    uint64_t stream[3] = {};  // The light, its lobes, and the choice each have a random stream.
+    double eps = 0;           // It is the relative spacing of positions on the light.
 
     bool is_infinite() const {
         return kind == Kind::directional || kind == Kind::environment || kind == Kind::harmonics;
@@ -42,7 +42,8 @@ struct Light {
     bool casts() const { return kind != Kind::harmonics; }
 };
 
-// By coordinates that stay while the light moves: a face and its last two barycentrics, or a texel and the place in it.
+// Identifies a point by coordinates that stay fixed while the light moves. They are a face and its last two
+// barycentrics, or a texel and the position in it.
 struct LightPoint {
     int64_t index = 0;
     double u = 0, v = 0, pdf = 1;
@@ -50,8 +51,8 @@ struct LightPoint {
     bool exists() const { return pdf > 0; }
 };
 
-// Which of the parts first … first + n − 1 of the running sum of their probabilities, each `step` wide, a number in
-// [0, 1) picks, and how far within that: uniform as well.
+// Selects one of the parts first … first + n − 1 of a running sum of probabilities, each `step` wide. `within` is the
+// position of the number u in [0, 1) inside that part, uniform as well.
 struct Picked {
     int64_t part;
     double within;
@@ -59,7 +60,7 @@ struct Picked {
 inline Picked pick(const double* running, int64_t first, int64_t n, int64_t step, double u) {
     const auto before = [&](int64_t k) { return k == 0 ? 0.0 : running[k * step - 1]; };
     const double start = before(first), at = start + u * (before(first + n) - start);
-    int64_t low = first, high = first + n - 1;  // the part is one of these
+    int64_t low = first, high = first + n - 1;  // The part lies in this range.
     while (low < high) {
         const int64_t middle = (low + high) / 2;
         if (at < before(middle + 1)) high = middle;
@@ -69,7 +70,7 @@ inline Picked pick(const double* running, int64_t first, int64_t n, int64_t step
     return {low, mass > 0 ? std::clamp((at - before(low)) / mass, 0.0, 1.0) : 0.5};
 }
 
-// From numbers in [0, 1), so that near ones give near points: of an environment first the row, then the column.
+// Samples a point from numbers in [0, 1); close numbers give close points. Environments select row, then column.
 inline LightPoint draw(const Light& light, Vec2 u) {
     if (light.is_punctual()) return {};
     if (light.kind == Light::Kind::environment) {
@@ -78,19 +79,18 @@ inline LightPoint draw(const Light& light, Vec2 u) {
         return {texel.part, texel.within, row.within, light.pdf[texel.part]};
     }
     const Picked face = pick(light.running, 0, light.size, 1, u.x);
-    const double root = std::sqrt(face.within);  // uniform in a triangle (Turk 1990)
+    const double root = std::sqrt(face.within);  // This is uniform in a triangle (Turk 1990).
     return {face.part, root * (1 - u.y), root * u.y, light.pdf[face.part]};
 }
 
-// What arrives at a point of a surface: from where, and how much at normal incidence over the pdf of the point of
-// the light, nothing in between.
+// Holds the direction of arriving light, and its unoccluded irradiance at normal incidence over the point's pdf.
 template <class S>
 struct Arriving {
-    Vector<S> l;  // unit
+    Vector<S> l;  // It is a unit vector.
     S E[most_lit_channels];
 };
 
-// Intensity times colour.
+// Writes intensity times colour.
 template <class S>
 void power(const std::vector<Table>& tables, const Light& light, int channels, S* out) {
     const S intensity = tables[light.intensity].at<S>(0);
@@ -109,20 +109,20 @@ inline void power_vjp(const std::vector<Table>& tables, const Light& light, int 
     if (light.color != no_table) to.add_channels(light.color, 0, tables[light.color].width, channels, color_bar);
 }
 
-// A direction of any length, whose square may be beyond the range of doubles.
+// Returns the direction, scaled so that its square stays within the range of doubles.
 template <class S>
 Vector<S> direction_of(const std::vector<Table>& tables, const Light& light) {
     const Vector<S> d = tables[light.direction].vector_at<S>(0);
     const Vec3 p = plain(d);
     return 1 / std::max({std::fabs(p.x), std::fabs(p.y), std::fabs(p.z)}) * d;
 }
-// The cotangent of the direction as it is given, from that of direction_of().
+// Adds the cotangent of the direction as given, from the cotangent of direction_of().
 inline void direction_vjp(const std::vector<Table>& tables, const Light& light, Vec3 bar, Cotangents& to) {
     const Vec3 p = tables[light.direction].vector_at<double>(0);
     to.add(light.direction, 0, 1 / std::max({std::fabs(p.x), std::fabs(p.y), std::fabs(p.z)}) * bar);
 }
 
-// The world's axes from those of an environment or of harmonics, and back.
+// Rotates from the axes of an environment or of harmonics to those of the world, and back.
 template <class S>
 struct Rotation {
     Vector<S> row[3];
@@ -143,7 +143,7 @@ struct Rotation {
         return sum;
     }
 };
-// Adds outer(row_bar, d) to the cotangent of the rotation: of to_world(d) from that of the result.
+// Adds outer(rows, columns) to the cotangent of the rotation: for to_world(d), the result's cotangent and d.
 inline void rotation_vjp(const Light& light, Vec3 rows, Vec3 columns, Cotangents& to) {
     const double r[3] = {rows.x, rows.y, rows.z}, c[3] = {columns.x, columns.y, columns.z};
     double bar[9];

@@ -1,4 +1,5 @@
-// Light samples: points of lights that light a surface, and what one of them adds to its radiance.
+// Samples points of lights that illuminate a surface (next-event estimation), and evaluates their contributions to its
+// radiance. A sample's pdf is with respect to area on meshes, and to solid angle on environments.
 #pragma once
 
 #include <cstdint>
@@ -13,7 +14,7 @@
 
 namespace edgegrad {
 
-// What arrives at y from a point of a light.
+// Returns what arrives at y from a point of a light.
 template <class S>
 Arriving<S> arriving(const LitScene& lit, const Light& light, const LightPoint& point, Vector<S> y) {
     switch (light.kind) {
@@ -41,7 +42,7 @@ inline void arriving_vjp(const LitScene& lit, const Light& light, const LightPoi
     }
 }
 
-// The place of a point of a light; of one at infinity, the unit direction towards it.
+// Returns the position of a point of a light, or the unit direction towards it if it lies at infinity.
 inline Vec3 place(const LitScene& lit, const Light& light, const LightPoint& p) {
     const std::vector<Table>& tables = lit.tables;
     switch (light.kind) {
@@ -61,14 +62,14 @@ inline Vec3 place(const LitScene& lit, const Light& light, const LightPoint& p) 
     }
 }
 
-// Uniform numbers of one point and light, that fill the unit square evenly over the points of a pixel, and of blocks of
-// pixels (edgegrad/points/sobol.py). The upper half of a seed says which sequence, the lower which of its points: each
-// takes as many in a row as it has parts.
+// Supplies uniform numbers for one point and light. They fill the unit square evenly over the points of a pixel, and of
+// blocks of pixels (edgegrad/points/sobol.py). A seed's upper half selects the sequence, its lower half the point in
+// it. Each point takes as many consecutive numbers as it needs.
 struct RandomNumbers {
     const Light& light;
     uint64_t seed;
 
-    // So many numbers of one kind, by their index.
+    // Supplies `count` numbers of one kind by their index.
     class Parts {
        public:
         Parts(const RandomNumbers& of, int kind, int count)
@@ -85,14 +86,14 @@ struct RandomNumbers {
     double of_choice() const { return Parts(*this, 2, 1)(0).x; }
 };
 
-// How many candidates are drawn by each.
+// Holds how many candidates each technique draws.
 struct Shares {
     double light = 0, lobe = 0;
 };
 
-// Calls add(candidate, whether the lobe drew it) for so many points of a light, half of them drawn by the lobe if it is
-// asked, and says before how many of both kinds there are. by_light(numbers, add) and towards(direction, add) say what
-// they are.
+// Calls add(candidate, whether the lobe drew it) for `all` points of a light. The lobe draws half of them if `ask_lobe`
+// is set. `shares` gets the number of both kinds first. by_light(numbers, add) and towards(direction, add) define the
+// candidates.
 template <class ByLight, class Towards, class Add>
 void draw_candidates(const DrawnLobe& lobe, const RandomNumbers& numbers, int all, bool ask_lobe, Shares& shares,
                      ByLight by_light, Towards towards, Add add) {
@@ -106,7 +107,7 @@ void draw_candidates(const DrawnLobe& lobe, const RandomNumbers& numbers, int al
         towards(lobe.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
     }
 }
-// Those of an environment.
+// Draws candidates from an environment.
 template <class Add>
 void draw_candidates(const LitScene& lit, const Light& light, const DrawnLobe& lobe, const RandomNumbers& numbers,
                      int all, Shares& shares, Add add) {
@@ -125,13 +126,13 @@ void draw_candidates(const LitScene& lit, const Light& light, const DrawnLobe& l
         add);
 }
 
-// Points of a light, drawn by what they give to a glossy surface where nothing lies between, the target: of
-// candidates that the light and the lobe have drawn, and that the power heuristic weights (Veach and Guibas 1995),
-// `count` are kept in proportion to target / pdf (resampled importance sampling, Talbot et al. 2005). Their pdf
-// is the target over its integral as the candidates estimate it.
+// Samples points of a light for a glossy surface by resampled importance sampling (Talbot et al. 2005). The target is
+// the unoccluded radiance that a point adds. The light and the lobe draw candidates, weighted by the power heuristic
+// (Veach and Guibas 1995). `count` candidates are kept in proportion to target / pdf. Their pdf is the target over its
+// integral, which the candidates estimate.
 class Resampled {
    public:
-    static constexpr int each = 8;  // candidates for one that is kept
+    static constexpr int each = 8;  // This many candidates are drawn for each one that is kept.
 
     template <class S>
     Resampled(const LitScene& lit, const Light& light, const RandomNumbers& numbers, const Surface<S>& o, int count,
@@ -150,7 +151,7 @@ class Resampled {
         }
     }
 
-    // Writes `count` points; ones that do not exist where nothing arrives.
+    // Writes `count` points; they have pdf 0 where no light arrives.
     void keep(double u, int count, LightPoint* out) const {
         if (kept_.empty()) return void(std::fill(out, out + count, LightPoint{0, 0, 0, 0}));
         size_t j = 0;
@@ -161,7 +162,7 @@ class Resampled {
         }
     }
 
-    // What a surface makes of light, but for colours that are nearly black, of which there are derivatives too.
+    // Evaluates the BSDF times the cosine. Nearly black colours become `dark`, as they have derivatives, too.
     class Target {
        public:
         template <class S>
@@ -209,7 +210,7 @@ class Resampled {
     std::vector<double> running_;
 };
 
-// The points of a light that point i of a surface is lit by: `count` of them.
+// Writes the `count` points of a light that illuminate point i of a surface.
 template <class S>
 void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int number, int count, double dark,
                   const Surface<S>& o, LightPoint* out) {
@@ -231,7 +232,7 @@ void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int n
     }
 }
 
-// What one light sample adds, before it is known to be seen: f E max(0, n·l).
+// Adds the unoccluded contribution of one light sample: f E max(0, n·l).
 template <class S>
 void add_light(const LitScene& lit, const Light& light, const LightPoint& point, double share, const Surface<S>& o,
                S* total) {

@@ -14,7 +14,7 @@ namespace {
 
 double size_of(Vec3 y) { return std::max({std::fabs(y.x), std::fabs(y.y), std::fabs(y.z)}); }
 
-// Some arrivals, on one thread.
+// Traces a few arrivals on one thread.
 template <class T>
 class LightPaths {
    public:
@@ -42,17 +42,17 @@ class LightPaths {
     }
 
    private:
-    // Where a path has come to.
+    // Holds the current end of a path.
     struct End {
         int64_t arrival, seed;
-        double through;  // what it gives to its end, of what came to its beginning, in the channel that has most
+        double through;  // It is the throughput up to this end, in its largest channel.
         Vec3 in;
-        double carried[most_lit_channels];  // B t (n · in) / |g · in|, once it is placed
+        double carried[most_lit_channels];  // It is B t (n · in) / |g · in| once the end is placed.
         Surface<double> o;
         int64_t face;
     };
 
-    // False where its side that faces the light scatters none.
+    // Returns false where the side that faces the light scatters none.
     bool place(int64_t face, const double* b, End& end) const {
         Surface<double>& o = end.o;
         end.face = face;
@@ -70,7 +70,7 @@ class LightPaths {
         return true;
     }
 
-    // What a point scatters from one unit direction into another; false if nothing.
+    // Writes the BSDF for light from one unit direction into another. Returns false if nothing is scattered.
     bool scatters(const Surface<double>& o, Vec3 into, Vec3 from, double* f) const {
         if (!(dot(o.n, into) > 0 && dot(o.g, into) > 0)) return false;
         scatter(o.scattering, into, o.n, from, C_, f);
@@ -116,7 +116,7 @@ class LightPaths {
         }
     }
 
-    // The k-th step of all ends that take it.
+    // Extends all paths by step k, and plays Russian roulette.
     void go_on(int k) {
         leaving_.clear(), rays_.clear();
         for (const End& end : ends_) {
@@ -161,7 +161,7 @@ class LightPaths {
     const RayCaster& caster_;
     const CameraConnections& camera_;
     const int C_;
-    double eps_ = 0;  // relative spacing of places
+    double eps_ = 0;  // It is the relative spacing of positions.
     bool filtered_ = false;
     std::vector<End> ends_, leaving_;
     struct {

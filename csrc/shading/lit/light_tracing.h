@@ -1,16 +1,15 @@
-// Light that has come to points of surfaces, followed on to the camera: each point scatters it into a direction that is
-// drawn, and each that a direction meets sends some to the camera, where nothing hides it (light tracing; Dutré,
-// Lafortune and Willems 1993). It is what those curves need that the camera does not see: paths back from pixels do not
-// come upon them.
+// Traces light that has reached points of surfaces on to the camera (light tracing; Dutré, Lafortune and Willems 1993).
+// Each point scatters it into a sampled direction, and each point that is hit connects to the camera if nothing
+// occludes it. Curves that the camera does not see directly need this, because paths from pixels do not find them.
 //
-// A point x_k to which B_k comes from the unit direction i sends, with the normals n for shading and g of the face, and
-// the terminator t (terminator()),
+// Let B_k arrive at a point x_k from the unit direction i. With the normals n for shading and g of the face, and the
+// terminator t (terminator()), the point sends
 //
 //     f(i → e) B_k t (n · i) / |g · i| · |∂x/∂A|       to the camera in the direction e, per px²,
-//     B_{k+1} = f(i → w) B_k t (n · i) / |g · i| · |g · w| / p(w)     to the point that the direction w meets,
+//     B_{k+1} = f(i → w) B_k t (n · i) / |g · i| · |g · w| / p(w)     to the point that the direction w hits,
 //
-// drawn with the pdf p by solid angle. B is radiance times an area across the ray: what light of the radiance L
-// brings through a projected area |g · i| dA has B = L |g · i| dA. The quotients are those of shading normals (Veach
+// with the pdf p with respect to solid angle. B is radiance times an area across the ray: light of the radiance L
+// through a projected area |g · i| dA carries B = L |g · i| dA. The quotients are those of shading normals (Veach
 // 1996).
 #pragma once
 
@@ -25,14 +24,14 @@
 
 namespace edgegrad {
 
-// Points of faces to which light has come.
+// Holds points of faces that light has reached.
 struct Arrivals {
     int64_t size;
     const int64_t* face;
     const double* b;        // (N, 3) barycentrics
-    const double* from;     // (N, 3) unit directions where it came from
+    const double* from;     // (N, 3) unit directions from which it came
     const double* carried;  // (N, channels)
-    const int64_t* seed;    // (N,) of random numbers
+    const int64_t* seed;    // (N,) seeds of random numbers
 
     Arrivals part(int64_t first, int64_t count, int channels) const {
         return {std::min(count, size - first), face + first, b + 3 * first, from + 3 * first,
@@ -40,15 +39,15 @@ struct Arrivals {
     }
 };
 
-// What comes to the image of it, at most one place after each step.
+// Holds connections to the image, at most one after each step.
 struct Connections {
-    std::vector<int64_t> arrival;  // (M,) of which it is
+    std::vector<int64_t> arrival;  // (M,) the arrival of each
     std::vector<double> x;         // (M, 2) pixel positions
-    std::vector<double> radiance;  // (M, channels) that it adds there, times px²
+    std::vector<double> radiance;  // (M, channels) added radiance times px²
 };
 
-// After first, first + 1, …, last steps, with `first` at least 0: then also the points themselves send light to the
-// camera. In order of blocks of arrivals.
+// Selects the steps after which paths connect to the camera: first, …, last. With `first` = 0, the arrivals themselves
+// connect, too. Results are in the order of blocks of arrivals.
 struct StepRange {
     int first, last;
 };

@@ -83,7 +83,7 @@ void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const R
         std::vector<int8_t> seen(shaded_at_once * K);
         for (; first < last; first += shaded_at_once) {
             const LitPoints some = points.part(first, std::min(shaded_at_once, last - first));
-            // What the loss ignores is not asked, for its derivatives are zero.
+            // Points with a zero cotangent are skipped, because their derivatives are zero.
             const auto wanted = [&](int64_t i) {
                 const double* of_point = bar + (first + i) * lit.channels;
                 return std::any_of(of_point, of_point + lit.channels, [](double x) { return x != 0; });

@@ -1,4 +1,4 @@
-// Radiance at a point of which it is known which lights it sees, and its _vjp.
+// Evaluates the radiance at a point whose visible lights are known, and its _vjp.
 #pragma once
 
 #include <algorithm>
@@ -10,7 +10,7 @@
 
 namespace edgegrad {
 
-// What a surface sends by itself: what it emits, or the colour of one without a material.
+// Adds what a surface sends by itself: its emission, or its colour if it has no material.
 template <class S>
 void add_own(const LitScene& lit, const Surface<S>& o, S* total) {
     if (!o.mesh->has_material) {
@@ -30,7 +30,7 @@ inline void add_own_vjp(const LitScene& lit, const Surface<double>& o, const dou
     }
 }
 
-// What it scatters of lights that cast no shadows.
+// Adds the scattered light of lights that cast no shadows.
 template <class S>
 void add_unshadowed(const LitScene& lit, const Surface<S>& o, S* total) {
     if (!o.mesh->has_material) return;
@@ -56,7 +56,7 @@ inline void add_unshadowed_vjp(const LitScene& lit, const Surface<double>& o, co
     }
 }
 
-// What it scatters of the points of lights that it sees.
+// Adds the scattered light of the light samples that the surface sees.
 template <class S>
 void add_lights(const LitScene& lit, const std::vector<LightSample>& lights, const LightPoint* points,
                 const Surface<S>& o, const int8_t* seen, S* total) {
@@ -79,7 +79,7 @@ void radiance(const LitScene& lit, const LitOptions& options, const std::vector<
     if (options.only < 0) add_own(lit, o, total), add_unshadowed(lit, o, total);
     add_lights(lit, lights, points, o, seen, total);
 }
-// Whether no light that a point sees, nor anything else, gives it radiance: then it has no derivatives either.
+// Returns whether a point has no radiance: it sees no light, and has no other source. It has no derivatives either.
 inline bool is_unlit(const LitScene& lit, const LitMesh& mesh, const int8_t* seen, size_t lights) {
     if (!mesh.has_material || mesh.emission.exists()) return false;
     return std::none_of(seen, seen + lights, [](int8_t s) { return s > 0; }) &&

@@ -1,4 +1,4 @@
-// A scene with materials and lights, as tables and what refers to them by number; and points of its surfaces.
+// Holds a scene with materials and lights, as tables and references to them by number, and points of its surfaces.
 #pragma once
 
 #include <algorithm>
@@ -20,7 +20,8 @@ struct LitMesh {
     int64_t first_face = 0, faces = 0;
     int32_t first_vertex = 0;
     bool has_material = false, two_sided = true, lambertian = true;
-    Source color, base, metallic, roughness, emission;  // the colour of the mesh itself, and its material's
+    // These are the colour of the mesh itself, and the parameters of its material.
+    Source color, base, metallic, roughness, emission;
     NormalSource normal;
 
     std::array<const Source*, 6> sources() const {
@@ -30,14 +31,14 @@ struct LitMesh {
 
 struct LitScene {
     std::vector<Table> tables;
-    std::vector<LitMesh> meshes;  // ascending by first face
+    std::vector<LitMesh> meshes;  // They ascend by first face.
     std::vector<Light> lights;
     const int32_t* faces = nullptr;  // (F, 3) rows of `verts`
     int verts = no_table;
-    int eye = no_table;  // where it is; in an orthographic view, the unit direction towards it
+    int eye = no_table;  // It is the position, or the unit direction towards the eye in an orthographic view.
     bool perspective = true;
     int channels = 0;
-    Vec3 center;  // of a ball around all vertices
+    Vec3 center;  // It is the centre of a bounding sphere of all vertices.
     double radius = 0;
 
     const LitMesh& mesh_of(int64_t face) const {
@@ -45,7 +46,7 @@ struct LitScene {
         while (k + 1 < meshes.size() && face >= meshes[k + 1].first_face) ++k;
         return meshes[k];
     }
-    // Whether a texture is looked up by how far pixels lie apart.
+    // Returns whether some texture is filtered by the footprints of pixels.
     bool is_filtered() const {
         return std::any_of(meshes.begin(), meshes.end(), [](const LitMesh& mesh) {
             const auto all = mesh.sources();
@@ -58,9 +59,9 @@ struct LitScene {
     }
 };
 
-// What is known of the shadow of one light, instead of being drawn and traced: a row for each point.
+// Fixes the sampled point and the shadow of one light, which are then neither drawn nor traced; each point has a row.
 struct ForcedLight {
-    int light = -1;  // −1: nothing
+    int light = -1;  // −1 means none.
     const int64_t* index = nullptr;
     const double *uv = nullptr, *pdf = nullptr;
     const uint8_t* lit = nullptr;
@@ -70,13 +71,13 @@ struct LitPoints {
     int64_t size = 0;
     const int64_t* face = nullptr;
     const double* b = nullptr;      // (N, 3) barycentrics
-    const int64_t* seed = nullptr;  // (N,) of random numbers
+    const int64_t* seed = nullptr;  // (N,) seeds of random numbers
     ForcedLight forced;
-    const double* spread = nullptr;  // (N, 2, 2), see source.h; null: not known
+    const double* spread = nullptr;  // (N, 2, 2), see source.h; null: unknown
 
     const double* spread_at(int64_t i) const { return spread ? spread + spread_size * i : nullptr; }
 
-    // So many from `first` on, or those that there are.
+    // Returns `count` points from `first` on, or as many as there are.
     LitPoints part(int64_t first, int64_t count) const {
         LitPoints o{std::min(count, size - first), face + first, b + 3 * first, seed + first, forced, spread_at(first)};
         if (forced.light >= 0)
@@ -86,7 +87,7 @@ struct LitPoints {
     }
 };
 
-// Cotangents, or tangents, of places.
+// Points to the cotangents or tangents of positions.
 template <class Number>
 struct LitPlaces {
     Number* b = nullptr;       // (N, 3)
@@ -94,36 +95,36 @@ struct LitPlaces {
 };
 
 constexpr int most_bounces = 64;
-// Paths of an image that go on from one point. They share its ray from the camera and its points of lights, and their
-// directions fill the sphere more evenly (docs/tried.md).
+// An image starts this many paths at one point. They share the camera ray and the light samples, and their directions
+// fill the sphere more evenly (docs/tried.md).
 constexpr int paths_of_point = 4;
 
 struct LitOptions {
     bool shadows = true;
-    int samples = 1;  // points of each light with an extent, for each point that is shaded
-    int only = -1;    // the light of which alone radiance is wanted; −1: of all that there is
-    // Whether only derivatives are wanted: on glossy surfaces points of environments are then drawn in antithetic sets.
+    int samples = 1;  // It counts the points of each light with an extent.
+    int only = -1;    // Only this light contributes; −1 means all.
+    // Only derivatives are wanted. Glossy surfaces then sample environments in antithetic sets.
     bool antithetic = false;
-    double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
-    int bounces = 1;  // how often light is scattered on its way, at most (path.h)
-    // World units, 0: none. Derivatives by where points lie on their faces, of light that is scattered more than once,
-    // are those of what does not come from nearer (near_field.h); `only_near_field`: values are those of what does.
+    // Light sampling treats darker glossy surfaces as this dark, because black ones have derivatives, too.
+    double dark = 0;
+    int bounces = 1;  // It bounds how often light is scattered (path.h).
+    // The radius of the near field in world units, 0: none. Derivatives of indirect light with respect to positions on
+    // faces then leave out the near part (near_field.h). With `only_near_field`, values are those of the near part.
     double near = 0;
     bool only_near_field = false;
-    int by_paths = -1;  // a light of which no points are drawn for Lambertian surfaces: paths from them find it
+    int by_paths = -1;  // Paths find this light from Lambertian surfaces, which draw no points of it.
 };
 
-// Whether a point sees a light sample: 1, or 0 where it is in shadow, or that it was not asked, for the surface is
-// turned away from it.
+// Marks a light sample behind the surface, which is not traced. Otherwise visibility is 1, or 0 in shadow.
 constexpr int8_t not_asked = -1;
 
 struct LightSample {
-    int light, sample, count;  // one of so many of a light
+    int light, sample, count;  // It is one of `count` samples of a light.
 };
-// What is cast for one sample of a light, where points come in antithetic sets: the image has many more points that are
-// lit, and derivatives have both signs (docs/tried.md).
+// Counts the antithetic sets that replace one sample of a light. The image has many more points that are lit, and
+// derivatives have both signs (docs/tried.md).
 constexpr int sets_for_one = 2;
-// The most of them (sets_of() in derivative_points.h).
+// Bounds what sets_of() in derivative_points.h returns.
 constexpr int most_sets_for_one = 8;
 inline bool draws_antithetic(const LitScene& lit, const LitOptions& options, const Light& light) {
     return options.antithetic && light.kind == Light::Kind::environment &&

@@ -1,4 +1,4 @@
-// A point of a surface that light falls on: its place, normals and material, each with its _vjp.
+// Describes a surface point that light illuminates: its position, normals and material, each with its _vjp.
 #pragma once
 
 #include <algorithm>
@@ -15,9 +15,9 @@ struct Surface {
     const LitMesh* mesh;
     FacePoint<S> at;
     FaceFrame<Vector<S>> frame;
-    Vector<S> y, v;  // place, and the unit direction to the viewer
-    Vector<S> g, n;  // unit normals of the face and for shading, on the viewer's side
-    double side;     // 1 in front of the face, or −1
+    Vector<S> y, v;  // They are the position, and the unit direction to the viewer.
+    Vector<S> g, n;  // They are the unit normals of the face and for shading, on the viewer's side.
+    double side;     // It is 1 in front of the face, −1 behind it.
     Scattering<S> scattering;
 
     bool is_black() const { return side < 0 && mesh->has_material && !mesh->two_sided; }
@@ -29,8 +29,8 @@ Vector<S> towards_viewer(const LitScene& lit, Vector<S> y) {
     return lit.perspective ? unit(eye - y) : eye;
 }
 
-// Where it lies. Written in place: it is large, and what it scatters comes later. It refers to `spread` (null: not
-// known).
+// Sets the position. It writes in place, because a surface is large and its material follows later. It keeps a
+// reference to `spread` (null: unknown).
 template <class S>
 void set_place(const LitScene& lit, int64_t face, const S* b, const S* spread, Surface<S>& o) {
     const std::vector<Table>& tables = lit.tables;
@@ -43,7 +43,7 @@ void set_place(const LitScene& lit, int64_t face, const S* b, const S* spread, S
     }
     o.frame.g = unit(cross(o.frame.corner[1] - o.frame.corner[0], o.frame.corner[2] - o.frame.corner[0]));
 }
-// Which side of it is seen from the unit direction v.
+// Sets the visible side for the unit direction v to the viewer.
 template <class S>
 void set_view(const LitScene& lit, Vector<S> v, Surface<S>& o) {
     o.v = v;
@@ -52,15 +52,15 @@ void set_view(const LitScene& lit, Vector<S> v, Surface<S>& o) {
     o.scattering.lambertian = !o.mesh->has_material || o.mesh->lambertian;
     o.n = o.mesh->normal.is_flat() ? o.g : o.side * shading_normal(lit.tables, o.mesh->normal, o.at, o.frame);
 }
-// As the viewer of the scene sees it.
+// Sets a surface as the scene's viewer sees it.
 template <class S>
 void set_surface(const LitScene& lit, int64_t face, const S* b, const S* spread, Surface<S>& o) {
     set_place(lit, face, b, spread, o);
     set_view<S>(lit, towards_viewer<S>(lit, o.y), o);
 }
 
-// The base colour, and what else scatters.
-constexpr double plain_color = 0.7;  // of a mesh without colours (PLAIN in edgegrad/scene/mesh.py)
+// Sets the base colour and the other parameters of the BSDF.
+constexpr double plain_color = 0.7;  // A mesh without colours has this one (PLAIN in edgegrad/scene/mesh.py).
 template <class S>
 void look_up_material(const LitScene& lit, Surface<S>& o) {
     const LitMesh& mesh = *o.mesh;
@@ -78,7 +78,7 @@ void look_up_material(const LitScene& lit, Surface<S>& o) {
     if (mesh.roughness.exists()) value(lit.tables, mesh.roughness, o.at, 1, &s.roughness);
 }
 
-// Cotangents of what a point is made of.
+// Holds the cotangents of a surface point.
 struct SurfaceBar {
     Vec3 y, v, g, n;
     Scattering<double> scattering;
@@ -111,14 +111,14 @@ inline void look_up_material_vjp(const LitScene& lit, const Surface<double>& o, 
     if (mesh.roughness.exists()) value_vjp(lit.tables, mesh.roughness, o.at, 1, &s_bar.roughness, bar.at, to);
 }
 
-// From the cotangent of the direction to the viewer to those of place and eye.
+// Adds the cotangents of position and eye, from the cotangent of the direction to the viewer.
 inline void view_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar, Cotangents& to) {
-    if (o.scattering.lambertian) return;  // is the same from everywhere
+    if (o.scattering.lambertian) return;  // A Lambertian surface looks the same from everywhere.
     if (!lit.perspective) return to.add(lit.eye, 0, bar.v);
     const Vec3 towards_bar = unit_vjp(lit.tables[lit.eye].vector_at<double>(0) - o.y, bar.v);
     to.add(lit.eye, 0, towards_bar), bar.y -= towards_bar;
 }
-// From the cotangents of place and normals to those of barycentrics, vertices and normals.
+// Adds the cotangents of barycentrics, vertices and normals, from the cotangents of position and normals.
 inline void place_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar, Cotangents& to) {
     if (o.mesh->normal.is_flat()) bar.g += bar.n;
     else shading_normal_vjp(lit.tables, o.mesh->normal, o.at, o.frame, o.side * bar.n, bar.frame, bar.at, to);

@@ -1,9 +1,9 @@
-// Points of a mesh that emits as a point y of a surface meets them: with the direction towards them, by how much solid
-// angle grows with area there, and what lies in a direction that a lobe has drawn.
+// Samples points of an emissive mesh for a surface point y: by the directions towards them, converted by the solid
+// angle per area, or by what a lobe's direction hits.
 //
-// A direction l may pass through several faces. Each point q of them is then drawn with the pdf p(l) |dl/dq|, for
-// on one face l says q and q says l; so all of them are candidates, and the pdf of a point asks nothing about
-// others. But what surely lies behind another face of the light is left out, since no light comes from there.
+// A direction l may pass through several faces. Each point q of them then has the pdf p(l) |dl/dq|, because on one face
+// l determines q and q determines l. All of them are candidates, and the pdf of one is independent of the others.
+// Points that certainly lie behind another face of the light are left out, as no light arrives from them.
 #pragma once
 
 #include <algorithm>
@@ -17,32 +17,33 @@
 
 namespace edgegrad {
 
-// A point of a light that may be kept.
+// Holds a point of a light that may be kept.
 struct Candidate {
     LightPoint point;
-    Vec3 l;                  // unit, towards it
-    double brightness = 0;   // about, but nowhere zero
-    double solid_angle = 1;  // |dl/dq| of the coordinates that its pdf counts
+    Vec3 l;                  // It is the unit direction towards the point.
+    double brightness = 0;   // It is approximate, but zero nowhere.
+    double solid_angle = 1;  // It is |dl/dq| of the coordinates that its pdf counts.
 };
 
-// Whether directions are drawn by the lobe as well: where all of the light lies within a part of it they would only
-// miss, and far off the lobe scatters evenly to all of the light.
-constexpr double least_emitter = 0.25;  // solid angle over that of the lobe
-constexpr double least_round = 1;       // the same of round lights, whose own draws are better
-constexpr double farthest_lobe = 4;     // between them, in half angles of the lobe
+// These decide whether the lobe draws directions, too. They would only miss a light that lies within a part of the
+// lobe. Far from its centre, the lobe scatters evenly to all of the light.
+constexpr double least_emitter = 0.25;  // It is a solid angle over the lobe's.
+constexpr double least_round = 1;       // The limit is higher for round lights, which sample themselves better.
+constexpr double farthest_lobe = 4;     // It is the distance of both, in half angles of the lobe.
 constexpr double smallest_emitter =
-    0.1;                           // solid angle over that of the lobe, below which points of a flat light are equal
-constexpr double most_uneven = 4;  // the largest pdf of points over the mean, of lights that emit about evenly
+    0.1;  // Below this solid angle over the lobe's, points of a flat light are equivalent.
+// It bounds the largest pdf of points over the mean, for lights of about even emission.
+constexpr double most_uneven = 4;
 
-// Whether a light is drawn by directions to a ball around it, whose own points are drawn with such pdfs by area. Of
-// these half would be seen from behind; and directions that fill a cone evenly give about the same light each.
+// Returns whether a light with such pdfs by area is sampled by directions to its bounding sphere. Half of the points
+// sampled by area would face away. Directions that fill a cone evenly contribute about equally.
 inline bool is_round(const EmissiveFaceTree& tree, const double* pdf, int64_t n) {
     return tree.fills_ball() && *std::max_element(pdf, pdf + n) * tree.area() <= most_uneven;
 }
 
 class MeshTowards {
    public:
-    // `own`: the surface's face, as the scene counts them.
+    // `own` is the surface's face, counted in the scene.
     MeshTowards(const LitScene& lit, const Light& light, const DrawnLobe& lobe, Vec3 y, int64_t own)
         : lit_(lit), light_(light), from_(lit.emitter(light)), tree_(*light.tree), y_(y), own_(own - from_.first) {
         const double size = std::max({std::fabs(y.x), std::fabs(y.y), std::fabs(y.z), tree_.size()});
@@ -58,22 +59,22 @@ class MeshTowards {
         if (by_ball_) around_ = axes_around(middle_);
     }
 
-    // Whether directions are drawn by the lobe as well.
+    // Returns whether the lobe draws directions, too.
     bool by_lobe() const { return by_lobe_; }
-    // Whether points that the light draws are nearly equal, so that one is as good as another.
+    // Returns whether the light's own points contribute about equally, so that any one will do.
     bool interchangeable() const { return interchangeable_; }
 
     // Calls found(candidate) for what the light draws from numbers in [0, 1).
     template <class Found>
     void draw_by_light(Vec2 u, Found found) const {
         if (!by_ball_) return found(of(draw(light_, u)));
-        // Uniform in the cone around the ball.
+        // This is uniform in the cone around the bounding sphere.
         const double z = u.y * one_minus_cosine(), across = std::sqrt(z * (2 - z)), phi = 2 * M_PI * u.x;
         const Vec3 l{across * std::cos(phi), across * std::sin(phi), 1 - z};
         each_towards(transposed_times(around_, l), found);
     }
 
-    // A point that was drawn, whatever by, with the pdf of the light's draws.
+    // Returns a point drawn by any technique as a candidate, with the pdf of the light's own technique.
     Candidate of(const LightPoint& p) const {
         const FacePoint<double> at = on_emitter<double>(from_, p);
         Vec3 corner[3], away = y_;
@@ -96,7 +97,7 @@ class MeshTowards {
         return c;
     }
 
-    // Calls found(candidate) for what lies in the direction l.
+    // Calls found(candidate) for the points in the direction l.
     template <class Found>
     void each_towards(Vec3 l, Found found) const {
         crossings_.clear();
@@ -105,7 +106,7 @@ class MeshTowards {
             if (c.face != own_) crossings_.push_back(c), nearest = std::min(nearest, c.t);
             return light_.hides ? nearest + contact_ : INFINITY;
         });
-        // Whatever the tree's order: by distance, and of what is as far by number.
+        // Sorting by distance, then by face makes the order independent of the tree's.
         std::sort(crossings_.begin(), crossings_.end(),
                   [](const auto& a, const auto& b) { return a.t != b.t ? a.t < b.t : a.face < b.face; });
         for (const EmissiveFaceTree::Crossing& c : crossings_) {
@@ -130,7 +131,7 @@ class MeshTowards {
     double one_minus_cosine() const { return sine_ * sine_ / (1 + cosine_); }
     double solid_angle() const { return sine_ < 1 ? 2 * M_PI * one_minus_cosine() : 4 * M_PI; }
 
-    // Whether the light hides a point that is seen from behind.
+    // Returns whether the light occludes a point that is seen from behind.
     bool hides_back(const LightPoint& p, Vec3 away) const {
         if (!light_.hides || tree_.is_flat()) return false;
         if (tree_.is_convex() && sine_ < 1) return true;
@@ -149,9 +150,9 @@ class MeshTowards {
     const EmissiveFaceTree& tree_;
     Vec3 y_, middle_;
     int64_t own_;
-    double contact_, distance_, sine_ = 1, cosine_ = 0;  // of half the angle of the ball around the light
+    double contact_, distance_, sine_ = 1, cosine_ = 0;  // Half the bounding cone's angle has this sine and cosine.
     bool by_lobe_ = false, by_ball_ = false, interchangeable_ = false;
-    Mat3 around_;  // axes around the direction to the middle
+    Mat3 around_;  // These axes surround the direction to the centre.
     mutable std::vector<EmissiveFaceTree::Crossing> crossings_;
 };
 

@@ -1,11 +1,10 @@
-// Light that comes to the first point x₁ of a path from what is near, φ(d) of it with d = |x₂ − x₁|, and the rest, 1 −
-// φ:
+// Splits light that reaches the first point x₁ of a path into a near part, φ, and the rest, 1 − φ. With d = |x₂ − x₁|,
 //
 //     φ = (1 − d² / r²)² for d < r, else 0.
 //
-// As x₁ slides on its face with x₂ held on its own, light changes by up to 1 / d of it, and next to corners the
-// variance of that is infinite. So of what is near no such derivatives are taken: it is compared at places that lie
-// apart (edgegrad/light/near_field.py). Of the rest they are bounded by some 1 / r.
+// As x₁ slides on its face with x₂ fixed, light changes by up to 1 / d, relatively. Next to corners, this derivative
+// has infinite variance. The near part therefore uses finite differences instead, the near-field term
+// (edgegrad/light/near_field.py). The derivatives of the rest are bounded by about 1 / r.
 #pragma once
 
 #include <algorithm>
@@ -19,7 +18,7 @@ class NearField {
     explicit NearField(double radius) : squared_(radius * radius) {}
 
     bool exists() const { return squared_ > 0; }
-    // φ of a place at x₂ − x₁, and its derivative by x₂.
+    // Returns φ for a displacement d = x₂ − x₁, and its derivative with respect to x₂.
     double share(Vec3 d) const { return exists() ? rest(d) * rest(d) : 0; }
     Vec3 slope(Vec3 d) const { return exists() ? (-4 * rest(d) / squared_) * d : Vec3{}; }
 

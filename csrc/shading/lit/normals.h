@@ -1,5 +1,5 @@
-// The normal that shades a point: that of the face, or interpolated between those of vertices, or bent by a normal map.
-// Value, and beneath it the _vjp.
+// Computes the shading normal of a point, and its _vjp. The normal is that of the face, interpolated between vertex
+// normals, or perturbed by a normal map.
 #pragma once
 
 #include "shading/lit/source.h"
@@ -11,7 +11,7 @@ struct NormalSource {
     const int32_t* normal_faces = nullptr;  // (F, 3) rows of normals
     Source map;
     int map_scale = no_table;
-    Source tangents;  // at corners, with the handedness (edgegrad/scene/mikktspace.py); none: of faces
+    Source tangents;  // Corners have tangents with the handedness (edgegrad/scene/mikktspace.py), else faces.
 
     bool is_flat() const { return normals == no_table && !map.exists(); }
 };
@@ -19,13 +19,13 @@ struct NormalSource {
 template <class V>
 struct FaceFrame {
     V corner[3];
-    V g;  // the unit normal to the side from which the corners run counter-clockwise
+    V g;  // It is the unit normal of the side from which the corners run counter-clockwise.
 };
 
-// Interpolated, on the side of g.
+// Holds the interpolated normal on the side of g.
 template <class S>
 struct SmoothNormal {
-    Vector<S> sum;  // before it is given the length 1
+    Vector<S> sum;  // It is not normalised.
     bool exists = false, turned = false;
     Vector<S> n;
 };
@@ -59,18 +59,17 @@ inline void smooth_normal_vjp(const std::vector<Table>& tables, const NormalSour
     }
 }
 
-// A bent normal that is no longer than this before it is given the length 1 tells no direction, and would have
-// derivatives as large as it is short: a map of 8 bits is off by up to 1/255 in each component, √3/255 in length.
-// The normal is not bent there.
+// A perturbed normal that is not longer than this, unnormalised, has no direction. Its derivatives would be as large as
+// it is short. An 8-bit map is off by up to 1/255 in each component, √3/255 in length. The map is ignored there.
 constexpr double faintest_normal = 1.0 / 128;
 
-// The frame of texture coordinates at the point, and what the map says in it.
+// Holds the frame of texture coordinates at the point, and the map's normal in it.
 template <class S>
 struct MappedNormal {
-    S d1 = 0, d2 = 0;                       // how v changes along the edges from the first corner
-    Vector<S> e1, e2;                       // these
-    double hand = 1;                        // −1 where the image is mirrored
-    Vector<S> along, across, t, bitangent;  // ∂x/∂u of any length; what of it is normal to n; unit vectors
+    S d1 = 0, d2 = 0;                       // They are the change of v along the edges from the first corner.
+    Vector<S> e1, e2;                       // They are these edges.
+    double hand = 1;                        // It is −1 where the image is mirrored.
+    Vector<S> along, across, t, bitangent;  // They are ∂x/∂u of any length, its part normal to n, and unit vectors.
     S mapped[3], scale;
     Vector<S> m;
     bool exists = false;
@@ -103,7 +102,7 @@ MappedNormal<S> mapped_normal(const std::vector<Table>& tables, const NormalSour
     return o;
 }
 
-// Of d2 e1 − d1 e2.
+// Adds the cotangents of d2 e1 − d1 e2.
 inline void face_tangent_vjp(const Source& map, const FacePoint<double>& at, const MappedNormal<double>& o, Vec3 bar,
                              FaceFrame<Vec3>& frame_bar, Cotangents& to) {
     frame_bar.corner[0] -= (o.d2 - o.d1) * bar;
@@ -144,7 +143,7 @@ inline void shading_normal_vjp(const std::vector<Table>& tables, const NormalSou
             n_bar = o.mapped[2] * m_bar;
             Vec3 t_bar = o.scale * o.mapped[0] * m_bar;
             cross_vjp(n, o.t, o.hand * o.scale * o.mapped[1] * m_bar, n_bar, t_bar);
-            // across = along − n (n · along)
+            // This differentiates across = along − n (n · along).
             const Vec3 across_bar = unit_vjp(o.across, t_bar);
             const double kept = dot(n, across_bar);
             const Vec3 along_bar = across_bar - kept * n;

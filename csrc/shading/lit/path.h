@@ -1,14 +1,15 @@
-// Paths along which light comes to points of surfaces that has been scattered before: light, xₙ, …, x₂, x₁, viewer.
-// They are drawn and found once, without derivatives; path_radiance.h says what they carry, as a function of what
-// moves. Each point x₂ … stays at the barycentrics of its face while faces move, and the pdfs of all draws are
-// constants: with paths that keep their directions instead, a moving surface would be differentiated with a bias
-// (Worchel, Finnendahl and Alexa 2025).
+// Traces paths backwards from points of surfaces, for light that surfaces have scattered before: light, xₙ, …, x₂, x₁,
+// viewer. It uses next-event estimation, MIS by the balance heuristic for images, and Russian roulette.
 //
-// What lights give a point of a path directly is found as it is of points that are seen (light_sample.h), with draws by
-// the light and by the material. So what a drawn direction meets of a light is counted there already, and is not
-// counted again here. Only for images, which have no derivatives, such draws of Lambertian surfaces, which the light
-// alone makes else, share with the direction of the path (multiple importance sampling, Veach and Guibas 1995). A path
-// ends at meshes without a material, at backs of faces that show none, and in the open.
+// Paths are sampled once, without derivatives; path_radiance.h evaluates them as a function of what moves. Each point
+// x₂ … stays at the barycentrics of its face while faces move, and the pdfs of all samples are constants. Paths that
+// kept their directions instead would give biased derivatives for moving surfaces (Worchel, Finnendahl and Alexa 2025).
+//
+// Next-event estimation samples lights at a path's points as it does at points that are seen (light_sample.h), by the
+// light and by the BSDF. It thereby already counts emitters that a sampled direction hits; the path does not count them
+// again. Only images, which need no derivatives, apply MIS (Veach and Guibas 1995) to Lambertian surfaces. There,
+// samples of the light alone share their weight with the path's direction. A path ends at meshes without a material, at
+// back faces of one-sided materials, and where its ray leaves the scene.
 #pragma once
 
 #include <algorithm>
@@ -25,8 +26,8 @@ namespace edgegrad {
 constexpr int steps_without_roulette = 2;
 constexpr double least_survival = 0.05;
 
-// How much solid angle the last two barycentrics of a point fill as it is seen over the distance d: |M · d| / |d|³,
-// with M the cross product of two sides of its face.
+// Returns the solid angle of a face per unit of its last two barycentrics, seen from the displacement d: |M · d| /
+// |d|³. M is the cross product of two sides of the face.
 template <class S>
 S solid_angle(const Surface<S>& o, Vector<S> d) {
     const Vector<S> M = cross(o.frame.corner[1] - o.frame.corner[0], o.frame.corner[2] - o.frame.corner[0]);
@@ -34,24 +35,25 @@ S solid_angle(const Surface<S>& o, Vector<S> d) {
     return S(plain(facing) < 0 ? -1 : 1) * facing / (squared * sqrt(squared));
 }
 
-// A point of a light that the direction in which a path goes on has met. Its pdf, and that of points of the light
-// that light the same point of the path, is that of both ways to draw it (the balance heuristic).
+// Holds the point of an emitter that the path's sampled direction hits. By the balance heuristic, its pdf is the sum of
+// the pdfs of both sampling techniques. Light samples for the same point of the path have the same kind of pdf.
 struct EmitterHit {
-    int light = -1;  // none
+    int light = -1;  // −1 means no hit.
     LightPoint point;
 };
 
-// One path of `points` points. Arrays begin at its first point; the next one is `stride` further, or as many rows of
-// `lights`.
+// Views one path of `points` points. Arrays begin at its first point; the next one is `stride` elements further, or as
+// many rows of `lights`.
 struct Path {
     int points;
     const int64_t* face;
     const double* b;    // (3,) barycentrics
-    const double* pdf;  // of the last two of them, as the point before draws them, times the chance to come so far
+    const double* pdf;  // The pdf of the last two barycentrics, as the previous point samples them, times the
+                        // probability of survival.
     const LightPoint* drawn;
     const int8_t* seen;
     size_t stride, lights;
-    const EmitterHit* met;  // null: not asked
+    const EmitterHit* met;  // Null means that hits of emitters do not count.
 
     int64_t face_at(int k) const { return face[k * stride]; }
     const double* b_at(int k) const { return b + 3 * k * stride; }
@@ -62,8 +64,7 @@ struct Path {
     const EmitterHit& met_at(int k) const { return met[k * stride]; }
 };
 
-// The paths of some points, about shaded_at_once of them, point by point of all paths. It is kept from one call to the
-// next.
+// Holds the paths of about shaded_at_once points, ordered by step and then by path. Calls reuse its memory.
 class Paths {
    public:
     Paths(const LitScene& lit, const LitOptions& options) : lit_(lit), options_(options), C_(lit.channels) {
@@ -81,7 +82,7 @@ class Paths {
     const std::vector<LightSample>& lights() const { return lights_; }
     const LitOptions& options() const { return options_; }
 
-    // From points that are `wanted`; the others get paths without any points.
+    // Traces paths from points that are `wanted`; the others get paths without points.
     template <class T, class Wanted>
     void find(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Wanted wanted) {
         begin(from, [&](int64_t i, Surface<double>& o) {
@@ -91,9 +92,9 @@ class Paths {
         });
         go_on(scene, caster, from);
     }
-    // For an image: lights are asked for the first points, too, and lights that paths meet count. From each point go
-    // paths_of_point paths, path(paths_of_point · i) and those after it, of which the first has what is asked of
-    // lights.
+    // Traces paths for an image: lights are also sampled for the first points, and emitters that paths hit count. Each
+    // point i starts paths_of_point paths, path(paths_of_point · i) and those after it. The first of them has the light
+    // samples of the point.
     template <class T>
     void find_whole(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
         meets_ = options_.shadows, each_ = paths_of_point;
@@ -103,8 +104,7 @@ class Paths {
             return true;
         });
     }
-    // From points that `place(i, surface)` sets, if it returns true, seen from where it says; lights are asked for
-    // them, too.
+    // Traces paths from points that `place(i, surface)` sets if it returns true, and samples lights for them, too.
     template <class T, class Place>
     void find_lit(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Place place) {
         begin(from, place);
@@ -125,11 +125,11 @@ class Paths {
                 size_t(K()),
                 meets_ ? &met_[i] : nullptr};
     }
-    // What they were found with.
+    // Returns the surface point with which the path was traced.
     const Surface<double>& surface(int64_t i, int k) const { return surfaces_[k * n_ + i]; }
 
    private:
-    // Rays from the points that paths have come to.
+    // Holds rays from the current ends of paths.
     struct Rays {
         std::vector<int64_t> index;
         std::vector<int32_t> face, hit;
@@ -161,7 +161,7 @@ class Paths {
             }
         }
     }
-    // Paths from one point have numbers one after another.
+    // Paths from one point have consecutive indices in its sequence.
     uint64_t seed_of(const LitPoints& from, int64_t i) const {
         const uint64_t seed = uint64_t(from.seed[i / each_]), sequence = seed >> 32 << 32;
         return sequence | uint32_t(uint32_t(seed) * uint32_t(each_) + uint32_t(i % each_));
@@ -178,7 +178,7 @@ class Paths {
 
     int64_t K() const { return int64_t(lights_.size()); }
 
-    // Draws where the paths go on to from their points after k steps.
+    // Samples the directions in which paths continue after k steps, and plays Russian roulette.
     void leave(const LitPoints& from, int k) {
         rays_.clear();
         std::optional<PathRandomNumbers> numbers;
@@ -208,7 +208,7 @@ class Paths {
         }
     }
 
-    // Finds what they meet.
+    // Traces these rays, and extends the paths by what they hit.
     template <class T>
     void arrive(const SceneView<T>& scene, const RayCaster& caster, int k) {
         rays_.hit.resize(rays_.index.size()), rays_.hit_b.resize(2 * rays_.index.size());
@@ -245,12 +245,12 @@ class Paths {
         }
     }
 
-    // How many draw what a point is lit by after k steps.
+    // Returns the number of paths whose directions share a point's light samples after k steps.
     int paths_at(int k) const { return k == 0 ? each_ : 1; }
 
-    // -- lights that are found in two ways ----------------------------------------------------------------------------
+    // -- MIS of sampled lights and emitters that paths hit ----------------------------------------------------------
 
-    // The pdf of a direction by area on the light that it meets, d away.
+    // Converts the pdf of a direction from solid angle to area of the emitter that it hits at the displacement d.
     static double by_area(double pdf, Vec3 normal, Vec3 d) {
         const double squared = dot(d, d);
         return pdf * std::fabs(dot(normal, d)) / (squared * std::sqrt(squared));
@@ -266,11 +266,11 @@ class Paths {
         const Light& light = lit_.lights[sky_];
         LightPoint p = point_towards(lit_.tables, light, {l[0], l[1], l[2]});
         if (light.is_image) p = above(lit_.tables, light, p, o.g);
-        else p.pdf = k == 0 && by_paths_ >= 0 ? 0 : rays_.pdf[r];  // by the cosine as well: draw_even_sky()
+        else p.pdf = k == 0 && by_paths_ >= 0 ? 0 : rays_.pdf[r];  // draw_even_sky() also samples by the cosine.
         p.pdf += paths_at(k) * rays_.pdf[r] * rays_.survival[r];
         met_[k * n_ + i] = {sky_, p};
     }
-    // Of the points of lights that a point of a path sees.
+    // Adds the BSDF's pdf to the pdfs of light samples that a point of a path sees (balance heuristic).
     void apply_mis(int64_t at, double paths) {
         const Surface<double>& o = surfaces_[at];
         for (int64_t j = 0; j < K(); ++j) {
@@ -292,7 +292,7 @@ class Paths {
         }
     }
 
-    // Lights the points that paths have come to after k steps.
+    // Samples the lights at the points that paths have reached after k steps (next-event estimation).
     template <class T>
     void sample_lights(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, int k) {
         const int64_t first = k * n_;
@@ -312,22 +312,22 @@ class Paths {
     const LitScene& lit_;
     LitOptions options_;
     const int C_;
-    double eps_ = 0;             // relative spacing of places
-    std::vector<int> light_of_;  // of each mesh, −1: none
-    int sky_ = -1;               // the light that paths meet in the open
-    bool meets_ = false;         // whether lights that paths meet count
-    int each_ = 1;               // paths from one point
-    int by_paths_ = -1;          // the light of which these find enough there
+    double eps_ = 0;             // It is the relative spacing of positions.
+    std::vector<int> light_of_;  // Maps meshes to their lights, −1: none.
+    int sky_ = -1;               // Escaping rays hit this environment.
+    bool meets_ = false;         // Says whether emitters that paths hit count.
+    int each_ = 1;               // This many paths start at one point.
+    int by_paths_ = -1;          // These paths sample this light well enough alone.
     std::vector<LightSample> lights_;
-    int64_t n_ = 0;  // paths
-    // Of the points of paths after no step, one step, …, and of the points of lights for each.
+    int64_t n_ = 0;  // It counts paths.
+    // Rows hold the points of all paths after no step, one step, …, and the light samples of each.
     std::vector<Surface<double>> surfaces_;
     std::vector<double> pdf_, b_;
     std::vector<int64_t> face_, seed_;
     std::vector<LightPoint> drawn_;
     std::vector<int8_t> seen_;
     std::vector<EmitterHit> met_;
-    // Of each path how many points it has, and what its end gives to its beginning.
+    // For each path: the number of its points, and the throughput from its end to its beginning.
     std::vector<int> length_;
     std::vector<double> throughput_;
     Rays rays_;

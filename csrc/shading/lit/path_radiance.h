@@ -1,11 +1,11 @@
-// What a path carries to the viewer of its first point x₁, and the _vjp. With the direct light D_k that x_k scatters
-// along the path,
+// Evaluates the radiance that a path carries to the viewer of its first point x₁, and the _vjp. With the direct light
+// D_k that x_k scatters along the path,
 //
-//     L_k = D_k + f(x_k) (n_k · l_k) |M_{k+1} · d_k| / |d_k|³ / p_{k+1} · L_{k+1},    d_k = x_{k+1} − x_k, l_k = d_k /
-//     |d_k|
+//     L_k = D_k + f(x_k) (n_k · l_k) |M_{k+1} · d_k| / |d_k|³ / p_{k+1} · L_{k+1},
+//     d_k = x_{k+1} − x_k,  l_k = d_k / |d_k|
 //
-// where p_{k+1} is the pdf of the barycentrics of x_{k+1}, and M_{k+1} the cross product of two sides of its face.
-// D₁ is left out: lit_radiance.h has it.
+// where p_{k+1} is the pdf of the barycentrics of x_{k+1}, and M_{k+1} the cross product of two sides of its face. D₁
+// is left to lit_radiance.h.
 #pragma once
 
 #include <algorithm>
@@ -16,7 +16,7 @@
 
 namespace edgegrad {
 
-// One step of a path from o to next: f and what it is multiplied with.
+// Holds one step of a path from o to next: the BSDF f, and the factors that multiply it.
 template <class S>
 struct Step {
     Vector<S> d, l;
@@ -30,7 +30,7 @@ struct Step {
     }
     S factor() const { return cosine * terminated * measure; }
 };
-// Of what the step carries, f · factor · from, from the cotangent of what it gives.
+// Adds the cotangents of one step, which maps the radiance `from` to f · factor · from.
 inline void step_vjp(const LitScene& lit, const Surface<double>& o, const Surface<double>& next,
                      const Step<double>& step, const double* from, const double* to_bar, SurfaceBar& bar,
                      SurfaceBar& next_bar) {
@@ -43,10 +43,10 @@ inline void step_vjp(const LitScene& lit, const Surface<double>& o, const Surfac
     dot_vjp(o.n, step.l, factor_bar * step.terminated * step.measure, bar.n, l_bar);
     if (!o.mesh->normal.is_flat())
         terminator_vjp(o.g, o.n, step.l, factor_bar * step.cosine * step.measure, bar.g, bar.n, l_bar);
-    // |M · d| / |d|³
+    // The next lines differentiate |M · d| / |d|³.
     const Vec3 e1 = next.frame.corner[1] - next.frame.corner[0], e2 = next.frame.corner[2] - next.frame.corner[0];
     const Vec3 M = cross(e1, e2);
-    const double whole_bar = factor_bar * factor;  // by the logarithm
+    const double whole_bar = factor_bar * factor;  // This is the cotangent of the factor's logarithm.
     dot_vjp(M, step.d, whole_bar / dot(M, step.d), M_bar, d_bar);
     d_bar -= 3 * whole_bar / dot(step.d, step.d) * step.d;
     Vec3 e1_bar, e2_bar;
@@ -57,8 +57,7 @@ inline void step_vjp(const LitScene& lit, const Surface<double>& o, const Surfac
     next_bar.y += d_bar, bar.y -= d_bar;
 }
 
-// What a point scatters of direct light: by the points of lights that are drawn for it, and by the light that the path
-// meets there.
+// Adds the direct light that a point scatters: from its light samples, and from the emitter that the path hits.
 template <class S>
 void add_drawn(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,
                const Surface<S>& o, S* total) {
@@ -75,7 +74,7 @@ void add_direct(const LitScene& lit, const std::vector<LightSample>& lights, con
     add_drawn(lit, lights, path, k, o, total), add_met(lit, path, k, o, total);
 }
 
-// (channels,) of a path with the surfaces at(k).
+// Writes the radiance (channels,) of a path with the surfaces at(k).
 template <class S, class At>
 void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, At at, S* total) {
     const int C = lit.channels;
@@ -91,7 +90,7 @@ void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, 
     }
 }
 
-// Points of a path as functions of what moves, by their derivatives in one direction; `first` is that of the first one.
+// Returns the points of a path as dual numbers, moving in one direction; `first` is the first point.
 inline std::vector<Surface<Dual>> moving_surfaces(const LitScene& lit, const Path& path, const Surface<Dual>& first) {
     std::vector<Surface<Dual>> surfaces(std::max(1, path.points));
     surfaces[0] = first;
@@ -105,14 +104,14 @@ inline std::vector<Surface<Dual>> moving_surfaces(const LitScene& lit, const Pat
     return surfaces;
 }
 
-// What radiance_vjp() of paths keeps from one to the next.
+// Holds memory that calls of path_radiance_vjp() reuse.
 struct PathBuffers {
     std::vector<Step<double>> steps;
-    std::vector<double> L, L_bar;  // a row for each point
+    std::vector<double> L, L_bar;  // Each point has a row.
     std::vector<SurfaceBar> bars;
 };
 
-// Adds to the cotangents of the tables, and writes that of the place of the first point.
+// Adds to the cotangents of the tables, and writes the cotangent of the first point's position.
 template <class At>
 void path_radiance_vjp(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, At at,
                        const double* total_bar, PathBuffers& own, FacePointBar& at_bar, Cotangents& to) {
@@ -132,7 +131,7 @@ void path_radiance_vjp(const LitScene& lit, const std::vector<LightSample>& ligh
         const double factor = own.steps[k].factor();
         for (int c = 0; c < C; ++c) own.L_bar[(k + 1) * C + c] = own.L_bar[k * C + c] * own.steps[k].f[c] * factor;
     }
-    // From the last point on, for how each is seen depends on the one before.
+    // The loop runs from the last point to the first, because each point is viewed from the one before.
     for (int k = n - 1; k >= 0; --k) {
         const Surface<double>& o = at(k);
         const double* L_bar = &own.L_bar[k * C];

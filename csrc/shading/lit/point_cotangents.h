@@ -1,5 +1,4 @@
-// What derivatives at points of surfaces have in common: the cotangents of their places and of the tables, and points
-// that move in one direction.
+// Holds what derivatives at surface points share: cotangents of positions and tables, and points that move.
 #pragma once
 
 #include <algorithm>
@@ -20,7 +19,7 @@ inline void write(const FacePointBar& bar, LitPlaces<double> places, int64_t i) 
     if (places.spread) std::copy(bar.spread, bar.spread + spread_size, places.spread + spread_size * i);
 }
 
-// Calls body(first, last, cotangents) for chunks of points, and adds these up.
+// Calls body(first, last, cotangents) for chunks of points, and adds up the cotangents.
 template <class Body>
 void add_cotangents(const LitScene& lit, int64_t points, const std::vector<TableBar>& to, ThreadTeam& team, Body body) {
     std::vector<Cotangents> chunks;
@@ -30,7 +29,7 @@ void add_cotangents(const LitScene& lit, int64_t points, const std::vector<Table
         [&](const Cotangents& chunk, int owner) { chunk.add_to(to, owner); }, [](Cotangents&) {}, seconds);
 }
 
-// Point i with the tangent of its place; it refers to itself.
+// Holds point i with the tangent of its position. It refers to itself, and so cannot be copied.
 struct MovingPoint {
     MovingPoint(const LitScene& lit, const LitPoints& points, LitPlaces<const double> dot, int64_t i) {
         Dual b[3];

@@ -1,4 +1,4 @@
-// Lights of one point or one direction, as in glTF (KHR_lights_punctual).
+// Evaluates lights of one point or one direction, as in glTF (KHR_lights_punctual).
 #pragma once
 
 #include "shading/lit/light.h"
@@ -19,12 +19,11 @@ inline void from_direction_vjp(const std::vector<Table>& tables, const Light& li
     power_vjp(tables, light, channels, bar.E, to);
 }
 
-// How much of the intensity on its axis a spot has towards a point: the square of (cos θ − cos outer) / (cos inner −
-// cos outer), from 0 to 1.
-constexpr double least_ramp = 1e-3;  // glTF's own limit of the denominator
+// Evaluates a spot's falloff: the square of (cos θ − cos outer) / (cos inner − cos outer), clamped to [0, 1].
+constexpr double least_ramp = 1e-3;  // glTF limits the denominator to this.
 template <class S>
 struct Cone {
-    Vector<S> direction, away;  // units
+    Vector<S> direction, away;  // They are unit vectors.
     S inner, outer, cosine, scale, x;
 
     S ramp() const { return x * x; }
@@ -56,7 +55,7 @@ inline void cone_vjp(const std::vector<Table>& tables, const Light& light, Vec3 
     direction_vjp(tables, light, unit_vjp(direction_of<double>(tables, light), cosine_bar * o.away), to);
 }
 
-// Zero, without a derivative, at the light itself.
+// Returns what arrives from a point or spot light; it is zero, without a derivative, at the light itself.
 template <class S>
 Arriving<S> from_point(const std::vector<Table>& tables, const Light& light, int channels, Vector<S> y) {
     Arriving<S> o;

@@ -1,5 +1,5 @@
-// Where a parameter of a material comes from: a constant, numbers of vertices, faces or corners, or a texture. Value,
-// and beneath it the _vjp.
+// Looks up material parameters, and implements the _vjp. They are constants, arrays over vertices, faces or corners, or
+// textures.
 #pragma once
 
 #include <algorithm>
@@ -14,21 +14,21 @@ namespace edgegrad {
 struct Source {
     enum class Kind { constant, vertex, face, corner, texture };
     Kind kind = Kind::constant;
-    int value = no_table;  // none: there is no such parameter
-    // Of textures: coordinates, a factor if there is one, rows of coordinates by the corners of faces, and the image.
+    int value = no_table;  // Without a table the parameter does not exist.
+    // Textures have coordinates, an optional factor, the corners' rows of coordinates, and an image.
     int uvs = no_table, factor = no_table;
     const int32_t* uv_faces = nullptr;
     int64_t height = 0, width = 0;
     Sampler sampler = {};
-    int levels = 1;  // of the image's pyramid (pyramid.h)
+    int levels = 1;  // This counts the levels of the image's pyramid (pyramid.h).
 
     bool exists() const { return value != no_table; }
-    // Whether it is looked up by how far pixels lie apart.
+    // Returns whether the footprint of a pixel selects the level.
     template <class Point>
     bool is_filtered(const Point& at) const {
         return levels > 1 && at.spread;
     }
-    // The texels are rows of the table, level after level.
+    // Returns the grid of one level; the table holds the texels level after level.
     TexelGrid grid(int level = 0) const {
         TexelGrid o{0, height, width, sampler};
         for (; level > 0; --level) o = o.halved();
@@ -36,26 +36,26 @@ struct Source {
     }
 };
 
-// How the last two barycentrics of a point differ from one pixel to the next: (2,) to the right, and (2,) down.
+// Counts the differences of the last two barycentrics between neighbouring pixels: (2,) to the right and (2,) down.
 constexpr int spread_size = 4;
 
-// A point on a face of a mesh.
+// Identifies a point on a face of a mesh.
 template <class S>
 struct FacePoint {
-    int64_t face;               // as the mesh counts its own
-    const int32_t* vertex;      // (3,) as the scene counts them
-    int32_t first_vertex;       // of the mesh
+    int64_t face;               // It is a number among the mesh's own faces.
+    const int32_t* vertex;      // (3,) vertices of the scene
+    int32_t first_vertex;       // It is the mesh's first one.
     S b[3];                     // barycentrics
-    const S* spread = nullptr;  // null: not known, and textures are looked up as they are
+    const S* spread = nullptr;  // Null means unknown; textures are then looked up unfiltered.
     int64_t row(int i) const { return vertex[i] - first_vertex; }
 };
 
-// Cotangents of a point's barycentrics and of their spread.
+// Holds the cotangents of a point's barycentrics and of their spread.
 struct FacePointBar {
     double b[3] = {}, spread[spread_size] = {};
 };
 
-// The texture coordinates of a corner.
+// Holds the texture coordinates of a corner or a point.
 template <class S>
 struct Uv {
     S u = 0, v = 0;
@@ -76,7 +76,7 @@ Uv<S> interpolated_uv(const std::vector<Table>& tables, const Source& source, co
 }
 inline Footprint footprint(const Source& source, Vec2 uv) { return footprint(source.grid(), uv); }
 
-// A fraction between texels, whose derivative is that of the coordinate times the texels in it.
+// Returns a fraction between texels. Its derivative is the coordinate's derivative times the number of texels.
 inline double fraction(double value, double, double) { return value; }
 inline Dual fraction(double value, Dual coordinate, double texels) { return {value, texels * coordinate.dot}; }
 
@@ -94,16 +94,16 @@ void each_texel(const TexelGrid& grid, Uv<S> uv, Visit visit) {
     each_texel(f, a, b, visit);
 }
 
-// Where in a pyramid a point is looked up (Williams 1983): at log2 of the distance in texels of neighbouring pixels,
-// the larger of both directions; linearly between two levels. edgegrad/points/footprints.py has the same.
+// Selects the level of a pyramid (Williams 1983): log2 of the distance between neighbouring pixels in texels. The
+// larger distance of both directions counts; two levels are interpolated. edgegrad/points/footprints.py does the same.
 template <class S>
 struct Level {
     int fine = 0;
-    S share = 0;             // of the level above
-    int axis = -1;           // in whose direction pixels lie farther apart
-    S across = 0, down = 0;  // how far, in texels
+    S share = 0;             // It is the weight of the coarser level.
+    int axis = -1;           // It is the direction with the larger distance.
+    S across = 0, down = 0;  // They are that distance in texels.
 
-    // Else it is the finest level or the coarsest one, and has no derivative.
+    // Returns whether it lies between two levels. Otherwise it is the finest or the coarsest one, without a derivative.
     bool is_between() const { return axis >= 0; }
 };
 template <class S>
@@ -117,7 +117,7 @@ Level<S> level_of(const std::vector<Table>& tables, const Source& source, const 
         down[axis] = S(double(source.height)) * (u * (corner[1].v - corner[0].v) + v * (corner[2].v - corner[0].v));
         squared[axis] = across[axis] * across[axis] + down[axis] * down[axis];
     }
-    // What is no number counts as the larger one, and as no distance.
+    // NaN counts as the larger distance here, and as no distance below.
     const int axis = plain(squared[1]) > plain(squared[0]) || std::isnan(plain(squared[1])) ? 1 : 0;
     Level<S> o;
     if (!(plain(squared[axis]) > 1)) return o;
@@ -130,7 +130,7 @@ Level<S> level_of(const std::vector<Table>& tables, const Source& source, const 
     o.axis = axis, o.across = across[axis], o.down = down[axis];
     return o;
 }
-// Of the share.
+// Adds the cotangents of `share`.
 inline void level_vjp(const std::vector<Table>& tables, const Source& source, const FacePoint<double>& at,
                       const Level<double>& o, double bar, FacePointBar& at_bar, Cotangents& to) {
     const double scale = bar / (M_LN2 * (o.across * o.across + o.down * o.down));
@@ -148,7 +148,7 @@ inline void level_vjp(const std::vector<Table>& tables, const Source& source, co
     to.add(source.uvs, source.uv_faces[3 * at.face], first_bar);
 }
 
-// Calls visit(row of the table, its weight) for the rows whose weighted sum the value is.
+// Calls visit(row of the table, its weight) for the rows whose weighted sum is the value.
 template <class S, class Visit>
 void each_row(const std::vector<Table>& tables, const Source& source, const FacePoint<S>& at, Visit visit) {
     switch (source.kind) {
@@ -174,7 +174,7 @@ void each_row(const std::vector<Table>& tables, const Source& source, const Face
     }
 }
 
-// Of `channels` numbers, or of one for all of them.
+// Writes `channels` numbers; a table of width 1 serves all channels.
 template <class S>
 void value(const std::vector<Table>& tables, const Source& source, const FacePoint<S>& at, int channels, S* out) {
     const Table& table = tables[source.value];
@@ -188,12 +188,12 @@ void value(const std::vector<Table>& tables, const Source& source, const FacePoi
         for (int c = 0; c < channels; ++c) out[c] *= tables[source.factor].channel<S>(0, c);
 }
 
-// Adds to the cotangents of the point.
+// Adds to the cotangents of the point and of the tables.
 inline void value_vjp(const std::vector<Table>& tables, const Source& source, const FacePoint<double>& at, int channels,
                       const double* bar, FacePointBar& at_bar, Cotangents& to) {
     const Table& table = tables[source.value];
     const int n = table.width == 1 ? 1 : channels;
-    double own[most_lit_channels];  // that of the value before the factor
+    double own[most_lit_channels];  // It is the cotangent of the value before the factor.
     if (source.factor != no_table) {
         const Table& factor = tables[source.factor];
         Source plain_source = source;
@@ -208,7 +208,7 @@ inline void value_vjp(const std::vector<Table>& tables, const Source& source, co
     }
     if (n < channels)
         for (int c = 1; c < channels; ++c) own[0] += own[c];
-    double row_bar[most_lit_channels], s[4];  // of the texels: bar · texel
+    double row_bar[most_lit_channels], s[4];  // `s` holds bar · texel.
     int k = 0;
     const auto add = [&](int64_t row, double weight) {
         double sum = 0;
@@ -224,7 +224,7 @@ inline void value_vjp(const std::vector<Table>& tables, const Source& source, co
     }
     const Uv<double> uv = interpolated_uv(tables, source, at);
     double u_bar = 0, v_bar = 0;
-    // Returns bar · value of one image, of which the value takes so much.
+    // Returns bar · value of one image, which enters the value with the weight `share`.
     const auto look_up_vjp = [&](const TexelGrid& grid, double share) {
         const Footprint f = footprint(grid, {uv.u, uv.v});
         k = 0;

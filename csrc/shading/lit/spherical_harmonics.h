@@ -1,4 +1,4 @@
-// Irradiance by the direction of the normal, in real, orthonormal spherical harmonics up to the second order
+// Evaluates irradiance as a function of the normal, in real, orthonormal spherical harmonics up to the second order
 // (Ramamoorthi and Hanrahan 2001).
 #pragma once
 
@@ -8,7 +8,7 @@ namespace edgegrad {
 
 constexpr int n_harmonics = 9;
 
-// Y_00, Y_1−1, Y_10, Y_11, Y_2−2 … Y_22 of a unit vector.
+// Writes Y_00, Y_1−1, Y_10, Y_11, Y_2−2 … Y_22 of a unit vector.
 template <class S>
 void harmonics(S x, S y, S z, S* Y) {
     const double one = 0.5 / std::sqrt(M_PI), c1 = std::sqrt(3 / (4 * M_PI)), c2 = std::sqrt(15 / (4 * M_PI)),
@@ -17,7 +17,7 @@ void harmonics(S x, S y, S z, S* Y) {
     Y[4] = S(c2) * x * y, Y[5] = S(c2) * y * z, Y[6] = S(c3) * (S(3) * z * z - S(1)), Y[7] = S(c2) * x * z;
     Y[8] = S(c2 / 2) * (x * x - y * y);
 }
-// The cotangent of the vector: each partial derivative is that in one direction.
+// Returns the cotangent of the vector, by forward derivatives along each axis.
 inline Vec3 harmonics_vjp(Vec3 n, const double* Y_bar) {
     double along[3];
     for (int axis = 0; axis < 3; ++axis) {
@@ -34,7 +34,7 @@ inline void components(DualVec3 n, Dual* out) {
     out[0] = {n.value.x, n.dot.x}, out[1] = {n.value.y, n.dot.y}, out[2] = {n.value.z, n.dot.z};
 }
 
-// E (channels,) of a surface with the unit normal n.
+// Writes the irradiance E (channels,) of a surface with the unit normal n.
 template <class S>
 void irradiance(const std::vector<Table>& tables, const Light& light, int channels, Vector<S> n, S* E) {
     S own[3], Y[n_harmonics];

@@ -1,5 +1,5 @@
-// The tensors that lit scenes are made of, as tables of rows: vertices, normals, texture coordinates, texels,
-// constants; and the cotangents of their rows.
+// Holds the tensors of lit scenes as tables of rows, and the cotangents of the rows. Tables store vertices, normals,
+// texture coordinates, texels and constants.
 #pragma once
 
 #include <cstdint>
@@ -15,10 +15,10 @@ constexpr int most_lit_channels = 16;
 
 struct Table {
     const void* values = nullptr;
-    bool wide = false;  // double, or else float
+    bool wide = false;  // Values are double, otherwise float.
     int64_t rows = 0;
     int width = 0;
-    const double* tangent = nullptr;  // null: zero
+    const double* tangent = nullptr;  // Null means zero.
 
     double number(int64_t i) const {
         return wide ? static_cast<const double*>(values)[i] : double(static_cast<const float*>(values)[i]);
@@ -29,19 +29,19 @@ struct Table {
         if constexpr (std::is_same_v<S, double>) return number(i);
         else return {number(i), tangent ? tangent[i] : 0};
     }
-    // Of the first three columns.
+    // Returns the first three columns.
     template <class S>
     Vector<S> vector_at(int64_t row) const {
         return vector(at<S>(row, 0), at<S>(row, 1), at<S>(row, 2));
     }
-    // A row of one number stands for all channels.
+    // Returns one channel; a row of one number serves all channels.
     template <class S>
     S channel(int64_t row, int c) const {
         return at<S>(row, width == 1 ? 0 : c);
     }
 };
 
-// Where the cotangents of a table are added up, in double or in float; neither where none are wanted.
+// Points to the gradient of a table, in double or in float. Both are null if it is not wanted.
 struct TableBar {
     double* wide = nullptr;
     float* narrow = nullptr;
@@ -49,7 +49,7 @@ struct TableBar {
     bool is_wanted() const { return wide || narrow; }
 };
 
-// What the points of one chunk give, a buffer for each table; those of tables that are not wanted take nothing.
+// Buffers the cotangents of one chunk of points, one buffer for each table. Tables that are not wanted ignore theirs.
 class Cotangents {
    public:
     void prepare(const std::vector<Table>& tables, const std::vector<TableBar>& to, int owners) {
@@ -67,7 +67,7 @@ class Cotangents {
         const double row_bar[3] = {bar.x, bar.y, bar.z};
         add(table, row, row_bar);
     }
-    // Of channels, where a row may have one number for all.
+    // Adds the cotangents of channels; a row may have one number for all of them.
     void add_channels(int table, int64_t row, int width, int channels, const double* bar) {
         if (!wants(table)) return;
         if (width > 1 || channels == 1) return of_[table].add(row, bar);

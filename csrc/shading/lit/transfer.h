@@ -1,10 +1,11 @@
-// Light that goes from one point of a surface to another, were nothing between them: the reflector gets it from lights,
-// or by way of further surfaces. With its radiance L towards the receiver, without what it emits itself, the viewer
-// sees
+// Computes the light that goes from one surface point, the reflector, to another, the shading point, if nothing
+// occludes it. The reflector gets light from lights, or from further surfaces. Let L be its radiance towards the
+// shading point, without its own emission. The viewer sees
 //
 //     f(v, l) L (n · l) / |g · l|
 //
-// of it by the measure of lines, in which the cosine of the receiver's face is (g is its normal, n that for shading).
+// with respect to the measure of lines, which contains the cosine of the shading point's face. g is the normal of that
+// face, n its shading normal.
 #pragma once
 
 #include <cstdint>
@@ -16,7 +17,7 @@
 
 namespace edgegrad {
 
-// Points by face and barycentrics (N, 3), and seeds of the numbers that are drawn at reflectors.
+// Holds points by face and barycentrics (N, 3), and seeds of the random numbers used at reflectors.
 struct LitLines {
     int64_t size = 0;
     const int64_t *receiver = nullptr, *reflector = nullptr;
@@ -24,8 +25,9 @@ struct LitLines {
     const int64_t* seed = nullptr;
 };
 
-// (N, channels), of few lines on one thread: what the viewer sees, or L, that comes to the receiver from wherever it is
-// seen. `paths`: from reflectors, by which light is scattered so often at most as it may be up to there.
+// Writes (N, channels) for a few lines, on one thread. `received` selects what the viewer sees, or L, which reaches the
+// shading point from wherever it is viewed. `paths` start at reflectors, and their bounces limit how often light is
+// scattered up to there.
 enum class Received { by_viewer, there };
 template <class T>
 void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitLines& lines,

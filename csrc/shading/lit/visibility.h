@@ -1,4 +1,4 @@
-// Visibility queries: which light samples the points of surfaces see.
+// Queries visibility: which light samples the points of surfaces see.
 #pragma once
 
 #include <algorithm>
@@ -14,7 +14,7 @@
 
 namespace edgegrad {
 
-// Shadow rays from points to points of lights.
+// Holds shadow rays from surface points to points of lights.
 struct ShadowRays {
     std::vector<int32_t> face;
     std::vector<double> b, to, contact;
@@ -40,22 +40,22 @@ struct ShadowRays {
     }
 };
 
-// What queries keep from one call to the next.
+// Holds memory that queries reuse.
 struct ShadeBuffers {
     std::vector<LightSample> lights;
     std::vector<Surface<double>> surfaces;
-    std::vector<LightPoint> points;  // of lights, a row for each surface
+    std::vector<LightPoint> points;  // Each surface has a row of points of lights.
     ShadowRays rays;
 };
 
-// Surfaces, and what is written of each, a row: the points of lights that are drawn for it, and which of them it sees.
+// Holds surfaces and, in a row for each, its sampled points of lights and which of them it sees.
 struct LightQuery {
     Surface<double>* surfaces;
     LightPoint* drawn;
     int8_t* seen;
 };
 
-// Draws points of lights for the surfaces at the points that are `wanted`, and finds which of them these see.
+// Samples points of lights for the surfaces at the points that are `wanted`, and finds which of them are visible.
 template <class T, class Wanted>
 void query_lights(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   const LitOptions& options, const std::vector<LightSample>& lights, const LightQuery& query,
@@ -68,7 +68,7 @@ void query_lights(const LitScene& lit, const SceneView<T>& scene, const RayCaste
             if (!o.scattering.lambertian) look_up_material(lit, o);
             light_points(lit, points, options, lights, i, o, query.drawn + i * K);
         }
-    // Light by light, for rays that are cast together are the faster the more similar they are.
+    // The loop goes light by light, because similar rays are faster to trace together.
     for (size_t k = 0; k < K; ++k) {
         const Light& light = lit.lights[lights[k].light];
         const Vec3 only_place = light.is_punctual() ? place(lit, light, {}) : Vec3();
@@ -85,7 +85,7 @@ void query_lights(const LitScene& lit, const SceneView<T>& scene, const RayCaste
             if (!point.exists()) continue;
             if (light.kind == Light::Kind::mesh &&
                 !shows(scene, lit.emitter(light).first + point.index, {point.u, point.v}))
-                continue;  // the light is alpha-tested there
+                continue;  // The light is transparent there (alpha-tested).
             const Vec3 there = light.is_punctual() ? only_place : place(lit, light, point);
             const Vec3 l = light.is_infinite() ? there : unit(there - o.y);
             if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
@@ -98,7 +98,7 @@ void query_lights(const LitScene& lit, const SceneView<T>& scene, const RayCaste
     rays.cast(scene, caster);
 }
 
-// Finds the surfaces at points that are `wanted`, and which lights they see.
+// Sets the surfaces at points that are `wanted`, and finds the lights they see.
 template <class T, class Wanted>
 void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                       const LitOptions& options, ShadeBuffers& buffers, int8_t* seen, Wanted wanted) {
