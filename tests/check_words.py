@@ -41,8 +41,7 @@ TERMS = {
 IGNORED = {"Found"}
 
 # Files, or folders, and the words that have their ordinary meaning there.
-EXCEPTIONS: dict[str, str] = {
-}
+EXCEPTIONS: dict[str, str] = {}
 
 
 def words() -> dict[str, str]:

@@ -21,7 +21,7 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
                                 const Gradients& grad);
 
 // Adds derivatives of the image in several directions, forward mode, to `image_dot` (H, W, D, C). `adjoint` is the
-// importance of each pixel for the placement of samples; ones, if all count alike.
+// importance of each pixel for the placement of samples; ones, if all count equally.
 template <class T>
 void render_tangents(const BackwardInput<T>& input, GradientOptions options, ThreadTeam& team,
                      const std::vector<Tangents>& tangents, double* image_dot);

@@ -129,7 +129,7 @@ struct Camera {
 
     // Returns the orientation of (q0, q1, q2) in the image, x to the right and y down: > 0 where (x1 − x0) ∧ (x2 − x0)
     // > 0. The triple product also serves triangles that reach behind the camera. It is one number for the three edges
-    // of a face, so that they never disagree. 0 means edge-on: the plane contains the eye, as far as doubles can tell.
+    // of a face, so that they never disagree. 0 means edge-on: the plane contains the eye, to the precision of doubles.
     int facing(Vec3 q0, Vec3 q1, Vec3 q2) const {
         const Vec3 view = view_direction(q0), e1 = q1 - q0, e2 = q2 - q0;
         const double s = dot(view, cross(e1, e2));

@@ -78,7 +78,7 @@ class PooledLines {
 template <class T>
 class EdgeLines {
    public:
-    // `means` belong to the cells of `pooled`. If it is empty, all cells count alike.
+    // `means` belong to the cells of `pooled`. If it is empty, all cells count equally.
     EdgeLines(const SceneView<T>& casters, const Topology& topology, const std::vector<AlphaEdge>& alpha_edges,
               const PooledLines& pooled, const std::vector<double>& means, const Mirrors& mirrors)
         : scene_(casters),

@@ -19,7 +19,7 @@ constexpr int64_t intervals_of_block = 64;
 constexpr int64_t neighbours = 16;       // number of intervals on either side whose pilots are shared
 constexpr int64_t mirrored = 2;          // samples per place before a light with an extent
 constexpr double own_share = 0.3;        // fraction of the mean square that comes from the interval itself
-constexpr double floor_share = 0.1;      // fraction of the density that is independent of pilots
+constexpr double uniform_share = 0.1;    // fraction of the density that is independent of pilots
 constexpr int64_t pair_tests = 1 << 22;  // number of tested pairs of edges and light parts
 constexpr int64_t fewest_intervals = 1 << 10, most_intervals = 1 << 15, samples_of_interval = 16;
 constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
@@ -251,13 +251,13 @@ inline Array<double> density_of(const std::vector<ShadowStatistics>& of_interval
     Array<double> measure(count);
     double known = 0;
     for (int64_t i = 0; i < count; ++i) {
-        double sub_camera = 0;
+        double around = 0;
         const int64_t low = std::max<int64_t>(i - neighbours, 0), high = std::min(i + neighbours, count - 1);
-        for (int64_t k = low; k <= high; ++k) sub_camera += of_interval[k].squares / double(high - low + 1);
-        measure[i] = std::sqrt((own_share * of_interval[i].squares + (1 - own_share) * sub_camera) / pilots),
+        for (int64_t k = low; k <= high; ++k) around += of_interval[k].squares / double(high - low + 1);
+        measure[i] = std::sqrt((own_share * of_interval[i].squares + (1 - own_share) * around) / pilots),
         known += measure[i] / double(count);
     }
-    for (int64_t i = 0; i < count; ++i) measure[i] += floor_share * (known > 0 ? known : 1);
+    for (int64_t i = 0; i < count; ++i) measure[i] += uniform_share * (known > 0 ? known : 1);
     return measure;
 }
 

@@ -113,7 +113,7 @@ inline void look_up_material_vjp(const LitScene& lit, const Surface<double>& o, 
 
 // Adds the cotangents of position and eye, from the cotangent of the direction to the viewer.
 inline void view_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar, Cotangents& to) {
-    if (o.scattering.lambertian) return;  // A Lambertian surface looks the same from everywhere.
+    if (o.scattering.lambertian) return;  // A Lambertian surface has one radiance in all directions.
     if (!lit.perspective) return to.add(lit.eye, 0, bar.v);
     const Vec3 towards_bar = unit_vjp(lit.tables[lit.eye].vector_at<double>(0) - o.y, bar.v);
     to.add(lit.eye, 0, towards_bar), bar.y -= towards_bar;

@@ -1,4 +1,4 @@
-// Looks up material parameters, and implements the _vjp. They are constants, arrays over vertices, faces or corners, or
+// Reads material parameters, and implements the _vjp. They are constants, arrays over vertices, faces or corners, or
 // textures.
 #pragma once
 

@@ -74,7 +74,7 @@ def read(
     note_unread(shared, READ | HARMLESS, unread, INSTEAD)
     for names, why in (
         (lost, "no such file"),
-        (outside, "outside of the file's folder, where nobody looks; pass their folder as images="),
+        (outside, "outside of the file's folder, which is not searched; pass their folder as images="),
     ):
         if names:
             unread.note(f"{len(names)} of {len(frames)} images, as {names[0]!r}", f"View.image is None: {why}")
@@ -138,7 +138,7 @@ def _camera(own: Mapping[str, Any], shared: Mapping[str, Any], found: Found, siz
     elif found.file is not None:
         H, W = read_size(StoredPath(found.file))
     else:
-        why = ": it is outside of the file's folder, where nobody looks" * found.outside
+        why = ": it is outside of the file's folder, which is not searched" * found.outside
         raise ValueError(
             f"w and h: expected the image's size, or the image itself, got neither{why}; pass size=(height, width), or the "
             "images' folder as images="
