@@ -8,7 +8,7 @@ SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -nam
 # Tests start Python some hundred times, and each would compile all that it imports where it may not keep it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-browser mutants coverage sanitize sanitize-all sanitize-threads bench report lint docs wheel format
+.PHONY: demo test quick test-slow test-browser mutants coverage sanitize sanitize-all sanitize-threads bench report lint docs wheel format
 .PHONY: clean
 .DELETE_ON_ERROR:
 
@@ -21,6 +21,10 @@ BUDGET := 30
 # Failures are shown, and written to a file, as they come: an interrupted run leaves them.
 test: $(VENV)/.ready
 	$(BIN)/python -m pytest -m "not slow" $(WORKERS) --budget $(BUDGET) --failures=out/failures.txt
+
+# Some tests of each layer, within a minute on two processors.
+quick: $(VENV)/.ready
+	$(BIN)/python -m pytest -q -m "quick and not slow" $(WORKERS) $(call marked,quick)
 
 test-slow: $(VENV)/.ready
 	$(BIN)/python -m pytest -m slow --timeout 3600 $(WORKERS) --failures=out/failures-slow.txt
@@ -44,16 +48,11 @@ mutants: $(VENV)/.ready
 # Tests with a kernel in which AddressSanitizer and UndefinedBehaviorSanitizer watch every access and sum. Python itself is
 # not built with them, so they are loaded before it; what it leaks at its end is not looked at.
 SANITIZE := build/sanitize
-# Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick; without tests marked
-# `unwatched`.
-WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows lens_boundary wide_fisheye aovs lit_kernel glossy_light derivative_points shadow_alpha_edges secondary_edges forward_mode samples messages raster raster_texture raster_antialias
-WATCHED_TESTS = $(foreach name,$(WATCHED),$(wildcard tests/*/test_$(name).py))
-CHOSEN := not slow and not unwatched
-# Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for
-# longer; tests of load measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
-WITHOUT := 3mf_files browser cli derivatives distributed docs fit fit_faults late_imports format_variants hostile_files malformed_files mesh_files unusual_files gltf_arrays gltf_files images saved_cameras load notebooks oracles polygons error_time viewer world_coordinates
-sanitize-all: WATCHED_TESTS := $(WITHOUT:%=--ignore-glob=*/test_%.py)
-sanitize-all: CHOSEN := not slow
+# Files marked `watched` reach the lines of each source of the kernel, as `make coverage` checks, and are quick. Only files that
+# have the marker are imported.
+marked = $(sort $(shell grep -rlw "mark.$(1)" tests --include="test_*.py"))
+CHOSEN = -m "watched and not slow and not unwatched" $(call marked,watched)
+sanitize-all: CHOSEN = -m "not slow and not unsanitized"
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
 sanitize sanitize-all: $(VENV)/.ready
 ifneq ($(words $(filter /%,$(PRELOAD))),3)
@@ -67,13 +66,13 @@ else
 	EDGEGRAD_KERNEL=$(CURDIR)/$(SANITIZE)/_core.abi3.so LD_PRELOAD="$(PRELOAD)" \
 	  ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1:detect_stack_use_after_return=1 \
 	  UBSAN_OPTIONS=print_stacktrace=1:halt_on_error=1 \
-	  $(BIN)/python -m pytest -m "$(CHOSEN)" -n 2 --dist worksteal -p no:faulthandler $(WATCHED_TESTS)
+	  $(BIN)/python -m pytest -n 2 --dist worksteal -p no:faulthandler $(CHOSEN)
 endif
 
 # What the tests of `make sanitize` reach of the kernel, by gcov.
 coverage: $(VENV)/.ready
 	$(TOOLS)
-	$(BIN)/python tests/kernel_coverage.py $(WATCHED_TESTS)
+	$(BIN)/python tests/kernel_coverage.py
 
 # The kernel without Python, from several threads, under ThreadSanitizer. First it must report a race that is there on
 # purpose. Addresses are not randomised where this can be had: the sanitizer's own map has no room for all of them.

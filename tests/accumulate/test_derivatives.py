@@ -20,6 +20,8 @@ from torch import Tensor
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.unsanitized
+
 SIZE = 40
 AXIS = (0.48, 0.6, 0.64)
 

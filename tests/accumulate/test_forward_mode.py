@@ -16,6 +16,8 @@ from torch.autograd import forward_ad
 import edgegrad as eg
 from edgegrad.kernel import memory, operators
 
+pytestmark = pytest.mark.watched
+
 F64 = torch.float64
 SIZE = 20
 TRIANGLE = one_triangle()

@@ -14,6 +14,8 @@ from torch import Tensor
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.quick
+
 HEIGHT, WIDTH = 5, 6
 ADJOINT = 1.5 + smooth_adjoint(HEIGHT, WIDTH, 3)
 LIGHTS = ("point", "spot", "sun", "area", "emitter", "sky", "harmonics")

@@ -7,7 +7,11 @@ import pkgutil
 import re
 from pathlib import Path
 
+import pytest
+
 import benchmarks
+
+pytestmark = pytest.mark.quick
 
 FOLDER = Path(benchmarks.__file__).parent
 

@@ -21,6 +21,8 @@ from benchmarks.error_time.methods import Edgegrad, FiniteDifferences, rigid
 from benchmarks.error_time.references import QUICK, exact, long_run
 from benchmarks.error_time.run import error_time
 
+pytestmark = pytest.mark.unsanitized
+
 OURS = ("edgegrad", "interior", "boundary", "finite-differences")
 ASKED = ("--scene", "triangle", "--methods", *OURS, "--size", "32", "--seeds", "2", "--quick")
 

@@ -18,6 +18,8 @@ from edgegrad.camera.camera import Camera
 from edgegrad.scene.mesh import PLAIN, Mesh
 from edgegrad.scene.scene import Scene
 
+pytestmark = pytest.mark.unsanitized
+
 PROJECTIONS = ("perspective", "orthographic")
 KINDS = ("plain", "colors", "face_colors", "corner_colors", "texture")
 

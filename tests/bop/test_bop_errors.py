@@ -16,6 +16,8 @@ import edgegrad as eg
 from edgegrad import bop
 from edgegrad.bop.evaluate import matched
 
+pytestmark = pytest.mark.quick
+
 CAMERA = camera()
 
 

@@ -9,6 +9,8 @@ from kernel_parts import parts
 
 from edgegrad.library import core
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 # Upper rows of K, with skew and with an entry where K usually has a zero: every one of the six has a derivative.
 K6 = np.array([80.0, 7.0, 33.0, -3.0, 90.0, 25.0])
 perspective = pytest.mark.parametrize("perspective", [True, False], ids=["perspective", "orthographic"])

@@ -71,7 +71,7 @@ cameras = pytest.mark.parametrize(
         for name, view in CAMERAS.items()
     ],
 )
-pytestmark = pytest.mark.filterwarnings("ignore:distortion")
+pytestmark = [pytest.mark.watched, pytest.mark.filterwarnings("ignore:distortion")]
 # Seen ahead, around 90°, and far behind that plane.
 PLACES: dict[str, Place] = {"ahead": (0.9, 0.7, 2.0), "beside": (-0.8, 2.4, 0.6), "behind": (2.3, 0.4, -1.1)}
 

@@ -22,6 +22,8 @@ from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from edgegrad.fit import PoseFit, fit_camera, fit_pose
 
+pytestmark = [pytest.mark.quick, pytest.mark.unsanitized]
+
 
 @pytest.fixture
 def files(tmp_path):

@@ -9,6 +9,8 @@ import pytest
 from adjoints import random
 from kernel_parts import parts
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 
 @pytest.mark.parametrize("points", [parts.lattice, parts.sequence, parts.sobol], ids=["lattice", "sequence", "sobol"])
 class TestPoints:

@@ -14,6 +14,8 @@ import edgegrad as eg
 from benchmarks.stability.painted import PAINTED
 from edgegrad.points import borders
 
+pytestmark = pytest.mark.quick
+
 SIZE = 24
 FLAT = eg.Camera(
     torch.eye(4, dtype=F64),

@@ -16,6 +16,8 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.plan import Term
 
+pytestmark = pytest.mark.watched
+
 SIZE = 32
 CAMERA = front_camera(SIZE)
 K = CAMERA.K

@@ -27,7 +27,7 @@ import edgegrad as eg
 many_views = example("many_views")
 TASK = many_views.Task(views=6, batch=5, size=24, steps=6, spp=2, subdivisions=2)  # shares of two sizes
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.unsanitized, pytest.mark.timeout(300)]
 forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="workers are forked, so that none imports torch anew")
 
 

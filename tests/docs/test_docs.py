@@ -27,6 +27,8 @@ import edgegrad.bop
 import edgegrad.fit
 import edgegrad.raster
 
+pytestmark = pytest.mark.unsanitized
+
 FOLDER = Path(__file__).parents[2] / "docs"
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
 LONG = ("how-to/shape-from-depth.md", "how-to/bop.md", "how-to/training-loop.md")
@@ -171,6 +173,7 @@ MAINTAINERS = [
 ]
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("page", MAINTAINERS)
 def test_files_that_a_page_names_exist(page: str) -> None:
     """Names are paths from the root, or the last parts of paths; NAME stands for the reader's own file."""
@@ -184,6 +187,7 @@ def test_files_that_a_page_names_exist(page: str) -> None:
     assert not lost
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("page", MAINTAINERS)
 def test_pages_for_maintainers_are_short(page: str) -> None:
     assert len((FOLDER / page).read_text(encoding="utf-8").split()) <= (1800 if page == "contributing.md" else 1500)

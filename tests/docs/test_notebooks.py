@@ -17,6 +17,8 @@ import torch
 from nbclient.exceptions import CellExecutionError
 from nbformat import NotebookNode
 
+pytestmark = pytest.mark.unsanitized
+
 FOLDER = Path(__file__).parents[2] / "notebooks"
 NAMES = sorted(path.stem for path in FOLDER.glob("[0-9]*_*.py"))
 QUICK = "1_images_and_gradients"

@@ -10,6 +10,8 @@ from mesh_files import linear
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.unsanitized
+
 MICROSOFT = "http://schemas.microsoft.com/3dmanufacturing"
 SPACES = (
     f'xmlns="{MICROSOFT}/core/2015/02" xmlns:p="{MICROSOFT}/production/2015/06" xmlns:m="{MICROSOFT}/material/2015/02" '

@@ -11,6 +11,8 @@ from PIL import Image
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.unsanitized
+
 VERTS = "0 0 0\n1 0 0\n0 1 0\n"
 
 

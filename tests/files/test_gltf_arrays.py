@@ -10,6 +10,8 @@ from mesh_files import SQUARE, TEXELS, TRIANGLES, changed, glb, square_glb
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.unsanitized
+
 DRACO = "KHR_draco_mesh_compression"
 PLAIN = {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
 

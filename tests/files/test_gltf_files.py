@@ -15,6 +15,8 @@ from edgegrad.files.image import srgb_to_linear
 from edgegrad.files.load import load_mesh, load_scene
 from edgegrad.scene.scene import Scene
 
+pytestmark = pytest.mark.unsanitized
+
 trimesh = pytest.importorskip("trimesh")
 
 

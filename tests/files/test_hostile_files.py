@@ -38,6 +38,8 @@ from PIL import EpsImagePlugin
 import edgegrad as eg
 from edgegrad.files.parts import MESHES
 
+pytestmark = pytest.mark.unsanitized
+
 # -- headers that announce what is not there --------------------------------------------------------------------------
 
 

@@ -12,6 +12,8 @@ from PIL import Image
 
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 
+pytestmark = pytest.mark.unsanitized
+
 
 def test_srgb_curve_is_the_standard_s_and_inverts():
     codes = np.arange(256)

@@ -34,6 +34,8 @@ from PIL import Image
 import edgegrad as eg
 from edgegrad.files.load import load_mesh, load_scene
 
+pytestmark = pytest.mark.unsanitized
+
 
 @pytest.mark.parametrize(
     ("name", "content", "fault"),

@@ -11,6 +11,8 @@ from PIL import Image
 
 from edgegrad.files.load import load_mesh, load_scene
 
+pytestmark = [pytest.mark.quick, pytest.mark.unsanitized]
+
 trimesh = pytest.importorskip("trimesh")
 
 

@@ -12,6 +12,8 @@ from mesh_files import SQUARE, ply
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.unsanitized
+
 C = [[1, -1], [1, -0.6], [-0.6, -0.6], [-0.6, 0.6], [1, 0.6], [1, 1], [-1, 1], [-1, -1]]
 ARROW = [[0, 0], [2, 1], [0, 2], [0.5, 1]]  # a concave quad, whose reflex corner is the last
 SPIRAL = [[0, 0], [5, 0], [5, 5], [0, 5], [0, 2], [3, 2], [3, 3], [1, 3], [1, 4], [4, 4], [4, 1], [0, 1]]

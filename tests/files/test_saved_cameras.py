@@ -10,6 +10,8 @@ import torch
 from edgegrad.camera.camera import Camera
 from edgegrad.files.cameras import load_camera, load_cameras, save_camera
 
+pytestmark = [pytest.mark.quick, pytest.mark.unsanitized]
+
 
 def test_camera_round_trip(tmp_path):
     eye = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)

@@ -15,6 +15,8 @@ from hypothesis import HealthCheck, given, settings
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.unsanitized
+
 FORMATS = {**TEXT_FORMATS, "gltf": gltf_files(), "3mf": threemf_files()}
 QUIET = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large]
 

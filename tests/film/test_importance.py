@@ -10,6 +10,8 @@ import pytest
 from adjoints import filters, random
 from kernel_parts import parts
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 CELL = 1 / 256  # importance is counted in 256ths, so that its sums are exact
 
 

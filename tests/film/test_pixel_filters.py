@@ -10,6 +10,8 @@ from scipy.special import erf
 
 from edgegrad.library import core
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 GAUSSIAN_INSIDE = erf(3 / np.sqrt(2))  # of a Gaussian within 3 σ = 1.5 px
 
 

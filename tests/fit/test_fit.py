@@ -13,6 +13,8 @@ from edgegrad.fit.checkpoints import FORMAT
 from edgegrad.fit.pose.gauss_newton import GaussNewton, NormalEquations
 from edgegrad.fit.pose.result import pose_from_json
 
+pytestmark = pytest.mark.unsanitized
+
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
 

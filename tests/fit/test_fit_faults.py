@@ -21,6 +21,8 @@ from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, write_image
 from edgegrad.fit import PoseFit
 
+pytestmark = pytest.mark.unsanitized
+
 try:
     import resource
 except ImportError:  # Windows

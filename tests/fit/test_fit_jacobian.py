@@ -13,6 +13,8 @@ from edgegrad.fit.pose.jacobian import Motion
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.task import DISTORTION, PoseTask, Unknowns
 
+pytestmark = pytest.mark.quick
+
 CENTER = torch.tensor([1.0, 0.75, 0.4], dtype=torch.float64)
 CHANNELS = ["image", "alpha", "position", "depth", "shading_normal", "normal"]
 

@@ -16,6 +16,8 @@ from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask, Unknowns
 from edgegrad.fit.pose.uncertainty import CORRELATION_LENGTH
 from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
 
+pytestmark = pytest.mark.quick
+
 SIZE = 160
 
 

@@ -19,6 +19,8 @@ from torch import Tensor
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.quick
+
 SIZE = 64
 SEEDS = 16
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=torch.float64)

@@ -10,6 +10,8 @@ import edgegrad as eg
 from edgegrad.check import all_below, check_finite
 from edgegrad.library import core
 
+pytestmark = pytest.mark.quick
+
 # Around the sizes of vectors, of blocks, and of what is worth several threads.
 SIZES = [1, 7, 15, 16, 17, 33, 4095, 4096, 4097, (1 << 18) - 1, (1 << 18) + 3]
 

@@ -17,6 +17,8 @@ from scenes import cube, front_camera, icosphere
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.unsanitized
+
 TESTS = Path(__file__).parents[1]
 posix = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals and processes as in POSIX")
 

@@ -20,6 +20,8 @@ from edgegrad.kernel.flat import flatten
 from edgegrad.kernel.operators import kernel_scene as scene_of_kernel
 from edgegrad.library import core
 
+pytestmark = pytest.mark.watched
+
 F64 = torch.float64
 NAN, INF = torch.nan, torch.inf
 VERTS, FACES = cube().verts.float(), cube().faces

@@ -10,6 +10,8 @@ import edgegrad as eg
 from edgegrad.aovs import with_channels
 from edgegrad.kernel.request import SLOTS, make_request
 
+pytestmark = pytest.mark.quick
+
 
 def operator_inputs(scene: eg.Scene) -> tuple:
     return make_request(scene, CAMERA, 4, surface_samples=200, edge_samples=200, grad_seed=3).pack()

@@ -12,7 +12,7 @@ import pytest
 from edgegrad.library import core
 
 KERNEL = os.environ.get("EDGEGRAD_KERNEL", "")
-pytestmark = pytest.mark.skipif(not KERNEL, reason="run by `make sanitize`")
+pytestmark = [pytest.mark.watched, pytest.mark.skipif(not KERNEL, reason="run by `make sanitize`")]
 
 FAULTS = {
     "read_beyond(c_long(100))": "AddressSanitizer: heap-buffer-overflow",

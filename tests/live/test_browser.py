@@ -24,6 +24,7 @@ pytestmark = [
     pytest.mark.skipif(
         BROWSER is None or DRIVER is None, reason="no chromium with its chromedriver; run `make test-browser`"
     ),
+    pytest.mark.unsanitized,
 ]
 # WebGL on the processor; --no-sandbox, for Chromium has none for root, and it opens only the test's own page.
 FLAGS = ("headless=new", "no-sandbox", "use-gl=angle", "use-angle=swiftshader", "enable-unsafe-swiftshader",

@@ -24,6 +24,8 @@ from edgegrad.fit.views import white_level
 from edgegrad.live import snapshot, view
 from edgegrad.live.browser import Browser
 
+pytestmark = [pytest.mark.quick, pytest.mark.unsanitized]
+
 viser = pytest.importorskip("viser", reason="the live view needs edgegrad[view]")
 QUIET = {"progress": False, "spp": 4}
 

@@ -16,6 +16,8 @@ from edgegrad.light import by_material, in_kernel
 from edgegrad.light.bsdf import Scattering
 from edgegrad.points.frame import Frame
 
+pytestmark = pytest.mark.quick
+
 CAMERA = eg.Camera.look_at((0.4, 0.9, 4.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(20, 20))
 
 

@@ -11,6 +11,8 @@ from torch import Tensor
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.watched
+
 F64 = torch.float64
 SIZE = 24
 

@@ -15,6 +15,8 @@ from torch import Tensor
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.watched
+
 F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
 ALONG = torch.tensor([0.7, 0.6, -0.2], dtype=F64)

@@ -18,7 +18,7 @@ import edgegrad as eg
 
 F64 = torch.float64
 SIZE = (40, 48)
-pytestmark = pytest.mark.filterwarnings("ignore:distortion")
+pytestmark = [pytest.mark.watched, pytest.mark.filterwarnings("ignore:distortion")]
 
 # Where det ∂m/∂n = 0 within the image; K takes the rim there to some 16 px.
 COEFFICIENTS = {

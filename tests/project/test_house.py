@@ -14,6 +14,8 @@ from PIL import Image
 
 from edgegrad.files.load import load_mesh
 
+pytestmark = pytest.mark.quick
+
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "docs"))
 import house  # noqa: E402

@@ -11,6 +11,8 @@ from edgegrad import Mesh, read_image, save_mesh
 from edgegrad.files.image import write_image
 from edgegrad.files.load import load_mesh
 
+pytestmark = pytest.mark.unsanitized
+
 trimesh = pytest.importorskip("trimesh")
 
 

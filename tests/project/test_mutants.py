@@ -7,6 +7,8 @@ import re
 import mutants
 import pytest
 
+pytestmark = pytest.mark.quick
+
 
 def test_lines_stand_once_and_tests_exist() -> None:
     every = mutants.changes()

@@ -13,6 +13,8 @@ from torch import Tensor
 
 import edgegrad.raster as dr
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 
 def perspective(f: float = 2.0, near: float = 0.5, far: float = 20.0) -> Tensor:
     """OpenGL's, with the eye looking along −z."""

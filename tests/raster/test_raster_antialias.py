@@ -15,6 +15,8 @@ from torch import Tensor
 
 import edgegrad.raster as dr
 
+pytestmark = pytest.mark.watched
+
 
 def scene(seed: int) -> tuple[Tensor, Tensor]:
     """A sphere, folded at its silhouette, before loose triangles."""

@@ -12,6 +12,8 @@ from torch import Tensor
 
 import edgegrad.raster as dr
 
+pytestmark = pytest.mark.watched
+
 
 def draws(seed: int, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
     return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * (high - low) + low

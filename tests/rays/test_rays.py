@@ -14,6 +14,8 @@ from edgegrad.kernel.flat import flatten
 from edgegrad.kernel.operators import kernel_scene
 from edgegrad.scene.scene import Scene
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 
 class Rays(NamedTuple):
     origins: np.ndarray  # (N, 3)

@@ -17,6 +17,8 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.aovs import AOVS, IDS
 
+pytestmark = pytest.mark.watched
+
 F64 = torch.float64
 SIZE = 24
 AFFINE = ["alpha", "position", "depth", "normal", "barycentrics", "uv"]  # what exact_image can integrate

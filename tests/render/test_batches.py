@@ -21,6 +21,8 @@ from torch_scenes import (
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.quick
+
 
 def test_batch_of_one_is_that_camera():
     single = image_and_gradients(TRIANGLE, CAMERA)

@@ -9,6 +9,8 @@ from torch import Tensor
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.quick
+
 
 def camera(k: int, size: tuple[int, int] = (20, 24), **options: object) -> eg.Camera:
     return eg.Camera.look_at((0.3 * k, 0.5, 3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, size, **options)  # pyright: ignore[reportArgumentType]

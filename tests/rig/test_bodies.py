@@ -7,6 +7,8 @@ import torch
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.quick
+
 VERTS = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
 FACES = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 

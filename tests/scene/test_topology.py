@@ -8,6 +8,8 @@ from adjoints import random
 from kernel_parts import parts
 from scenes import cube, icosphere
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 EPS32, EPS64 = 2.0**-23, 2.0**-52
 
 

@@ -11,6 +11,8 @@ from PIL import Image
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.unsanitized
+
 UTM = np.array([5e5, 4.6e6, 120.0])  # metres east and north, and above the sea
 
 

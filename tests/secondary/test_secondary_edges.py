@@ -16,6 +16,8 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.light import secondary_edges
 
+pytestmark = pytest.mark.watched
+
 F64 = torch.float64
 Leaves = dict[str, Tensor]
 BLACK = eg.Material(torch.zeros(3, dtype=F64))

@@ -18,6 +18,8 @@ from torch.autograd import forward_ad
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.watched
+
 
 class Setting(Whole):
     """The rectangle is there where alpha, from one texel to the next, is at least ½."""

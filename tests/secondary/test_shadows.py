@@ -13,6 +13,8 @@ from torch import Tensor
 
 import edgegrad as eg
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 FOCAL, HEIGHT, SIZE = 45.0, 0.9, 96  # of the camera: px, world units above the plane, px
 CORNERS = ((-0.3, -0.2), (0.35, -0.2), (0.35, 0.25), (-0.3, 0.25))
 DOUBLE = torch.float64

@@ -21,6 +21,8 @@ from edgegrad.light.resampled import Glossy, resampled
 from edgegrad.points.hits import Hits
 from edgegrad.scene.lights import LightPoints
 
+pytestmark = pytest.mark.watched
+
 N = normalize(vector(0.2, -0.3, 0.8), dim=0)
 ACROSS = normalize(torch.linalg.cross(N, vector(1, 0, 0)), dim=0)
 AXES = torch.stack([ACROSS, torch.linalg.cross(N, ACROSS), N])

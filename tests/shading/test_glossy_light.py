@@ -17,6 +17,8 @@ from edgegrad.light.bsdf import Scattering
 from edgegrad.light.lobes import WIDEST_LOBE, Lobes
 from edgegrad.light.resampled import Glossy, resampled
 
+pytestmark = pytest.mark.watched
+
 N = normalize(vector(0.2, -0.3, 0.8), dim=0)
 ACROSS = normalize(torch.linalg.cross(N, vector(1, 0, 0)), dim=0)
 

@@ -22,6 +22,8 @@ from edgegrad.points.hits import Hits
 from edgegrad.points.shadow_rays import Forced
 from edgegrad.scene.lights import LightPoints
 
+pytestmark = pytest.mark.watched
+
 F64 = torch.float64
 Leaves = dict[str, Tensor]
 CAMERAS = {

@@ -21,6 +21,8 @@ from edgegrad.kernel.flat import flatten
 from edgegrad.kernel.operators import kernel_camera, kernel_scene
 from edgegrad.kernel.request import FILTERS, PackedCamera, pack_camera
 
+pytestmark = pytest.mark.quick
+
 F64 = torch.float64
 
 

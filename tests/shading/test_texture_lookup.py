@@ -11,6 +11,8 @@ from kernel_parts import parts
 from edgegrad.points.pyramid import Pyramid
 from edgegrad.scene.textures import bilinear
 
+pytestmark = [pytest.mark.quick, pytest.mark.watched]
+
 
 def texels(height: int = 4, width: int = 5, channels: int = 3) -> np.ndarray:
     return random(height, width, channels, seed=3)
