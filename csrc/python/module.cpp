@@ -18,6 +18,7 @@
 #include "forward/centers.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
+#include "texture/texture.h"
 
 using namespace nanobind::literals;
 
