@@ -14,11 +14,13 @@ import edgegrad as eg
 from edgegrad.files.paths import replacing
 from edgegrad.kernel.operators import Hits, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad.kernel.request import make_request
-from edgegrad.library import core
+from edgegrad.library import core, load
 
 from .error_time.methods import differentiate
 from .error_time.references import standard_error
 from .scenes import ReportScene, icosphere, smooth_adjoint
+
+parts = load("_core_tests")  # what only tests and benchmarks call
 
 
 def sphere(size: int | tuple[int, int], subdivisions: int = 6) -> tuple[eg.Mesh, eg.Camera, Tensor]:

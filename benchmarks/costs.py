@@ -14,7 +14,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.library import core
 
-from .common import Kernel, Step, single, sphere
+from .common import Kernel, Step, parts, single, sphere
 from .scenes import build, cube, front_camera, icosphere, smooth_adjoint, smooth_colors
 from .table import Bench, Row, median_row, median_time, ratio_row, seconds_of
 
@@ -34,9 +34,7 @@ def forward(bench: Bench) -> list[Row]:
             eg.render(mesh, camera)
 
     widths = sorted({8, core.packet_width()})
-    loops = [
-        lambda n=n: core.for_tests.bare_loop(kernel.scene, kernel.camera, kernel.options, n, threads) for n in widths
-    ]
+    loops = [lambda n=n: parts.bare_loop(kernel.scene, kernel.camera, kernel.options, n, threads) for n in widths]
     *bare, inside, whole = bench.interleaved(21, *loops, kernel.forward, lambda: seconds_of(call))
     target: dict[str, Any] = {"must": 0.8, "aim": 0.95, "more_is_better": True}
     rows = []

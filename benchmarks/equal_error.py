@@ -16,7 +16,7 @@ import edgegrad as eg
 from edgegrad.library import core
 
 from . import mitsuba
-from .common import Kernel, Step, sphere
+from .common import Kernel, Step, parts, sphere
 from .table import Bench, Row, Skipped, median_time, quartiles
 
 Run = Callable[[float, int], tuple[Tensor, float]]  # (budget, seed) → gradient (V, 3), seconds
@@ -162,7 +162,7 @@ def interior(bench: Bench) -> list[Row]:
         # The forward pass again, and the shading differentiated at each hit. The seconds are those of its pixel loop and of
         # adding up; not of what the kernel sets up around it and this estimator does not need.
         image = core.ImageOptions(spp=round(spp), filter="box", seed=seed)
-        seconds = core.for_tests.pixel_backward(
+        seconds = parts.pixel_backward(
             kernel.scene, kernel.camera, image, torch.get_num_threads(), kernel.adjoint.numpy(), verts.zero_().numpy()
         )
         return verts.clone(), seconds

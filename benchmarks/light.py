@@ -17,9 +17,9 @@ from edgegrad.kernel.request import make_request
 from edgegrad.library import core
 from edgegrad.light.radiance import Lighting
 from edgegrad.points.frame import Frame
-from edgegrad.shader import Effort, _Image
+from edgegrad.shader import Effort, UserShader, _Image
 
-from .common import Kernel
+from .common import Kernel, parts
 from .scenes import ReportScene, build
 from .table import Bench, Row, median_time, ratio_row, seconds_of
 
@@ -71,7 +71,7 @@ def images(bench: Bench) -> list[Row]:
         images[:] = [eg.render(eg.Scene([moved], lights=shining), globe.camera)]
 
     bare, plain, open_, shadowed, ahead, back = bench.interleaved(
-        9, lambda: core.for_tests.bare_loop(kernel.scene, kernel.camera, kernel.options, packet, threads),
+        9, lambda: parts.bare_loop(kernel.scene, kernel.camera, kernel.options, packet, threads),
         image(unlit), image(lit, shadows=False), image(lit), lambda: seconds_of(whole),
         lambda: seconds_of(lambda: torch.autograd.backward(images[0], globe.adjoint, inputs=[*leaves, *powers])),
     )  # fmt: skip
@@ -116,7 +116,7 @@ def shadow_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, 
     moved = scene.moved(verts)
     request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
     image = ShadowBoundaries(
-        Frame(moved, request, 0), Lighting(True, 1), False, False, Effort(keeps_little=True, additive=True)
+        Frame(moved, request, 0), UserShader(Lighting(True, 1)), False, False, Effort(keeps_little=True, additive=True)
     )
     found = image.render()
     begin = time.perf_counter()

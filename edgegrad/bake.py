@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from . import raster
 from .camera.camera import Camera
-from .check import as_tensor, check_finite, check_float, check_int, check_positive, check_shape
+from .check import as_tensor, check_choice, check_finite, check_float, check_int, check_positive, check_shape
 from .optional import require
 from .points.rays import trace
 from .scene.appearance import OnMesh, coordinates
@@ -98,8 +98,7 @@ def bake(
     """
     _check_mesh(mesh)
     shape = _shape(size)
-    if what not in WHAT:
-        raise ValueError(f"what: expected one of {', '.join(WHAT)}, got {what!r}")
+    check_choice("what", what, WHAT)
     if by not in ("rays", "nearest"):
         raise ValueError(f"by: expected 'rays' or 'nearest', got {by!r}")
     check_int("rays", rays, 1, 1 << 16)

@@ -303,6 +303,12 @@ def check_dtype(dtype: torch.dtype | None) -> torch.dtype | None:
     return dtype
 
 
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Check for one of some words. Raises ValueError."""
+    if value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
 def check_flag(name: str, flag: object) -> bool:
     """Return True or False itself. Raises TypeError."""
     if not isinstance(flag, bool):

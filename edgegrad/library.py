@@ -31,23 +31,24 @@ def embree_path() -> str:
     )
 
 
-def load() -> Any:
-    """Return the kernel module, with Embree open. Raises ImportError that says how to get what is missing. Two environment
-    variables serve its tests. EDGEGRAD_KERNEL is the file of another build of it, with sanitizers. EDGEGRAD_EMBREE has options
-    of Embree's device, such as "max_isa=avx2" for what older processors run."""
+def load(name: str = "_core") -> Any:
+    """Return a compiled module, with Embree open: the kernel, or `_core_tests`, which only tests call. Raises ImportError that
+    says how to get what is missing. Two environment variables serve tests. EDGEGRAD_KERNEL is the file of another build of the
+    kernel, with sanitizers. EDGEGRAD_EMBREE has options of Embree's device, such as "max_isa=avx2" for older processors."""
     if path := os.environ.get("EDGEGRAD_KERNEL"):
-        spec = importlib.util.spec_from_file_location("edgegrad._core", path)
+        path = os.path.join(os.path.dirname(path), os.path.basename(path).replace("_core", name, 1))
+        spec = importlib.util.spec_from_file_location(f"edgegrad.{name}", path)
         assert spec is not None and spec.loader is not None, f"EDGEGRAD_KERNEL: expected a compiled module, got {path}"
-        _core = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(_core)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
     else:
-        _core = importlib.import_module("edgegrad._core")
+        module = importlib.import_module(f"edgegrad.{name}")
 
     try:
-        _core.open_embree(embree_path(), os.environ.get("EDGEGRAD_EMBREE", ""))
+        module.open_embree(embree_path(), os.environ.get("EDGEGRAD_EMBREE", ""))
     except RuntimeError as error:
         raise ImportError(f"{HOW_TO_GET_EMBREE}; {error}") from None
-    return _core
+    return module
 
 
 core = load()

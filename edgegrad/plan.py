@@ -348,8 +348,11 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
         intersections=intersections, step_lines=counts["step_lines"],
     )  # fmt: skip
 
-    def bytes_of(*parts: str) -> int:
-        return sum(needs.get(part, 0) for part in parts)
+    needs = {**needs, "view": needs.get("view", 0) + ones.nbytes}
+
+    def term(on: float, off: str, why: str, none: str, *parts: str, samples: int = 0) -> Term:
+        """Return a term that is on where something is counted; else `off`, or `none`, says why not."""
+        return Term(on > 0, off or (why if on else none), samples, sum(needs.get(part, 0) for part in parts))
 
     # Why the terms are off, "" where nothing keeps them from running.
     still = "" if moves else "neither verts nor the camera require a gradient"
@@ -361,65 +364,26 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     reasons = [label(name) for name in ("colors", "uvs", "texels") if name in wanted]
     reasons += ["radiance varies over faces that move"] if work.motion else []
 
+    has_steps, lines, unseen = flat.has_steps, counts["step_lines"], "none in view"
+    no_steps = "" if work.steps else "no face is cut out, and no nearest texels"
+    if not work.steps and has_steps:
+        no_steps = "nothing that moves them" if request.gradient.visibility else "visibility=False"
+    topology = "edges, found once for a set of faces"
+    inside = ", ".join(reasons) + _bound(surface, counts["surface_wanted"])
+    jumps = "what moves shows where radiance jumps" + _bound(edge, counts["edge_wanted"])
+    lens = f"where the lens folds or ends, {lens_boundary:,} px in view"
+    of_surface, of_edges = ("faces in view", "controls", "surface samples"), ("edges in view", "edge samples")
     terms = {
-        "view": Term(
-            any(work),
-            "vertices and importance map of the image" if any(work) else "nothing asks for it",
-            bytes=ones.nbytes + bytes_of("view"),
-        ),
-        "interior": Term(
-            surface > 0,
-            no_interior
-            or (", ".join(reasons) + _bound(surface, counts["surface_wanted"]) if surface else "nothing in view"),
-            samples=surface,
-            bytes=bytes_of("faces in view", "controls", "surface samples"),
-        ),
-        "topology": Term(
-            work.boundary, no_boundary or "edges, found once for a set of faces", bytes=bytes_of("topology")
-        ),
-        "boundary": Term(
-            edge > 0,
-            no_boundary
-            or (
-                "what moves shows where radiance jumps" + _bound(edge, counts["edge_wanted"])
-                if edge
-                else "no jump in view"
-            ),
-            samples=edge,
-            bytes=bytes_of("edges in view", "edge samples"),
-        ),
-        "silhouettes": Term(
-            silhouettes > 0, no_boundary or (f"{silhouettes:,} in view" if silhouettes else "none in view")
-        ),
-        "creases": Term(
-            creases > 0,
-            no_boundary or (f"{creases:,} in view" if creases else "nothing jumps between neighbours"),
-            bytes=bytes_of("creases"),
-        ),
-        "intersections": Term(
-            intersections > 0,
-            no_boundary or (f"{intersections:,} in view" if intersections else "none in view"),
-            bytes=bytes_of("intersections"),
-        ),
-        "lens boundary": Term(
-            lens_boundary > 0,
-            no_boundary
-            or no_lens_boundary
-            or (
-                f"where the lens folds or ends, {lens_boundary:,} px in view"
-                if lens_boundary
-                else "no lens ends in view"
-            ),
-        ),
+        "view": term(any(work), "", "vertices and importance map of the image", "nothing asks for it", "view"),
+        "interior": term(surface, no_interior, inside, "nothing in view", *of_surface, samples=surface),
+        "topology": term(work.boundary, no_boundary, topology, topology, "topology"),
+        "boundary": term(edge, no_boundary, jumps, "no jump in view", *of_edges, samples=edge),
+        "silhouettes": term(silhouettes, no_boundary, f"{silhouettes:,} in view", unseen),
+        "creases": term(creases, no_boundary, f"{creases:,} in view", "nothing jumps between neighbours", "creases"),
+        "intersections": term(intersections, no_boundary, f"{intersections:,} in view", unseen, "intersections"),
+        "lens boundary": term(lens_boundary, no_boundary or no_lens_boundary, lens, "no lens ends in view"),
+        "steps": term(lines, no_steps, f"on {lines:,} lines over faces", unseen, "steps"),
     }
-    lines = counts["step_lines"]
-    no_steps = "no face is cut out, and no nearest texels" if not flat.has_steps else "nothing that moves them"
-    no_steps = no_steps if request.gradient.visibility or not flat.has_steps else "visibility=False"
-    terms["steps"] = Term(
-        lines > 0,
-        (f"on {lines:,} lines over faces" if lines else "none in view") if work.steps else no_steps,
-        bytes=bytes_of("steps"),
-    )
     for name in SLOTS:
         why = "required; summed in double" if name in wanted else "not required"
         terms[f"{label(name)} gradient"] = Term(name in wanted, why, bytes=8 * request.slot(name).numel())

@@ -58,11 +58,9 @@ def shaded_points(spp: int) -> int:
 
 
 class Effort(NamedTuple):
-    """What shading an image takes."""
+    """What shading an image takes, and what the renderer may rely on."""
 
     points: int = 1  # of a face in a pixel that are shaded
-    # The image (H · W, C) in one call of the kernel; None, or where it gives None: points are shaded one by one.
-    kernel_image: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
     # Whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright or changes.
@@ -71,18 +69,47 @@ class Effort(NamedTuple):
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     closer: float = 1.0  # by which lines that look for steps lie closer, for what is shaded next to them is noisy
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
-    steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
     step_margin: float = 0.0  # how far from a step its sides are shaded
-    # Of samples inside faces: how light from nearby changes as they slide on these, and how near that is (light/near_field.py).
-    near_field: Callable[[Frame, Hits], tuple[float, Tensor]] | None = None
-    # What samples on the borders of light that surfaces scatter to one another give to the image.
-    indirect: Callable[[Frame, Watch], list[Term]] | None = None
-    watch: Watch = Watch()  # is told what it takes
 
     @property
     def at_once(self) -> int:
         """Points of the image that are shaded together."""
         return 2 * AT_ONCE if self.keeps_little else AT_ONCE
+
+
+class Radiance:
+    """The radiance at hits, and what else an image may ask of it. A user's shader gives the radiance alone: see UserShader."""
+
+    declares_steps = False  # whether steps() declares its steps; else it does so while it shades
+
+    def __call__(self, hits: Hits) -> Tensor:
+        """Return the radiance (N, C)."""
+        raise NotImplementedError
+
+    def image(self, frame: Frame) -> Tensor | None:
+        """Return the image (H · W, C) before black by one call of the kernel, or None: then points are shaded one by one."""
+        return None
+
+    def steps(self, hits: Hits) -> None:
+        """Declare the steps without shading."""
+
+    def near_field(self, frame: Frame, hits: Hits) -> tuple[float, Tensor] | None:
+        """Return how near light changes as samples slide on faces, and that change (N, C); see light/near_field.py."""
+        return None
+
+    def indirect(self, frame: Frame, watch: Watch) -> list[Term]:
+        """Return the terms of samples on the borders of light that surfaces scatter to one another."""
+        return []
+
+
+class UserShader(Radiance):
+    """A user's function of hits."""
+
+    def __init__(self, shader: Shader) -> None:
+        self._shader = shader
+
+    def __call__(self, hits: Hits) -> Tensor:
+        return self._shader(hits)
 
 
 def render_shaded(
@@ -93,16 +120,19 @@ def render_shaded(
     creases: bool | str,
     check: bool,
     effort: Effort | None = None,
+    watch: Watch = Watch(),  # noqa: B008  it keeps nothing
 ) -> Tensor:
-    """The image (H, W, C), or (B, H, W, C) for a batch of cameras; see Effort."""
+    """The image (H, W, C), or (B, H, W, C) for a batch of cameras; see Effort and Radiance. `watch` is told what it takes."""
     if not callable(shader):
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
+    radiance = shader if isinstance(shader, Radiance) else UserShader(shader)
     effort = effort or Effort(shaded_points(request.image.spp), blended=scene.blends)
     with shaded_memory(request, textured=effort.lit and scene.textured_faces is not None):
         images = [
-            _Image(Frame(scene, request, k), shader, creases, check, effort).render() for k in range(request.cameras)
+            _Image(Frame(scene, request, k), radiance, creases, check, effort, watch).render()
+            for k in range(request.cameras)
         ]
     return images[0] if camera.batch is None else torch.stack(images)
 
@@ -123,29 +153,38 @@ def _where_bright(image: Tensor) -> Tensor | None:
 class _Image:
     """The image of one camera of a batch."""
 
-    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, effort: Effort) -> None:
-        self._frame, self._creases, self._check, self._effort = frame, creases, check, effort
+    def __init__(
+        self,
+        frame: Frame,
+        radiance: Radiance,
+        creases: bool | str,
+        check: bool,
+        effort: Effort,
+        watch: Watch = Watch(),  # noqa: B008  it keeps nothing
+    ) -> None:
+        self._frame, self._creases, self._check, self._effort, self._watch = frame, creases, check, effort, watch
+        self._radiance = radiance
         # (C,) or (H, W, C): the scene's background, or the environments that it shows. Found here, where derivatives are
         # enabled if they are asked for; the values of an image are found without.
         background = frame.surfaces.scene.background
         self._behind_all = environments(frame) if background is None else background
-        self._shader = shader
+        self._shader: Shader = radiance
         if effort.blended:
-            self._shader = Blended(frame, shader, self._behind_all)
+            self._shader = Blended(frame, radiance, self._behind_all)
             frame.sampler.transparent = transparent(frame.surfaces)
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
-        self.steps_move = effort.steps is not None  # whether one of their functions has a derivative
+        self.steps_move = radiance.declares_steps  # whether one of their functions has a derivative
 
     def render(self) -> Tensor:
-        watch = self._effort.watch
+        watch = self._watch
         with watch.part("image"):
             image = self._values()
         if not differentiates():
             return image
-        if self._effort.steps is not None:
+        if self._radiance.declares_steps:
             none = self._frame.no_hits
-            self._effort.steps(none)
+            self._radiance.steps(none)
             self._kinds = list(none._steps.kinds)
         frame = self._frame
         visibility = frame.request.gradient.visibility
@@ -171,15 +210,14 @@ class _Image:
                 terms += self._boundary(EdgeSamples(frame, curves))
         if visibility and self._kinds and self.steps_move:
             with watch.part("steps"):
-                declare = self._effort.steps or self._shade
+                declare = self._radiance.steps if self._radiance.declares_steps else self._shade
                 margin = self._effort.step_margin
                 found = StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE, self._step_spacing, margin)
                 terms += found.found(watch)
         if visibility:
             with watch.part("shadows"):
                 terms += self._shadows()
-            if self._effort.indirect is not None:
-                terms += self._effort.indirect(frame, watch)
+            terms += self._radiance.indirect(frame, watch)
         return frame.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
@@ -188,7 +226,7 @@ class _Image:
         """The image, without a graph of its surfaces."""
         frame = self._frame
         with torch.no_grad():
-            image = None if self._effort.kernel_image is None else self._effort.kernel_image(frame)
+            image = self._radiance.image(frame)
             if image is None:
                 image = self._point_by_point()
             self._channels = image.shape[1]
@@ -247,9 +285,9 @@ class _Image:
                 # Hits of its own each time, for these keep what was computed from them.
                 hits = samples.part(first, first + at_once).hits
                 hits._needs_values = not self._effort.gives_derivatives
-                if self._effort.near_field is None:
+                if (change := self._radiance.near_field(self._frame, hits)) is None:
                     return self._shade(hits)
-                hits._near, slid = self._effort.near_field(self._frame, hits)
+                hits._near, slid = change
                 return self._shade(hits) + slid
 
             # So that memory is that of some points, not of all.
@@ -275,7 +313,7 @@ class _Image:
                 one = self._effort.additive
                 casters = frame.fixed.casters if frame.surfaces.scene.blends else None
                 records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one, casters)
-                self._effort.watch.count("shadow_samples", len(records.x))
+                self._watch.count("shadow_samples", len(records.x))
                 if len(records.x):
                     terms += self._boundary(EdgeSamples(frame, records, light, one))
         return terms
@@ -316,7 +354,7 @@ class _Image:
     def _shade(self, hits: Hits) -> Tensor:
         """(N, C), checked."""
         radiance = self._checked(self._shader(hits), hits)
-        if self._effort.steps is None and not hits._only_light:  # for one light less may be looked up
+        if not self._radiance.declares_steps and not hits._only_light:  # for one light less may be looked up
             kinds = list(hits._steps.kinds)
             if self._kinds not in (None, kinds):
                 raise ValueError(UNEQUAL)

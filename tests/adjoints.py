@@ -7,9 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from edgegrad.library import core
-
-pieces = core.for_tests
 Arrays = Sequence[np.ndarray]
 
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from finite_differences import Case, finite_difference, gradient, rotation
+from kernel_parts import parts
 from scenes import cube, icosphere
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.library import core
 
 F64 = torch.float64
 Place = tuple[float, float, float]  # before the camera at pose(), in its coordinates
@@ -24,12 +24,12 @@ def check_boxes(window: object, shown_whole: bool) -> None:
     """Places in boxes of a window's plane are seen in the boxes of the image that the kernel says; all of them, or those that
     are shown."""
     rng = np.random.default_rng(1)
-    box = np.array(core.for_tests.view_box(window))
+    box = np.array(parts.view_box(window))
     for _ in range(30):
         low, high = np.sort(rng.uniform(box[0], box[1], (2, 2)), 0)
-        image_low, image_high = (np.array(p) for p in core.for_tests.image_box(window, low, high))
+        image_low, image_high = (np.array(p) for p in parts.image_box(window, low, high))
         for u in rng.uniform(low, high, (20, 2)):
-            x, area_scale, _ = core.for_tests.distort(window, u, [0.0, 0.0])
+            x, area_scale, _ = parts.distort(window, u, [0.0, 0.0])
             assert area_scale > 0 or not shown_whole
             if area_scale > 0:
                 assert (np.array(x) >= image_low - 1e-9).all() and (np.array(x) <= image_high + 1e-9).all()

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import pytest
 import torch
 from combinations import diagonal
+from kernel_parts import parts
 from test_lit_kernel import CAMERAS, Leaves, numbers_of, scene_of
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
-from edgegrad.library import core
 from edgegrad.light import in_kernel
 from edgegrad.light.at_points import Options
 from edgegrad.light.bsdf import dot, terminator
@@ -77,7 +77,7 @@ class Oracle:
         self._hits, self._unfiltered = hits, unfiltered
         at, tensors = in_kernel._at(hits)
         options = Options(shadows=True, samples=1, bounces=bounces)
-        found = core.for_tests.paths(at.kernel(tensors), **at.arguments(tensors, options))
+        found = parts.paths(at.kernel(tensors), **at.arguments(tensors, options))
         self.paths = {name: torch.from_numpy(value) for name, value in found.items()}
 
     def radiance(self) -> Tensor:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from adjoints import Arrays, check_vjp, pieces, random
+from adjoints import Arrays, check_vjp, random
+from kernel_parts import parts
 
 from edgegrad.library import core
 
@@ -31,11 +32,11 @@ lenses = pytest.mark.parametrize("lens", LENSES)
 
 
 def test_cross_vjp():
-    check_vjp(lambda a, b: np.array(pieces.cross(a, b)), pieces.cross_vjp, [random(3), random(3, seed=2)])
+    check_vjp(lambda a, b: np.array(parts.cross(a, b)), parts.cross_vjp, [random(3), random(3, seed=2)])
 
 
 def test_dot_vjp():
-    check_vjp(lambda a, b: np.array(pieces.dot(a, b)), pieces.dot_vjp, [random(3), random(3, seed=2)])
+    check_vjp(lambda a, b: np.array(parts.dot(a, b)), parts.dot_vjp, [random(3), random(3, seed=2)])
 
 
 @lenses
@@ -46,10 +47,10 @@ def test_project_vjp(lens, q):
     perspective, name, distortion = LENSES[lens]
 
     def forward(q, k, d):
-        return np.array(pieces.project(kernel_camera(k, perspective, name, d), q))
+        return np.array(parts.project(kernel_camera(k, perspective, name, d), q))
 
     def vjp(q, k, d, bar):
-        return pieces.project_vjp(kernel_camera(k, perspective, name, d), q, bar)
+        return parts.project_vjp(kernel_camera(k, perspective, name, d), q, bar)
 
     check_vjp(forward, vjp, [np.array(q), K6, distortion])
 
@@ -61,10 +62,10 @@ def test_normalised_vjp(lens):
     perspective, name, distortion = LENSES[lens]
 
     def forward(k, d):
-        return np.array(pieces.normalised(kernel_camera(k, perspective, name, d), x))
+        return np.array(parts.normalised(kernel_camera(k, perspective, name, d), x))
 
     def vjp(k, d, bar):
-        return pieces.normalised_vjp(kernel_camera(k, perspective, name, d), x, bar)
+        return parts.normalised_vjp(kernel_camera(k, perspective, name, d), x, bar)
 
     check_vjp(forward, vjp, [K6, distortion])
 
@@ -74,14 +75,14 @@ def test_bend_jvp_and_area_scale(lens):
     """Of the straight image, against differences of the positions in the image."""
     perspective, name, distortion = LENSES[lens]
     camera, pinhole = kernel_camera(K6, perspective, name, distortion), kernel_camera(K6, perspective)
-    u = np.array(pieces.project(pinhole, [0.2, -0.3, 0.9]))
+    u = np.array(parts.project(pinhole, [0.2, -0.3, 0.9]))
 
     def bent(u):
-        return np.array(pieces.distort(camera, u, [0.0, 0.0])[0])
+        return np.array(parts.distort(camera, u, [0.0, 0.0])[0])
 
     J = np.stack([(bent(u + h) - bent(u - h)) / 2e-4 for h in 1e-4 * np.eye(2)], 1)
     tangent = np.array([0.7, -1.9])
-    _, area_scale, along = pieces.distort(camera, u, tangent)
+    _, area_scale, along = parts.distort(camera, u, tangent)
     np.testing.assert_allclose(along, J @ tangent, rtol=1e-7)
     np.testing.assert_allclose(area_scale, np.linalg.det(J), rtol=1e-7)
 
@@ -96,9 +97,9 @@ def seen_at(perspective: bool, n: np.ndarray, depth: float) -> np.ndarray:
 def test_normalised_and_project_are_inverse(lens, x):
     perspective, name, distortion = LENSES[lens]
     camera = kernel_camera(K6, perspective, name, distortion)
-    n = np.array(pieces.normalised(camera, x))
+    n = np.array(parts.normalised(camera, x))
     for depth in (0.5, 3.0):
-        np.testing.assert_allclose(pieces.project(camera, seen_at(perspective, n, depth)), x, rtol=1e-13, atol=1e-12)
+        np.testing.assert_allclose(parts.project(camera, seen_at(perspective, n, depth)), x, rtol=1e-13, atol=1e-12)
 
 
 N = np.array([0.03, -0.12])  # inside the image of the triangle below
@@ -107,7 +108,7 @@ TRIANGLE = np.array([[-1.0, -0.8, 2.1], [1.2, -0.7, 2.9], [0.1, 1.3, 2.4]])
 
 @perspective
 def test_barycentrics_are_those_of_the_point_on_the_ray(perspective):
-    met, (u, v) = pieces.barycentrics(pieces.face_map(kernel_camera(K6, perspective), TRIANGLE), N)
+    met, (u, v) = parts.barycentrics(parts.face_map(kernel_camera(K6, perspective), TRIANGLE), N)
     point = (1 - u - v) * TRIANGLE[0] + u * TRIANGLE[1] + v * TRIANGLE[2]
     assert met and min(u, v, 1 - u - v) > 0
     np.testing.assert_allclose(point, seen_at(perspective, N, point[2]), atol=1e-14)
@@ -119,7 +120,7 @@ def test_barycentrics_say_when_there_is_no_point(perspective, degenerate):
     n = np.array([0.25, -0.125])
     ray = np.stack([seen_at(perspective, n, depth) for depth in (1.0, 2.0, 4.0)])
     triangle = {"segment": TRIANGLE[[0, 0, 1]], "point": TRIANGLE[[2, 2, 2]], "edge-on": ray}[degenerate]
-    assert not pieces.barycentrics(pieces.face_map(kernel_camera(K6, perspective), triangle), n)[0]
+    assert not parts.barycentrics(parts.face_map(kernel_camera(K6, perspective), triangle), n)[0]
 
 
 @perspective
@@ -127,15 +128,15 @@ def test_face_map_vjp(perspective):
     camera = kernel_camera(K6, perspective)
 
     def forward(triangle):
-        return np.array(pieces.face_map(camera, triangle))
+        return np.array(parts.face_map(camera, triangle))
 
-    check_vjp(forward, lambda triangle, bar: [pieces.face_map_vjp(camera, triangle, bar)], [TRIANGLE])
+    check_vjp(forward, lambda triangle, bar: [parts.face_map_vjp(camera, triangle, bar)], [TRIANGLE])
 
 
 @perspective
 def test_barycentrics_vjp(perspective):
-    face_map = np.array(pieces.face_map(kernel_camera(K6, perspective), TRIANGLE))
-    check_vjp(lambda m, n: np.array(pieces.barycentrics(m, n)[1]), pieces.barycentrics_vjp, [face_map, N])
+    face_map = np.array(parts.face_map(kernel_camera(K6, perspective), TRIANGLE))
+    check_vjp(lambda m, n: np.array(parts.barycentrics(m, n)[1]), parts.barycentrics_vjp, [face_map, N])
 
 
 def check_jvp(jvp: Arrays | np.ndarray, vjp: Arrays, tangents: Arrays, bar: np.ndarray) -> None:
@@ -151,29 +152,29 @@ def test_forward_mode_is_the_adjoint(lens):
     q, x = np.array([0.4, -0.7, 2.3]), np.array([11.3, 40.2])
     q_dot, k_dot, bar = random(3), random(14, seed=2), random(2, seed=3)
     intrinsics_dot = [k_dot[:6], k_dot[6:]]
-    vjp = pieces.project_vjp(camera, q, bar)
-    check_jvp(pieces.project_jvp(camera, q, q_dot, k_dot), vjp, [q_dot, *intrinsics_dot], bar)
-    check_jvp(pieces.normalised_jvp(camera, x, k_dot), pieces.normalised_vjp(camera, x, bar), intrinsics_dot, bar)
+    vjp = parts.project_vjp(camera, q, bar)
+    check_jvp(parts.project_jvp(camera, q, q_dot, k_dot), vjp, [q_dot, *intrinsics_dot], bar)
+    check_jvp(parts.normalised_jvp(camera, x, k_dot), parts.normalised_vjp(camera, x, bar), intrinsics_dot, bar)
     moved, map_bar = random(3, 3, seed=4), random(3, 3, seed=5)
-    vjp = [pieces.face_map_vjp(camera, TRIANGLE, map_bar)]
-    check_jvp(pieces.face_map_jvp(camera, TRIANGLE, moved), vjp, [moved], map_bar)
-    face_map, n_dot = np.array(pieces.face_map(camera, TRIANGLE)), random(2, seed=6)
-    vjp = pieces.barycentrics_vjp(face_map, N, bar)
-    check_jvp(pieces.barycentrics_jvp(face_map, N, map_bar, n_dot), vjp, [map_bar, n_dot], bar)
+    vjp = [parts.face_map_vjp(camera, TRIANGLE, map_bar)]
+    check_jvp(parts.face_map_jvp(camera, TRIANGLE, moved), vjp, [moved], map_bar)
+    face_map, n_dot = np.array(parts.face_map(camera, TRIANGLE)), random(2, seed=6)
+    vjp = parts.barycentrics_vjp(face_map, N, bar)
+    check_jvp(parts.barycentrics_jvp(face_map, N, map_bar, n_dot), vjp, [map_bar, n_dot], bar)
 
 
 def test_check_rejects_a_wrong_vjp():
     def forward(a, b):
-        return np.array(pieces.cross(a, b))
+        return np.array(parts.cross(a, b))
 
     def swapped(a, b, bar):
-        return pieces.cross_vjp(b, a, bar)
+        return parts.cross_vjp(b, a, bar)
 
     def half_a_percent_off(a, b, bar):
-        return [1.005 * np.array(g) for g in pieces.cross_vjp(a, b, bar)]
+        return [1.005 * np.array(g) for g in parts.cross_vjp(a, b, bar)]
 
     def one_entry_missing(a, b, bar):
-        return [np.array(g) * [1, 1, 0] for g in pieces.cross_vjp(a, b, bar)]
+        return [np.array(g) * [1, 1, 0] for g in parts.cross_vjp(a, b, bar)]
 
     for wrong in (swapped, half_a_percent_off, one_entry_missing):
         with pytest.raises(AssertionError):
@@ -182,11 +183,11 @@ def test_check_rejects_a_wrong_vjp():
 
 def test_inside_keeps_what_is_inside():
     for u, v in [(0.2, 0.3), (0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.25, 0.75)]:
-        assert pieces.inside(u, v) == [u, v]
+        assert parts.inside(u, v) == [u, v]
 
 
 @pytest.mark.parametrize("u, v", [(-0.1, 0.4), (0.3, -1e9), (0.8, 0.9), (1e300, 1e-3), (-1.0, -1.0), (2.0, -0.5)])
 def test_inside_moves_to_the_rim(u, v):
-    a, b = pieces.inside(u, v)
+    a, b = parts.inside(u, v)
     assert a >= 0 and b >= 0 and a + b <= 1 + 1e-15
     assert min(a, b, 1 - a - b) <= 1e-15  # on the rim, to rounding

@@ -179,6 +179,7 @@ def test_files_that_a_page_names_exist(page: str) -> None:
     paths = [str(path.relative_to(root)) for top in tops for path in (root / top).rglob("*.*")] + ["pyproject.toml"]
     text = (FOLDER / page).read_text(encoding="utf-8")
     names = {name for name in re.findall(r"`([\w./*]+\.(?:py|pyi|h|cpp|toml|\*))`", text) if "NAME" not in name}
+    names |= {f"{name}.py" for name in re.findall(r"`(test_[\w*]+)`", text)}
     lost = [name for name in names if not any(fnmatch("/" + path, "*/" + name) for path in paths)]
     assert not lost
 

@@ -9,6 +9,7 @@ import time
 import extreme_scenes
 import pytest
 import torch
+from kernel_parts import parts
 from scenes import front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
@@ -110,7 +111,7 @@ def test_copies_weld_at_the_spacing_of_the_coarser_one():
     b = torch.tensor([[1.0, 1, 0], [0, 1, 0], [1, 0, 0]], dtype=F64) * (1 + 2.0**-23)
     verts, faces = torch.cat([a, b]).numpy(), torch.arange(6, dtype=torch.int32).reshape(2, 3).numpy()
     for spacing, edges in (([2.0**-23, 2.0**-52], 5), ([2.0**-52, 2.0**-23], 5), ([2.0**-52, 2.0**-52], 6)):
-        assert len(core.for_tests.edges(verts, faces, [0, 3], spacing)) == edges
+        assert len(parts.edges(verts, faces, [0, 3], spacing)) == edges
 
 
 def test_an_orthographic_eye_very_far_away():
@@ -141,7 +142,7 @@ def seconds_of_edges(verts: Tensor) -> float:
     """Of the processor, to find the edges of a soup, and how many there are."""
     faces = torch.arange(len(verts), dtype=torch.int32).reshape(-1, 3).numpy()
     begin = time.process_time()
-    core.for_tests.edges(verts.numpy(), faces, [0], [2.0**-52])
+    parts.edges(verts.numpy(), faces, [0], [2.0**-52])
     return time.process_time() - begin
 
 

@@ -10,7 +10,7 @@ import torch
 import edgegrad as eg
 from edgegrad.fit import PoseFit, fit_pose
 from edgegrad.fit.checkpoints import FORMAT
-from edgegrad.fit.pose.gauss_newton import GaussNewton, Normal
+from edgegrad.fit.pose.gauss_newton import GaussNewton, NormalEquations
 from edgegrad.fit.pose.result import pose_from_json
 
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
@@ -440,7 +440,7 @@ def test_the_curvature_from_probes():
     generator = torch.Generator().manual_seed(0)
     J = torch.randn(4000, 3, generator=generator).double()
     p = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    found = [Normal.probed(p, [J @ p + 1.0], 24, generator) for _ in range(50)]
+    found = [NormalEquations.from_probes(p, [J @ p + 1.0], 24, generator) for _ in range(50)]
     mean = torch.stack([one.curvature for one in found]).mean(0)
     # 1200 probes: √(2/1200) = 0.04; four of it.
     assert float((mean - J.T @ J).norm() / (J.T @ J).norm()) < 0.16
@@ -451,7 +451,7 @@ def test_the_normal_equations_of_several_images():
     generator = torch.Generator().manual_seed(0)
     tangents = [torch.randn(3, *shape, generator=generator) for shape in ((4, 5, 2), (6, 3, 2))]
     residuals = [torch.randn(J.shape[1:], generator=generator) for J in tangents]
-    curvature, gradient = Normal.of(residuals, tangents)
+    curvature, gradient = NormalEquations.from_tangents(residuals, tangents)
     J = torch.cat([one.flatten(1) for one in tangents], 1).double()
     torch.testing.assert_close(curvature, J @ J.T)
     torch.testing.assert_close(gradient, J @ torch.cat([r.flatten() for r in residuals]).double())
@@ -468,7 +468,7 @@ def test_gauss_newton_goes_to_the_minimum_and_back_from_a_rise():
 
     for _ in range(40):
         r = J @ (at - truth)
-        assert search.observe(float(r.square().mean()), lambda r=r: Normal.of([r], [J.T]))
+        assert search.observe(float(r.square().mean()), lambda r=r: NormalEquations.from_tangents([r], [J.T]))
         at = at + search.step()
     assert float((at - truth).norm()) < 1e-3
     damping = search.damping

@@ -13,10 +13,10 @@ import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import PoseFit, PoseParameter, fit_pose, fit_scene
 from edgegrad.fit.edge_support import edge_support
-from edgegrad.fit.pose.given import Names
+from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.robust import Comparison
-from edgegrad.fit.pose.task import Lens, PoseTask
+from edgegrad.fit.pose.robust_loss import Comparison
+from edgegrad.fit.pose.task import PoseTask, Unknowns
 from edgegrad.fit.views import has_levels, white_level
 
 
@@ -61,8 +61,8 @@ def test_the_gains_of_object_and_background(gain: float, behind: float) -> None:
     with torch.no_grad():
         alpha = eg.render_aovs(bracket(), view, ["image", "alpha"], spp=64)
     image = gain * alpha["image"] + behind * (1.0 - alpha["alpha"]) * BACKGROUND.to(alpha["image"])
-    task = PoseTask.of(bracket(), image, view, None, None, BACKGROUND, Lens(), 1.0, Names())
-    level = task.level(1.0, 0.0, 1.0, 64, task.free)
+    task = PoseTask.from_arguments(bracket(), image, view, None, None, BACKGROUND, Unknowns(), 1.0, ArgumentNames())
+    level = task.level(1.0, 0.0, 1.0, 64, task.dofs)
     with torch.no_grad():
         compared = Comparison(task, level, task.images(level, pose_from_matrix("", torch.eye(4)), 64, 1))
     # Pictures are compared in units of their white, and so is the background.
@@ -123,7 +123,7 @@ def test_the_uncertainty_is_saved(expected: PoseFit) -> None:
     assert '"reason": "converged"' in expected.to_json()
 
 
-def test_the_white_of_a_picture() -> None:
+def test_the_white_level_a_picture() -> None:
     levels = torch.randint(0, 40, (32, 32, 3), generator=torch.Generator().manual_seed(0))
     dark = srgb_to_linear(levels / 255.0)
     assert has_levels(dark) and not has_levels(0.5 * dark) and not has_levels(2.0 * picture(camera(32)))

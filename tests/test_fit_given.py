@@ -13,9 +13,9 @@ from test_fit_photo import depth_of, photograph, silhouette
 import edgegrad as eg
 from edgegrad.fit import fit_camera, fit_pose, fit_poses, track
 from edgegrad.fit.pose.fit_poses import _masks
-from edgegrad.fit.pose.given import Names, shots_of
-from edgegrad.fit.pose.photo import ways
+from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
 from edgegrad.fit.pose.photo.depth import warn_of_units
+from edgegrad.fit.pose.photo.photo_search import CONTOUR_SUPPORT, most_steps
 
 SIZE = 48
 QUICK = {"init": START, "search": False, "progress": False, "steps": 1, "spp": 2, "max_size": 24}
@@ -76,10 +76,10 @@ def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
     ):  # fmt: skip
         for own, expected in zip(_masks(mask, 2, cameras), masks, strict=True):
             picture = torch.zeros(SIZE, SIZE, 3)
-            ((_, _, _, found, _),) = shots_of(cameras, picture, own, None, Names())
+            ((_, _, _, found, _),) = shots_of(cameras, picture, own, None, ArgumentNames())
             assert torch.equal(torch.as_tensor(found).reshape(SIZE, SIZE), expected), (type(mask), cameras)
     for target in (torch.zeros(SIZE, SIZE, 3), np.zeros((1, SIZE, SIZE, 3)), [np.zeros((SIZE, SIZE, 3))]):
-        ((_, _, found, _, _),) = shots_of([view], target, None, None, Names())
+        ((_, _, found, _, _),) = shots_of([view], target, None, None, ArgumentNames())
         assert found.shape == (SIZE, SIZE, 3)
 
 
@@ -154,14 +154,22 @@ def test_a_film_begins_where_the_object_is_seen(taken, along, message):
 
 
 def test_more_steps_are_taken_where_they_are_asked_for():
-    assert [ways.most_steps(40, *level) for level in ((False, True), (False, False), (True, False))] == [12, 8, 20]
-    assert [ways.most_steps(5, *level) for level in ((False, True), (False, False), (True, False))] == [5, 5, 5]
-    assert ways.most_steps(80, True, False) == 40 and ways.most_steps(80, False, True) == 24
+    assert [most_steps(40, *level) for level in ((False, True), (False, False), (True, False))] == [
+        12,
+        8,
+        20,
+    ]
+    assert [most_steps(5, *level) for level in ((False, True), (False, False), (True, False))] == [
+        5,
+        5,
+        5,
+    ]
+    assert most_steps(80, True, False) == 40 and most_steps(80, False, True) == 24
 
 
 def test_what_is_not_explained_is_not_blamed_on_steps(taken):
     """A plain mesh has to show more of its edges than one with colours."""
     view, image = taken
     fit = fit_pose(bracket(True), image, view, init=START, search=False, progress=False, steps=2)
-    assert 0.6 < fit.explained < ways.ALONE_ENOUGH and not fit.converged, fit.explained
+    assert 0.6 < fit.explained < CONTOUR_SUPPORT and not fit.converged, fit.explained
     assert fit.reason.startswith("edges not explained"), fit.reason

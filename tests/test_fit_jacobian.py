@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from motions import about, derivatives
 from test_fit import BACKGROUND, START, about_center, bracket, camera
 
 import edgegrad as eg
-from edgegrad.fit.pose.given import Names
-from edgegrad.fit.pose.jacobian import Motion, derivatives
-from edgegrad.fit.pose.observed import motion
+from edgegrad.fit.pose.inputs import ArgumentNames
+from edgegrad.fit.pose.jacobian import Motion
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import BEND, Lens, PoseTask
+from edgegrad.fit.pose.task import DISTORTION, PoseTask, Unknowns
 
 CENTER = torch.tensor([1.0, 0.75, 0.4], dtype=torch.float64)
 CHANNELS = ["image", "alpha", "position", "depth", "shading_normal", "normal"]
@@ -26,7 +26,7 @@ def test_derivatives_by_a_rigid_motion():
     """The same as torch.func's from the same samples, of all channels."""
     view, scene = camera(24), eg.Scene([smooth()], BACKGROUND)
     axes = camera().world_to_camera[:3, :3]
-    motion = Motion.about(CENTER, axes, size=2.0)
+    motion = about(CENTER, axes, size=2.0)
     images, found = derivatives(scene, view, CHANNELS, motion, spp=16, seed=3)
     verts = scene.meshes[0].verts
     turns = torch.stack([torch.linalg.cross(axis.expand_as(verts), verts - CENTER) for axis in axes.double()])
@@ -56,7 +56,7 @@ def test_derivatives_by_the_lens():
 
 
 def test_other_channels_are_refused():
-    motion = Motion.about(CENTER)
+    motion = about(CENTER)
     with pytest.raises(ValueError, match=r"aovs: expected a channel that has derivatives .*'face_id'"):
         derivatives(eg.Scene([smooth()]), camera(8), ["face_id"], motion)
     lit = eg.Scene([smooth()], lights=[eg.PointLight((0.0, 0.0, 9.0), 100.0)])
@@ -65,11 +65,13 @@ def test_other_channels_are_refused():
     assert derivatives(lit, camera(8), ["alpha"], motion)[1]["alpha"].shape == (6, 8, 8, 1)
 
 
-@pytest.mark.parametrize("free", [range(7), [0, 1, 2, 3, 4, 5, 7], range(18), [0, 1, 2, 3, 4, 5, *range(8, 18)]])
+@pytest.mark.parametrize("dofs", [range(7), [0, 1, 2, 3, 4, 5, 7], range(18), [0, 1, 2, 3, 4, 5, *range(8, 18)]])
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
-def test_the_motion_of_a_step(free, kind):
+def test_the_motion_of_a_step(dofs, kind):
     """That of where points are, and of the lens, by differences of PoseTask.moved() and lens()."""
-    free = [entry for entry in free if entry < BEND or kind == "perspective"]  # a parallel projection has no distortion
+    dofs = [
+        entry for entry in dofs if entry < DISTORTION or kind == "perspective"
+    ]  # a parallel projection has no distortion
     if kind == "orthographic":
         view = eg.Camera.orthographic((3.0, 2.0, 4.0), CENTER, height=3.0, size=(24, 32))
     else:
@@ -78,22 +80,22 @@ def test_the_motion_of_a_step(free, kind):
     if kind == "perspective":
         view = view.replace(distortion=torch.tensor([0.1, 0.0, 0.01, 0.0]).double())
     picture = eg.render(eg.Scene([bracket()], BACKGROUND), view)
-    task = PoseTask.of(bracket(), picture, view, None, None, BACKGROUND, Lens(), 1.0, Names())
-    task = replace(task, free=free)
-    level = task.level(1.0, 0.0, 1.0, 4, free)
+    task = PoseTask.from_arguments(bracket(), picture, view, None, None, BACKGROUND, Unknowns(), 1.0, ArgumentNames())
+    task = replace(task, dofs=dofs)
+    level = task.level(1.0, 0.0, 1.0, 4, dofs)
     pose = pose_from_matrix("", about_center(1.1 * START[:3, :3], (0.2, 0.1, -0.1)))._replace(
         focal=torch.tensor(1.2).double()
     )
-    found = motion(task, level, level.shots[0], pose)
+    found = task.motion(level, level.shots[0], pose)
     verts, h = bracket().verts, 1e-6
 
     def at(k, step):
-        moved = task.moved(pose, free, torch.zeros(len(free)).double().index_fill(0, torch.tensor(k), step))
+        moved = task.moved(pose, dofs, torch.zeros(len(dofs)).double().index_fill(0, torch.tensor(k), step))
         camera = task.lens(view, moved)
         return moved.scale * verts @ moved.R.T + moved.t, camera.K, camera.coefficients
 
     points = found.of_points(pose.scale * verts @ pose.R.T + pose.t)
-    for k in range(len(free)):
+    for k in range(len(dofs)):
         moved, K, bend = ((a - b) / (2 * h) for a, b in zip(at(k, h), at(k, -h), strict=True))
         torch.testing.assert_close(points[k], moved, rtol=0, atol=1e-6)
         torch.testing.assert_close(torch.zeros_like(K) if found.K is None else found.K[k], K, rtol=0, atol=1e-6)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from motions import about
 from PIL import Image
 from test_fit import START, about_center, bracket, camera, errors, rotation
 
@@ -16,19 +17,19 @@ from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import fit_camera, fit_pose
 from edgegrad.fit.contour_colors import CONTOUR_BLURS, PIXEL_NOISE, ContourColors, blur_losses, mask_noise
-from edgegrad.fit.pose.fit_pose import looks_alike
-from edgegrad.fit.pose.given import Names
-from edgegrad.fit.pose.jacobian import Motion, Rendered
-from edgegrad.fit.pose.photo import light, search, ways
+from edgegrad.fit.pose.fit_pose import ambiguity
+from edgegrad.fit.pose.inputs import ArgumentNames
+from edgegrad.fit.pose.jacobian import Rendered
+from edgegrad.fit.pose.photo import light, photo_search
 from edgegrad.fit.pose.photo.contour import contour_term
 from edgegrad.fit.pose.photo.depth import depth_term
 from edgegrad.fit.pose.photo.level import photo_levels
-from edgegrad.fit.pose.photo.light import Lit, _blurred_inside, spherical
+from edgegrad.fit.pose.photo.light import FittedLight, _blurred_inside, harmonics_of
 from edgegrad.fit.pose.photo.picture import Picture
-from edgegrad.fit.pose.photo.region import region_term
-from edgegrad.fit.pose.photo.surface import AOVS, Surface
+from edgegrad.fit.pose.photo.region_term import region_term
+from edgegrad.fit.pose.photo.surface_interior import AOVS, SurfaceInterior
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import Lens, PoseTask, is_clutter
+from edgegrad.fit.pose.task import PoseTask, Unknowns, is_clutter
 from edgegrad.fit.region import OUTLIERS, Windows, palette, posterior, smoothed
 from edgegrad.fit.views import area_mean
 
@@ -48,7 +49,7 @@ def shown(view, radiance, weight=None, depth=None, mask=None):
 
 
 def moved(mesh, step, axes, center, size=1.0):
-    """By a rotation vector about the centre and a shift, both along axes, the rows of (3, 3), as Motion.about() has it."""
+    """By a rotation vector about the centre and a shift, both along axes, the rows of (3, 3), as motions.about() has it."""
     R = turned(axes.T @ step[:3])
     return mesh.transformed(R, center + size * axes.T @ step[3:] - R @ center)
 
@@ -74,7 +75,7 @@ def test_the_region_terms_gradient_is_that_of_its_loss():
         return -float((near * (soft * p + (1 - soft) * (1 - p) + OUTLIERS).log()).sum())
 
     rendered = Rendered(eg.Scene([mesh]), view, ["alpha"], 512, 2)
-    tangents = rendered.derivatives(Motion.about(CENTER, axes, SIZE))["alpha"][..., 0].float()
+    tangents = rendered.derivatives(about(CENTER, axes, SIZE))["alpha"][..., 0].float()
     zero = torch.zeros(6, dtype=torch.float64)
     normal, mean = region_term(p, alpha(zero), tangents, near, sigma)
     steps = h * torch.eye(6, dtype=torch.float64)
@@ -126,7 +127,7 @@ def ball(size=64, step=None, spp=64):
         mesh = moved(mesh, step, axes, center)
     with torch.no_grad():
         channels = eg.render_aovs(mesh, view, list(AOVS), spp=spp, seed=1)
-    return view, Surface.of(view, channels, Motion.about(center, axes))
+    return view, SurfaceInterior.from_channels(view, channels, about(center, axes))
 
 
 LIGHT = torch.tensor([
@@ -138,7 +139,7 @@ LIGHT = torch.tensor([
 
 def under(surface, coefficients):
     """(h, w, 3), the radiance of a surface in a light."""
-    Y = spherical(surface.normals)[..., : coefficients.shape[1]]
+    Y = harmonics_of(surface.normals)[..., : coefficients.shape[1]]
     return surface.channels["image"].float() * torch.einsum("hwn,cn->hwc", Y, coefficients)
 
 
@@ -146,7 +147,7 @@ def test_an_exposure_is_found():
     view, surface = ball()
     gain = torch.tensor([[1.7], [0.6], [0.9]])
     for harmonics in (1, 9):
-        lit = Lit.of(shown(view, under(surface, gain)), surface, harmonics)
+        lit = FittedLight.from_picture(shown(view, under(surface, gain)), surface, harmonics)
         torch.testing.assert_close(lit.coefficients[:, :1], gain, rtol=2e-3, atol=0)
         assert float(lit.coefficients[:, 1:].abs().sum()) < 0.02
 
@@ -168,9 +169,9 @@ def test_the_light_of_a_matte_ball_is_found(spoilt, monkeypatch):
             / image[free].norm()
         )
 
-    assert off(Lit.of(shown(view, spoilt_image), surface, 9)) < 0.03  # the ridge
-    monkeypatch.setattr(light, "RIDGE", 0.0)
-    lit = Lit.of(shown(view, spoilt_image), surface, 9)
+    assert off(FittedLight.from_picture(shown(view, spoilt_image), surface, 9)) < 0.03  # the ridge
+    monkeypatch.setattr(light, "LIGHT_RIDGE", 0.0)
+    lit = FittedLight.from_picture(shown(view, spoilt_image), surface, 9)
     assert off(lit) < (0.02 if spoilt else 3e-4)
     # Half of a ball tells the harmonics of z apart hardly, and float32 solves for them: rounding differs by processor.
     assert float((lit.coefficients - LIGHT).norm() / LIGHT.norm()) < (0.2 if spoilt else 0.08)
@@ -183,7 +184,7 @@ def test_a_step_of_the_light_term_undoes_a_small_motion(harmonics, most):
     step = torch.tensor([0.008, -0.01, 0.012, 0.006, -0.005, 0.02]).double()
     view, surface = ball()
     _, there = ball(step=step)
-    normal = Lit.of(shown(view, under(there, LIGHT[:, :harmonics])), surface, harmonics).term()
+    normal = FittedLight.from_picture(shown(view, under(there, LIGHT[:, :harmonics])), surface, harmonics).term()
     off = -torch.linalg.solve(normal.curvature, normal.gradient) - step
     share = float(off @ normal.curvature @ off) / float(step @ normal.curvature @ step)
     assert share**0.5 < most
@@ -238,11 +239,11 @@ def test_the_noise_of_a_mask_is_that_of_its_pixels():
 def test_a_pose_that_looks_alike_may_be_elsewhere(taken):
     """Not turned, but nearer: it is as good a reason for doubt."""
     view, image = taken
-    task = PoseTask.of(bracket(), image, view, None, None, None, Lens(), 1.0, Names())
+    task = PoseTask.from_arguments(bracket(), image, view, None, None, None, Unknowns(), 1.0, ArgumentNames())
     pose = pose_from_matrix("pose", START)
     for far, words in ((0.02, ""), (0.09, "9% of the size away")):
         others = [pose, pose._replace(t=pose.t + far * task.size * torch.tensor([0.0, 0.6, 0.8]))]
-        said = looks_alike(pose, others, None, task)
+        said = ambiguity(pose, others, None, task)
         assert words in said and bool(said) == bool(words)
 
 
@@ -275,7 +276,7 @@ def test_a_shift_of_depth_is_found(spoilt):
         with torch.no_grad():
             return eg.render_aovs(one, view, list(AOVS), spp=64, seed=1)
 
-    surface = Surface.of(view, seen(mesh), Motion.about(CENTER, axes, SIZE))
+    surface = SurfaceInterior.from_channels(view, seen(mesh), about(CENTER, axes, SIZE))
     there = seen(moved(mesh, step, axes, CENTER, SIZE))
     measured = (there["depth"] / there["alpha"].clamp(min=1e-6))[..., 0].float()
     measured[there["alpha"][..., 0] < 0.5] = torch.nan
@@ -354,7 +355,7 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     fit = fit_pose(bracket(kind == "plain"), image, view, init=START, progress=False, **given)
     off = errors(fit)
     assert off[0] < degrees and off[1] < percent, (off, fit.explained)  # 12.3° and 8.4 % off at the start
-    assert fit.explained >= ways.ENOUGH and fit.converged == (kind != "plain")
+    assert fit.explained >= photo_search.PHOTO_SUPPORT and fit.converged == (kind != "plain")
     # So small a contour does not show all turns to 2°.
     words = "directions unknown: rotation about (" if kind == "plain" else "converged"
     assert fit.reason.startswith(words), fit.reason
@@ -404,7 +405,7 @@ def test_a_camera_in_a_photograph(taken):
 def test_a_photograph_of_something_else_is_not_converged():
     view = camera(64)
     fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, progress=False)
-    assert not fit.converged and fit.explained < ways.ENOUGH
+    assert not fit.converged and fit.explained < photo_search.PHOTO_SUPPORT
     assert fit.reason.startswith("edges not explained")
 
 
@@ -415,10 +416,10 @@ def test_a_faint_contour_proves_little(step, least, most):
     texture = smoothed(torch.randn(3, 96, 96, generator=generator), 0.8).movedim(0, -1)
     display = 0.3 + 0.1 * texture + step * smoothed(silhouette(view)[..., 0][None], 0.7)[0][..., None]
     image = srgb_to_linear((255.0 * display).round() / 255.0)  # of 8 bits, in which 1 is white
-    task = PoseTask.of(bracket(True), image, view, None, None, None, Lens(), 1.0, Names())
+    task = PoseTask.from_arguments(bracket(True), image, view, None, None, None, Unknowns(), 1.0, ArgumentNames())
     pose = pose_from_matrix("init", torch.eye(4))
     level = photo_levels(task, pose, [None], 96, 16, 0)[-1]
-    assert least <= level.explained(pose, 0) <= most
+    assert least <= level.edge_support(pose, 0) <= most
 
 
 @pytest.mark.slow
@@ -428,7 +429,7 @@ def test_noise_is_refused_without_following_other_starts():
     assert not fit.converged and fit.explained < 0.1
     assert fit.reason.startswith("edges not explained")
     finest = [step for step in fit.history if step.size == fit.history[-1].size]
-    assert len(finest) <= ways.LAST_STEPS + ways.FINE_STEPS + 1  # of the given start alone
+    assert len(finest) <= photo_search.LAST_STEPS + photo_search.FINE_STEPS + 1  # of the given start alone
 
 
 def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, tmp_path):
@@ -478,8 +479,10 @@ def test_what_looks_alike_in_unknown_light_is_not_converged():
     start = torch.eye(4, dtype=torch.float64)
     start[:3, :3] = turned(torch.tensor([0.05, -0.2, 0.0], dtype=torch.float64))
     fit = fit_pose(box, photograph(view, box.transformed(R), seed=4), view, init=start, spp=8, progress=False)
-    assert fit.explained >= ways.ENOUGH and not fit.uncertainty.unknown and not fit.converged
-    assert fit.reason.startswith("looks alike: the pictures hardly tell it from a pose that is turned by "), fit.reason
+    assert fit.explained >= photo_search.PHOTO_SUPPORT and not fit.uncertainty.unknown and not fit.converged
+    assert fit.reason.startswith("ambiguous: the pictures hardly separate it from a pose that is turned by "), (
+        fit.reason
+    )
     assert "give symmetries of the mesh, depth" in fit.reason
 
 
@@ -497,15 +500,15 @@ def test_what_looks_alike_is_not_converged(monkeypatch):
     found = []
     for least in (
         1.0,
-        search.ALIKE,
+        photo_search.AMBIGUITY_NATS,
     ):  # the colours of this clutter make the right one likelier, by a factor of some exp(2.6)
-        monkeypatch.setattr(search, "ALIKE", least)
-        monkeypatch.setattr(search, "ALONE_ALIKE", least)
+        monkeypatch.setattr(photo_search, "AMBIGUITY_NATS", least)
+        monkeypatch.setattr(photo_search, "CONTOUR_AMBIGUITY_NATS", least)
         found.append(fit_pose(box, image, view, init=start, progress=False))
     for fit in found:
         assert math.degrees(math.acos(min(1.0, (float((fit.R.T @ R).trace()) - 1.0) / 2.0))) < 3.0
-        assert fit.explained >= ways.ALONE_ENOUGH
+        assert fit.explained >= photo_search.CONTOUR_SUPPORT
     assert found[0].converged and not found[1].converged
-    words = r"looks alike: the pictures hardly tell it from a pose that is turned by (\d+)°"
+    words = r"ambiguous: the pictures hardly separate it from a pose that is turned by (\d+)°"
     said = re.match(words, found[1].reason)
     assert said and 15 < int(said[1]) < 30, found[1].reason

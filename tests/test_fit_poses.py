@@ -1,5 +1,5 @@
 """fit_poses: several objects that cover one another in one photograph, with equations against oracles and poses end to end; and
-what covers an object that fit_pose looks for."""
+what occluder_weights an object that fit_pose looks for."""
 
 import io
 import json
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from motions import about
 from PIL import Image
 from test_fit import bracket, rotation
 from test_fit_photo import clutter
@@ -18,21 +19,20 @@ from edgegrad.camera.poses import rotation as turned
 from edgegrad.cli import main
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import PoseFit, fit_pose, fit_poses
-from edgegrad.fit.pose.given import Names
-from edgegrad.fit.pose.jacobian import Motion, Motions, Rendered
-from edgegrad.fit.pose.photo.cover import covers
-from edgegrad.fit.pose.photo.cover import left as left_of
+from edgegrad.fit.pose.inputs import ArgumentNames
+from edgegrad.fit.pose.jacobian import Motions, Rendered
 from edgegrad.fit.pose.photo.level import photo_levels
-from edgegrad.fit.pose.photo.light import Lit
+from edgegrad.fit.pose.photo.light import FittedLight
+from edgegrad.fit.pose.photo.occluders import occluder_weights, visible_share
 from edgegrad.fit.pose.photo.picture import Picture
-from edgegrad.fit.pose.photo.region import regions_term
-from edgegrad.fit.pose.photo.surface import AOVS, Surface
+from edgegrad.fit.pose.photo.region_term import regions_term
+from edgegrad.fit.pose.photo.surface_interior import AOVS, SurfaceInterior
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import Lens, PoseTask
+from edgegrad.fit.pose.task import PoseTask, Unknowns
 from edgegrad.fit.region import OUTLIERS, smoothed
 
 MIDDLE = torch.tensor([1.0, 0.75, 0.4]).double()
-BESIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which covers a part of the bracket
+BESIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which occluder_weights a part of the bracket
 
 
 def view_of(size=96, distance=6.0):
@@ -108,7 +108,7 @@ def photograph(view, meshes, seed=0):
 
 
 def shares_of(view, meshes, spp=32):
-    """(H, W, n), of each pixel what each mesh covers."""
+    """(H, W, n), of each pixel what each mesh occluder_weights."""
     colours = torch.eye(len(meshes))
     painted = [
         eg.Mesh(mesh.verts, mesh.faces, colors=colour.expand(len(mesh.verts), -1))
@@ -133,7 +133,7 @@ def two():
 
 
 def test_the_region_terms_gradient_is_that_of_its_loss():
-    """Of two objects, of which one covers the other: against central differences of renders with many samples."""
+    """Of two objects, of which one occluder_weights the other: against central differences of renders with many samples."""
     view, h, sigma = view_of(48), 0.004, 0.7
     meshes = [mesh.replace(material=None) for mesh in scene_of(2, light=False)]
     axes, colours = view.world_to_camera[:3, :3].double(), torch.eye(2, dtype=torch.float64)
@@ -161,7 +161,7 @@ def test_the_region_terms_gradient_is_that_of_its_loss():
 
     zero = torch.zeros(12, dtype=torch.float64)
     rendered = Rendered(painted(zero), view, ["image"], 512, 2)
-    ways = Motions([Motion.about(middle, axes, size) for middle in centres], [len(mesh.verts) for mesh in meshes])
+    ways = Motions([about(middle, axes, size) for middle in centres], [len(mesh.verts) for mesh in meshes])
     tangents = rendered.derivatives(ways)["image"].float().movedim(-1, 1)
     alphas = rendered.images["image"].float().movedim(-1, 0)
     normal, mean = regions_term(posteriors, alphas, tangents, near, sigma)
@@ -172,7 +172,7 @@ def test_the_region_terms_gradient_is_that_of_its_loss():
         off = float((normal.gradient[own] - expected[own]).norm() / expected[own].norm())
         assert off < 0.04, (own, normal.gradient, expected)
     assert mean == pytest.approx(loss(zero) / float(near.sum()), rel=1e-3)
-    # Where the box covers the bracket, both move the same contour.
+    # Where the box occluder_weights the bracket, both move the same contour.
     assert float(normal.curvature[:6, 6:].abs().max()) > 0.01 * float(normal.curvature.abs().max())
 
 
@@ -216,7 +216,7 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
         if kind == "plain" and known > 2.0:  # the contour of the covered one tells its turn to about as much
             assert fit.reason.startswith("directions unknown: ") and off[0] < known < 2.5, (off, known)
         elif kind == "plain":  # a plain box shows nearly the same contour in a pose that is turned by 10°
-            assert fit.converged or fit.reason.startswith("looks alike: "), (off, fit.reason)
+            assert fit.converged or fit.reason.startswith("ambiguous: "), (off, fit.reason)
         else:
             assert fit.converged and fit.reason == "converged", (kind, off, fit.explained)
     assert 0.5 < fits[0].visible < 0.7 and fits[1].visible > 0.98
@@ -287,7 +287,7 @@ WITHIN = at(torch.eye(3).double(), MIDDLE + BESIDE)
         (MESHES[:2], {"init": [STARTS[0], FAR]}, ValueError, r"init\[1\]: expected a pose at which the camera sees"),
         (MESHES[:2], {"init": [STARTS[0], BEHIND]}, ValueError, r"init\[1\]: expected the object in front of the camera"),
         ([*MESHES[:2], box((0.3, 0.3, 0.3))], {"init": [*STARTS[:2], WITHIN]}, ValueError,
-         r"init\[2\]: expected the objects beside one another, got meshes\[2\] inside meshes\[1\]"),
+         r"init\[2\]: expected the objects next to one another, got meshes\[2\] inside meshes\[1\]"),
         ([MESHES[0]] * 2, {"init": [STARTS[0]] * 2}, ValueError, r"init\[0\]: expected the objects apart"),
         (MESHES[:2], {"init": STARTS[:2], "mask": BLANK[..., 0]}, TypeError, r"mask: expected an image of labels, of integers"),
         (MESHES[:2], {"init": STARTS[:2], "mask": [BLANK[..., 0]]}, ValueError, r"mask: expected 2, one for each mesh, got 1"),
@@ -330,7 +330,7 @@ def test_from_the_shell(two, tmp_path, capsys):
     # The contour of the first tells its rotation to about 2°, and what is less exact is unknown. That of a box in so few
     # pixels is nearly the same in a pose that is turned by 10°.
     assert f"{tmp_path}/0.ply: converged" in said or f"{tmp_path}/0.ply: directions unknown" in said, said
-    assert f"{tmp_path}/1.ply: converged" in said or f"{tmp_path}/1.ply: looks alike" in said, said
+    assert f"{tmp_path}/1.ply: converged" in said or f"{tmp_path}/1.ply: ambiguous" in said, said
     assert main(given[:-2]) == 2
     assert "--init: expected 2, one for each --mesh, got 1" in capsys.readouterr().err
     Image.fromarray((labels_of(view, scene_of(2)) == 1).byte().numpy()).save(tmp_path / "labels.png")
@@ -340,7 +340,7 @@ def test_from_the_shell(two, tmp_path, capsys):
     assert "--label" not in said
 
 
-# What covers an object and is none of the meshes
+# What occluder_weights an object and is none of the meshes
 
 
 @pytest.fixture(scope="module")
@@ -360,10 +360,10 @@ def test_what_covers_an_object_is_told_by_its_light(covered, strength):
     view, image, over, alpha = covered
     bare = photograph(view, [bracket().replace(material=eg.Material())], seed=2)
     image = torch.lerp(bare, image, strength)
-    task = PoseTask.of(bracket(), image, view, None, None, None, Lens(), 1.0, Names())
+    task = PoseTask.from_arguments(bracket(), image, view, None, None, None, Unknowns(), 1.0, ArgumentNames())
     pose = pose_from_matrix("pose", torch.eye(4))
     level = photo_levels(task, pose, [None], 256, 16, 0)[-1]
-    (weight,) = covers(level.see(pose, 0))
+    (weight,) = occluder_weights(level.comparisons(pose, 0))
     # The level is a part of the picture.
     top, left = (
         round(float(a - b)) for a, b in zip(view.K[[1, 0], 2], level.pictures[0].camera.K[[1, 0], 2], strict=True)
@@ -373,7 +373,7 @@ def test_what_covers_an_object_is_told_by_its_light(covered, strength):
     inside = alpha[rows, columns] > 0.99
     wrong = ((weight < 0.5) != over[rows, columns])[inside].float().mean()
     assert float(wrong) < 0.03, float(wrong)  # 0.25 where nothing is told
-    assert left_of(level.see(pose, 0), [weight]) == pytest.approx(0.75, abs=0.02)
+    assert visible_share(level.comparisons(pose, 0), [weight]) == pytest.approx(0.75, abs=0.02)
 
 
 @pytest.mark.slow
@@ -391,9 +391,9 @@ def test_white_may_be_any_brighter_colour():
     with torch.no_grad():
         seen = eg.render_aovs(mesh, view, list(AOVS), 32)
     picture = (seen["image"] * 1.6 + (1 - seen["alpha"]) * 0.2).float().clamp(0, 1)
-    surface = Surface.of(view, seen, Motion.about(MIDDLE))
+    surface = SurfaceInterior.from_channels(view, seen, about(MIDDLE))
     display = linear_to_srgb(picture)
-    lit = Lit.of(Picture(view, picture, display, None, torch.ones(96, 96), None), surface, 1)
+    lit = FittedLight.from_picture(Picture(view, picture, display, None, torch.ones(96, 96), None), surface, 1)
     torch.testing.assert_close(lit.coefficients[1:, 0], torch.tensor([1.6, 1.6]), atol=0.02, rtol=0.0)
     assert float(lit.residual.abs().max()) < 0.02  # 0.44 too bright in red, of which 1 is all that is shown
 

@@ -160,7 +160,7 @@ def test_ctrl_c_while_limbs_are_drawn_anew_keeps_what_there_is(monkeypatch) -> N
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("edgegrad.fit.rig.limbs.Search.run", stop)
+    monkeypatch.setattr("edgegrad.fit.rig.limbs.LimbSearch.run", stop)
     rig, cameras = arm(), views(32, 2)
     found = fit_rig(rig, cameras, masks=shown(rig.posed(TRUTH), cameras), steps=2, progress=False)
     assert found.fit.interrupted and not found.converged
@@ -196,7 +196,7 @@ def test_what_a_frame_misses_is_looked_for_once(monkeypatch, loss: float, angles
         )
 
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.fit_rig", fit)
-    monkeypatch.setattr("edgegrad.fit.rig.track_rig.ONWARD", 0.0)
+    monkeypatch.setattr("edgegrad.fit.rig.track_rig.MOTION_SHARE", 0.0)
     start = {"rotations": torch.zeros(2, 3, dtype=torch.float64)}
     found = list(track_rig(arm(), views(16, 1), [{}, {}, {}], start=start, again=5, checkpoint="a.ckpt", resume=True))
     assert [float(one.values["rotations"][0, 0]) for one in found] == angles

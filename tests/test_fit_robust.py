@@ -14,12 +14,12 @@ from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, p
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import fit_camera, fit_pose, fit_scene, fit_texture
-from edgegrad.fit.pose import search
-from edgegrad.fit.pose.given import Names
+from edgegrad.fit.pose import color_search
+from edgegrad.fit.pose.blur_estimate import estimate_blur
+from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.robust import Comparison
-from edgegrad.fit.pose.soft import softness
-from edgegrad.fit.pose.task import PARTS, Lens, PoseTask, blurred, is_clutter
+from edgegrad.fit.pose.robust_loss import Comparison
+from edgegrad.fit.pose.task import STEP_PARTS, PoseTask, Unknowns, blurred, is_clutter
 from edgegrad.fit.views import over_black
 
 
@@ -50,7 +50,7 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
     """Where something covers the object, as a board does, turned poses are looked at."""
     view = camera(64)
     image, _ = covered(view, picture(view))
-    down, aside = search.Search._down, []
+    down, aside = color_search.ColorSearch._down, []
 
     def ends_aside(self, pose, levels):
         if aside:
@@ -58,10 +58,10 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
         aside.append(self.task.moved(pose_from_matrix("", torch.eye(4)), [0], torch.tensor([0.12]).double()))
         return aside[0], True
 
-    monkeypatch.setattr(search.Search, "_down", ends_aside)
-    monkeypatch.setattr(search, "MIN_EDGE_SUPPORT", 0.0)  # all ends are taken for right
+    monkeypatch.setattr(color_search.ColorSearch, "_down", ends_aside)
+    monkeypatch.setattr(color_search, "MIN_EDGE_SUPPORT", 0.0)  # all ends are taken for right
     if not looks:
-        monkeypatch.setattr(search, "APART", math.inf)
+        monkeypatch.setattr(color_search, "MIN_BLOCK_ERROR", math.inf)
     fit = fit_pose(bracket(), image, view, init=START, background=BACKGROUND, steps=24, progress=False)
     assert (errors(fit)[0] < 1.0) == looks and fit.converged
     assert torch.equal([step for step in fit.history if step.best][-1].pose.matrix, fit.matrix)
@@ -100,11 +100,13 @@ def test_blur_and_compression_cost_no_second_search(kind):
 def test_the_softness_of_a_picture():
     view = camera(64)
     for sigma in (0.0, 0.6, 1.0):
-        task = PoseTask.of(bracket(), blurred(picture(view), sigma), view, None, None, BACKGROUND, Lens(), 1.0, Names())
+        task = PoseTask.from_arguments(
+            bracket(), blurred(picture(view), sigma), view, None, None, BACKGROUND, Unknowns(), 1.0, ArgumentNames()
+        )
         pose = pose_from_matrix("", torch.eye(4))
-        level = task.level(1.0, 0.0, 1.0, 64, task.free)
+        level = task.level(1.0, 0.0, 1.0, 64, task.dofs)
         renders = [task.images(level, pose, 64, seed) for seed in (0, 1)]
-        assert softness(task, level, *renders) == pytest.approx(sigma, abs=0.1)
+        assert estimate_blur(task, level, *renders) == pytest.approx(sigma, abs=0.1)
 
 
 def lit():
@@ -133,11 +135,11 @@ def test_an_unlit_mesh_in_a_lit_picture_stays_near_its_start(further):
 
 
 def test_an_answer_shows_as_much_of_the_edges():
-    start = search._Judged(loss=1.0, explained=0.5, apart=0.1, edges=10.0)
-    assert start._replace(loss=0.9, explained=0.6).beats(start)
-    assert not start._replace(loss=1.1, explained=0.9).beats(start)
-    assert not start._replace(loss=0.9, explained=0.4).beats(start)
-    assert not start._replace(loss=0.9, explained=0.9, edges=5.0).beats(start)  # hardly in view
+    start = color_search.Score(loss=1.0, edge_support=0.5, block_error=0.1, edges=10.0)
+    assert start._replace(loss=0.9, edge_support=0.6).beats(start)
+    assert not start._replace(loss=1.1, edge_support=0.9).beats(start)
+    assert not start._replace(loss=0.9, edge_support=0.4).beats(start)
+    assert not start._replace(loss=0.9, edge_support=0.9, edges=5.0).beats(start)  # hardly in view
 
 
 def test_a_border_of_many_colours_is_clutter():
@@ -225,9 +227,11 @@ def test_residuals_have_the_gradient_of_the_loss(clutter):
     image = picture(
         view, background=torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(1)) if clutter else BACKGROUND
     )
-    task = PoseTask.of(bracket(), image, view, None, torch.rand(16, 16), background, Lens(), 1.0, Names())
+    task = PoseTask.from_arguments(
+        bracket(), image, view, None, torch.rand(16, 16), background, Unknowns(), 1.0, ArgumentNames()
+    )
     assert task.clutter == clutter
-    level = task.level(1.0, 0.0, 1.0, 4, task.free)
+    level = task.level(1.0, 0.0, 1.0, 4, task.dofs)
     g = torch.Generator().manual_seed(0)
     with torch.no_grad():
         (base,) = (layer.double() for layer in task.images(level, pose_from_matrix("", torch.eye(4)), 16, 0))
@@ -361,7 +365,7 @@ def test_the_gradient_in_the_history(part):
         return compared.loss(c or compared.scale())[0], compared.scale()
 
     c = loss(0, 0.0)[1]
-    slopes = [(loss(entry, h, c)[0] - loss(entry, -h, c)[0]) / (2 * h) for entry in PARTS[part]]
+    slopes = [(loss(entry, h, c)[0] - loss(entry, -h, c)[0]) / (2 * h) for entry in STEP_PARTS[part]]
     assert first.gradient[part] == pytest.approx(math.hypot(*slopes), rel=0.05)
 
 
@@ -498,7 +502,7 @@ def test_what_a_picture_holds_at_a_soft_mask_does_not_matter(kind):
     assert degrees < 0.08 and percent < 0.15, (degrees, percent)  # mostly 0.02 and 0.01; a hard mask: 0.7 and 0.8
 
 
-def test_the_object_before_black():
+def test_the_object_over_black():
     mask = torch.tensor([0.0, 0.0, 0.3, 0.6, 1.0, 1.0, 1.0, 0.5])[None, :, None]
     inside = torch.tensor([9.0, 9.0, 9.0, 9.0, 2.0, 3.0, 4.0, 9.0])[None, :, None]
     image, sure = over_black(inside, mask)

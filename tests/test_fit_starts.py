@@ -15,12 +15,12 @@ import edgegrad as eg
 from benchmarks import photo_cases
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import fit_pose
-from edgegrad.fit.pose.given import Names
-from edgegrad.fit.pose.photo.match import ACROSS, ROUNDS, SIZED, Matches, Mips, _in_mask, closer
+from edgegrad.fit.pose.inputs import ArgumentNames
+from edgegrad.fit.pose.photo.match import BEAM_ROUNDS, SIZE_SPACING, VIEW_PIXELS, Matches, Mips, _in_mask, closer
 from edgegrad.fit.pose.photo.nearby import EVERYWHERE, comparable, nearby
-from edgegrad.fit.pose.photo.views import Views, all_sides, ball, pose_at, seen_at, spread
+from edgegrad.fit.pose.photo.template_views import TemplateViews, all_sides, ball, pose_at, seen_at, spread
 from edgegrad.fit.pose.pose import Pose, angle, pose_from_matrix
-from edgegrad.fit.pose.task import Lens, PoseTask
+from edgegrad.fit.pose.task import PoseTask, Unknowns
 
 CENTER = torch.tensor([1.0, 0.75, 0.4])
 SIZE = 96
@@ -88,7 +88,7 @@ def test_a_ball_begins_with_no_turn_and_is_filled_evenly() -> None:
 
 def test_a_pose_off_the_axis_shows_the_object_where_it_should_and_turned_alike() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    task = PoseTask.of(mesh, picture, camera(), mask, None, None, Lens(), 1.0, Names())
+    task = PoseTask.from_arguments(mesh, picture, camera(), mask, None, None, Unknowns(), 1.0, ArgumentNames())
     R = rotation(torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64))
     pose = pose_at(task, R, torch.tensor([80.0, 20.0]), 5.0)
     center = pose.R @ task.center + pose.t
@@ -114,17 +114,19 @@ def test_matches_come_closer_than_views_are_apart() -> None:
     """Views are 20° apart, and places a tenth of the object's size: the rounds after them bring matches nearer."""
     R, t = truth((2.5, 0.3, 0.2), (0.3, -0.2, 0.4))
     mesh, picture, mask = pictured(R, t)
-    task = PoseTask.of(mesh, picture, camera(), mask, None, None, Lens(), 1.0, Names())
-    mips = Mips(task, ACROSS)
-    found = _in_mask(Views.of(task, all_sides()[::2], ACROSS, 0), mips).distinct(24, 0.2, 0.1, SIZED)
+    task = PoseTask.from_arguments(mesh, picture, camera(), mask, None, None, Unknowns(), 1.0, ArgumentNames())
+    mips = Mips(task, VIEW_PIXELS)
+    found = _in_mask(TemplateViews.from_rotations(task, all_sides()[::2], VIEW_PIXELS, 0), mips).distinct(
+        24, 0.2, 0.1, SIZE_SPACING
+    )
     coarse = found
-    for one in ROUNDS:
+    for one in BEAM_ROUNDS:
         before = found
         found = closer(task, before, mips, one, 0.0, 0)
-        if one.across == ACROSS:  # the match itself is among those compared
+        if one.across == VIEW_PIXELS:  # the match itself is among those compared
             assert bool((found.scores >= before.scores - 1e-4).all())
             assert float((found.scores - before.scores).mean()) > 0.1
-        found = found.distinct(12, one.turned, one.placed, SIZED)
+        found = found.distinct(12, one.turned, one.spacing, SIZE_SPACING)
     assert any(near(pose, R, t, task, 0.2, 0.1) for pose in found.poses(task)[:4])
     assert not any(near(pose, R, t, task, 0.2, 0.1) for pose in coarse.poses(task)[:4])
 
@@ -132,9 +134,11 @@ def test_matches_come_closer_than_views_are_apart() -> None:
 @pytest.mark.slow
 def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a quarter nothing is seen: one side has to be left out, and the right one."""
-    monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.STARTS", 24)
+    monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.NEARBY_ROTATIONS", 24)
     case = photo_cases.rendered("pebble", pebble(), [photo_cases.clutter(k) for k in range(2)], "covered", 4)
-    task = PoseTask.of(case.mesh, case.picture, case.camera, None, None, None, Lens(), 1.0, Names())
+    task = PoseTask.from_arguments(
+        case.mesh, case.picture, case.camera, None, None, None, Unknowns(), 1.0, ArgumentNames()
+    )
     start = pose_from_matrix(
         "init", case.perturbed(case.truth, 15.0, 0.05 * case.size, np.random.default_rng(4)).matrix
     )

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from adjoints import filters, pieces, random
+from adjoints import filters, random
+from kernel_parts import parts
 
 CELL = 1 / 256  # importance is counted in 256ths, so that its sums are exact
 
@@ -44,7 +45,7 @@ def test_importance_is_the_mean_of_its_pixels(kind, radius):
     formula = np.where(size > 0, 1 + 8 * size / size[size > 0].mean(), 0)
     pixel = np.array(
         [
-            [pieces.importance(image, 0.0, [x + 0.5, y + 0.5], [x + 0.5, y + 0.5]) for x in range(image.shape[1])]
+            [parts.importance(image, 0.0, [x + 0.5, y + 0.5], [x + 0.5, y + 0.5]) for x in range(image.shape[1])]
             for y in range(image.shape[0])
         ]
     )
@@ -52,7 +53,7 @@ def test_importance_is_the_mean_of_its_pixels(kind, radius):
     for low, high in rectangles():
         part = reached(pixel, radius, low, high)
         expected = part.sum() / part.size if part.size else 0.0
-        assert pieces.importance(image, radius, low, high) == expected
+        assert parts.importance(image, radius, low, high) == expected
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.5, 1.0])
@@ -63,7 +64,7 @@ def test_importance_is_zero_only_where_no_adjoint_is(radius):
     seen = set()
     for low, high in rectangles(200):
         any_adjoint = bool((reached(image, radius, low, high) != 0).any())
-        assert (pieces.importance(image, radius, low, high) > 0) == any_adjoint
+        assert (parts.importance(image, radius, low, high) > 0) == any_adjoint
         seen.add(any_adjoint)
     assert seen == {True, False}
 
@@ -73,11 +74,11 @@ def test_importance_reaches_as_far_as_the_filter(name):
     """A single pixel with an adjoint: wherever its filter has weight, the importance is not zero."""
     image = np.zeros((11, 17, 1))
     image[5, 8] = -2.0
-    radius = pieces.filter_radius(name)
+    radius = parts.filter_radius(name)
     for dx, dy in itertools.product(np.linspace(-2.4, 2.4, 25), repeat=2):
         x = [8.5 + dx, 5.5 + dy]
-        weight = pieces.filter_weight(name, dx) * pieces.filter_weight(name, dy)
-        importance = pieces.importance(image, radius - 0.5, x, x)
+        weight = parts.filter_weight(name, dx) * parts.filter_weight(name, dy)
+        importance = parts.importance(image, radius - 0.5, x, x)
         # On its own border the box belongs to one pixel only; everywhere else weight means importance.
         if weight > 0 and not (name == "box" and max(abs(dx), abs(dy)) == 0.5):
             assert importance > 0
@@ -86,4 +87,4 @@ def test_importance_reaches_as_far_as_the_filter(name):
 
 
 def test_importance_of_no_adjoint():
-    assert pieces.importance(np.zeros((3, 4, 3)), 0.5, [0.0, 0.0], [4.0, 3.0]) == 0
+    assert parts.importance(np.zeros((3, 4, 3)), 0.5, [0.0, 0.0], [4.0, 3.0]) == 0

@@ -9,6 +9,7 @@ import pytest
 import torch
 from combinations import diagonal
 from finite_differences import check, check_ratio, estimate, rotation
+from kernel_parts import parts
 from oracles.cut_apart import cut_apart, faces_that_cross
 from oracles.exact import exact_image
 from scenes import cube, front_camera, icosphere, smooth_adjoint, smooth_colors, soup
@@ -39,7 +40,7 @@ def found(verts: Tensor, faces: Tensor, *, threads: int = 1, windings: Tensor | 
     share = torch.ones(len(faces)) if share is None else share
     arrays = verts.double().numpy(), faces.int().numpy(), windings.int().numpy()
     spacing = torch.finfo(verts.dtype).eps
-    pairs, drawn = core.for_tests.intersections(*arrays, spacing, share.numpy(), seed, threads)
+    pairs, drawn = parts.intersections(*arrays, spacing, share.numpy(), seed, threads)
     return [pair[:4] for pair in pairs], torch.tensor([pair[4] for pair in pairs], dtype=F64), drawn
 
 

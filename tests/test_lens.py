@@ -15,6 +15,7 @@ import torch
 from around import area, check_area
 from combinations import diagonal
 from finite_differences import Case, finite_difference, gradient, loss, right_ratio, rotation
+from kernel_parts import parts
 from scenes import icosphere, smooth_adjoint
 from torch import Tensor
 
@@ -22,7 +23,6 @@ import edgegrad as eg
 from edgegrad.camera.lens import distort
 from edgegrad.kernel.operators import kernel_camera
 from edgegrad.kernel.request import pack_camera
-from edgegrad.library import core
 
 F64 = torch.float64
 DISTORTION = {
@@ -63,7 +63,7 @@ def test_points_agree_with_opencv(lens: str) -> None:
     np.testing.assert_allclose(view.project(torch.from_numpy(points[:, 0])).numpy(), expected, atol=1e-9)
     kernel = kernel_camera(pack_camera(view))
     q = points[:, 0] @ M[:3, :3].T + M[:3, 3]
-    np.testing.assert_allclose([core.for_tests.project(kernel, p) for p in q], expected, atol=1e-9)
+    np.testing.assert_allclose([parts.project(kernel, p) for p in q], expected, atol=1e-9)
 
 
 @lenses
@@ -87,9 +87,9 @@ def test_boxes_hold_what_they_say(lens: str) -> None:
     rng = np.random.default_rng(1)
     for _ in range(200):
         middle, half = rng.uniform(-30, 80, 2), rng.uniform(0, 20, 2) ** 2 / 10
-        low, high = core.for_tests.image_box(kernel, middle - half, middle + half)
+        low, high = parts.image_box(kernel, middle - half, middle + half)
         for u in rng.uniform(middle - half, middle + half, (30, 2)):
-            x, area_scale, _ = core.for_tests.distort(kernel, u, [0.0, 0.0])
+            x, area_scale, _ = parts.distort(kernel, u, [0.0, 0.0])
             if area_scale > 0 and (np.array(x) > -1).all() and x[0] < SIZE[1] + 1 and x[1] < SIZE[0] + 1:
                 assert (np.array(x) >= np.array(low) - 1e-9).all() and (np.array(x) <= np.array(high) + 1e-9).all()
 
@@ -409,7 +409,7 @@ def test_what_is_refused() -> None:
 def normalised_places(view: eg.Camera, pixels: list[tuple[int, int]], places: np.ndarray) -> np.ndarray:
     """n (P, N, 2) of the rays through places (N, 2) of the unit square of each pixel, as images have them."""
     kernel = kernel_camera(pack_camera(view))
-    return np.array([core.for_tests.place_in_pixel(kernel, x, y, places.tolist()) for x, y in pixels])
+    return np.array([parts.place_in_pixel(kernel, x, y, places.tolist()) for x, y in pixels])
 
 
 RADIAL = {

@@ -159,7 +159,7 @@ def bits_with(threads, mesh, seed=0):
 
 
 def test_the_same_bits_with_1_2_and_5_threads_and_several_callers(tmp_path):
-    """Also where callers with different numbers of threads share the workers."""
+    """Also where callers with different numbers of threads render at once."""
     meshes = [icosphere(5), soup(icosphere(4))]
     alone = [bits_with(1, mesh) for mesh in meshes]
     for threads in (2, 5):
@@ -196,9 +196,9 @@ step(size=64)
 time.sleep(0.1)  # other libraries' threads come to rest
 begin = seconds_of_workers()
 with torch.no_grad():
-    for _ in range(20):
+    for _ in range(8):
         eg.render(SPHERE, front_camera(64), spp=4)
-        time.sleep(0.01)
+        time.sleep(0.05)
         quiet = seconds_of_workers()
         time.sleep(0.02)
         found["waited"].append(seconds_of_workers() - quiet)
@@ -245,12 +245,13 @@ def threads(tmp_path_factory):
     """What one process finds of its threads, for the tests below: it takes longer to import torch than to render."""
     code = WAITING + NAMES
     if hasattr(signal, "SIGALRM"):
-        code += HANDLER + INTERRUPTED + 'found["interrupted"] = interrupted("edge samples")\n'
+        code += HANDLER + INTERRUPTED
+        code += 'found["interrupted"] = {kind: interrupted(kind) for kind in ("edge samples", "last tile")}\n'
     return script(code + "print(json.dumps(found))", folder=tmp_path_factory.mktemp("threads"))
 
 
 def test_workers_that_wait_sleep(threads):
-    """Spinning would take the processors from torch and from other processes."""
+    """By default OpenMP's threads spin for some milliseconds; longer would take the processors from other processes."""
     assert threads["worked"] > 0, "no worker did anything"
     assert max(threads["waited"]) < 0.005, "workers took seconds of processor time while nothing was to do"
 
@@ -416,9 +417,14 @@ def interrupted(kind):
     before, sent = step(), []
     mesh, camera = SPHERE.replace(verts=SPHERE.verts.clone().requires_grad_()), front_camera(512 if kind == "image" else 64)
     many = {"surface samples": {"surface_samples": 1 << 26}, "edge samples": {"edge_samples": 1 << 26}}.get(kind, {})
-    image = None
-    if kind != "image":
+    image, spp = None, 1 << 10
+    if many:
         image = eg.render(mesh, camera, spp=1, **many).sum()
+    if kind == "last tile":  # of two; the calling thread has the one with 2 pixels, another thread that with 16
+        torch.set_num_threads(2)
+        mesh = SPHERE.replace(verts=(18.0 * SPHERE.verts + torch.tensor([16.0, 0.0, 0.0])).requires_grad_())
+        camera = eg.Camera.orthographic((0.0, 0.0, -40.0), (0.0, 0.0, 0.0), height=1.0, size=(1, 32))
+        spp = 1 << 20
 
     def press():
         sent.append(time.time())
@@ -428,7 +434,7 @@ def interrupted(kind):
     timer.start()
     try:
         if image is None:
-            eg.render(mesh, camera, spp=1 << 10)
+            eg.render(mesh, camera, spp=spp)
         else:
             image.backward()
     except KeyboardInterrupt:
@@ -446,8 +452,10 @@ def check_interrupted(found):
 
 
 @posix
-def test_ctrl_c_ends_a_long_render(threads):
-    check_interrupted(threads["interrupted"])
+@pytest.mark.parametrize("kind", ["edge samples", "last tile"])
+def test_ctrl_c_ends_a_long_render(kind, threads):
+    """Also where the calling thread has nothing left to do."""
+    check_interrupted(threads["interrupted"][kind])
 
 
 @posix

@@ -17,13 +17,19 @@ TESTS = Path(__file__).parent
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mapped files as on Linux")
 
-# Renders with three threads and torch's own operators, then prints the gradient's bits, whether the environment is as it
-# was, each mapped OpenMP runtime, and the kernel's own word.
+# The script renders with three threads and torch's own operators. It prints the gradient's bits, whether the environment
+# is as it was, each mapped OpenMP runtime, and the kernel's own word.
 RENDER = """
 import os, sys
 before = dict(os.environ)
 import hashlib
 from pathlib import Path
+
+def threads():
+    "The number of threads but Embree's."
+    files = Path("/proc/self/task").glob("*/comm")
+    return sum(file.read_text().strip() != "embree" for file in files)
+
 {imports}
 from edgegrad.library import core
 from scenes import front_camera, icosphere
@@ -71,7 +77,10 @@ runtime.omp_set_dynamic(1)
 assert runtime.omp_get_dynamic() == 1
 print(bits())
 """
-ORDERS = {"torch first": "import torch\nimport edgegrad as eg", "edgegrad first": "import edgegrad as eg\nimport torch"}
+ORDERS = {
+    "torch first": "import torch\nhere = threads()\nimport edgegrad as eg\nassert threads() == here",
+    "edgegrad first": "import edgegrad as eg\nimport torch",
+}
 
 
 def lines_of(code: str, **variables: str) -> list[str]:
@@ -101,8 +110,12 @@ def test_one_runtime():
     assert limited()[2:] == [parent, own]
 
 
+def test_import_starts_no_threads_of_openmp():
+    whole()  # it counts them
+
+
 def test_the_environment_stays_as_it_is():
-    """How threads wait is the kernel's own matter, whatever was imported first: it asks for no variable."""
+    """How OpenMP's threads wait is the user's matter: the kernel sets no variable."""
     assert whole()[1] == limited()[1] == "True"
 
 

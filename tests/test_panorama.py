@@ -13,6 +13,7 @@ import pytest
 import torch
 from around import BACKGROUND, ball, both, boundary, check_boxes, check_gradient, moved, pose, room, traced, world
 from finite_differences import estimate, finite_difference, gradient, right_ratio, rotation
+from kernel_parts import parts
 from scenes import cube, smooth_adjoint
 from torch import Tensor
 
@@ -59,7 +60,7 @@ def directions(view: eg.Camera, x: np.ndarray) -> np.ndarray:
 
 
 def windows(view: eg.Camera, reach: float = 0.0) -> list:
-    return core.for_tests.sub_cameras(kernel_camera(pack_camera(view)), reach)
+    return parts.sub_cameras(kernel_camera(pack_camera(view)), reach)
 
 
 def seen_through(window, turn: list, q: np.ndarray) -> np.ndarray | None:
@@ -67,13 +68,13 @@ def seen_through(window, turn: list, q: np.ndarray) -> np.ndarray | None:
     x, y, z = np.array(turn) @ q
     if z <= 0 or max(abs(x), abs(y)) > z:
         return None
-    low, high = core.for_tests.view_box(window)
-    scale = np.abs(core.for_tests.project_straight(window, [1.0, 1.0, 1.0]))
-    u = core.for_tests.project_straight(window, [x, y, z])
+    low, high = parts.view_box(window)
+    scale = np.abs(parts.project_straight(window, [1.0, 1.0, 1.0]))
+    u = parts.project_straight(window, [x, y, z])
     slack = 1e-9 * scale
     if (np.array(u) < np.array(low) - slack).any() or (np.array(u) > np.array(high) + slack).any():
         return None
-    return np.array(core.for_tests.project(window, [x, y, z]))
+    return np.array(parts.project(window, [x, y, z]))
 
 
 @cameras
@@ -114,7 +115,7 @@ def test_every_pixel_position_belongs_to_one_window(view: eg.Camera) -> None:
     ]
     through = [window for window, _ in windows(view)]
     for place in x:
-        found = [np.array(core.for_tests.normalised(window, place)) for window in through]
+        found = [np.array(parts.normalised(window, place)) for window in through]
         assert sum(np.isfinite(n).all() for n in found) == 1
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from adjoints import RADIUS, filters, pieces, random
+from adjoints import RADIUS, filters, random
+from kernel_parts import parts
 from scipy.special import erf
 
 from edgegrad.library import core
@@ -23,9 +24,9 @@ CUMULATIVE = {
 @filters
 def test_filter_weight(name):
     """It is the density of the cumulative weight, one in all, and zero beyond the radius."""
-    radius = pieces.filter_radius(name)
+    radius = parts.filter_radius(name)
     assert radius == RADIUS[name]
-    assert pieces.filter_weight(name, radius + 1e-9) == pieces.filter_weight(name, -radius - 1e-9) == 0
+    assert parts.filter_weight(name, radius + 1e-9) == parts.filter_weight(name, -radius - 1e-9) == 0
     # Gauss-Legendre with 20 points on either side of the kink in the middle: exact to rounding.
     x, w = np.polynomial.legendre.leggauss(20)
     for end in np.linspace(-radius, radius, 7)[1:]:
@@ -34,9 +35,7 @@ def test_filter_weight(name):
             if high > low:
                 points = low + 0.5 * (x + 1) * (high - low)
                 mass += (
-                    0.5
-                    * (high - low)
-                    * sum(wi * pieces.filter_weight(name, p) for p, wi in zip(points, w, strict=True))
+                    0.5 * (high - low) * sum(wi * parts.filter_weight(name, p) for p, wi in zip(points, w, strict=True))
                 )
         assert mass == pytest.approx(CUMULATIVE[name](end), abs=1e-13)
 
@@ -45,7 +44,7 @@ def test_filter_weight(name):
 def test_filter_sample_agrees_with_its_weight(name):
     """The sample at u leaves the share u of the weight on its left, so samples are distributed as the weight."""
     u = np.concatenate([[2.0**-54, 1e-12, 1e-6], (np.arange(999) + 0.5) / 999, [1 - 1e-6, 1 - 1e-12, 1 - 2.0**-53]])
-    x = np.array([pieces.filter_sample(name, ui) for ui in u])
+    x = np.array([parts.filter_sample(name, ui) for ui in u])
     assert np.all(np.abs(x) <= RADIUS[name]) and np.all(np.diff(x) >= 0)
     np.testing.assert_allclose(CUMULATIVE[name](x), u, atol=1e-13)  # what Newton's steps on erf promise
     np.testing.assert_allclose(x, -x[::-1], atol=1e-6)  # symmetric; at 1 - 1e-12 u itself is rounded to 1e-16

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from kernel_parts import parts
 
 import edgegrad as eg
 from edgegrad.kernel.flat import flatten
 from edgegrad.kernel.operators import kernel_scene
-from edgegrad.library import core
 from edgegrad.scene.scene import Scene
 
 
@@ -85,7 +85,7 @@ def cast(corners: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     mesh = eg.Mesh(torch.from_numpy(corners.reshape(-1, 3)), faces)
     n = len(rays.ends)
     face, hidden = np.empty(n, np.int32), np.empty(n, np.uint8)
-    core.for_tests.cast_rays(
+    parts.cast_rays(
         kernel_scene(flatten(Scene([mesh]))),
         rays.origins,
         rays.directions,

@@ -12,9 +12,9 @@ import edgegrad as eg
 from edgegrad.fit import Options
 from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.rig.alternatives import Alternatives, exchanged
-from edgegrad.fit.rig.limbs import Limb, Search, Values, limbs
-from edgegrad.fit.rig.sought import Sought
-from edgegrad.fit.rig.twists import untwisted
+from edgegrad.fit.rig.axial_rotations import search_axial_rotations
+from edgegrad.fit.rig.free_parameters import FreeParameters
+from edgegrad.fit.rig.limbs import Limb, LimbSearch, Values, limbs
 from edgegrad.fit.views import views_of
 
 roma = pytest.importorskip("roma")
@@ -88,9 +88,9 @@ def test_twists_are_found(seed: int) -> None:
     assert fit.converged and float(body.Errors.of(fit.rig, fit.values["rotations"], truth).rotation.quantile(0.9)) < 3.0
 
 
-def arm_of(rig: eg.Rig) -> tuple[Sought, Alternatives]:
+def arm_of(rig: eg.Rig) -> tuple[FreeParameters, Alternatives]:
     """Of a figure, the joints of one arm, by whose rotations it is posed."""
-    sought = Sought.of(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
+    sought = FreeParameters.from_arguments(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
     return sought, Alternatives(rig, sought, "rotations")
 
 
@@ -98,14 +98,14 @@ def test_a_twist_keeps_what_hangs_below_in_place() -> None:
     rig = figure.figure(fine=3)
     sought, alternatives = arm_of(rig)
     values = {"rotations": figure.pose(7, 40.0)[[rig.joints.names.index(name) for name in ARM]]}
-    twists = {(ARM[t.row], None if t.child is None else ARM[t.child]): t for t in alternatives.twists(values)}
+    twists = {(ARM[t.row], None if t.child is None else ARM[t.child]): t for t in alternatives.axial_rotations(values)}
     assert list(twists) == [("left arm", "left elbow"), ("left elbow", "left hand"), ("left hand", None)]
     # The hand's own axis points to the middle of its ellipsoid.
     along = torch.tensor(figure.BONES_ALONG[8], dtype=F64)
     assert float(twists["left hand", None].axis @ along / along.norm()) > 0.99
     before = rig.joints.world(roma.rotvec_to_rotmat(sought.all(values)["rotations"]))
     for (name, _), twist in twists.items():
-        found = sought.all({"rotations": alternatives.twisted(values, twist, 0.7)})["rotations"]
+        found = sought.all({"rotations": alternatives.with_rotation(values, twist, 0.7)})["rotations"]
         after = rig.joints.world(roma.rotvec_to_rotmat(found))
         at = rig.joints.names.index(name)
         others = [k for k in range(20) if k != at]
@@ -131,11 +131,11 @@ def test_twists_are_found_by_the_loss_along_them() -> None:
         views,
         Options(spp=32),
     )
-    shared, _, across = alternatives.twists(truth)
-    wrong = {"rotations": alternatives.twisted(truth, shared, 0.35)}
-    wrong = {"rotations": alternatives.twisted(wrong, across, 1.5)}
+    shared, _, across = alternatives.axial_rotations(truth)
+    wrong = {"rotations": alternatives.with_rotation(truth, shared, 0.35)}
+    wrong = {"rotations": alternatives.with_rotation(wrong, across, 1.5)}
     for start, most in ((wrong, 0.1), (truth, 0.06)):
-        found = untwisted(objective, alternatives, parameter, start)["rotations"]
+        found = search_axial_rotations(objective, alternatives, parameter, start)["rotations"]
         R, S = (roma.rotvec_to_rotmat(one) for one in (found, truth["rotations"]))
         assert float(roma.rotmat_geodesic_distance(R, S).max()) < most
 
@@ -150,10 +150,10 @@ def test_tries_that_gain_nothing_end(nearly: bool, costs: list[float], tries: in
         def cost(self, values: Values) -> float:
             return 1.0
 
-        def explained(self, values: Values) -> bool:
+        def matches(self, values: Values) -> bool:
             return False
 
-        def nearly(self, values: Values) -> bool:
+        def nearly_matches(self, values: Values) -> bool:
             return nearly
 
         def off(self, values: Values) -> torch.Tensor:
@@ -162,7 +162,7 @@ def test_tries_that_gain_nothing_end(nearly: bool, costs: list[float], tries: in
         def renew(self, values: Values) -> None:
             pass
 
-    class Few(Search):
+    class Few(LimbSearch):
         def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
             return (dict(best[0]), costs[len(told)]) if len(told) < len(costs) and costs[len(told)] < 1.0 else best
 

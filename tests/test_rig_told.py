@@ -12,7 +12,7 @@ import edgegrad as eg
 from edgegrad.fit import Options, Parameter, fit_rig
 from edgegrad.fit.descent.curvature import curvature, derivatives
 from edgegrad.fit.descent.objective import Objective
-from edgegrad.fit.rig.shown import explained_by_joint, left_out
+from edgegrad.fit.rig.joint_support import edge_support_by_joint, left_out
 from edgegrad.fit.rig.uncertainty import uncertainty_of
 from edgegrad.fit.views import views_of
 
@@ -33,7 +33,7 @@ def test_a_hand_in_a_wrong_place_is_told() -> None:
     names = {"rotations": rig.joints.names}
     wrong = TRUTH.clone()
     wrong[2, 2] = -1.0
-    right, off = (explained_by_joint(judged, {"rotations": pose}, names) for pose in (TRUTH, wrong))
+    right, off = (edge_support_by_joint(judged, {"rotations": pose}, names) for pose in (TRUTH, wrong))
     assert min(right.values()) > 0.95
     assert off["bone 2"] < 0.5 < 0.6 < off["bone 0"] and off["bone 2"] < off["bone 1"] < off["bone 0"]
 

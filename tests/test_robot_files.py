@@ -12,7 +12,7 @@ from PIL import Image
 
 import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
-from edgegrad.scene.winding import flipped
+from edgegrad.rig.robot_visuals import flipped
 
 pytest.importorskip("yourdfpy")
 pytest.importorskip("pytorch_kinematics")

@@ -6,12 +6,11 @@ import itertools
 
 import numpy as np
 import pytest
-from adjoints import pieces, random
+from adjoints import random
+from kernel_parts import parts
 
 
-@pytest.mark.parametrize(
-    "points", [pieces.lattice, pieces.sequence, pieces.sobol], ids=["lattice", "sequence", "sobol"]
-)
+@pytest.mark.parametrize("points", [parts.lattice, parts.sequence, parts.sobol], ids=["lattice", "sequence", "sobol"])
 class TestPoints:
     def test_lie_in_the_unit_square(self, points):
         for n, seed in itertools.product([1, 2, 7, 64, 1000], [0, 1, 2**63 - 1]):
@@ -47,7 +46,7 @@ class TestPoints:
 
 
 def test_lattice_is_regular_along_x():
-    x = np.sort(np.array(pieces.lattice(5, 16))[:, 0])
+    x = np.sort(np.array(parts.lattice(5, 16))[:, 0])
     np.testing.assert_allclose(np.diff(x), 1 / 16, atol=1e-12)
 
 
@@ -56,7 +55,7 @@ def test_lattice_is_regular_along_x():
 def test_runs_of_sobol_fill_boxes(m, first):
     """2^m points from a multiple of 2^m on: one in each of the boxes of any shape 2^−a × 2^(a−m)."""
     for seed in (1, 2, 77):
-        x = np.array(pieces.sobol(seed, 2**m, first))
+        x = np.array(parts.sobol(seed, 2**m, first))
         for a in range(m + 1):
             box = np.floor(x * [2**a, 2 ** (m - a)]).astype(int)
             assert len({tuple(b) for b in box}) == 2**m
@@ -64,7 +63,7 @@ def test_runs_of_sobol_fill_boxes(m, first):
 
 def test_scrambles_are_independent():
     """Two points in different halves of the square, over 4,000 scrambles: any two places within their halves are as likely."""
-    x = np.array([pieces.sobol(seed, 2) for seed in range(4000)])
+    x = np.array([parts.sobol(seed, 2) for seed in range(4000)])
     assert ((x[:, 0] < 0.5) != (x[:, 1] < 0.5)).all()
     folded = 2 * x % 1 < 0.5  # in which quarter of its half
     for i, j in itertools.combinations(range(4), 2):
@@ -74,17 +73,17 @@ def test_scrambles_are_independent():
 
 def test_z_order_counts_blocks():
     """Squares of 2^k pixels have consecutive numbers; far pixels do not overflow."""
-    found = np.array([[pieces.z_order(x, y) for x in range(16)] for y in range(16)])
+    found = np.array([[parts.z_order(x, y) for x in range(16)] for y in range(16)])
     for k in range(5):
         blocks = found.reshape(16 >> k, 1 << k, 16 >> k, 1 << k).transpose(0, 2, 1, 3).reshape(-1, 4**k)
         assert (np.sort(blocks, 1) == blocks.min(1, keepdims=True) + np.arange(4**k)).all()
         assert (blocks.min(1) % 4**k == 0).all()
-    assert pieces.z_order(2**31 - 1, 0) == int("01" * 31, 2)
-    assert pieces.z_order(0, 2**31 - 1) == 2 * int("01" * 31, 2)
+    assert parts.z_order(2**31 - 1, 0) == int("01" * 31, 2)
+    assert parts.z_order(0, 2**31 - 1) == 2 * int("01" * 31, 2)
 
 
 def test_shifts_differ():
-    for points in (pieces.lattice, pieces.sequence, pieces.sobol):
+    for points in (parts.lattice, parts.sequence, parts.sobol):
         assert len({x for seed in range(1, 101) for x in points(seed, 1)[0]}) == 200
 
 
@@ -105,7 +104,7 @@ def test_systematic_counts_are_proportional(measure, n):
     """A run of primitives gets its share to within one point, and each point weighs 1 / density."""
     total = measure.sum()
     for shift in SHIFTS:
-        which, weight = map(np.array, zip(*pieces.systematic(measure, n, shift), strict=True))
+        which, weight = map(np.array, zip(*parts.systematic(measure, n, shift), strict=True))
         assert (np.diff(which) >= 0).all()
         count = np.bincount(which, minlength=len(measure))
         assert (count[measure == 0] == 0).all()
@@ -125,7 +124,7 @@ def test_systematic_is_unbiased(measure):
     n, shifts = 3, 2000
     expected = np.zeros(len(measure))
     for i in range(shifts):
-        for k, weight in pieces.systematic(measure, n, (i + 0.5) / shifts):
+        for k, weight in parts.systematic(measure, n, (i + 0.5) / shifts):
             expected[k] += weight / shifts
     # 6,000 equally spaced points count a share s to within one: 1 / (6,000 s). Where that is no test, it is left out.
     share = measure / measure.sum()

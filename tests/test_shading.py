@@ -10,6 +10,7 @@ import math
 
 import pytest
 import torch
+from kernel_parts import parts
 from oracles import reference
 from scenes import cube, front_camera, smooth_colors
 from torch import Tensor
@@ -19,7 +20,6 @@ import edgegrad as eg
 from edgegrad.kernel.flat import flatten
 from edgegrad.kernel.operators import kernel_camera, kernel_scene
 from edgegrad.kernel.request import FILTERS, PackedCamera, pack_camera
-from edgegrad.library import core
 
 F64 = torch.float64
 
@@ -33,7 +33,7 @@ class Shade(torch.autograd.Function):
         packed = PackedCamera(world_to_camera[None], K[None], *view)
         kernel = kernel_scene(flat), kernel_camera(packed)
         radiance = torch.empty((len(points), flat.background.shape[-1]), dtype=F64)
-        core.for_tests.shade_at(*kernel, faces.int().numpy(), points.numpy(), radiance.numpy())
+        parts.shade_at(*kernel, faces.int().numpy(), points.numpy(), radiance.numpy())
         ctx.save_for_backward(verts, colors, uvs, texels, world_to_camera, K)
         ctx.rest = kernel, faces, points
         return radiance
@@ -44,7 +44,7 @@ class Shade(torch.autograd.Function):
         (scene, camera), faces, points = ctx.rest
         grads = [torch.zeros_like(x) for x in ctx.saved_tensors]
         arrays = [x.numpy() for x in (faces.int(), points, radiance_bar.contiguous(), *grads)]
-        core.for_tests.shade_at_vjp(scene, camera, *arrays)
+        parts.shade_at_vjp(scene, camera, *arrays)
         return (*grads, None, None, None, None)
 
 

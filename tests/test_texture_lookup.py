@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from adjoints import check_vjp, pieces, random
+from adjoints import check_vjp, random
+from kernel_parts import parts
 
 from edgegrad.points.pyramid import Pyramid
 from edgegrad.scene.textures import bilinear
@@ -25,13 +26,13 @@ def test_texture_has_its_texels_at_their_centres():
     for row, column in np.ndindex(texture.shape[:2]):
         u, v = texel_centre(row, column, 4, 5)
         for i, j in [(0, 0), (1, -2), (-3, 5)]:
-            np.testing.assert_allclose(pieces.texture_eval(texture, [u + i, v + j]), texture[row, column], atol=1e-13)
+            np.testing.assert_allclose(parts.texture_eval(texture, [u + i, v + j]), texture[row, column], atol=1e-13)
 
 
 def test_texture_is_linear_between_texels():
     texture = texels()
     u, v = texel_centre(1, 2, 4, 5)
-    value = pieces.texture_eval(texture, [u + 0.25 / 5, v - 0.6 / 4])  # a quarter to the right, 0.6 down
+    value = parts.texture_eval(texture, [u + 0.25 / 5, v - 0.6 / 4])  # a quarter to the right, 0.6 down
     upper = 0.75 * texture[1, 2] + 0.25 * texture[1, 3]
     lower = 0.75 * texture[2, 2] + 0.25 * texture[2, 3]
     np.testing.assert_allclose(value, 0.4 * upper + 0.6 * lower, rtol=1e-13)
@@ -41,10 +42,10 @@ def test_texture_is_linear_between_texels():
 @pytest.mark.parametrize("shape", [(4, 5, 3), (1, 1, 2), (1, 7, 1), (3, 1, 20)])
 def test_texture_eval_vjp(uv, shape):
     def forward(texture, uv):
-        return np.array(pieces.texture_eval(texture, uv))
+        return np.array(parts.texture_eval(texture, uv))
 
     def vjp(texture, uv, bar):
-        uv_bar, rows, weights = pieces.texture_eval_vjp(texture, uv, bar)
+        uv_bar, rows, weights = parts.texture_eval_vjp(texture, uv, bar)
         texture_bar = np.zeros((texture.shape[0] * texture.shape[1], texture.shape[2]))
         np.add.at(texture_bar, rows, np.outer(weights, bar))
         return texture_bar.reshape(texture.shape), uv_bar
@@ -55,7 +56,7 @@ def test_texture_eval_vjp(uv, shape):
 def test_texture_far_out():
     """Beyond what an integer holds a coordinate has no fraction left, and must still find a texel."""
     for uv in ([1e30, 0.5], [-1e30, 1e25], [2.0**62, -(2.0**63)]):
-        assert np.isfinite(pieces.texture_eval(texels(), uv)).all()
+        assert np.isfinite(parts.texture_eval(texels(), uv)).all()
 
 
 @pytest.mark.parametrize("wraps", [("repeat", "mirror"), ("clamp", "repeat"), ("mirror", "clamp")])

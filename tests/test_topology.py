@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from adjoints import pieces, random
+from adjoints import random
+from kernel_parts import parts
 from scenes import cube, icosphere
 
 EPS32, EPS64 = 2.0**-23, 2.0**-52
@@ -12,7 +13,7 @@ EPS32, EPS64 = 2.0**-23, 2.0**-52
 
 def edges_of(verts: torch.Tensor, faces: torch.Tensor, spacing: float = EPS64) -> list[list[tuple[int, int, bool]]]:
     """The edges, each a list of its half-edges (face, corner where it begins, whether against the edge)."""
-    return pieces.edges(verts.double().numpy(), faces.int().numpy(), [0], [spacing])
+    return parts.edges(verts.double().numpy(), faces.int().numpy(), [0], [spacing])
 
 
 def faces_at(edges: list[list[tuple[int, int, bool]]]) -> list[int]:

@@ -27,6 +27,7 @@ from around import (
     world,
 )
 from finite_differences import rotation
+from kernel_parts import parts
 from scenes import smooth_adjoint
 from torch import Tensor
 
@@ -106,7 +107,7 @@ def directions(view: eg.Camera, x: np.ndarray) -> np.ndarray:
 
 
 def windows(view: eg.Camera, reach: float = 0.0) -> list:
-    return core.for_tests.sub_cameras(kernel_camera(pack_camera(view)), reach)
+    return parts.sub_cameras(kernel_camera(pack_camera(view)), reach)
 
 
 # -- positions ----------------------------------------------------------------------------------------------------------
@@ -125,8 +126,8 @@ def test_points_agree_with_the_formula(view: eg.Camera) -> None:
         for window, turn in through:
             x, y, z = np.array(turn) @ q
             if z > 0 and max(abs(x), abs(y)) <= z:
-                found.append(core.for_tests.project(window, [x, y, z]))
-                seen = core.for_tests.distort(window, core.for_tests.project_straight(window, [x, y, z]), [0.0, 0.0])[1]
+                found.append(parts.project(window, [x, y, z]))
+                seen = parts.distort(window, parts.project_straight(window, [x, y, z]), [0.0, 0.0])[1]
                 assert (seen > 0) == (math.atan2(math.hypot(q[0], q[1]), q[2]) < end)
         inside = 0 < expected[0] < W and 0 < expected[1] < H and math.atan2(math.hypot(q[0], q[1]), q[2]) < end
         assert len(found) == 1 or not inside
@@ -158,7 +159,7 @@ def test_every_pixel_position_belongs_to_one_window(view: eg.Camera) -> None:
     through, K = windows(view), view.K.numpy()
     reach = theta_bent(view, np.array(rim(view)))
     for place in x:
-        found = [np.array(core.for_tests.normalised(window, place)) for window, _ in through]
+        found = [np.array(parts.normalised(window, place)) for window, _ in through]
         seen = [i for i, n in enumerate(found) if np.isfinite(n).all()]
         size = np.linalg.norm(np.linalg.solve(K[:2, :2], place - K[:2, 2]))
         assert len(seen) == (size < reach)
@@ -189,12 +190,12 @@ def test_bending(view: eg.Camera) -> None:
             p = (leaves[0] - M[:3, 3]) @ M[:3, :3]
             x = view.replace(K=torch.cat([leaves[1][:2], view.K[2:]]), distortion=leaves[2]).project(p)
             truth = [g.numpy() for g in torch.autograd.grad((x * torch.from_numpy(bar)).sum(), leaves)]
-            found = core.for_tests.project_vjp(window, [*n, 1.0], bar)
+            found = parts.project_vjp(window, [*n, 1.0], bar)
             np.testing.assert_allclose(np.array(turn).T @ found[0], truth[0], atol=1e-8)
             np.testing.assert_allclose(found[1], truth[1][:2].reshape(-1), atol=1e-9)
             np.testing.assert_allclose(found[2][:4], truth[2], atol=1e-9)
             assert not any(found[2][4:])
-            moved_x = core.for_tests.project_jvp(window, [*n, 1.0], np.zeros(3), k_dot)
+            moved_x = parts.project_jvp(window, [*n, 1.0], np.zeros(3), k_dot)
             expected = np.dot(k_dot[:6], found[1]) + np.dot(k_dot[6:10], truth[2])
             np.testing.assert_allclose(np.dot(bar, moved_x), expected, atol=1e-9)
 

@@ -23,7 +23,7 @@ struct CurveHits {
 
 // Barycentrics are no less than `least`, a little inside of a face, so that rounding does not take a step along its
 // border for passed: at u = 1 a texture that repeats begins anew. `one`: of the first surface alone.
-inline CurveHits curve_hits(const std::vector<CurveRecords>& parts, double least, bool one, Team& team) {
+inline CurveHits curve_hits(const std::vector<CurveRecords>& parts, double least, bool one, ThreadTeam& team) {
     constexpr int all = CurveRecords::surfaces;
     const int most = one ? 1 : all;
     std::vector<int64_t> first_hit{0}, first_sample{0};
@@ -34,7 +34,7 @@ inline CurveHits curve_hits(const std::vector<CurveRecords>& parts, double least
         first_hit.push_back(first_hit.back() + n), first_sample.push_back(first_sample.back() + part.size());
     }
     CurveHits out(first_hit.back(), first_sample.back());
-    team.each(int64_t(parts.size()), [&](int64_t p) {
+    team.parallel_for(int64_t(parts.size()), [&](int64_t p) {
         const CurveRecords& part = parts[p];
         int64_t k = first_hit[p];
         for (int64_t i = 0; i < part.size(); ++i) {

@@ -96,17 +96,18 @@ struct RecordList {
 
 // One array of them end to end.
 template <class Part, class X>
-Array<X> joined(const std::vector<Part>& parts, std::vector<X> Part::* field, Team& team) {
+Array<X> joined(const std::vector<Part>& parts, std::vector<X> Part::* field, ThreadTeam& team) {
     std::vector<int64_t> first{0};
     for (const Part& part : parts) first.push_back(first.back() + int64_t((part.*field).size()));
     Array<X> out(first.back());
-    team.each(int64_t(parts.size()),
-              [&](int64_t k) { std::copy((parts[k].*field).begin(), (parts[k].*field).end(), out.data() + first[k]); });
+    team.parallel_for(int64_t(parts.size()), [&](int64_t k) {
+        std::copy((parts[k].*field).begin(), (parts[k].*field).end(), out.data() + first[k]);
+    });
     return out;
 }
 // The same of rows that name samples, as they are numbered then.
 inline Array<int64_t> joined_rows(const std::vector<CurveRecords>& parts, std::vector<int64_t> CurveRecords::* field,
-                                  Team& team) {
+                                  ThreadTeam& team) {
     Array<int64_t> out = joined(parts, field, team);
     int64_t *row = out.begin(), samples = 0;
     for (const CurveRecords& part : parts) {

@@ -140,8 +140,8 @@ constexpr int most_owners = 16;
 // Calls body(first, last, chunk) for all samples 0 … n − 1, after prepare(chunk, owners); then add(chunk, owner) for
 // the chunks in order and each owner, and last(chunk). `seconds`: of the samples and of the adding.
 template <class Chunk, class Prepare, class Body, class Add, class Last>
-void scatter_in_waves(Team& team, int64_t n, std::vector<Chunk>& chunks, Prepare prepare, Body body, Add add, Last last,
-                      double (&seconds)[2]) {
+void scatter_in_waves(ThreadTeam& team, int64_t n, std::vector<Chunk>& chunks, Prepare prepare, Body body, Add add,
+                      Last last, double (&seconds)[2]) {
     const int64_t size = scatter_chunk, wave = chunks_in_flight * team.threads();
     const int owners = std::min(team.threads(), most_owners);
     if (const int64_t most = std::min(wave, (n + size - 1) / size); int64_t(chunks.size()) < most) chunks.resize(most);
@@ -149,13 +149,13 @@ void scatter_in_waves(Team& team, int64_t n, std::vector<Chunk>& chunks, Prepare
     for (int64_t first = 0; first < n; first += size * wave) {
         team.check();  // the calling thread may get no chunk of a wave
         const int64_t count = std::min(wave, (n - first + size - 1) / size);
-        team.each(count, [&](int64_t i) {
+        team.parallel_for(count, [&](int64_t i) {
             prepare(chunks[i], owners);
             const int64_t begin = first + i * size;
             body(begin, std::min(begin + size, n), chunks[i]);
         });
         seconds[0] += watch.lap();
-        team.each(owners, [&](int64_t owner) {
+        team.parallel_for(owners, [&](int64_t owner) {
             for (int64_t i = 0; i < count; ++i) add(chunks[i], int(owner));
         });
         for (int64_t i = 0; i < count; ++i) last(chunks[i]);
@@ -169,7 +169,7 @@ class Scatter {
     struct Widths {
         int radiance, vertex_attributes, face_attributes;
     };
-    Scatter(Team& team, Widths widths) : team_(team), widths_(widths) {}
+    Scatter(ThreadTeam& team, Widths widths) : team_(team), widths_(widths) {}
 
     // Calls body(first, last, grad) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
     // samples and of the adding.
@@ -180,7 +180,7 @@ class Scatter {
     void prepare(LocalGradients& g, const GradientSink& to, int owners) const;
     int width_of(const RowSlot& slot, const GradientSink& to) const;
 
-    Team& team_;
+    ThreadTeam& team_;
     const Widths widths_;
     std::vector<LocalGradients> grads_;
 };

@@ -24,13 +24,13 @@ struct Direction {
 
 // q = R p + t: q̇ = R ṗ + Ṙ p + ṫ.
 inline Direction make_direction(const Tangents& tangents, const Camera& sub_camera, const double* verts,
-                                int64_t n_verts, Team& team) {
+                                int64_t n_verts, ThreadTeam& team) {
     Direction out{.tangents = tangents};
     if (!tangents.geometry()) return out;
     out.intrinsics = sub_camera_intrinsics(sub_camera, tangents.K, tangents.distortion);
     out.q = Array<Vec3>(n_verts);
     const auto at = [](const double* a) { return Vec3{a[0], a[1], a[2]}; };
-    team.each_block(n_verts, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(n_verts, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
             Vec3 q_dot;
             if (const double* dot = tangents.verts) q_dot += sub_camera.R * at(dot + 3 * v);

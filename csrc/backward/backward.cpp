@@ -27,17 +27,17 @@ namespace {
 
 // δI = (1 − coverage) δbackground, pixel by pixel: exact for the image that the forward pass made.
 template <class T>
-void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint, const T* coverage, Team& team,
+void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint, const T* coverage, ThreadTeam& team,
                     double* grad) {
     const int C = scene.channels;
     if (scene.background_is_image) {
-        team.each_block(pixels, [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(pixels, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t p = first; p < last; ++p)
                 for (int c = 0; c < C; ++c) grad[p * C + c] += (1 - double(coverage[p])) * adjoint[p * C + c];
         });
         return;
     }
-    const auto parts = team.of_blocks(pixels, [&](int64_t first, int64_t last) {
+    const auto parts = team.map_blocks(pixels, [&](int64_t first, int64_t last) {
         std::vector<double> sum(C, 0.0);
         for (int64_t p = first; p < last; ++p)
             for (int c = 0; c < C; ++c) sum[c] += (1 - double(coverage[p])) * adjoint[p * C + c];
@@ -85,7 +85,7 @@ struct InImage {
     Importance importance;
     OcclusionHint occlusion;
 
-    InImage(const BackwardInput<T>& input, Team& team)
+    InImage(const BackwardInput<T>& input, ThreadTeam& team)
         : filtered(input.adjoint, input.scene, input.image.filter, input.camera.width, input.camera.height),
           importance(input.importance_map ? input.importance_map : input.adjoint, input.camera.width,
                      input.camera.height, input.importance_map ? 1 : input.scene.channels, margin_of(input.image), team,
@@ -102,7 +102,7 @@ using ViewBody = std::function<void(const BackwardView<T>&)>;
 // Calls body(view) with what all terms look at through one sub-camera.
 template <class T>
 void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
-               const GradientOptions& o, const Terms& terms, Team& team, const ViewBody<T>& body) {
+               const GradientOptions& o, const Terms& terms, ThreadTeam& team, const ViewBody<T>& body) {
     const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed, transparent, importance_map] = input;
     const auto& [filtered, importance, occlusion] = in_image;
     const ViewVolume volume(camera, InImage<T>::margin_of(image));
@@ -176,7 +176,8 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Gradi
 
 // At most so many samples as the budget of the image allows, but for those that the user asks for.
 template <class T>
-SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted, Team& team) {
+SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted,
+                           ThreadTeam& team) {
     const int64_t pixels = int64_t(input.camera.width) * input.camera.height;
     const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, o.lit, team);
     SampleCounts n = budget.share(wanted);
@@ -212,7 +213,7 @@ void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const
 template <class T>
 std::vector<GradientOptions> options_of_sub_cameras(const BackwardInput<T>& input,
                                                     const std::vector<Camera>& sub_cameras, const InImage<T>& in_image,
-                                                    const GradientOptions& o, const Terms& terms, Team& team) {
+                                                    const GradientOptions& o, const Terms& terms, ThreadTeam& team) {
     std::vector<GradientOptions> options(sub_cameras.size(), o);
     for (size_t k = 1; k < sub_cameras.size(); ++k) options[k].seed = hash(o.seed, k, gradient_stream + 1);
     if (sub_cameras.size() == 1 || o.pixel_spp) return options;
@@ -243,7 +244,7 @@ std::vector<GradientOptions> options_of_sub_cameras(const BackwardInput<T>& inpu
 
 // Calls body(view) for each sub-camera of the camera.
 template <class T>
-void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, Team& team,
+void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, ThreadTeam& team,
                const std::type_identity_t<ViewBody<T>>& body) {
     const std::vector<Camera> sub_cameras = sub_cameras_of(input.camera, InImage<T>::margin_of(input.image));
     const InImage<T> in_image(input, team);
@@ -254,7 +255,7 @@ void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Te
 
 // The same for one sub-camera, where none shows more of what is looked for than another.
 template <class T>
-void with_any_sub_camera(const BackwardInput<T>& input, const GradientOptions& o, Team& team,
+void with_any_sub_camera(const BackwardInput<T>& input, const GradientOptions& o, ThreadTeam& team,
                          const std::type_identity_t<ViewBody<T>>& body) {
     const Camera sub_camera = sub_cameras_of(input.camera, InImage<T>::margin_of(input.image)).front();
     with_view<T>(input, sub_camera, InImage<T>(input, team), o, Terms{}, team, body);
@@ -262,11 +263,11 @@ void with_any_sub_camera(const BackwardInput<T>& input, const GradientOptions& o
 
 // δI = (1 − coverage) δbackground of direction d, for pixels (H, W, D, C).
 template <class T>
-void add_background_tangent(const BackwardInput<T>& input, const std::vector<Tangents>& directions, Team& team,
+void add_background_tangent(const BackwardInput<T>& input, const std::vector<Tangents>& directions, ThreadTeam& team,
                             double* image_dot) {
     const int C = input.scene.channels;
     const int64_t pixels = int64_t(input.camera.width) * input.camera.height, D = int64_t(directions.size());
-    team.each_block(pixels, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(pixels, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t p = first; p < last; ++p)
             for (int64_t d = 0; d < D; ++d)
                 if (const double* dot = directions[d].background)
@@ -289,9 +290,9 @@ BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
     return *this;
 }
 
-void add_world(const Camera& sub_camera, const double* verts, const Array<double>& q_bar, Team& team,
+void add_world(const Camera& sub_camera, const double* verts, const Array<double>& q_bar, ThreadTeam& team,
                const Gradients& grad) {
-    const auto parts = team.of_blocks(q_bar.size() / 3, [&](int64_t first, int64_t last) {
+    const auto parts = team.map_blocks(q_bar.size() / 3, [&](int64_t first, int64_t last) {
         std::array<double, 12> sum{};
         for (int64_t v = first; v < last; ++v) {
             const double *q = q_bar.data() + 3 * v, *p = verts + 3 * v;
@@ -319,7 +320,7 @@ void add_world(const Camera& sub_camera, const double* verts, const Array<double
 }
 
 template <class T>
-BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& o, Team& team,
+BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& o, ThreadTeam& team,
                                 const Gradients& grad) {
     const auto& [scene, camera, geometry, image, adjoint, hits, detailed, transparent, importance_map] = input;
     BackwardProfile profile;
@@ -347,7 +348,7 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
 }
 
 template <class T>
-void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& team,
+void render_tangents(const BackwardInput<T>& input, GradientOptions o, ThreadTeam& team,
                      const std::vector<Tangents>& tangents, double* image_dot) {
     const SceneView<T>& scene = input.scene;
     Terms terms{};
@@ -371,7 +372,7 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& tea
 }
 
 template <class T>
-void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Team& team, double* gradient) {
+void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, ThreadTeam& team, double* gradient) {
     const Terms terms = all_motion(o);
     if (!terms.any()) return;
     o.controls = false;
@@ -383,7 +384,7 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Te
 }
 
 template <class T>
-RecordList record_samples(const BackwardInput<T>& input, GradientOptions o, Team& team) {
+RecordList record_samples(const BackwardInput<T>& input, GradientOptions o, ThreadTeam& team) {
     RecordList records;
     const Terms terms = all_motion(o);
     if (!terms.any()) return records;
@@ -399,7 +400,7 @@ RecordList record_samples(const BackwardInput<T>& input, GradientOptions o, Team
 template <class T>
 std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
                                          const GradientOptions& o, const LightParts& light, int64_t samples,
-                                         Team& team) {
+                                         ThreadTeam& team) {
     RecordList records;
     GradientSink to;
     to.records = &records;
@@ -413,7 +414,7 @@ std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const Sc
 template <class T>
 std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
                                                  const GradientOptions& o, const LitPaths& paths, int64_t samples,
-                                                 Team& team, SecondaryEdgeSamples& out) {
+                                                 ThreadTeam& team, SecondaryEdgeSamples& out) {
     RecordList records;
     GradientSink to;
     to.records = &records;
@@ -428,7 +429,7 @@ std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>& input, 
 template <class T>
 std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
                                                const GradientOptions& o, const LitPaths& paths, MovingEdges moving,
-                                               int64_t samples, Team& team, SecondaryEdgeSamples& out) {
+                                               int64_t samples, ThreadTeam& team, SecondaryEdgeSamples& out) {
     RecordList records;
     GradientSink to;
     to.records = &records;
@@ -441,7 +442,7 @@ std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>& input, co
 template <class T>
 std::vector<CurveRecords> record_indirect_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
                                                   const GradientOptions& o, const LightParts& light, int64_t samples,
-                                                  Team& team) {
+                                                  ThreadTeam& team) {
     RecordList records;
     GradientSink to;
     to.records = &records;
@@ -451,22 +452,24 @@ std::vector<CurveRecords> record_indirect_shadows(const BackwardInput<T>& input,
 }
 
 #define EDGEGRAD_INSTANTIATE(T)                                                                                        \
-    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,                   \
+    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, ThreadTeam&,             \
                                              const Gradients&);                                                        \
-    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,       \
+    template void render_tangents(const BackwardInput<T>&, GradientOptions, ThreadTeam&, const std::vector<Tangents>&, \
                                   double*);                                                                            \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);                    \
-    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                               \
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, ThreadTeam&, double*);              \
+    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, ThreadTeam&);                         \
     template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,                    \
-                                                      const GradientOptions&, const LightParts&, int64_t, Team&);      \
+                                                      const GradientOptions&, const LightParts&, int64_t,              \
+                                                      ThreadTeam&);                                                    \
     template std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>&, const SceneView<T>&,            \
-                                                              const GradientOptions&, const LitPaths&, int64_t, Team&, \
-                                                              SecondaryEdgeSamples&);                                  \
+                                                              const GradientOptions&, const LitPaths&, int64_t,        \
+                                                              ThreadTeam&, SecondaryEdgeSamples&);                     \
     template std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>&, const SceneView<T>&,              \
                                                             const GradientOptions&, const LitPaths&, MovingEdges,      \
-                                                            int64_t, Team&, SecondaryEdgeSamples&);                    \
-    template std::vector<CurveRecords> record_indirect_shadows(                                                        \
-        const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&);
+                                                            int64_t, ThreadTeam&, SecondaryEdgeSamples&);              \
+    template std::vector<CurveRecords> record_indirect_shadows(const BackwardInput<T>&, const SceneView<T>&,           \
+                                                               const GradientOptions&, const LightParts&, int64_t,     \
+                                                               ThreadTeam&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

@@ -169,7 +169,7 @@ template <class T>
 Array<int8_t> facing_of_faces(const BackwardView<T>& view) {
     Array<int8_t> facing(view.scene.n_faces);
     const double rounding = 16 * view.camera.rounding_of_positions();
-    view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+    view.team.parallel_for_blocks(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
         constexpr int64_t ahead = 16;
         for (int64_t f = first; f < last; ++f) {
             const int32_t* v = view.scene.faces + 3 * f;

@@ -45,9 +45,10 @@ EDGEGRAD_VECTORIZED void view_lanes(VertexLanes& l, const Camera& camera, const 
 
 }  // namespace
 
-VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n, Team& team) {
+VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n,
+                         ThreadTeam& team) {
     VertexView view{Array<Vec3>(n), Array<Vec2>(n), Array<uint8_t>(n)};
-    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(n, [&](int64_t, int64_t first, int64_t last) {
         VertexLanes l;
         Vec3* q = view.q.data();
         Vec2* x = view.x.data();

@@ -25,14 +25,15 @@ inline Vec3 camera_vertex(const Camera& camera, const double* verts, int64_t v) 
     return camera.to_camera({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
 }
 
-inline Array<Vec3> camera_vertices(const Camera& camera, const double* verts, int64_t n, Team& team) {
+inline Array<Vec3> camera_vertices(const Camera& camera, const double* verts, int64_t n, ThreadTeam& team) {
     Array<Vec3> q(n);
-    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(n, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) q[v] = camera_vertex(camera, verts, v);
     });
     return q;
 }
 
-VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n, Team& team);
+VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n,
+                         ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -9,13 +9,14 @@
 
 namespace edgegrad {
 
-double bare_loop(const Camera& camera, const RayCaster& caster, const ImageOptions& o, int packet_width, Team& team) {
+double bare_loop(const Camera& camera, const RayCaster& caster, const ImageOptions& o, int packet_width,
+                 ThreadTeam& team) {
     constexpr int tile = 16;
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + tile - 1) / tile;
     const CameraFrame frame(caster, camera, nullptr);
     const PixelRays pixel_rays(camera, o);
     std::vector<double> seconds(int64_t(tiles_x) * tiles_y);
-    team.each_with(
+    team.parallel_for_with_state(
         seconds.size(), [] { return std::make_unique<std::vector<CameraRays>>(); },
         [&](std::vector<CameraRays>& batches, int64_t t) {
             const int x0 = int(t % tiles_x) * tile, y0 = int(t / tiles_x) * tile;

@@ -16,7 +16,7 @@ namespace edgegrad {
 template <class T>
 void shade_at(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces, const double* points,
               double* radiance) {
-    Team team(1);
+    ThreadTeam team(1);
     const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
     for (int64_t i = 0; i < n; ++i) {
         const int32_t* v = scene.faces + 3 * int64_t(faces[i]);
@@ -31,7 +31,7 @@ void shade_at(const SceneView<T>& scene, const Camera& camera, int64_t n, const 
 template <class T>
 void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces,
                   const double* points, const double* radiance_bar, const Gradients& grad) {
-    Team team(1);
+    ThreadTeam team(1);
     const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
     LocalGradients chunk;
     chunk.q.prepare(3, 1), chunk.uvs.prepare(2, 1);

@@ -32,6 +32,6 @@ void cast_rays(const RayCaster& caster, const RayArrays& rays, const IgnoredArra
 
 // Seconds that the rays of the forward pass take when they are cast and nothing else is done.
 double bare_loop(const Camera& camera, const RayCaster& caster, const ImageOptions& options, int packet_width,
-                 Team& team);
+                 ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -132,10 +132,9 @@ struct Lit {
     }
 };
 
-// The image and all gradients, one after the other.
+// Returns the image and all gradients, one after the other.
 template <class T>
-std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKind filter, int spp) {
-    Team team(team_size, [] { return stop; });
+std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKind filter, int spp, ThreadTeam& team) {
     const SceneView<T> view = scene.view();
     std::vector<T> image(width * height * channels), coverage(width * height);
     std::vector<float> depth(width * height);
@@ -173,6 +172,14 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
         if (!(size > 0) || !std::isfinite(size)) std::puts("a gradient is zero or not finite"), std::exit(1);
         all.insert(all.end(), values->begin(), values->end());
     }
+    return all;
+}
+
+template <class T>
+std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKind filter, int spp) {
+    ThreadTeam team(team_size, [] { return stop; });
+    std::vector<double> all;
+    team.run([&] { all = render(scene, camera, filter, spp, team); });
     return all;
 }
 
@@ -230,7 +237,7 @@ bool same_bits_at_once() {
 int main(int argc, char** argv) {
     if (argc > 2 && std::strcmp(argv[2], "race") == 0) {
         int sum = 0;
-        Team(team_size).each(100, [&](int64_t) {
+        ThreadTeam(team_size).parallel_for(100, [&](int64_t) {
             std::this_thread::sleep_for(std::chrono::milliseconds(1));  // the others are awake by then
             ++sum;
         });

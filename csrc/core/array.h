@@ -72,16 +72,16 @@ class Array {
 };
 
 template <class T = double>
-Array<T> zeros(int64_t n, Team& team) {
+Array<T> zeros(int64_t n, ThreadTeam& team) {
     Array<T> a(n);
-    team.each_block(
+    team.parallel_for_blocks(
         n, [&](int64_t, int64_t first, int64_t last) { std::fill(a.begin() + first, a.begin() + last, T(0)); });
     return a;
 }
 
-inline Array<float> to_float(const Array<double>& values, Team& team) {
+inline Array<float> to_float(const Array<double>& values, ThreadTeam& team) {
     Array<float> a(values.size());
-    team.each_block(a.size(), [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(a.size(), [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) a[i] = float(values[i]);
     });
     return a;

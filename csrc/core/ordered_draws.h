@@ -19,10 +19,10 @@ class OrderedDraws {
     // n samples, kind after kind: `ends` says up to which primitive each kind goes. Within a kind they are in the order
     // of key(k) of their primitive k, a number of 16 bits, and those of one primitive side by side.
     template <class Key>
-    OrderedDraws(const Systematic& systematic, int64_t n, const std::vector<int64_t>& ends, Key key, Team& team)
+    OrderedDraws(const Systematic& systematic, int64_t n, const std::vector<int64_t>& ends, Key key, ThreadTeam& team)
         : systematic_(systematic) {
         std::vector<std::vector<Run>> parts((n + part - 1) / part);
-        team.each(int64_t(parts.size()), [&](int64_t p) {
+        team.parallel_for(int64_t(parts.size()), [&](int64_t p) {
             std::vector<Run> runs;
             int64_t k = systematic.primitive(systematic.position(p * part));
             for (int64_t i = p * part; i < std::min(n, (p + 1) * part); ++i) {

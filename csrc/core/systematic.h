@@ -15,10 +15,10 @@ namespace edgegrad {
 class Systematic {
    public:
     // `measure` holds one number ≥ 0 for each primitive and is turned into its running sum.
-    Systematic(Array<double>& measure, Team& team) : end_(measure) {
-        const int64_t n = end_.size(), blocks = Team::blocks(n);
+    Systematic(Array<double>& measure, ThreadTeam& team) : end_(measure) {
+        const int64_t n = end_.size(), blocks = ThreadTeam::blocks(n);
         std::vector<double> before(blocks + 1, 0.0);
-        team.each_block(n, [&](int64_t k, int64_t first, int64_t last) {
+        team.parallel_for_blocks(n, [&](int64_t k, int64_t first, int64_t last) {
             double sum = 0;
             for (int64_t i = first; i < last; ++i) {
                 // What overflows the range of doubles (coordinates beyond 1e150) cannot be sampled.
@@ -29,7 +29,7 @@ class Systematic {
         });
         for (int64_t k = 0; k < blocks; ++k) before[k + 1] += before[k];
         if (blocks == 1) return;
-        team.each_block(n, [&](int64_t k, int64_t first, int64_t last) {
+        team.parallel_for_blocks(n, [&](int64_t k, int64_t first, int64_t last) {
             for (int64_t i = first; i < last; ++i) end_[i] += before[k];
         });
     }

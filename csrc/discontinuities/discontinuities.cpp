@@ -57,7 +57,7 @@ class StepLines {
           shift_{to_unit(hash(view.options.seed, 5, gradient_stream)),
                  to_unit(hash(view.options.seed, 6, gradient_stream))} {
         const SceneView<T>& scene = view.scene;
-        const auto parts = view.team.of_blocks(scene.n_faces, [&](int64_t first, int64_t last) {
+        const auto parts = view.team.map_blocks(scene.n_faces, [&](int64_t first, int64_t last) {
             std::vector<LinedFace> part;
             VisiblePolygon polygon;
             for (int64_t f = first; f < last; ++f)

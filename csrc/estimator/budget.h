@@ -20,8 +20,8 @@ class SampleBudget {
    public:
     // `coverage` (H · W): of the image, which cast `spp` rays in each pixel. Rays that hit nothing cost little.
     template <class T>
-    SampleBudget(const T* coverage, int64_t pixels, int spp, bool lit, Team& team) : cost_(lit ? shaded : plain) {
-        const auto covered = team.of_blocks(pixels, [&](int64_t first, int64_t last) {
+    SampleBudget(const T* coverage, int64_t pixels, int spp, bool lit, ThreadTeam& team) : cost_(lit ? shaded : plain) {
+        const auto covered = team.map_blocks(pixels, [&](int64_t first, int64_t last) {
             return std::count_if(coverage + first, coverage + last, [](T c) { return c > 0; });
         });
         for (const auto c : covered) rays_ += share_of_image * double(c) * spp;

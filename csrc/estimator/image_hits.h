@@ -22,9 +22,9 @@ class ImageHits {
     // `seen` (F,): see HitBuffers.
     template <class T>
     ImageHits(const SceneView<T>& scene, const Camera& camera, const VertexView& vertices,
-              const OcclusionHint& occlusion, const Parts& parts, const uint8_t* seen, Team& team)
+              const OcclusionHint& occlusion, const Parts& parts, const uint8_t* seen, ThreadTeam& team)
         : parts_(parts), at_(scene.n_verts), share_(2 * parts.size()) {
-        team.each_block(scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t v = first; v < last; ++v)
                 at_[v] = camera.is_undistorted() && !vertices.outcode[v] &&
                                  occlusion.hides_around(vertices.x[v], vertices.q[v].z)
@@ -38,7 +38,7 @@ class ImageHits {
                 if (!(at.load(std::memory_order_relaxed) & bit)) at.fetch_or(bit, std::memory_order_relaxed);
             }
         };
-        team.each_block(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
             // Neighbours mostly count for the same, and threads that all add to one number wait for each other.
             int64_t counter = 0;
             int32_t n = 0;
@@ -55,7 +55,7 @@ class ImageHits {
             }
             count();
         });
-        team.each_block(scene.n_faces, [&](int64_t k, int64_t first, int64_t last) {
+        team.parallel_for_blocks(scene.n_faces, [&](int64_t k, int64_t first, int64_t last) {
             // Where no face of a part was hit there is no border.
             if (const int64_t part = parts_.of_block(k); part >= 0 && hits[2 * part] + hits[2 * part + 1] == 0) return;
             for (int64_t f = first; f < last; ++f) {
@@ -67,7 +67,7 @@ class ImageHits {
                 if (n == 1 || n == 2) mark(v, border);
             }
         });
-        team.each_block(parts_.size(), [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(parts_.size(), [&](int64_t, int64_t first, int64_t last) {
             for (int64_t k = 2 * first; k < 2 * last; ++k) {
                 const double all = double(hits[k]) + hits[k ^ 1];
                 share_[k] = all < enough ? 1 : float(hits[k] / all);

@@ -18,7 +18,7 @@ namespace edgegrad {
 class OcclusionHint {
    public:
     // `depth` (H, W), see HitBuffers; null: nothing is known.
-    OcclusionHint(const float* depth, int width, int height, Team& team) : width_(width), height_(height) {
+    OcclusionHint(const float* depth, int width, int height, ThreadTeam& team) : width_(width), height_(height) {
         if (!depth) return;
         levels_.push_back({depth, width, height});
         while (levels_.back().width > 1 || levels_.back().height > 1) {
@@ -27,7 +27,7 @@ class OcclusionHint {
             storage_.emplace_back(size_t(w) * h);
             float* out = storage_.back().data();
             const int rows = std::max(1, (1 << 14) / w);
-            team.each((h + rows - 1) / rows, [&](int64_t k) {
+            team.parallel_for((h + rows - 1) / rows, [&](int64_t k) {
                 for (int j = int(k) * rows; j < std::min(h, (int(k) + 1) * rows); ++j)
                     for (int i = 0; i < w; ++i)
                         out[size_t(j) * w + i] = below.of_corners(2 * i, std::min(2 * i + 1, below.width - 1), 2 * j,
@@ -38,7 +38,7 @@ class OcclusionHint {
         if (int(levels_.size()) <= tile_level) return;
         const Level& tiles = levels_[tile_level];
         around_tile_.resize(size_t(tiles.width) * tiles.height);
-        team.each(tiles.height, [&](int64_t j) {
+        team.parallel_for(tiles.height, [&](int64_t j) {
             for (int i = 0; i < tiles.width; ++i)
                 around_tile_[j * tiles.width + i] =
                     tiles.of_all(std::max(i - 1, 0), std::min(i + 1, tiles.width - 1), std::max(int(j) - 1, 0),

@@ -13,11 +13,11 @@ namespace edgegrad {
 // Ã at the vertices of faces that the image hit, (V, C); elsewhere, and outside the view, not set.
 template <class T>
 Array<T> adjoint_at_vertices(const FilteredAdjoint<T>& filtered, const VertexView& vertices, const ImageHits& hits,
-                             int C, Team& team) {
+                             int C, ThreadTeam& team) {
     const int64_t V = vertices.q.size();
     Array<T> adjoint(V * C);
     dispatch_channels(C, false, [&]<int N>() {
-        team.each_block(V, [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(V, [&](int64_t, int64_t first, int64_t last) {
             std::vector<double> A(C);
             for (int64_t v = first; v < last; ++v) {
                 if (!hits.at(v) || vertices.outcode[v]) continue;
@@ -32,7 +32,7 @@ Array<T> adjoint_at_vertices(const FilteredAdjoint<T>& filtered, const VertexVie
 // Adds cotangents of places in the image (V, 2) to those of camera coordinates and of K.
 template <class T>
 void add_places(const BackwardView<T>& view, const Array<double>& x_bar, GradientSink& to) {
-    const auto intrinsics = view.team.of_blocks(view.scene.n_verts, [&](int64_t first, int64_t last) {
+    const auto intrinsics = view.team.map_blocks(view.scene.n_verts, [&](int64_t first, int64_t last) {
         IntrinsicsGrad sum;
         for (int64_t v = first; v < last; ++v) {
             const Vec2 x{x_bar[2 * v], x_bar[2 * v + 1]};

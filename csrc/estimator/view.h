@@ -29,7 +29,7 @@ struct BackwardView {
     const Importance& importance;
     const ImageOptions& image;  // of the image that was made
     const GradientOptions& options;
-    Team& team;
+    ThreadTeam& team;
     Scatter& scatter;
     const CameraFrame& frame;
     const AlphaTest* alpha_masks;  // null: there are none
@@ -108,8 +108,9 @@ constexpr double float_reach = 0.01;
 // The distance exceeds what the rays of Embree err, for a ray along the border of a face may meet it in float or not.
 constexpr double least_curve_offset = 1e-5;   // px; coincident curves touch by less
 constexpr double curve_offset_in_errors = 4;  // of float rays at the vertex in view that they miss by most
-inline double curve_offset_of(const Camera& camera, const CameraFrame& frame, const VertexView& vertices, Team& team) {
-    const auto worst = team.of_blocks(vertices.q.size(), [&](int64_t first, int64_t last) {
+inline double curve_offset_of(const Camera& camera, const CameraFrame& frame, const VertexView& vertices,
+                              ThreadTeam& team) {
+    const auto worst = team.map_blocks(vertices.q.size(), [&](int64_t first, int64_t last) {
         double most = 0;
         for (int64_t v = first; v < last; ++v)
             if (!vertices.outcode[v])

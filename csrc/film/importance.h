@@ -21,7 +21,8 @@ class Importance {
     // Without an adjoint all pixels count the same, and there is no table. What stands for one that is not known yet
     // says nothing of how rough it is.
     template <class T>
-    Importance(const T* adjoint, int width, int height, int channels, double radius, Team& team, bool known = true)
+    Importance(const T* adjoint, int width, int height, int channels, double radius, ThreadTeam& team,
+               bool known = true)
         : width_(width), height_(height), radius_(radius), table_(adjoint ? int64_t(width + 1) * (height + 1) : 0) {
         if (!adjoint) return;
         const auto size = [&](int64_t pixel) {
@@ -34,7 +35,7 @@ class Importance {
         std::vector<double> row_sum(height, 0.0), row_change(height, 0.0);
         std::vector<int64_t> row_nonzero(height, 0);
         const auto each_row = [&](auto body) {
-            team.each(strips, [&](int64_t k) {
+            team.parallel_for(strips, [&](int64_t k) {
                 for (int j = int(k) * rows; j < std::min(height, (int(k) + 1) * rows); ++j) body(j);
             });
         };
@@ -63,7 +64,7 @@ class Importance {
         });
         std::fill(table_.begin(), table_.begin() + width + 1, 0);
         const int columns = std::max(64, std::min(width, (1 << 14) / height));
-        team.each((width + columns - 1) / columns, [&](int64_t k) {
+        team.parallel_for((width + columns - 1) / columns, [&](int64_t k) {
             const int first = 1 + int(k) * columns, last = std::min(first + columns, width + 1);
             for (int j = 1; j <= height; ++j)
                 for (int i = first; i < last; ++i) table_[index(i, j)] += table_[index(i, j - 1)];

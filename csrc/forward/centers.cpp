@@ -7,7 +7,7 @@
 namespace edgegrad {
 
 template <class T>
-void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, Team& team,
+void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, ThreadTeam& team,
                       int32_t* face) {
     const ImageOptions one{.spp = 1, .filter = Filter(FilterKind::box), .seed = 0};
     std::fill(face, face + int64_t(camera.width) * camera.height, -1);
@@ -18,7 +18,7 @@ void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const Ray
             const Vec3 corner[3] = {side.q[v[0]], side.q[v[1]], side.q[v[2]]};
             return !side.camera.passes_through_eye(corner);
         };
-        team.each(camera.height, [&](int64_t y) {
+        team.parallel_for(camera.height, [&](int64_t y) {
             team.check();
             CameraRays rays(side.frame);
             for (int x = 0; x < camera.width; x += RayBatch::size) {
@@ -40,7 +40,7 @@ void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const Ray
     }
 }
 
-template void faces_at_centers(const SceneView<float>&, const Camera&, const RayCaster&, Team&, int32_t*);
-template void faces_at_centers(const SceneView<double>&, const Camera&, const RayCaster&, Team&, int32_t*);
+template void faces_at_centers(const SceneView<float>&, const Camera&, const RayCaster&, ThreadTeam&, int32_t*);
+template void faces_at_centers(const SceneView<double>&, const Camera&, const RayCaster&, ThreadTeam&, int32_t*);
 
 }  // namespace edgegrad

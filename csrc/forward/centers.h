@@ -12,7 +12,7 @@ namespace edgegrad {
 
 // Writes the face that the ray through the centre of each pixel hits to `face` (H, W); −1: none.
 template <class T>
-void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, Team& team,
+void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, ThreadTeam& team,
                       int32_t* face);
 
 }  // namespace edgegrad

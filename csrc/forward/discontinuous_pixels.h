@@ -212,10 +212,10 @@ class ImageBorders {
     }
 
     // How many times as many points of each face are to be shaded in those pixels, 0: there are none.
-    int find(std::vector<uint8_t>& pixels, Team& team) const {
+    int find(std::vector<uint8_t>& pixels, ThreadTeam& team) const {
         pixels.assign(points_.size(), 0);
         if (lights_.empty() && !has_texels_ && !has_emitters_) return 0;
-        team.each(height_, [&](int64_t y) {
+        team.parallel_for(height_, [&](int64_t y) {
             if (!lights_.empty()) lights_.mark(int(y), &pixels[y * width_]);
             if (has_texels_) texels_.mark(int(y), &pixels[y * width_]);
             if (has_emitters_) emitters_.mark(int(y), &pixels[y * width_]);

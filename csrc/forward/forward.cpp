@@ -59,7 +59,7 @@ constexpr int tile = 16;
 template <int N, class T>
 class PixelRow {
    public:
-    PixelRow(const SceneView<T>& scene, const std::deque<Side>& sides, const ImageOptions& options, Team& team,
+    PixelRow(const SceneView<T>& scene, const std::deque<Side>& sides, const ImageOptions& options, ThreadTeam& team,
              T* image, const HitBuffers<T>& out)
         : scene_(scene),
           sides_(sides),
@@ -276,7 +276,7 @@ class PixelRow {
     const Side* side_;  // of the rays
     const int spp_;
     const double radius_;  // of the filter
-    Team& team_;
+    ThreadTeam& team_;
     T* const image_;  // (H, W, C)
     const HitBuffers<T>& out_;
     const int C_;
@@ -299,7 +299,7 @@ class PixelRow {
 
 template <int N, class T>
 void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, const RayCaster& caster,
-                   const ImageOptions& o, Team& team, T* image, const HitBuffers<T>& out) {
+                   const ImageOptions& o, ThreadTeam& team, T* image, const HitBuffers<T>& out) {
     const Camera& camera = sides.front().camera;
     // Tiles are lower where a pixel has many samples, so that the threads end together.
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
@@ -307,7 +307,7 @@ void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, con
     // Whole batches: also how sums are rounded depends on which rays lie in one.
     const int unit = std::min(tile, pixels_of_batches(o.spp));
     const ReachablePixels reachable(camera, caster, sides.front().q, o.filter.radius() - 0.5, team);
-    team.each_with(
+    team.parallel_for_with_state(
         int64_t(tiles_x) * tiles_y, [&] { return std::make_unique<PixelRow<N, T>>(scene, sides, o, team, image, out); },
         [&](PixelRow<N, T>& row, int64_t t) {
             const int x0 = int(t % tiles_x) * tile, x1 = std::min(x0 + tile, camera.width);
@@ -325,16 +325,16 @@ void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, con
 
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
-                    Team& team, T* image, const HitBuffers<T>& out) {
+                    ThreadTeam& team, T* image, const HitBuffers<T>& out) {
     const std::deque<Side> sides = make_sides(scene, camera, caster, o, team);
     std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
     dispatch_channels(scene.channels, scene.channels > scene.radiance,
                       [&]<int N>() { render_pixels<N>(scene, sides, caster, o, team, image, out); });
 }
 
-template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&, Team&,
+template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&, ThreadTeam&,
                              float*, const HitBuffers<float>&);
-template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&, Team&,
-                             double*, const HitBuffers<double>&);
+template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&,
+                             ThreadTeam&, double*, const HitBuffers<double>&);
 
 }  // namespace edgegrad

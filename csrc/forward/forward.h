@@ -17,6 +17,6 @@ namespace edgegrad {
 // Writes `image` (H, W, C) and `hits`.
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                    const ImageOptions& options, Team& team, T* image, const HitBuffers<T>& hits);
+                    const ImageOptions& options, ThreadTeam& team, T* image, const HitBuffers<T>& hits);
 
 }  // namespace edgegrad

@@ -25,7 +25,7 @@ Vec2 through(const Camera& side, Vec2 x) {
 
 template <class T>
 PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry, const Places& places,
-                  Team& team) {
+                  ThreadTeam& team) {
     PlaceHits out;
     out.face.assign(places.size, -1), out.part.assign(places.size, -1), out.b.assign(2 * places.size, 0.0);
     for (const Camera& side : sides_of(camera)) {
@@ -38,7 +38,7 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
         };
         // A face whose plane holds the eye is not seen; the image shows what is behind it, too.
         const auto is_seen = [&](int32_t face) { return !side.passes_through_eye(corners(face).data()); };
-        team.each_block(places.size, [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(places.size, [&](int64_t, int64_t first, int64_t last) {
             team.check();
             CameraRays rays(frame);
             int64_t place[RayBatch::size];
@@ -68,10 +68,10 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
     return out;
 }
 
-RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, Team& team) {
+RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, ThreadTeam& team) {
     const std::vector<Camera> sides = sides_of(camera);
-    std::vector<RayRecords> blocks(Team::blocks(places.size));
-    team.each_block(places.size, [&](int64_t block, int64_t first, int64_t last) {
+    std::vector<RayRecords> blocks(ThreadTeam::blocks(places.size));
+    team.parallel_for_blocks(places.size, [&](int64_t block, int64_t first, int64_t last) {
         RayRecords& to = blocks[block];
         for (int64_t k = first; k < last; ++k) {
             const Camera* sub_camera = &sides.front();
@@ -89,7 +89,7 @@ RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, 
     return all;
 }
 
-template PlaceHits hits_at(const SceneView<float>&, const Camera&, const Geometry&, const Places&, Team&);
-template PlaceHits hits_at(const SceneView<double>&, const Camera&, const Geometry&, const Places&, Team&);
+template PlaceHits hits_at(const SceneView<float>&, const Camera&, const Geometry&, const Places&, ThreadTeam&);
+template PlaceHits hits_at(const SceneView<double>&, const Camera&, const Geometry&, const Places&, ThreadTeam&);
 
 }  // namespace edgegrad

@@ -29,9 +29,9 @@ struct PlaceHits {
 // The geometry must have its parts.
 template <class T>
 PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry, const Places& places,
-                  Team& team);
+                  ThreadTeam& team);
 
 // Where the lens shows nothing, a ray holds NaN. Without `intrinsics` their derivatives are left out.
-RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, Team& team);
+RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -28,7 +28,7 @@ struct RowInput {
     LitImage<T>& to;
     ImageBorders* borders;  // null: not wanted
     SkyGuide* guide;        // null: not wanted
-    Team& team;
+    ThreadTeam& team;
 };
 
 template <class T>
@@ -122,8 +122,8 @@ std::vector<uint8_t> sparse_pixels(const Camera& camera) {
 
 template <class T>
 LitImage<T> render_lit(const LitScene& given, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                       const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,
-                       const HitBuffers<T>& hits) {
+                       const ImageOptions& image, const LitOptions& options, const LitSampling& sampling,
+                       ThreadTeam& team, const HitBuffers<T>& hits) {
     LitImage<T> out{Array<T>(int64_t(camera.width) * camera.height * given.channels),
                     std::vector<uint8_t>(given.lights.size(), 0)};
     std::unique_ptr<ImageBorders> borders;
@@ -158,10 +158,10 @@ LitImage<T> render_lit(const LitScene& given, const SceneView<T>& scene, const C
 }
 
 template LitImage<float> render_lit(const LitScene&, const SceneView<float>&, const Camera&, const RayCaster&,
-                                    const ImageOptions&, const LitOptions&, const LitSampling&, Team&,
+                                    const ImageOptions&, const LitOptions&, const LitSampling&, ThreadTeam&,
                                     const HitBuffers<float>&);
 template LitImage<double> render_lit(const LitScene&, const SceneView<double>&, const Camera&, const RayCaster&,
-                                     const ImageOptions&, const LitOptions&, const LitSampling&, Team&,
+                                     const ImageOptions&, const LitOptions&, const LitSampling&, ThreadTeam&,
                                      const HitBuffers<double>&);
 
 }  // namespace edgegrad

@@ -28,7 +28,7 @@ struct LitImage {
 // (discontinuous_pixels.h).
 template <class T>
 LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                       const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,
-                       const HitBuffers<T>& hits);
+                       const ImageOptions& image, const LitOptions& options, const LitSampling& sampling,
+                       ThreadTeam& team, const HitBuffers<T>& hits);
 
 }  // namespace edgegrad

@@ -97,9 +97,9 @@ struct ChunkOfHits {
 
 }  // namespace
 
-void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, Team& team) {
+void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team) {
     const Pose<double> pose(at.world_to_camera, nullptr);
-    team.each_block(hits.size, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(hits.size, [&](int64_t, int64_t first, int64_t last) {
         each_crossing<double>(hits, pose, at, {}, first, last, [&](int64_t r, const Crossing<double>& c) {
             const bool there = c.exists();
             b[3 * r] = there ? 1 - c.u - c.v : 1, b[3 * r + 1] = there ? c.u : 0, b[3 * r + 2] = there ? c.v : 0;
@@ -108,7 +108,7 @@ void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, do
 }
 
 void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
-                    const MovingArrays<double>& to, Team& team) {
+                    const MovingArrays<double>& to, ThreadTeam& team) {
     const Pose<double> pose(at.world_to_camera, nullptr);
     std::vector<ChunkOfHits> chunks;
     double seconds[2] = {};
@@ -160,9 +160,9 @@ void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at
 }
 
 void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
-                    const MovingArrays<const double>& tangents, double* b_dot, Team& team) {
+                    const MovingArrays<const double>& tangents, double* b_dot, ThreadTeam& team) {
     const Pose<Dual> pose(at.world_to_camera, tangents.world_to_camera);
-    team.each_block(hits.size, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(hits.size, [&](int64_t, int64_t first, int64_t last) {
         each_crossing<Dual>(hits, pose, at, tangents, first, last, [&](int64_t r, const Crossing<Dual>& c) {
             const double u = c.exists() ? c.u.dot : 0, v = c.exists() ? c.v.dot : 0;
             b_dot[3 * r] = -u - v, b_dot[3 * r + 1] = u, b_dot[3 * r + 2] = v;
@@ -170,11 +170,11 @@ void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at
     });
 }
 
-void form_vjp(const LinearForm& form, const double* bar, double* table_bar, Team& team) {
+void form_vjp(const LinearForm& form, const double* bar, double* table_bar, ThreadTeam& team) {
     // Each thread owns some rows, runs of them, and adds to them in order: so the sums are the same for any number.
     constexpr int64_t run = 64;
     const int owners = team.threads();
-    team.each(owners, [&](int64_t owner) {
+    team.parallel_for(owners, [&](int64_t owner) {
         for (int64_t i = 0; i < form.size; ++i) {
             if ((form.row[i] / run) % owners != owner) continue;
             const double weight = bar[form.sample[i]];

@@ -26,12 +26,12 @@ struct MovingHits {
 };
 
 // Barycentrics (N, rays, 3). Of a face without area, or seen edge-on, those of its first corner, without derivatives.
-void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, Team& team);
+void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team);
 // Adds to the cotangents of vertices and camera, and writes those of `along`.
 void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
-                    const MovingArrays<double>& to, Team& team);
+                    const MovingArrays<double>& to, ThreadTeam& team);
 void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
-                    const MovingArrays<const double>& tangents, double* b_dot, Team& team);
+                    const MovingArrays<const double>& tangents, double* b_dot, ThreadTeam& team);
 
 // How numbers of samples move with rows of a table: each is the sum over its rows of by · moved row.
 struct LinearForm {
@@ -41,6 +41,6 @@ struct LinearForm {
 };
 
 // Adds Σ bar[sample] · by to the rows of the table's cotangent.
-void form_vjp(const LinearForm& form, const double* bar, double* table_bar, Team& team);
+void form_vjp(const LinearForm& form, const double* bar, double* table_bar, ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -32,7 +32,7 @@ template <class T>
 class HitRow {
    public:
     HitRow(const SceneView<T>& scene, const std::deque<Side>& sides, const ImageOptions& options,
-           const PixelChoice& choice, const HitBuffers<T>& out, Team& team)
+           const PixelChoice& choice, const HitBuffers<T>& out, ThreadTeam& team)
         : scene_(scene),
           sides_(sides),
           side_(&sides.front()),
@@ -205,7 +205,7 @@ class HitRow {
     const ImageOptions& options_;
     const PixelChoice& choice_;
     const HitBuffers<T>& out_;
-    Team& team_;
+    ThreadTeam& team_;
 
     struct Part {
         int x, n;
@@ -238,8 +238,8 @@ class KeepRows : public RowVisitor {
 
 template <class T>
 void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                      const ImageOptions& options, const PixelChoice& choice, Team& team, const HitBuffers<T>& out,
-                      const MakeVisitor& make) {
+                      const ImageOptions& options, const PixelChoice& choice, ThreadTeam& team,
+                      const HitBuffers<T>& out, const MakeVisitor& make) {
     const std::deque<Side> sides = make_sides(scene, camera, caster, options, team);
     const int width = camera.width, unit = pixels_of_batches(options.spp);
     const ReachablePixels reachable(sides.front().camera, caster, sides.front().q, options.filter.radius() - 0.5, team);
@@ -248,7 +248,7 @@ void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const Ray
         std::unique_ptr<RowVisitor> visitor;
         std::vector<PixelHit> hits;
     };
-    team.each_with(
+    team.parallel_for_with_state(
         choice.end - choice.first,
         [&] {
             return std::unique_ptr<State>(new State{HitRow<T>(scene, sides, options, choice, out, team), make(), {}});
@@ -266,7 +266,7 @@ void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const Ray
 
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                          const ImageOptions& options, const PixelChoice& choice, Team& team,
+                          const ImageOptions& options, const PixelChoice& choice, ThreadTeam& team,
                           const HitBuffers<T>& out) {
     std::vector<std::vector<PixelHit>> rows(choice.end - choice.first);
     visit_pixel_hits(scene, camera, caster, options, choice, team, out,
@@ -274,7 +274,7 @@ PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const
     std::vector<int64_t> first_of{0};
     for (const std::vector<PixelHit>& row : rows) first_of.push_back(first_of.back() + int64_t(row.size()));
     PixelHits all(first_of.back());
-    team.each(int64_t(rows.size()), [&](int64_t k) {
+    team.parallel_for(int64_t(rows.size()), [&](int64_t k) {
         int64_t i = first_of[k];
         for (const PixelHit& hit : rows[k]) {
             all.pixel[i] = hit.pixel, all.face[i] = hit.face, all.weight[i] = hit.weight;
@@ -286,12 +286,12 @@ PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const
 }
 
 template void visit_pixel_hits(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&,
-                               const PixelChoice&, Team&, const HitBuffers<float>&, const MakeVisitor&);
+                               const PixelChoice&, ThreadTeam&, const HitBuffers<float>&, const MakeVisitor&);
 template void visit_pixel_hits(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&,
-                               const PixelChoice&, Team&, const HitBuffers<double>&, const MakeVisitor&);
+                               const PixelChoice&, ThreadTeam&, const HitBuffers<double>&, const MakeVisitor&);
 template PixelHits find_pixel_hits(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&,
-                                   const PixelChoice&, Team&, const HitBuffers<float>&);
+                                   const PixelChoice&, ThreadTeam&, const HitBuffers<float>&);
 template PixelHits find_pixel_hits(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&,
-                                   const PixelChoice&, Team&, const HitBuffers<double>&);
+                                   const PixelChoice&, ThreadTeam&, const HitBuffers<double>&);
 
 }  // namespace edgegrad

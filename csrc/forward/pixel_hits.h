@@ -59,12 +59,13 @@ using MakeVisitor = std::function<std::unique_ptr<RowVisitor>()>;  // one for ea
 // their samples stand for all is drawn independently of the draw for all pixels.
 template <class T>
 void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                      const ImageOptions& options, const PixelChoice& choice, Team& team, const HitBuffers<T>& out,
-                      const MakeVisitor& make);
+                      const ImageOptions& options, const PixelChoice& choice, ThreadTeam& team,
+                      const HitBuffers<T>& out, const MakeVisitor& make);
 
 // The same, as arrays.
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                          const ImageOptions& options, const PixelChoice& choice, Team& team, const HitBuffers<T>& out);
+                          const ImageOptions& options, const PixelChoice& choice, ThreadTeam& team,
+                          const HitBuffers<T>& out);
 
 }  // namespace edgegrad

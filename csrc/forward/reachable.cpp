@@ -6,9 +6,9 @@
 namespace edgegrad {
 
 ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius,
-                                 Team& team)
+                                 ThreadTeam& team)
     : width_(camera.width), margin_(radius + 1) {
-    const auto of_block = team.of_blocks(q.size(), [&](int64_t first, int64_t last) {
+    const auto of_block = team.map_blocks(q.size(), [&](int64_t first, int64_t last) {
         Bounds b;
         for (int64_t v = first; v < last; ++v) {
             if (!caster.uses(v)) continue;

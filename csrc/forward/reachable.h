@@ -23,7 +23,8 @@ inline int pixels_of_batches(int spp) { return RayBatch::size / std::gcd(RayBatc
 class ReachablePixels {
    public:
     // `q` are the vertices in the camera's frame.
-    ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius, Team& team);
+    ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius,
+                    ThreadTeam& team);
 
     // In row y, half open.
     struct Range {

@@ -8,7 +8,8 @@
 namespace edgegrad {
 
 template <class T>
-Side::Side(const SceneView<T>& scene, const Camera& camera_, const RayCaster& caster, const ImageOptions& o, Team& team)
+Side::Side(const SceneView<T>& scene, const Camera& camera_, const RayCaster& caster, const ImageOptions& o,
+           ThreadTeam& team)
     : camera(camera_),
       q(camera_vertices(camera, scene.verts, scene.n_verts, team)),
       frame(caster, camera, see_through(scene)),
@@ -25,15 +26,15 @@ const AlphaTest* Side::see_through(const SceneView<T>& scene) {
 
 template <class T>
 std::deque<Side> make_sides(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                            const ImageOptions& o, Team& team) {
+                            const ImageOptions& o, ThreadTeam& team) {
     std::deque<Side> sides;
     for (const Camera& side : sides_of(camera)) sides.emplace_back(scene, side, caster, o, team);
     return sides;
 }
 
 template std::deque<Side> make_sides(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&,
-                                     Team&);
+                                     ThreadTeam&);
 template std::deque<Side> make_sides(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&,
-                                     Team&);
+                                     ThreadTeam&);
 
 }  // namespace edgegrad

@@ -14,7 +14,8 @@ namespace edgegrad {
 // What a side of the camera has of its own: the vertices in its frame, and its rays.
 struct Side {
     template <class T>
-    Side(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o, Team& team);
+    Side(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
+         ThreadTeam& team);
     Side(const Side&) = delete;  // its parts point to its camera
     ~Side();
 
@@ -32,6 +33,6 @@ struct Side {
 
 template <class T>
 std::deque<Side> make_sides(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                            const ImageOptions& o, Team& team);
+                            const ImageOptions& o, ThreadTeam& team);
 
 }  // namespace edgegrad

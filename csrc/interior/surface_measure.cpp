@@ -426,7 +426,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     std::vector<double> total(chunks), of_pixels(chunks);
     const int columns = view.occlusion.columns(), rows = view.occlusion.rows();
     std::vector<double> importance_around(size_t(columns) * rows);
-    view.team.each(rows, [&](int64_t j) {
+    view.team.parallel_for(rows, [&](int64_t j) {
         constexpr double tile = OcclusionHint::tile;
         for (int i = 0; i < columns; ++i)
             importance_around[j * columns + i] =

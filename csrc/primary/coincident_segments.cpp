@@ -34,8 +34,8 @@ class Occupancy {
 // Calls body(k, first, last) for parts of n segments, few enough for all threads to have some.
 constexpr int64_t few = 256;
 template <class Body>
-void each_few(int64_t n, Team& team, Body body) {
-    team.each((n + few - 1) / few, [&](int64_t k) { body(k, k * few, std::min(n, (k + 1) * few)); });
+void each_few(int64_t n, ThreadTeam& team, Body body) {
+    team.parallel_for((n + few - 1) / few, [&](int64_t k) { body(k, k * few, std::min(n, (k + 1) * few)); });
 }
 
 // How s meets o, over the part of s that lies next to o.
@@ -63,10 +63,10 @@ CoincidentCurves::Meeting CoincidentCurves::meeting(const ImageSegment& s, const
 }
 
 CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples,
-                                   Team& team) {
+                                   ThreadTeam& team) {
     const int64_t n_parts = int64_t(parts.size());
     std::vector<double> length_of(parts.size()), reach_of(parts.size());
-    team.each(n_parts, [&](int64_t k) {
+    team.parallel_for(n_parts, [&](int64_t k) {
         double length = 0, reach = 0;
         for (const ImageSegment& s : parts[k]) length += edgegrad::length(s.b - s.a), reach = std::max(reach, s.reach);
         length_of[k] = length, reach_of[k] = reach;
@@ -86,7 +86,7 @@ CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts,
     std::vector<int64_t> first(parts.size() + 1, 0);
     for (size_t k = 0; k < parts.size(); ++k) first[k + 1] = first[k] + int64_t(parts[k].size());
     segments_ = Array<ImageSegment>(first.back());
-    team.each(int64_t(parts.size()), [&](int64_t k) {
+    team.parallel_for(int64_t(parts.size()), [&](int64_t k) {
         std::copy(parts[k].begin(), parts[k].end(), segments_.begin() + first[k]);
         parts[k] = {};
     });
@@ -97,16 +97,16 @@ CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts,
 
 // In most scenes nearly all segments are alone on their lines.
 void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, const Systematic& samples,
-                                            Team& team) const {
+                                            ThreadTeam& team) const {
     const int64_t n = int64_t(parts.size());
     std::atomic<int64_t> sampled = 0;
-    team.each(n, [&](int64_t k) {
+    team.parallel_for(n, [&](int64_t k) {
         sampled += std::count_if(parts[k].begin(), parts[k].end(),
                                  [&](const ImageSegment& s) { return samples.may_draw(s.curve); });
     });
     // Of sampled ones all buckets that lines next to them may be in; the others then ask for their own alone.
     Occupancy around_sampled(4 * sampled), of_sampled(sampled), of_others(sampled);
-    team.each(n, [&](int64_t k) {
+    team.parallel_for(n, [&](int64_t k) {
         for (const ImageSegment& s : parts[k])
             if (samples.may_draw(s.curve))
                 lines_.each_cell(s, [&](const LineBuckets::Line& l) {
@@ -116,7 +116,7 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
                     of_sampled.add(LineBuckets::key(l));
                 });
     });
-    team.each(n, [&](int64_t k) {
+    team.parallel_for(n, [&](int64_t k) {
         std::erase_if(parts[k], [&](const ImageSegment& s) {
             if (samples.may_draw(s.curve)) return false;
             bool adjacent = false;
@@ -129,7 +129,7 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
             return !adjacent;
         });
     });
-    team.each(n, [&](int64_t k) {
+    team.parallel_for(n, [&](int64_t k) {
         std::erase_if(parts[k], [&](const ImageSegment& s) {
             if (!samples.may_draw(s.curve)) return false;
             bool alone = true;
@@ -146,7 +146,7 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
     });
 }
 
-void CoincidentCurves::fill(Team& team) {
+void CoincidentCurves::fill(ThreadTeam& team) {
     const int64_t n = segments_.size(), buckets = int64_t(std::bit_ceil(2 * uint64_t(n)));
     mask_ = uint64_t(buckets - 1);
     std::vector<std::atomic<uint32_t>> end(buckets);
@@ -180,7 +180,7 @@ void CoincidentCurves::fill(Team& team) {
             .segment = uint32_t(i)};
     });
     // The threads put them there in any order.
-    team.each_block(buckets, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(buckets, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t k = first; k < last; ++k)
             std::sort(entries_.begin() + begin_[k], entries_.begin() + begin_[k + 1],
                       [](const Entry& e, const Entry& o) {
@@ -190,7 +190,7 @@ void CoincidentCurves::fill(Team& team) {
 }
 
 // Buckets are shared by what follows end to end along a line, too. Where one holds many, all of them are kept unasked.
-void CoincidentCurves::find_coincident(const Systematic& samples, Team& team) {
+void CoincidentCurves::find_coincident(const Systematic& samples, ThreadTeam& team) {
     constexpr uint32_t many = 64;
     const auto any_adjacent = [&](const ImageSegment& s, const LineBuckets::Line& l) {
         uint64_t keys[4];

@@ -115,7 +115,7 @@ class LineBuckets {
 class CoincidentCurves {
    public:
     // Of the segments in all parts. Only what lies near those that have samples is kept.
-    CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples, Team& team);
+    CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples, ThreadTeam& team);
 
     // Of each curve, at most: its segment in a list that doubles as it grows, and again where others lie on its line;
     // two tables; its entry in each of up to 7 cells; its companion, twice. Most pass one or two cells, and are alone.
@@ -160,9 +160,9 @@ class CoincidentCurves {
     };
 
     void keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, const Systematic& samples,
-                              Team& team) const;
-    void fill(Team& team);
-    void find_coincident(const Systematic& samples, Team& team);
+                              ThreadTeam& team) const;
+    void fill(ThreadTeam& team);
+    void find_coincident(const Systematic& samples, ThreadTeam& team);
     static Meeting meeting(const ImageSegment& s, const ImageSegment& o);
     static Meeting at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x);
 

@@ -43,7 +43,7 @@ class CreaseFaces {
           density_of_hidden_(
               view.occlusion.factor(CreaseSamples::hidden, OcclusionHint::pixels_around, view.image.spp)) {
         set_bounds();
-        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        view.team.parallel_for_blocks(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
             constexpr int64_t ahead = 16;
             for (int64_t f = first; f < last; ++f) {
                 if (f + ahead < last)
@@ -115,7 +115,7 @@ class CreaseFaces {
 
     // Bounds for all faces, of what else would be asked of each edge: how large coordinates and how coarse they are.
     void set_bounds() {
-        const auto parts = view_.team.of_blocks(view_.scene.n_verts, [&](int64_t first, int64_t last) {
+        const auto parts = view_.team.map_blocks(view_.scene.n_verts, [&](int64_t first, int64_t last) {
             double most[3] = {};
             for (int64_t v = first; v < last; ++v)
                 for (int i = 0; i < 3; ++i) most[i] = std::max(most[i], std::fabs(view_.scene.verts[3 * v + i]));

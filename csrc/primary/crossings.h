@@ -21,7 +21,7 @@ namespace edgegrad {
 class Crossings {
    public:
     // Of silhouettes and borders, in parts.
-    Crossings(const std::vector<std::vector<ImageSegment>>& parts, int width, int height, Team& team) {
+    Crossings(const std::vector<std::vector<ImageSegment>>& parts, int width, int height, ThreadTeam& team) {
         std::vector<int64_t> first(parts.size() + 1, 0);
         double total = 0;  // length
         for (size_t k = 0; k < parts.size(); ++k) {
@@ -44,7 +44,7 @@ class Crossings {
             }
         };
         const int64_t n = int64_t(parts.size());
-        team.each(n, [&](int64_t k) {
+        team.parallel_for(n, [&](int64_t k) {
             for (size_t i = 0; i < parts[k].size(); ++i) {
                 const ImageSegment& s = parts[k][i];
                 segments_[first[k] + int64_t(i)] = {s.a, s.b, s.depth, s.rounding};
@@ -54,7 +54,7 @@ class Crossings {
         uint32_t sum = 0;
         for (uint32_t& b : begin_) sum += std::exchange(b, sum);
         entries_ = Array<uint32_t>(sum);
-        team.each(n, [&](int64_t k) {
+        team.parallel_for(n, [&](int64_t k) {
             each_cell(k, [&](std::atomic_ref<uint32_t> end, uint32_t segment) {
                 entries_[end.fetch_add(1, std::memory_order_relaxed)] = segment;
             });

@@ -269,7 +269,7 @@ void measure_lens_boundary(const BackwardView<T>& view, Curves<T>& out) {
 // Silhouettes and borders.
 template <class T>
 std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, const CurveFinder<T>& finder) {
-    return view.team.of_blocks(view.geometry.topology().n_edges(), [&](int64_t first, int64_t last) {
+    return view.team.map_blocks(view.geometry.topology().n_edges(), [&](int64_t first, int64_t last) {
         std::vector<ImageSegment> part;
         finder.each(first, last, typename CurveFinder<T>::NoCreases(), [&](int64_t e) {
             Curve c;
@@ -309,7 +309,7 @@ void Curves<T>::add_segments(const BackwardView<T>& view, const Systematic& samp
         return image_segment(view, c, k);
     };
     if (all) {
-        auto hidden = view.team.of_blocks(int64_t(curve.size()), [&](int64_t first, int64_t last) {
+        auto hidden = view.team.map_blocks(int64_t(curve.size()), [&](int64_t first, int64_t last) {
             std::vector<ImageSegment> part;
             for (int64_t k = first; k < last; ++k)
                 if (curve[k].hidden) part.push_back(segment(k));
@@ -321,13 +321,13 @@ void Curves<T>::add_segments(const BackwardView<T>& view, const Systematic& samp
     // Two curves on one line matter if either is sampled, and two clear creases never do.
     CellMarks marks(view.camera.width, view.camera.height), marks_of_sampled(view.camera.width, view.camera.height);
     if (!all)
-        view.team.each(n, [&](int64_t part) {
+        view.team.parallel_for(n, [&](int64_t part) {
             for (const ImageSegment& s : segments[part]) {
                 marks.mark(s.a, s.b, s.reach);
                 if (samples.may_draw(s.curve)) marks_of_sampled.mark(s.a, s.b, s.reach);
             }
         });
-    view.team.each(int64_t(clear.size()), [&](int64_t part) {
+    view.team.parallel_for(int64_t(clear.size()), [&](int64_t part) {
         std::vector<ImageSegment> near;
         for (const ClearCrease& c : clear[part])
             if (all || marks_of_sampled.any(c.cells) || (samples.may_draw(c.curve) && marks.any(c.cells)))
@@ -357,8 +357,9 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
         found.resize(n), curves.resize(n), out.segments.resize(n), out.clear.resize(n), any_hidden.resize(n);
     };
     if (out.x_bar.empty()) {
-        resize(Team::blocks(E));
-        view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) { measure(k, first, last, nullptr); });
+        resize(ThreadTeam::blocks(E));
+        view.team.parallel_for_blocks(
+            E, [&](int64_t k, int64_t first, int64_t last) { measure(k, first, last, nullptr); });
     } else {
         resize((E + scatter_chunk - 1) / scatter_chunk);
         GradientSink whole;
@@ -381,7 +382,7 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
     for (const MeasuredIntersection& i : out.intersection) out.measure[next++] = i.measure;
     if (out.lens_boundary_curve)
         for (const LensBoundaryArc& arc : out.lens_boundary_curve->arcs) out.measure[next++] = arc.measure;
-    view.team.each(int64_t(curves.size()), [&](int64_t k) {
+    view.team.parallel_for(int64_t(curves.size()), [&](int64_t k) {
         for (ImageSegment& s : out.segments[k]) s.curve += int32_t(first[k]);
         for (ClearCrease& c : out.clear[k]) c.curve += int32_t(first[k]);
         std::copy(curves[k].begin(), curves[k].end(), out.curve.begin() + first[k]);

@@ -66,7 +66,7 @@ template <class T>
 Array<Intersection> draw_intersections(const BackwardView<T>& view) {
     constexpr float hidden = 1.0f / 8;
     Array<float> share(view.scene.n_faces);
-    view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+    view.team.parallel_for_blocks(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
         const VertexView& p = view.vertices;
         for (int64_t f = first; f < last; ++f) {
             const int32_t* v = view.scene.faces + 3 * f;
@@ -98,7 +98,7 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
         int64_t found = 0;
         double pixels = 0, sized = 0, squares = 0;  // Σ pixels, Σ pixels · size, Σ measure²
     };
-    const std::vector<Part> parts = view.team.of_blocks(n, [&](int64_t first, int64_t last) {
+    const std::vector<Part> parts = view.team.map_blocks(n, [&](int64_t first, int64_t last) {
         Part part;
         IntersectionSize<T> size_of(view, scale);
         for (int64_t i = first; i < last; ++i) {

@@ -17,9 +17,9 @@ struct JumpScale {
 
 // Mean of Σ_c weight_c |value_c| over all rows.
 template <class Number>
-double mean_size(const Number* values, int64_t rows, const double* weights, int width, Team& team) {
+double mean_size(const Number* values, int64_t rows, const double* weights, int width, ThreadTeam& team) {
     if (rows == 0 || width == 0) return 0;
-    const std::vector<double> parts = team.of_blocks(rows, [&](int64_t first, int64_t last) {
+    const std::vector<double> parts = team.map_blocks(rows, [&](int64_t first, int64_t last) {
         double sum = 0;
         for (int64_t i = first; i < last; ++i)
             for (int c = 0; c < width; ++c) sum += weights[c] * std::fabs(values[i * width + c]);
@@ -39,7 +39,7 @@ JumpScale jump_scale(const BackwardView<T>& view) {
     JumpScale out{std::vector<double>(C, 1.0)};
     if (C > R) {
         const int64_t pixels = int64_t(view.camera.width) * view.camera.height;
-        const auto parts = view.team.of_blocks(pixels, [&](int64_t first, int64_t last) {
+        const auto parts = view.team.map_blocks(pixels, [&](int64_t first, int64_t last) {
             std::vector<double> sum(C, 0.0);
             for (int64_t p = first; p < last; ++p)
                 for (int c = 0; c < C; ++c) sum[c] += std::fabs(view.adjoint.of(p)[c]);

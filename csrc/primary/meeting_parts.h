@@ -15,13 +15,13 @@ namespace edgegrad {
 class MeetingParts {
    public:
     // `hit` (H, W, 2): the first and the last of the faces (F, 3) that were hit in each pixel; see HitBuffers.
-    MeetingParts(const int32_t* hit, const int32_t* faces, const Parts& parts, int width, int height, Team& team)
+    MeetingParts(const int32_t* hit, const int32_t* faces, const Parts& parts, int width, int height, ThreadTeam& team)
         : width_(width), height_(height) {
         if (parts.size() < 2) return;
         std::vector<int32_t> part(size_t(width) * height);  // −1: none, −2: several
         const int rows = std::max(1, (1 << 14) / width), strips = (height + rows - 1) / rows;
         const auto each_row = [&](auto body) {
-            team.each(strips, [&](int64_t k) {
+            team.parallel_for(strips, [&](int64_t k) {
                 for (int j = int(k) * rows; j < std::min(height, (int(k) + 1) * rows); ++j) body(j);
             });
         };

@@ -88,7 +88,7 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
     const int64_t n = draws.end_of_kind(on_edges);
     const CoincidentCurves alone({}, draws.systematic(), view.team);
     std::vector<uint8_t> found((n + scatter_chunk - 1) / scatter_chunk, 0);
-    view.team.each(int64_t(found.size()), [&](int64_t chunk) {
+    view.team.parallel_for(int64_t(found.size()), [&](int64_t chunk) {
         VisibilityQuery query;
         CurveAccumulation& accumulation = query;
         EdgeSource<T> source(view, curves.finder, alone);

@@ -118,7 +118,8 @@ SceneView<T> SceneArrays<T>::view(const ChannelArrays& channels, int threads) co
 }
 
 template <class T>
-std::shared_ptr<const Geometry> SceneArrays<T>::geometry(GeometryWanted wanted, Team& team, GeometryWork& work) const {
+std::shared_ptr<const Geometry> SceneArrays<T>::geometry(GeometryWanted wanted, ThreadTeam& team,
+                                                         GeometryWork& work) const {
     return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, wanted, team, work);
 }
 

@@ -50,7 +50,7 @@ struct SceneArrays {
     SceneView<T> view() const { return view_of(Attributes()); }
     SceneView<T> view(const ChannelArrays& channels, int threads) const;
 
-    std::shared_ptr<const Geometry> geometry(GeometryWanted wanted, Team& team, GeometryWork& work) const;
+    std::shared_ptr<const Geometry> geometry(GeometryWanted wanted, ThreadTeam& team, GeometryWork& work) const;
 
    private:
     void check_textures(const char* name, const In<int64_t, 2>& table, int64_t texels) const;
@@ -88,7 +88,7 @@ const uint8_t* marked_faces(const char* name, const SceneArrays<T>& scene,
 // Geometry as the terms of a derivative want it.
 template <class T, class Work>
 void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Work work) {
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork done;
         work(*arrays.geometry(geometry_for(true, boundary), team, done), team);
     });

@@ -23,7 +23,7 @@ bool all_pass(int64_t n, int threads, const std::function<bool(int64_t, int64_t)
     constexpr int64_t block = 1 << 16, parallel_from = 1 << 18;
     if (n <= parallel_from) return pass(0, n);
     std::atomic<bool> all{true};
-    Team(threads).each((n + block - 1) / block, [&](int64_t k) {
+    ThreadTeam(threads).parallel_for((n + block - 1) / block, [&](int64_t k) {
         if (all && !pass(k * block, std::min(n, (k + 1) * block))) all = false;
     });
     return all;

@@ -8,16 +8,17 @@ namespace edgegrad {
 
 nb::dict curve_arrays(const std::vector<CurveRecords>& parts, double least, bool one, int threads) {
     nb::dict curves;
-    CurveHits hits = unlocked(threads, [&](Team& team) { return curve_hits(parts, least, one, team); });
+    CurveHits hits = unlocked(threads, [&](ThreadTeam& team) { return curve_hits(parts, least, one, team); });
     curves["hit_sample"] = rows(std::move(hits.sample)), curves["hit_face"] = rows(std::move(hits.face));
     curves["hit_side"] = rows(std::move(hits.side)), curves["hit_b"] = rows(std::move(hits.b), {3});
     curves["hit_x"] = rows(std::move(hits.x), {2}), curves["hit_factor"] = rows(std::move(hits.factor));
     curves["to_background"] = rows(std::move(hits.to_background));
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
-        curves[name] = rows(unlocked(threads, [&](Team& team) { return joined(parts, field, team); }), std::move(row));
+        curves[name] =
+            rows(unlocked(threads, [&](ThreadTeam& team) { return joined(parts, field, team); }), std::move(row));
     };
     const auto add_rows = [&](const char* name, auto field) {
-        curves[name] = rows(unlocked(threads, [&](Team& team) { return joined_rows(parts, field, team); }));
+        curves[name] = rows(unlocked(threads, [&](ThreadTeam& team) { return joined_rows(parts, field, team); }));
     };
     using C = CurveRecords;
     add("x", &C::x, {2}), add("by_k", &C::by_k, {intrinsics_width});

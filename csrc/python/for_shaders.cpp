@@ -34,7 +34,7 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
         refuse("only: expected a number a pixel");
     const PixelChoice choice{first, end, most, only ? only->data() : nullptr};
     PixelHits found(0);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         found = find_pixel_hits(arrays.view(), camera, geometry->caster(), options, choice, team, hits.view());
@@ -62,7 +62,7 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     }
     const SceneView<T> scene = arrays.view();
     RecordList found;
-    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
+    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, ThreadTeam& team) {
         found = record_samples(BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(),
                                                 marked_faces("detailed", arrays, detailed),
                                                 marked_faces("transparent", arrays, transparent),
@@ -71,8 +71,8 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     });
     nb::dict surface;
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
-        surface[name] =
-            rows(unlocked(threads, [&](Team& team) { return joined(found.surface, field, team); }), std::move(row));
+        surface[name] = rows(unlocked(threads, [&](ThreadTeam& team) { return joined(found.surface, field, team); }),
+                             std::move(row));
     };
     using S = SurfaceRecords;
     add("face", &S::face), add("x", &S::x, {2}), add("along", &S::along, {3}), add("weight", &S::weight);
@@ -114,7 +114,7 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
     if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
     const SceneView<T> scene = arrays.view(), casting = casters.view();
     std::vector<CurveRecords> found;
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
         const BackwardInput<T> input{scene,   camera,      *geometry, image,
@@ -129,7 +129,7 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
 template <class T>
 bool has_intersections(const SceneArrays<T>& arrays, int threads) {
     bool found = false;
-    with_geometry(arrays, true, threads, [&](const Geometry& geometry, Team&) {
+    with_geometry(arrays, true, threads, [&](const Geometry& geometry, ThreadTeam&) {
         const Intersections& all = geometry.intersections();
         found = all.are_drawn() || !all.all().empty();
     });
@@ -165,8 +165,8 @@ nb::object splat_vjp(In<double, 2> x, In<T, 2> image, const std::string& filter,
     if (weight && int64_t(weight->size()) != places.size) refuse("weight: expected a number for each point");
     const FilteredPixels pixels(make_filter(filter), width, height);
     Array<T> out(places.size * int64_t(C));
-    unlocked(threads, [&](Team& team) {
-        team.each_block(places.size, [&](int64_t, int64_t first, int64_t last) {
+    unlocked(threads, [&](ThreadTeam& team) {
+        team.parallel_for_blocks(places.size, [&](int64_t, int64_t first, int64_t last) {
             std::vector<double> sum(C);
             for (int64_t i = first; i < last; ++i) {
                 std::fill(sum.begin(), sum.end(), 0.0);
@@ -185,7 +185,7 @@ template <class T>
 nb::dict seen_at(const SceneArrays<T>& arrays, const Camera& camera, In<double, 2> x, int threads) {
     PlaceHits found;
     const Places places = places_of(x);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({.parts = true}, team, work);
         found = hits_at(arrays.view(), camera, *geometry, places, team);
@@ -199,7 +199,7 @@ nb::dict seen_at(const SceneArrays<T>& arrays, const Camera& camera, In<double, 
 nb::dict rays_of(const Camera& camera, In<double, 2> x, bool intrinsics, int threads) {
     RayRecords found;
     const Places places = places_of(x);
-    unlocked(threads, [&](Team& team) { found = rays_at(camera, places, intrinsics, team); });
+    unlocked(threads, [&](ThreadTeam& team) { found = rays_at(camera, places, intrinsics, team); });
     nb::dict out;
     out["along"] = rows(std::move(found.along), {3}), out["along_by_x"] = rows(std::move(found.along_by_x), {3, 2});
     out["along_by_k"] = rows(std::move(found.along_by_k), {3, intrinsics_width});
@@ -218,7 +218,7 @@ void bind_pyramid(nb::module_& m) {
         [shape](In<T, 3> image, int threads) {
             const PyramidShape own = shape(image.shape(0), image.shape(1), image.shape(2));
             Array<T> found(0);
-            unlocked(threads, [&](Team& team) { found = pyramid(own, image.data(), team); });
+            unlocked(threads, [&](ThreadTeam& team) { found = pyramid(own, image.data(), team); });
             return rows(std::move(found), {image.shape(2)});
         },
         "image"_a.noconvert(), "threads"_a);
@@ -228,7 +228,7 @@ void bind_pyramid(nb::module_& m) {
             const PyramidShape own = shape(height, width, bar.shape(1));
             if (int64_t(bar.shape(0)) != own.texels()) refuse("bar: expected a row a texel of the pyramid");
             Array<T> found(0);
-            unlocked(threads, [&](Team& team) { found = pyramid_vjp(own, bar.data(), team); });
+            unlocked(threads, [&](ThreadTeam& team) { found = pyramid_vjp(own, bar.data(), team); });
             return shaped(std::move(found), {height, width, bar.shape(1)});
         },
         "bar"_a.noconvert(), "height"_a, "width"_a, "threads"_a);
@@ -245,7 +245,7 @@ nb::dict trace_rays(const SceneArrays<T>& arrays, In<double, 2> origins, In<doub
     if (ignored && ignored->size() != n) refuse("ignored: expected a number a ray");
     check_rows("origins", origins, n), check_rows("directions", directions, n);
     RayHits found;
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         found = trace(arrays.view(), geometry->caster(),
@@ -264,7 +264,7 @@ nb::object visible_points(const SceneArrays<T>& arrays, In<int32_t, 1> face, In<
     check_rows("to", to, n);
     check_indices("face", face.data(), n, arrays.faces.shape(0), "faces", threads);
     std::vector<uint8_t> found;
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         found = visible(arrays.view(), geometry->caster(),

@@ -1,5 +1,6 @@
-// What only tests and benchmarks call: small functions with their _vjp and the parts of topology and sampling, each to
-// be compared with its definition; samples of one pass without the rest; the yardstick of the image's rays.
+// The module of what only tests and benchmarks call: small functions with their _vjp and the parts of topology and
+// sampling, each to be compared with its definition; samples of one pass without the rest; the yardstick of the image's
+// rays.
 
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
@@ -25,6 +26,7 @@
 #include "forward/forward.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
+#include "rays/embree.h"
 #include "scene/intersections.h"
 #include "scene/topology.h"
 #include "texture/texture.h"
@@ -74,7 +76,7 @@ void bind_scene_functions(nb::module_& m) {
     m.def(
         "bare_loop",
         [](const Scene& scene, const Camera& camera, const ImageOptions& options, int packet_width, int threads) {
-            return unlocked(threads, [&](Team& team) {
+            return unlocked(threads, [&](ThreadTeam& team) {
                 GeometryWork work;
                 return bare_loop(camera, scene.geometry({}, team, work)->caster(), options, packet_width, team);
             });
@@ -85,7 +87,7 @@ void bind_scene_functions(nb::module_& m) {
         "cast_rays",
         [](const Scene& scene, In<double, 2> origins, In<double, 2> directions, In<double, 1> ends,
            In<int32_t, 1> ignored, In<int64_t, 1> first, Out<int32_t, 1> face, Out<uint8_t, 1> hidden) {
-            return unlocked(1, [&](Team& team) {
+            return unlocked(1, [&](ThreadTeam& team) {
                 GeometryWork work;
                 const auto geometry = scene.geometry({}, team, work);
                 cast_rays(geometry->caster(), {origins.data(), directions.data(), ends.data(), int64_t(ends.size())},
@@ -101,7 +103,7 @@ void bind_scene_functions(nb::module_& m) {
            Out<double, 2> verts, std::optional<Out<double, 2>> colors) {
             const GradientOptions options{.seed = image.seed, .boundary = false, .pixel_spp = image.spp};
             const Gradients grad{.verts = verts.data(), .colors = colors ? colors->data() : nullptr};
-            return unlocked(threads, [&](Team& team) {
+            return unlocked(threads, [&](ThreadTeam& team) {
                 std::vector<uint8_t> seen(scene.faces.shape(0), 1);
                 GeometryWork work;
                 const auto geometry = scene.geometry({}, team, work);
@@ -142,8 +144,10 @@ void bind_scene_functions(nb::module_& m) {
 
 }  // namespace
 
-void bind_for_tests(nb::module_& m) {
-    nb::module_ p = m.def_submodule("for_tests", "What only tests and benchmarks call.");
+NB_MODULE(_core_tests, p) {
+    p.doc() = "What only tests and benchmarks call. It holds the kernel once more, but its classes are those of _core.";
+    nb::set_leak_warnings(false);
+    p.def("open_embree", &open_embree, "path"_a, "options"_a, nb::call_guard<Unlocked>());
     bind_scene_functions<float>(p);
     bind_scene_functions<double>(p);
     bind_paths_for_tests(p);
@@ -296,7 +300,7 @@ void bind_for_tests(nb::module_& m) {
         "random"_a, "n"_a, "first"_a = 0);
     p.def("z_order", &z_order);
     p.def("systematic", [](std::vector<double> measure, int64_t n, double shift) {
-        Team team(1);
+        ThreadTeam team(1);
         Array<double> ends(measure.size());
         std::copy(measure.begin(), measure.end(), ends.begin());
         Systematic systematic(ends, team);
@@ -310,7 +314,7 @@ void bind_for_tests(nb::module_& m) {
     });
     using Image = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
     p.def("importance", [](Image adjoint, double radius, A2 low, A2 high) {
-        Team team(2);
+        ThreadTeam team(2);
         const Importance importance(adjoint.data(), int(adjoint.shape(1)), int(adjoint.shape(0)), int(adjoint.shape(2)),
                                     radius, team);
         return importance.mean(vec(low), vec(high));
@@ -320,7 +324,7 @@ void bind_for_tests(nb::module_& m) {
     using Faces = nb::ndarray<const int32_t, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
     // The faces of each edge, as (face, corner, backwards); the vertices from first[i] on have spacing[i].
     p.def("edges", [](Verts verts, Faces faces, std::vector<int32_t> first, std::vector<double> spacing) {
-        Team team(1);
+        ThreadTeam team(1);
         Topology topology(faces.data(), faces.shape(0), verts.shape(0), team);
         topology.weld(verts.data(), {first, spacing}, team);
         std::vector<std::vector<std::tuple<int, int, bool>>> out(topology.n_edges());
@@ -333,7 +337,7 @@ void bind_for_tests(nb::module_& m) {
     // turned round.
     p.def("intersections", [](Verts verts, Faces faces, Faces windings, double spacing, In<float, 1> shares,
                               uint64_t seed, int threads) {
-        Team team(threads);
+        ThreadTeam team(threads);
         FaceOrder order;
         const Spacing all{{0}, {spacing}};
         Topology topology(windings.data(), faces.shape(0), verts.shape(0), team);

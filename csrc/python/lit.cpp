@@ -34,7 +34,7 @@ nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const
     const size_t lights = light_samples(lit.scene, options).size();
     Array<double> radiance(0);
     std::vector<int8_t> seen(size_t(view.size) * lights);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         radiance = zeros(view.size * lit.scene.channels, team);
@@ -57,7 +57,7 @@ nb::object light_on_faces(In<double, 2> verts, Rows faces, In<double, 1> eye, bo
     std::vector<PunctualLight> lights;
     for (size_t l = 0; l < L; ++l) lights.push_back({{place(l, 0), place(l, 1), place(l, 2)}, infinite[l], power[l]});
     Array<double> found(0);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         found = light_on_flat_faces(
             {verts.data(), faces.data(), int64_t(V), int64_t(F), {eye(0), eye(1), eye(2)}, perspective}, lights, team);
     });
@@ -72,7 +72,7 @@ nb::tuple lit_image(const SceneArrays<T>& arrays, const LitArrays& lit, const Ca
     check_faces(arrays, lit), hits.check(arrays, camera);
     if (points < 1) refuse("points: expected at least 1");
     LitImage<T> found{Array<T>(0), {}};
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         found = render_lit(lit.scene, arrays.view(), camera, geometry->caster(), image, options,
@@ -94,14 +94,14 @@ int64_t faces_of(const LitArrays& lit) { return lit.scene.meshes.back().first_fa
 // samples go to each row, and the doubles of a texture would take longer to come to memory than to be added to.
 class Cotangent {
    public:
-    Cotangent(const Table& table, bool wanted, Team& team) : table_(table) {
+    Cotangent(const Table& table, bool wanted, ThreadTeam& team) : table_(table) {
         if (!wanted) return;
         const int64_t n = table.rows * table.width;
         if (table.wide || n < large) wide_ = zeros(n, team);
         else narrow_ = zeros<float>(n, team);
     }
     TableBar bar() { return {wide_.empty() ? nullptr : wide_.data(), narrow_.empty() ? nullptr : narrow_.data()}; }
-    void finish(Team& team) {
+    void finish(ThreadTeam& team) {
         if (!table_.wide && !wide_.empty()) narrow_ = to_float(wide_, team);
     }
     nb::object take() {
@@ -126,7 +126,7 @@ nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<dou
     if (wanted.size() != lit.scene.tables.size()) refuse("wanted: expected a number for each table");
     std::vector<Cotangent> found;
     Array<double> b_bar(3 * points.size), spread_bar(points.spread ? spread_size * points.size : 0);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         std::vector<TableBar> to;
         for (size_t i = 0; i < wanted.size(); ++i) {
             found.emplace_back(lit.scene.tables[i], wanted[i], team);
@@ -146,7 +146,7 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, cons
                            In<int8_t, 2> seen, In<double, 2> bar, const std::vector<bool>& wanted, int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     check_seen(lit, view, options, seen);
-    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, Team& team) {
+    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, ThreadTeam& team) {
         shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, places, team);
     });
 }
@@ -157,7 +157,7 @@ nb::tuple traced_cotangents(const SceneArrays<T>& arrays, const LitArrays& lit, 
                             const In<double, 2>& bar, const std::vector<bool>& wanted, int threads, Compute compute) {
     check_faces(arrays, lit);
     const LitPoints view = points.view(lit.scene, faces_of(lit));
-    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, Team& team) {
+    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         compute(geometry->caster(), view, to, places, team);
@@ -168,11 +168,11 @@ template <class T>
 nb::tuple trace_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
                                      const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
                                      int threads) {
-    return traced_cotangents(arrays, lit, points, bar, wanted, threads,
-                             [&](const auto& caster, const LitPoints& view, const auto& to, auto places, Team& team) {
-                                 trace_and_shade_vjp(lit.scene, arrays.view(), caster, view, options, bar.data(), to,
-                                                     places, team);
-                             });
+    return traced_cotangents(
+        arrays, lit, points, bar, wanted, threads,
+        [&](const auto& caster, const LitPoints& view, const auto& to, auto places, ThreadTeam& team) {
+            trace_and_shade_vjp(lit.scene, arrays.view(), caster, view, options, bar.data(), to, places, team);
+        });
 }
 
 // Tangents of the tables, of b and of its spread; None: zero.
@@ -208,7 +208,7 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
     const LitScene moving = with_tangents(lit.scene, tangents);
     const LitPlaces<const double> dot = tangents_of_places(view, b_dot, spread_dot);
     std::vector<double> out(size_t(view.size) * size_t(moving.channels));
-    unlocked(threads, [&](Team& team) { shade_jvp(moving, view, options, seen.data(), dot, out.data(), team); });
+    unlocked(threads, [&](ThreadTeam& team) { shade_jvp(moving, view, options, seen.data(), dot, out.data(), team); });
     return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
 }
 
@@ -219,7 +219,7 @@ nb::object indirect_points(const SceneArrays<T>& arrays, const LitArrays& lit, c
     check_faces(arrays, lit);
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     std::vector<double> out(size_t(view.size) * size_t(lit.scene.channels));
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         indirect(lit.scene, arrays.view(), geometry->caster(), view, options, out.data(), team);
@@ -231,11 +231,11 @@ template <class T>
 nb::tuple indirect_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
                               const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
                               int threads) {
-    return traced_cotangents(arrays, lit, points, bar, wanted, threads,
-                             [&](const auto& caster, const LitPoints& view, const auto& to, auto places, Team& team) {
-                                 indirect_vjp(lit.scene, arrays.view(), caster, view, options, bar.data(), to, places,
-                                              team);
-                             });
+    return traced_cotangents(
+        arrays, lit, points, bar, wanted, threads,
+        [&](const auto& caster, const LitPoints& view, const auto& to, auto places, ThreadTeam& team) {
+            indirect_vjp(lit.scene, arrays.view(), caster, view, options, bar.data(), to, places, team);
+        });
 }
 
 template <class T>
@@ -247,7 +247,7 @@ nb::object indirect_points_jvp(const SceneArrays<T>& arrays, const LitArrays& li
     const LitScene moving = with_tangents(lit.scene, tangents);
     const LitPlaces<const double> dot = tangents_of_places(view, b_dot, spread_dot);
     std::vector<double> out(size_t(view.size) * size_t(moving.channels));
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         indirect_jvp(moving, arrays.view(), geometry->caster(), view, options, dot, out.data(), team);
@@ -272,7 +272,7 @@ nb::tuple points_towards_camera(const SceneArrays<T>& arrays, const LitArrays& l
     const Arrivals arrivals{int64_t(n), face.data(), b.data(), origin.data(), carried.data(), seed.data()};
     Array<int64_t> arrival(0);
     Array<double> x(0), radiance(0);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         const CameraConnections connections(camera, image.filter.radius() - 0.5);
@@ -294,7 +294,8 @@ nb::tuple drawn_light_points(const LitArrays& lit, const PointArrays& points, co
         refuse("light: expected one of the scene");
     const size_t n = size_t(view.size), k = size_t(options.samples);
     std::vector<LightPoint> found(n * k);
-    unlocked(threads, [&](Team& team) { draw_light_points(lit.scene, view, options, light, found.data(), team); });
+    unlocked(threads,
+             [&](ThreadTeam& team) { draw_light_points(lit.scene, view, options, light, found.data(), team); });
     std::vector<int64_t> index;
     std::vector<double> uv, pdf;
     for (const LightPoint& p : found) index.push_back(p.index), uv.insert(uv.end(), {p.u, p.v}), pdf.push_back(p.pdf);

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "backward/backward.h"
+#include "core/openmp_runtime.h"
 #include "core/stopwatch.h"
 #include "forward/centers.h"
 #include "python/arrays.h"
@@ -34,7 +35,6 @@ template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene);
 template <class T>
 void bind_scene_secondary_edges(nb::class_<SceneArrays<T>>& scene);
-void bind_for_tests(nb::module_& m);  // for_tests.cpp
 
 namespace {
 
@@ -57,7 +57,7 @@ Profile forward(const SceneArrays<T>& scene, const Camera& camera, const Channel
     check_image("image", image, camera, scene.background.shape(2));
     hits.check(scene, camera);
     const SceneView<T> view = scene.view(channels, threads);
-    return unlocked(threads, [&](Team& team) -> Profile {
+    return unlocked(threads, [&](ThreadTeam& team) -> Profile {
         Stopwatch watch;
         GeometryWork work;
         const auto geometry = scene.geometry({}, team, work);
@@ -73,7 +73,7 @@ void find_faces(const SceneArrays<T>& scene, const Camera& camera, const Channel
     if (int(face.shape(0)) != camera.height || int(face.shape(1)) != camera.width)
         refuse("face: expected one number a pixel");
     const SceneView<T> view = scene.view(channels, threads);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         faces_at_centers(view, camera, scene.geometry({}, team, work)->caster(), team, face.data());
     });
@@ -109,7 +109,7 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Chann
     const Gradients grad = make_gradients(gradients, scene, camera);
     GeometryWork work;
     double update = 0;
-    const BackwardProfile p = unlocked(threads, [&](Team& team) {
+    const BackwardProfile p = unlocked(threads, [&](ThreadTeam& team) {
         Stopwatch watch;
         const bool boundary = grad.geometry() && options.boundary;
         const bool interior = (grad.geometry() && options.interior_geometry) || grad.appearance();
@@ -161,7 +161,7 @@ void jvp(const SceneArrays<T>& arrays, const Camera& camera, const ChannelArrays
     }
     if (image_dot.size() != adjoint.size() * directions.size())
         refuse("image_dot: expected the image's size for each direction");
-    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
+    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, ThreadTeam& team) {
         render_tangents(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view()}, options, team,
                         directions, image_dot.data());
     });
@@ -177,7 +177,7 @@ void screen_gradient(const SceneArrays<T>& arrays, const Camera& camera, const C
     check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2), threads);
     if (gradient.size() != size_t(2) * camera.width * camera.height) refuse("gradient: expected two numbers a pixel");
     const SceneView<T> scene = arrays.view(channels, threads);
-    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
+    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, ThreadTeam& team) {
         render_screen_gradient(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view()}, options,
                                team, gradient.data());
     });
@@ -235,7 +235,7 @@ NB_MODULE(_core, m) {
         "after_fork",
         [](bool child) {
             if (child) forget_other_callers();
-            after_fork(child);
+            after_fork();
         },
         "child"_a);
     nb::class_<Camera>(m, "Camera")
@@ -280,7 +280,6 @@ NB_MODULE(_core, m) {
     bind_scene<float>(m, "SceneFloat", "HitsFloat");
     bind_scene<double>(m, "SceneDouble", "HitsDouble");
     bind_memory(m);
-    bind_for_tests(m);
 }
 
 }  // namespace edgegrad

@@ -50,7 +50,7 @@ void check(const HitFaces& hits, const Doubles& verts, const Doubles& world_to_c
 nb::object meet(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, int threads) {
     check(hits, verts, world_to_camera, along);
     std::vector<double> b(3 * along.shape(0));
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         meet_faces(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, b.data(), team);
     });
     return rows(std::move(b), {3});
@@ -65,7 +65,7 @@ nb::tuple meet_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera,
     std::vector<double> verts_bar(of_verts ? verts.size() : 0), pose_bar(of_pose ? 16 : 0),
         along_bar(of_along ? along.size() : 0);
     const auto to = [](std::vector<double>& bar) { return bar.empty() ? nullptr : bar.data(); };
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         meet_faces_vjp(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, bar.data(),
                        {to(verts_bar), to(pose_bar), to(along_bar)}, team);
     });
@@ -87,7 +87,7 @@ nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera
                                               tangent("pose_dot", pose_dot, world_to_camera),
                                               tangent("along_dot", along_dot, along)};
     std::vector<double> b_dot(3 * along.shape(0));
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         meet_faces_jvp(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, tangents, b_dot.data(),
                        team);
     });
@@ -103,7 +103,7 @@ nb::object form_vjp_by_rows(In<int64_t, 1> sample, In<int64_t, 1> row, Doubles b
         if (sample(i) < 0 || sample(i) >= int64_t(bar.size()) || row(i) < 0 || row(i) >= table)
             refuse("form: expected samples and rows that there are");
     Array<double> out(0);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         out = zeros(table * int64_t(K), team);
         form_vjp({sample.data(), row.data(), by.data(), int64_t(n), int64_t(K)}, bar.data(), out.data(), team);
     });

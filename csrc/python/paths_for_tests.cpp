@@ -22,7 +22,7 @@ nb::dict find_paths(const SceneArrays<T>& arrays, const LitArrays& lit, const Po
                     const LitOptions& options, int threads) {
     const LitPoints view = from.view(lit.scene, int64_t(arrays.faces.shape(0)));
     Paths paths(lit.scene, options);
-    unlocked(threads, [&](Team& team) {
+    unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
         paths.find(arrays.view(), geometry->caster(), view, [](int64_t) { return true; });

@@ -127,7 +127,7 @@ void bind_rasterize(nb::module_& m) {
             check_finite("pos", pos.data(), pos.size(), 4, threads);
             const Frames frames = frames_of(mesh.images(), height, width);
             if (behind && int64_t(behind->size()) != frames.pixels()) refuse("behind: expected a number a pixel");
-            auto found = unlocked(threads, [&](Team& team) {
+            auto found = unlocked(threads, [&](ThreadTeam& team) {
                 return rasterize(mesh.view(), frames, behind ? behind->data() : nullptr, derivatives, team);
             });
             return nb::make_tuple(shaped(std::move(found.rast), shape_of(frames, 4)),
@@ -145,7 +145,7 @@ void bind_rasterize(nb::module_& m) {
             check_triangles(rast, [&](int64_t i) { return std::pair(view.first(i), view.end(i)); }, threads);
             check_shape("rast_bar", rast_bar, frames, 4);
             if (db_bar) check_shape("db_bar", *db_bar, frames, 4);
-            Array<T> found = unlocked(threads, [&](Team& team) {
+            Array<T> found = unlocked(threads, [&](ThreadTeam& team) {
                 return rasterize_vjp(view, frames, rast.data(), rast_bar.data(), pointer(db_bar), team);
             });
             return shaped(std::move(found), {pos.shape(0), pos.shape(1), 4});
@@ -191,8 +191,8 @@ void bind_interpolate(nb::module_& m) {
            int threads) {
             const Interpolation<T> in{attr, rast, tri, rast_db, std::move(chosen)};
             in.check(threads);
-            auto found =
-                unlocked(threads, [&](Team& team) { return interpolate(in.attributes(), in.view(), in.chosen, team); });
+            auto found = unlocked(
+                threads, [&](ThreadTeam& team) { return interpolate(in.attributes(), in.view(), in.chosen, team); });
             const Frames frames = frames_of(rast);
             return nb::make_tuple(shaped(std::move(found.values), shape_of(frames, attr.shape(2))),
                                   shaped(std::move(found.da), shape_of(frames, 2 * int64_t(in.chosen.size()))));
@@ -208,7 +208,7 @@ void bind_interpolate(nb::module_& m) {
             const Frames frames = frames_of(rast);
             if (bar) check_shape("bar", *bar, frames, attr.shape(2));
             if (da_bar) check_shape("da_bar", *da_bar, frames, 2 * int64_t(in.chosen.size()));
-            auto found = unlocked(threads, [&](Team& team) {
+            auto found = unlocked(threads, [&](ThreadTeam& team) {
                 return interpolate_vjp(in.attributes(), in.view(), in.chosen, pointer(bar), pointer(da_bar),
                                        {wanted[0], wanted[1], wanted[2]}, team);
             });
@@ -271,7 +271,7 @@ void bind_texture(nb::module_& m) {
         [](const TextureOptions& options, In<T, 1> texels, In<T, 4> uv, std::optional<In<T, 4>> uv_da,
            std::optional<In<T, 3>> bias, int threads) {
             const TextureInput<T> in = texture_input(options, texels, uv, uv_da, bias);
-            Array<T> found = unlocked(threads, [&](Team& team) { return sample_texture(in, team); });
+            Array<T> found = unlocked(threads, [&](ThreadTeam& team) { return sample_texture(in, team); });
             return shaped(std::move(found), shape_of(in.frames, options.shape.channels));
         },
         "options"_a, "texels"_a.noconvert(), "uv"_a.noconvert(), "uv_da"_a.noconvert().none(),
@@ -283,7 +283,7 @@ void bind_texture(nb::module_& m) {
             const TextureInput<T> in = texture_input(options, texels, uv, uv_da, bias);
             const Frames& f = in.frames;
             check_shape("bar", bar, f, options.shape.channels);
-            auto found = unlocked(threads, [&](Team& team) {
+            auto found = unlocked(threads, [&](ThreadTeam& team) {
                 return sample_texture_vjp(in, bar.data(), {wanted[0], wanted[1], wanted[2], wanted[3]}, team);
             });
             return nb::make_tuple(or_none(std::move(found.texels), {texels.size()}),
@@ -322,8 +322,8 @@ void bind_antialias(nb::module_& m) {
             check_finite("pos", pos.data(), pos.size(), 4, threads);
             check_triangles(rast, [&](int64_t i) { return std::pair(view.first(i), view.end(i)); }, threads);
             const EdgeGroups groups = edges.view(tri.shape(0));
-            return Crossings{
-                unlocked(threads, [&](Team& team) { return find_crossings(view, frames, groups, rast.data(), team); })};
+            return Crossings{unlocked(
+                threads, [&](ThreadTeam& team) { return find_crossings(view, frames, groups, rast.data(), team); })};
         },
         "pos"_a.noconvert(), "tri"_a.noconvert(), "edges"_a, "rast"_a.noconvert(), "threads"_a);
     m.def(
@@ -331,7 +331,7 @@ void bind_antialias(nb::module_& m) {
         [](const Crossings& crossings, In<T, 4> color, int threads) {
             const Frames frames = frames_of(color);
             return image_of(unlocked(threads,
-                                     [&](Team& team) {
+                                     [&](ThreadTeam& team) {
                                          return antialias(crossings.all, frames, int(color.shape(3)), color.data(),
                                                           team);
                                      }),
@@ -345,7 +345,7 @@ void bind_antialias(nb::module_& m) {
             const ClipMesh<T> mesh(pos, tri, std::nullopt, threads);
             const Frames frames = frames_of(color);
             check_shape("bar", bar, frames, color.shape(3));
-            auto found = unlocked(threads, [&](Team& team) {
+            auto found = unlocked(threads, [&](ThreadTeam& team) {
                 return antialias_vjp(crossings.all, mesh.view(), frames, int(color.shape(3)), color.data(), bar.data(),
                                      {wanted[0], wanted[1]}, team);
             });

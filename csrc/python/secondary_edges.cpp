@@ -49,7 +49,7 @@ struct Asked {
         const SceneView<T> scene = arrays.view(), casting = casters.view();
         std::vector<CurveRecords> found;
         SecondaryEdgeSamples of_chunks;
-        unlocked(threads, [&](Team& team) {
+        unlocked(threads, [&](ThreadTeam& team) {
             GeometryWork done;
             const auto geometry = arrays.geometry(wanted, team, done);
             found = record(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view(), nullptr,
@@ -70,7 +70,7 @@ nb::tuple secondary_edge_samples(const SceneArrays<T>& arrays, const SceneArrays
                                  const std::optional<In<uint8_t, 1>>& transparent) {
     return Asked<T>{arrays, casters, lit, camera, image, hits, transparent, least, threads}.samples(
         lit_options, further, {.topology = true, .parts = true},
-        [&](const BackwardInput<T>& input, const SceneView<T>& casting, Team& team, SecondaryEdgeSamples& out) {
+        [&](const BackwardInput<T>& input, const SceneView<T>& casting, ThreadTeam& team, SecondaryEdgeSamples& out) {
             return record_secondary_edges(input, casting, options, {lit.scene, lit_options, further, seen}, samples,
                                           team, out);
         });
@@ -84,7 +84,7 @@ nb::tuple surface_edge_samples(const SceneArrays<T>& arrays, const SceneArrays<T
                                const std::optional<In<uint8_t, 1>>& transparent) {
     return Asked<T>{arrays, casters, lit, camera, image, hits, transparent, least, threads}.samples(
         lit_options, further, {.topology = true, .intersections = true},
-        [&](const BackwardInput<T>& input, const SceneView<T>& casting, Team& team, SecondaryEdgeSamples& out) {
+        [&](const BackwardInput<T>& input, const SceneView<T>& casting, ThreadTeam& team, SecondaryEdgeSamples& out) {
             return record_surface_edges(input, casting, options, {lit.scene, lit_options, further, false},
                                         {crossings, alpha_edges}, samples, team, out);
         });

@@ -2,7 +2,7 @@
 
 #include <atomic>
 #include <chrono>
-#include <thread>
+#include <semaphore>
 
 namespace edgegrad {
 
@@ -11,11 +11,16 @@ namespace {
 // Threads that called the kernel and still run, and those of them that wait for the end of the process.
 std::atomic<int> callers{0}, waiting_callers{0};
 std::atomic<bool> ending{false};
-std::thread::id ending_thread;
+thread_local bool ends_the_process = false;
+// A caller that ends, or waits for the end of the process, releases `news`. Nobody releases `never`.
+std::counting_semaphore<> news{0}, never{0};
 
 struct Caller {
     Caller() { ++callers; }
-    ~Caller() { --callers; }
+    ~Caller() {
+        --callers;
+        if (ending) news.release();
+    }
 };
 
 void count_caller() { thread_local const Caller caller; }
@@ -39,35 +44,35 @@ void forget_other_callers() { callers = 1, waiting_callers = 0; }
 void await_callers() {
     count_caller();
     ++waiting_callers;
-    ending_thread = std::this_thread::get_id();
+    ends_the_process = true;
     ending = true;
     const auto end = std::chrono::steady_clock::now() + std::chrono::milliseconds(500);
-    while (callers > waiting_callers && std::chrono::steady_clock::now() < end)
-        std::this_thread::sleep_for(std::chrono::milliseconds(1));
+    while (callers > waiting_callers && news.try_acquire_until(end)) continue;
 }
 
 Unlocked::Unlocked() : state_(PyEval_SaveThread()) { count_caller(); }
 
 Unlocked::~Unlocked() {
-    if (ending && std::this_thread::get_id() != ending_thread) {
+    if (ending && !ends_the_process) {
         // Not for ever: a handler called later may wait for this very thread.
         ++waiting_callers;
-        std::this_thread::sleep_for(std::chrono::seconds(1));
+        news.release();
+        never.try_acquire_for(std::chrono::seconds(1));
         --waiting_callers;
     }
     try {
         PyEval_RestoreThread(state_);
     } catch (...) {  // the unwinding; if this were left, the process would be ended
-        for (;;) std::this_thread::sleep_for(std::chrono::hours(1));
+        never.acquire();
     }
 }
 
-void run_unlocked(int threads, const std::function<void(Team&)>& f) {
+void run_unlocked(int threads, const std::function<void(ThreadTeam&)>& f) {
     const auto ask = in_main_thread() ? interrupted : nullptr;
     try {
         const Unlocked release;
-        Team team(threads, ask);
-        f(team);
+        ThreadTeam team(threads, ask);
+        team.run([&] { f(team); });
     } catch (const Interrupted&) {
         throw nb::python_error();  // that of the handler
     }

@@ -40,17 +40,17 @@ class Unlocked {
 };
 
 // Calls f(team) without the interpreter's lock.
-void run_unlocked(int threads, const std::function<void(Team&)>& f);
+void run_unlocked(int threads, const std::function<void(ThreadTeam&)>& f);
 
 // What it returns.
 template <class F>
 auto unlocked(int threads, F f) {
-    using Result = std::invoke_result_t<F, Team&>;
+    using Result = std::invoke_result_t<F, ThreadTeam&>;
     if constexpr (std::is_void_v<Result>) {
-        run_unlocked(threads, [&](Team& team) { f(team); });
+        run_unlocked(threads, [&](ThreadTeam& team) { f(team); });
     } else {
         std::optional<Result> out;
-        run_unlocked(threads, [&](Team& team) { out.emplace(f(team)); });
+        run_unlocked(threads, [&](ThreadTeam& team) { out.emplace(f(team)); });
         return *std::move(out);
     }
 }

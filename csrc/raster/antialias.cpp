@@ -38,9 +38,9 @@ bool is_silhouette(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t it
 
 // Of images with vertices of their own, or of all of them, a bit for each side of each triangle: (images, triangles).
 template <class T>
-std::vector<uint8_t> silhouettes(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t images, Team& team) {
+std::vector<uint8_t> silhouettes(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t images, ThreadTeam& team) {
     std::vector<uint8_t> out(images * mesh.triangles);
-    team.each_block(int64_t(out.size()), [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(int64_t(out.size()), [&](int64_t, int64_t first, int64_t last) {
         for (int64_t k = first; k < last; ++k)
             for (int i = 0; i < 3; ++i)
                 out[k] |= uint8_t(is_silhouette(mesh, edges, k / mesh.triangles, 3 * (k % mesh.triangles) + i) << i);
@@ -126,22 +126,22 @@ struct Blend {
 
 // Calls body(first, last) for the crossings of each image.
 template <class Body>
-void each_image(const std::vector<Crossing>& crossings, const Frames& frames, Team& team, Body body) {
+void each_image(const std::vector<Crossing>& crossings, const Frames& frames, ThreadTeam& team, Body body) {
     const int64_t pixels = frames.height * frames.width;
     const auto begin = [&](int64_t image) {
         return std::partition_point(crossings.begin(), crossings.end(),
                                     [&](const Crossing& c) { return c.near < image * pixels; });
     };
-    team.each(frames.count, [&](int64_t image) {
+    team.parallel_for(frames.count, [&](int64_t image) {
         const auto end = begin(image + 1);
         for (auto c = begin(image); c != end; ++c) body(image, *c);
     });
 }
 
 template <class T>
-Array<T> copy_of(const T* values, int64_t n, Team& team) {
+Array<T> copy_of(const T* values, int64_t n, ThreadTeam& team) {
     Array<T> out(n);
-    team.each_block(
+    team.parallel_for_blocks(
         n, [&](int64_t, int64_t first, int64_t last) { std::copy(values + first, values + last, out.data() + first); });
     return out;
 }
@@ -150,14 +150,14 @@ Array<T> copy_of(const T* values, int64_t n, Team& team) {
 
 template <class T>
 std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& frames, const EdgeGroups& edges,
-                                     const T* rast, Team& team) {
+                                     const T* rast, ThreadTeam& team) {
     const std::vector<uint8_t> sides =
         silhouettes(mesh, edges, mesh.shared ? std::min<int64_t>(1, frames.count) : frames.count, team);
     // Bands of rows, so that threads end at the same time; crossings come in order all the same.
     constexpr int64_t rows = 32;
     const int64_t H = frames.height, bands = (H + rows - 1) / rows;
     std::vector<std::vector<Crossing>> found(frames.count * bands);
-    team.each(frames.count * bands, [&](int64_t k) {
+    team.parallel_for(frames.count * bands, [&](int64_t k) {
         const int64_t item = k / bands, band = k % bands;
         const PairFinder<T> pairs(mesh, frames, sides.data() + (mesh.shared ? 0 : item * mesh.triangles), item, rast);
         std::vector<Crossing> own;  // threads that write next to one another wait for each other's caches
@@ -175,7 +175,7 @@ std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& fra
 
 template <class T>
 Array<T> antialias(const std::vector<Crossing>& crossings, const Frames& frames, int channels, const T* color,
-                   Team& team) {
+                   ThreadTeam& team) {
     Array<T> out = copy_of(color, frames.pixels() * channels, team);
     each_image(crossings, frames, team, [&](int64_t, const Crossing& c) {
         const Blend blend(c);
@@ -188,7 +188,7 @@ Array<T> antialias(const std::vector<Crossing>& crossings, const Frames& frames,
 
 template <class T>
 AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Triangles<T>& mesh, const Frames& frames,
-                               int channels, const T* color, const T* bar, AntialiasWanted wanted, Team& team) {
+                               int channels, const T* color, const T* bar, AntialiasWanted wanted, ThreadTeam& team) {
     AntialiasGrad<T> out;
     if (wanted.color) {
         out.color = copy_of(bar, frames.pixels() * channels, team);
@@ -240,10 +240,10 @@ AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Tri
 
 #define EDGEGRAD_OF(T)                                                                                             \
     template std::vector<Crossing> find_crossings(const Triangles<T>&, const Frames&, const EdgeGroups&, const T*, \
-                                                  Team&);                                                          \
-    template Array<T> antialias(const std::vector<Crossing>&, const Frames&, int, const T*, Team&);                \
+                                                  ThreadTeam&);                                                    \
+    template Array<T> antialias(const std::vector<Crossing>&, const Frames&, int, const T*, ThreadTeam&);          \
     template AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>&, const Triangles<T>&, const Frames&, int, \
-                                            const T*, const T*, AntialiasWanted, Team&);
+                                            const T*, const T*, AntialiasWanted, ThreadTeam&);
 EDGEGRAD_OF(float)
 EDGEGRAD_OF(double)
 

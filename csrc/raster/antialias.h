@@ -34,12 +34,12 @@ struct Crossing {
 // Image by image.
 template <class T>
 std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& frames, const EdgeGroups& edges,
-                                     const T* rast, Team& team);
+                                     const T* rast, ThreadTeam& team);
 
 // The blended image (pixels, channels).
 template <class T>
 Array<T> antialias(const std::vector<Crossing>& crossings, const Frames& frames, int channels, const T* color,
-                   Team& team);
+                   ThreadTeam& team);
 
 template <class T>
 struct AntialiasGrad {
@@ -51,6 +51,6 @@ struct AntialiasWanted {
 
 template <class T>
 AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Triangles<T>& mesh, const Frames& frames,
-                               int channels, const T* color, const T* bar, AntialiasWanted wanted, Team& team);
+                               int channels, const T* color, const T* bar, AntialiasWanted wanted, ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -71,12 +71,12 @@ void add_to_corners(const VertexAttributes<T>& attr, const RasterView<T>& at, co
 
 template <class T>
 Interpolated<T> interpolate(const VertexAttributes<T>& attr, const RasterView<T>& at, const std::vector<int>& chosen,
-                            Team& team) {
+                            ThreadTeam& team) {
     const Frames& frames = at.frames;
     Interpolated<T> out{Array<T>(frames.pixels() * attr.width), Array<T>(frames.pixels() * 2 * int64_t(chosen.size()))};
     constexpr int64_t rows = 16;
     const int64_t all = frames.count * frames.height;
-    team.each((all + rows - 1) / rows, [&](int64_t k) {
+    team.parallel_for((all + rows - 1) / rows, [&](int64_t k) {
         for (int64_t r = k * rows; r < std::min(all, (k + 1) * rows); ++r)
             dispatch_channels(attr.width, false, [&]<int N>() {
                 interpolate_row<N>(attr, at, chosen, r / frames.height, r * frames.width, out);
@@ -88,7 +88,7 @@ Interpolated<T> interpolate(const VertexAttributes<T>& attr, const RasterView<T>
 template <class T>
 InterpolateGrad<T> interpolate_vjp(const VertexAttributes<T>& attr, const RasterView<T>& at,
                                    const std::vector<int>& chosen, const T* bar, const T* da_bar,
-                                   InterpolateWanted wanted, Team& team) {
+                                   InterpolateWanted wanted, ThreadTeam& team) {
     const Frames& frames = at.frames;
     const int A = attr.width, D = int(chosen.size());
     InterpolateGrad<T> out;
@@ -113,7 +113,7 @@ InterpolateGrad<T> interpolate_vjp(const VertexAttributes<T>& attr, const Raster
     if (wanted.rast) out.rast.emplace(4 * frames.pixels());
     if (wanted.rast_db) out.rast_db.emplace(4 * frames.pixels());
     if (!wanted.rast && !wanted.rast_db) return out;
-    team.each(frames.count * frames.height, [&](int64_t r) {
+    team.parallel_for(frames.count * frames.height, [&](int64_t r) {
         for (int64_t p = r * frames.width; p < (r + 1) * frames.width; ++p) {
             double u = 0, v = 0, d[4] = {};
             const RasterPixel<T> seen(at.rast + 4 * p);
@@ -142,10 +142,10 @@ InterpolateGrad<T> interpolate_vjp(const VertexAttributes<T>& attr, const Raster
 
 #define EDGEGRAD_OF(T)                                                                                              \
     template Interpolated<T> interpolate(const VertexAttributes<T>&, const RasterView<T>&, const std::vector<int>&, \
-                                         Team&);                                                                    \
+                                         ThreadTeam&);                                                              \
     template InterpolateGrad<T> interpolate_vjp(const VertexAttributes<T>&, const RasterView<T>&,                   \
                                                 const std::vector<int>&, const T*, const T*, InterpolateWanted,     \
-                                                Team&);
+                                                ThreadTeam&);
 EDGEGRAD_OF(float)
 EDGEGRAD_OF(double)
 

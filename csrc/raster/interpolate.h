@@ -38,7 +38,7 @@ struct Interpolated {
 // `chosen`: of which attributes derivatives in the image are wanted.
 template <class T>
 Interpolated<T> interpolate(const VertexAttributes<T>& attr, const RasterView<T>& at, const std::vector<int>& chosen,
-                            Team& team);
+                            ThreadTeam& team);
 
 template <class T>
 struct InterpolateGrad {
@@ -52,6 +52,6 @@ struct InterpolateWanted {
 template <class T>
 InterpolateGrad<T> interpolate_vjp(const VertexAttributes<T>& attr, const RasterView<T>& at,
                                    const std::vector<int>& chosen, const T* bar, const T* da_bar,
-                                   InterpolateWanted wanted, Team& team);
+                                   InterpolateWanted wanted, ThreadTeam& team);
 
 }  // namespace edgegrad

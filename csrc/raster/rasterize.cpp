@@ -179,13 +179,13 @@ struct Barycentrics {
 
 template <class T>
 RasterImages<T> rasterize(const Triangles<T>& mesh, const Frames& frames, const T* behind, bool derivatives,
-                          Team& team) {
+                          ThreadTeam& team) {
     RasterImages<T> out{Array<T>(4 * frames.pixels()), Array<T>(derivatives ? 4 * frames.pixels() : 0)};
     const int64_t H = frames.height, W = frames.width;
     // Of one image several windows where there are fewer images than threads.
     const int64_t windows = std::clamp<int64_t>(2 * team.threads() / std::max<int64_t>(1, frames.count), 1, H);
     const auto scratch = [] { return std::make_unique<Nearest>(); };
-    team.each_with(frames.count * windows, scratch, [&](Nearest& found, int64_t k) {
+    team.parallel_for_with_state(frames.count * windows, scratch, [&](Nearest& found, int64_t k) {
         const int64_t item = k / windows, part = k % windows;
         const Window window{item, part * H / windows, (part + 1) * H / windows};
         find_nearest(mesh, frames, window, behind, found);
@@ -214,7 +214,7 @@ RasterImages<T> rasterize(const Triangles<T>& mesh, const Frames& frames, const 
 
 template <class T>
 Array<T> rasterize_vjp(const Triangles<T>& mesh, const Frames& frames, const T* rast, const T* rast_bar,
-                       const T* db_bar, Team& team) {
+                       const T* db_bar, ThreadTeam& team) {
     const Targets to{mesh.vertices, 4, mesh.shared};
     const auto shares = shares_of_vertices(frames, mesh, to);
     return sums_over<T>(shares, frames, to, team, [&](const Share& share, double* sums) {
@@ -259,9 +259,9 @@ Array<T> rasterize_vjp(const Triangles<T>& mesh, const Frames& frames, const T* 
     });
 }
 
-#define EDGEGRAD_OF(T)                                                                             \
-    template RasterImages<T> rasterize(const Triangles<T>&, const Frames&, const T*, bool, Team&); \
-    template Array<T> rasterize_vjp(const Triangles<T>&, const Frames&, const T*, const T*, const T*, Team&);
+#define EDGEGRAD_OF(T)                                                                                   \
+    template RasterImages<T> rasterize(const Triangles<T>&, const Frames&, const T*, bool, ThreadTeam&); \
+    template Array<T> rasterize_vjp(const Triangles<T>&, const Frames&, const T*, const T*, const T*, ThreadTeam&);
 EDGEGRAD_OF(float)
 EDGEGRAD_OF(double)
 

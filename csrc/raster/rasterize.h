@@ -23,11 +23,11 @@ struct RasterImages {
 // there.
 template <class T>
 RasterImages<T> rasterize(const Triangles<T>& mesh, const Frames& frames, const T* behind, bool derivatives,
-                          Team& team);
+                          ThreadTeam& team);
 
 // The cotangent of the positions, of the shape of pos; those of z are zero. `db_bar` may be null.
 template <class T>
 Array<T> rasterize_vjp(const Triangles<T>& mesh, const Frames& frames, const T* rast, const T* rast_bar,
-                       const T* db_bar, Team& team);
+                       const T* db_bar, ThreadTeam& team);
 
 }  // namespace edgegrad

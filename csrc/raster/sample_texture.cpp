@@ -165,7 +165,7 @@ void texels_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& planes
 
 // The cotangent of the texels: sums for each image of a texture of its own, put where its levels are among all images'.
 template <class T>
-Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, Team& team) {
+Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, ThreadTeam& team) {
     TextureShape one = in.shape;
     one.images = 1;
     const int C = in.shape.channels;
@@ -187,7 +187,7 @@ Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, Team& team) {
     });
     if (in.shape.images == 1) return sums;
     Array<T> out(in.shape.all_texels() * C);
-    team.each(in.shape.images, [&](int64_t image) {
+    team.parallel_for(in.shape.images, [&](int64_t image) {
         for (int level = 0; level < one.levels; ++level)
             std::copy_n(sums.data() + (image * one.all_texels() + one.first(level)) * C, one.texels(level) * C,
                         out.data() + TexelPlane(in.shape, image, level).first * C);
@@ -198,13 +198,13 @@ Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, Team& team) {
 }  // namespace
 
 template <class T>
-Array<T> sample_texture(const TextureInput<T>& in, Team& team) {
+Array<T> sample_texture(const TextureInput<T>& in, ThreadTeam& team) {
     const int C = in.shape.channels;
     const Frames& frames = in.frames;
     Array<T> out(frames.pixels() * C);
     constexpr int64_t rows = 8;
     const int64_t bands = (frames.height + rows - 1) / rows;
-    team.each(frames.count * bands, [&](int64_t k) {
+    team.parallel_for(frames.count * bands, [&](int64_t k) {
         const int64_t image = k / bands, row = k % bands * rows;
         const std::vector<TexelPlane> planes = planes_of(in.shape, image);
         const int64_t first = (image * frames.height + row) * frames.width,
@@ -217,7 +217,7 @@ Array<T> sample_texture(const TextureInput<T>& in, Team& team) {
 }
 
 template <class T>
-TextureGrad<T> sample_texture_vjp(const TextureInput<T>& in, const T* bar, TextureWanted wanted, Team& team) {
+TextureGrad<T> sample_texture_vjp(const TextureInput<T>& in, const T* bar, TextureWanted wanted, ThreadTeam& team) {
     const int C = in.shape.channels;
     const Frames& frames = in.frames;
     TextureGrad<T> out;
@@ -226,7 +226,7 @@ TextureGrad<T> sample_texture_vjp(const TextureInput<T>& in, const T* bar, Textu
     if (wanted.uv_da) out.uv_da.emplace(frames.pixels() * 2 * in.coordinates());
     if (wanted.bias) out.bias.emplace(frames.pixels());
     if (!wanted.coordinates()) return out;
-    team.each(frames.count * frames.height, [&](int64_t row) {
+    team.parallel_for(frames.count * frames.height, [&](int64_t row) {
         const std::vector<TexelPlane> planes = planes_of(in.shape, row / frames.height);
         dispatch_channels(C, false, [&]<int N>() {
             for (int64_t p = row * frames.width; p < (row + 1) * frames.width; ++p)
@@ -236,9 +236,9 @@ TextureGrad<T> sample_texture_vjp(const TextureInput<T>& in, const T* bar, Textu
     return out;
 }
 
-#define EDGEGRAD_OF(T)                                               \
-    template Array<T> sample_texture(const TextureInput<T>&, Team&); \
-    template TextureGrad<T> sample_texture_vjp(const TextureInput<T>&, const T*, TextureWanted, Team&);
+#define EDGEGRAD_OF(T)                                                     \
+    template Array<T> sample_texture(const TextureInput<T>&, ThreadTeam&); \
+    template TextureGrad<T> sample_texture_vjp(const TextureInput<T>&, const T*, TextureWanted, ThreadTeam&);
 EDGEGRAD_OF(float)
 EDGEGRAD_OF(double)
 

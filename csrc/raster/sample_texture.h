@@ -28,7 +28,7 @@ struct TextureInput {
 
 // (pixels, channels)
 template <class T>
-Array<T> sample_texture(const TextureInput<T>& in, Team& team);
+Array<T> sample_texture(const TextureInput<T>& in, ThreadTeam& team);
 
 template <class T>
 struct TextureGrad {
@@ -42,6 +42,6 @@ struct TextureWanted {
 
 // The cotangents that are wanted.
 template <class T>
-TextureGrad<T> sample_texture_vjp(const TextureInput<T>& in, const T* bar, TextureWanted wanted, Team& team);
+TextureGrad<T> sample_texture_vjp(const TextureInput<T>& in, const T* bar, TextureWanted wanted, ThreadTeam& team);
 
 }  // namespace edgegrad

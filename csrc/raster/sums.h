@@ -56,10 +56,11 @@ inline std::vector<Share> shares_of(const Frames& frames, const Targets& to) {
 // Calls body(share, sums) for each share, where sums are (targets, width) doubles, zero at first; the sums of all, as
 // T: (count, width), or (images, count, width) where they are not shared.
 template <class T, class Body>
-Array<T> sums_over(const std::vector<Share>& shares, const Frames& frames, const Targets& to, Team& team, Body body) {
+Array<T> sums_over(const std::vector<Share>& shares, const Frames& frames, const Targets& to, ThreadTeam& team,
+                   Body body) {
     std::vector<Array<double>> found;
     for (size_t k = 0; k < shares.size(); ++k) found.emplace_back(0);
-    team.each(int64_t(shares.size()), [&](int64_t k) {
+    team.parallel_for(int64_t(shares.size()), [&](int64_t k) {
         found[k] = Array<double>(shares[k].targets * to.width);
         std::fill(found[k].begin(), found[k].end(), 0.0);
         body(shares[k], found[k].data());
@@ -69,7 +70,7 @@ Array<T> sums_over(const std::vector<Share>& shares, const Frames& frames, const
     // Blocks of rows, each added by one thread in the order of the shares.
     constexpr int64_t block = 1 << 14;
     const int64_t blocks = std::max<int64_t>(1, (stride + block - 1) / block);
-    team.each(images * blocks, [&](int64_t k) {
+    team.parallel_for(images * blocks, [&](int64_t k) {
         const int64_t image = k / blocks, first = k % blocks * block, end = std::min(stride, first + block);
         double sum[block];
         std::fill(sum, sum + (end - first), 0.0);

@@ -154,7 +154,7 @@ void open_embree(const std::string& path, const std::string& options) {
     // The first scene starts Embree's threads: a millisecond that would be missed in the first render.
     const int32_t face[3] = {0, 1, 2};
     const double verts[9] = {0, 0, 0, 1, 0, 0, 0, 1, 0};
-    Team team(1);
+    ThreadTeam team(1);
     RayCaster(face, 1, 3).update(verts, team);
 }
 

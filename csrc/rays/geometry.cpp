@@ -5,6 +5,8 @@
 #include <list>
 #include <mutex>
 
+#include "core/openmp_runtime.h"
+
 namespace edgegrad {
 
 Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
@@ -30,7 +32,7 @@ class KeptGeometry {
     KeptGeometry(const int32_t* faces, int64_t n_faces, const double* verts, int64_t n_verts, const Spacing& spacing)
         : faces_(faces), verts_(verts), n_faces_(n_faces), n_verts_(n_verts), spacing_(spacing) {}
 
-    std::shared_ptr<const Geometry> acquire(GeometryWanted wanted, Team& team, GeometryWork& work) {
+    std::shared_ptr<const Geometry> acquire(GeometryWanted wanted, ThreadTeam& team, GeometryWork& work) {
         const bool moved = !find(wanted);
         if (moved) {
             work.rays = true;
@@ -113,7 +115,7 @@ class KeptGeometry {
 
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
                                                  int64_t n_verts, const Spacing& spacing, GeometryWanted wanted,
-                                                 Team& team, GeometryWork& work) {
+                                                 ThreadTeam& team, GeometryWork& work) {
     return KeptGeometry(faces, n_faces, verts, n_verts, spacing).acquire(wanted, team, work);
 }
 
@@ -135,12 +137,11 @@ void before_fork() {
     embree_mutex.lock();
     // Embree's threads are not missed in the child, where the one that builds can do all of the work.
     let_embree_sleep();
-    before_fork_of_workers();
+    end_waiting_threads();
 }
 
-void after_fork(bool child) {
+void after_fork() {
     if (--forks) return;
-    after_fork_of_workers(child);
     embree_mutex.unlock();
     mutex.unlock();
 }

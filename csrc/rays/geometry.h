@@ -57,7 +57,7 @@ class Geometry {
 // same new geometry at once both make it, and one is kept. Throws Interrupted where the call is to stop.
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
                                                  int64_t n_verts, const Spacing& spacing, GeometryWanted wanted,
-                                                 Team& team, GeometryWork& work);
+                                                 ThreadTeam& team, GeometryWork& work);
 
 // Forgets all kept geometry that is not in use.
 void clear_geometry();
@@ -65,6 +65,6 @@ void clear_geometry();
 // To be called around fork(), so that the child can render. Only the thread that forks lives on there. Before, wait
 // until no thread changes kept geometry or builds a ray structure, since the child would find their locks taken.
 void before_fork();
-void after_fork(bool child);  // in the parent and in the child
+void after_fork();  // in the parent and in the child
 
 }  // namespace edgegrad

@@ -20,7 +20,7 @@ namespace edgegrad {
 // takes products of three lengths, which must not leave the range of floats, 1e-38 … 1e38. So where the farthest vertex
 // lies very many times the size of a face away, that size (its geometric mean) lies as far below the unit as that
 // vertex lies above it.
-RayFrame frame_of(const PlacedTriangles& triangles, Team& team) {
+RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
     const auto& [faces, n_faces, verts, n_verts, used] = triangles;
     const auto vertex = [&](int64_t v) { return Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]}; };
     const Vec3 base = vertex(faces[0]);
@@ -29,7 +29,7 @@ RayFrame frame_of(const PlacedTriangles& triangles, Team& team) {
         double weight = 0;
         int64_t faces = 0, powers = 0;  // those that have a side; log₂ of its square, summed
     };
-    const auto of_faces = team.of_blocks(n_faces, [&](int64_t first, int64_t last) {
+    const auto of_faces = team.map_blocks(n_faces, [&](int64_t first, int64_t last) {
         Block block;
         for (int64_t f = first; f < last; ++f) {
             if (constexpr int ahead = 16; f + ahead < last)
@@ -54,7 +54,7 @@ RayFrame frame_of(const PlacedTriangles& triangles, Team& team) {
     if (!std::isfinite(centre.x + centre.y + centre.z)) centre = base;
 
     const Vec3 from = centre;
-    const std::vector<double> farthest = team.of_blocks(n_verts, [&](int64_t first, int64_t last) {
+    const std::vector<double> farthest = team.map_blocks(n_verts, [&](int64_t first, int64_t last) {
         double most = 0;
         for (int64_t v = first; v < last; ++v) {
             if (!(used.empty() || used[v])) continue;

@@ -32,6 +32,6 @@ struct PlacedTriangles {
     int64_t n_verts;
     const std::vector<uint8_t>& used;
 };
-RayFrame frame_of(const PlacedTriangles& triangles, Team& team);
+RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -46,9 +46,9 @@ RayCaster::~RayCaster() {
     rtc.rtcReleaseScene(static_cast<Scene>(scene_));
 }
 
-void RayCaster::update(const double* verts, Team& team) {
+void RayCaster::update(const double* verts, ThreadTeam& team) {
     frame_ = frame_of({faces_, n_faces_, verts, n_verts_, used_}, team);
-    team.each_block(n_verts_, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(n_verts_, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
             if (!uses(v)) continue;  // may be farther than floats reach
             const Vec3 p = frame_.position({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});

@@ -23,7 +23,7 @@ class RayCaster {
 
     // New positions (V, 3), world units. Throws std::invalid_argument if floats cannot hold the faces together, and
     // Interrupted, after which the caster is of no more use.
-    void update(const double* verts, Team& team);
+    void update(const double* verts, ThreadTeam& team);
 
     // Of Embree's structure, and of the copies of faces and vertices that it is made from. Resident memory grew by 74.4
     // bytes a face between spheres of 327,680 and 1,310,720 faces, of which 12 are the faces, 18 the vertices and 1

@@ -11,8 +11,8 @@ namespace edgegrad {
 namespace {
 
 template <class Body>
-void each_batch(int64_t size, Team& team, Body body) {
-    team.each_block(size, [&](int64_t, int64_t first, int64_t last) {
+void each_batch(int64_t size, ThreadTeam& team, Body body) {
+    team.parallel_for_blocks(size, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t k = first; k < last; k += RayBatch::size) {
             team.check();
             body(k, int(std::min<int64_t>(RayBatch::size, last - k)));
@@ -46,7 +46,7 @@ double extent(Vec3 v) { return std::max({std::fabs(v.x), std::fabs(v.y), std::fa
 }  // namespace
 
 template <class T>
-RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRays& rays, Team& team) {
+RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRays& rays, ThreadTeam& team) {
     RayHits out;
     out.face.resize(rays.size), out.b.resize(2 * rays.size);
     each_batch(rays.size, team, [&](int64_t first, int n) {
@@ -98,7 +98,8 @@ void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& l
 }
 
 template <class T>
-std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, Team& team) {
+std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines,
+                             ThreadTeam& team) {
     std::vector<uint8_t> out(lines.size);
     each_batch(lines.size, team, [&](int64_t first, int n) {
         see(scene, caster, {lines.face + first, lines.b + 2 * first, lines.to + 3 * first, lines.contact + first, n},
@@ -137,11 +138,11 @@ void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures
 
 template void depart(const SceneView<float>&, const RayCaster&, const Departures&, int32_t*, double*);
 template void depart(const SceneView<double>&, const RayCaster&, const Departures&, int32_t*, double*);
-template RayHits trace(const SceneView<float>&, const RayCaster&, const TracedRays&, Team&);
-template RayHits trace(const SceneView<double>&, const RayCaster&, const TracedRays&, Team&);
+template RayHits trace(const SceneView<float>&, const RayCaster&, const TracedRays&, ThreadTeam&);
+template RayHits trace(const SceneView<double>&, const RayCaster&, const TracedRays&, ThreadTeam&);
 template void see(const SceneView<float>&, const RayCaster&, const Sightlines&, uint8_t*);
 template void see(const SceneView<double>&, const RayCaster&, const Sightlines&, uint8_t*);
-template std::vector<uint8_t> visible(const SceneView<float>&, const RayCaster&, const Sightlines&, Team&);
-template std::vector<uint8_t> visible(const SceneView<double>&, const RayCaster&, const Sightlines&, Team&);
+template std::vector<uint8_t> visible(const SceneView<float>&, const RayCaster&, const Sightlines&, ThreadTeam&);
+template std::vector<uint8_t> visible(const SceneView<double>&, const RayCaster&, const Sightlines&, ThreadTeam&);
 
 }  // namespace edgegrad

@@ -23,7 +23,7 @@ struct RayHits {
     std::vector<double> b;      // (N, 2) where on it
 };
 template <class T>
-RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRays& rays, Team& team);
+RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRays& rays, ThreadTeam& team);
 
 // N points on faces, and the points (N, 3) that they may see.
 struct Sightlines {
@@ -34,7 +34,8 @@ struct Sightlines {
 };
 // (N,): 1 where nothing lies between the two. The face of the point itself hides nothing.
 template <class T>
-std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, Team& team);
+std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines,
+                             ThreadTeam& team);
 // The same on one thread.
 template <class T>
 void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out);

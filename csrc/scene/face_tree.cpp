@@ -187,7 +187,7 @@ unsigned CornerGroup::may_cross(const FacePlane& plane, double spacing) const {
 }
 
 FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, const Topology& topology,
-                   FaceOrder& order, Team& team) {
+                   FaceOrder& order, ThreadTeam& team) {
     for (int64_t n = n_faces; levels_.empty() || n > 1;) {
         n = (n + BoxGroup::size - 1) / BoxGroup::size;
         levels_.emplace_back(n);
@@ -210,7 +210,7 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, c
         }
         return m;
     };
-    const auto parts = team.of_blocks(n_faces, [&](int64_t first, int64_t last) {
+    const auto parts = team.map_blocks(n_faces, [&](int64_t first, int64_t last) {
         Vec3 low = middle(first), high = low;
         for (int64_t f = first; f < last; ++f) {
             const Vec3 m = middle(f);
@@ -232,7 +232,7 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, c
     std::vector<int32_t> size(n_faces, 0);  // of surfaces
     for (int64_t f = 0; f < n_faces; ++f) ++size[topology.surface(int32_t(f))];
     std::vector<Key> keys(n_faces);
-    team.each_block(n_faces, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(n_faces, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t f = first; f < last; ++f) {
             const Vec3 m = middle(f) - low, all = high - low;
             const auto bits = [](double place, double size) {
@@ -254,9 +254,9 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, c
     order.spread = spread();
 }
 
-void FaceTree::make_boxes(const int32_t* faces, const double* verts, Team& team) {
+void FaceTree::make_boxes(const int32_t* faces, const double* verts, ThreadTeam& team) {
     const int64_t n_faces = int64_t(face_->size());
-    team.each_block(n_leaves(), [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(n_leaves(), [&](int64_t, int64_t first, int64_t last) {
         CornerLanes lanes;
         for (int64_t i = first; i < last; ++i) {
             CornerGroup& corners = corners_[i];
@@ -274,7 +274,7 @@ void FaceTree::make_boxes(const int32_t* faces, const double* verts, Team& team)
     });
     for (size_t level = 1; level < levels_.size(); ++level) {
         const Array<BoxGroup>& below = levels_[level - 1];
-        team.each_block(levels_[level].size(), [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(levels_[level].size(), [&](int64_t, int64_t first, int64_t last) {
             for (int64_t i = first; i < last; ++i)
                 for (int lane = 0; lane < BoxGroup::size; ++lane) {
                     const int64_t k = BoxGroup::size * i + lane;
@@ -284,11 +284,11 @@ void FaceTree::make_boxes(const int32_t* faces, const double* verts, Team& team)
     }
 }
 
-void FaceTree::find_surfaces(const Topology& topology, Team& team) {
+void FaceTree::find_surfaces(const Topology& topology, ThreadTeam& team) {
     constexpr int size = BoxGroup::size;
     surface_.clear();
     for (size_t level = 0; level < levels_.size(); ++level) surface_.emplace_back(levels_[level].size());
-    team.each_block(n_leaves(), [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(n_leaves(), [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             int32_t all = topology.surface(face(i, 0));
             for (int lane = 1; lane < size && all >= 0; ++lane)

@@ -81,7 +81,7 @@ class FaceTree {
 
     // At these positions (V, 3). Makes the order where there is none, or one that fits no more.
     FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, const Topology& topology, FaceOrder& order,
-             Team& team);
+             ThreadTeam& team);
 
     int64_t n_leaves() const { return levels_[0].size(); }
     const BoxGroup& leaf(int64_t i) const { return levels_[0][i]; }
@@ -120,8 +120,8 @@ class FaceTree {
     }
 
    private:
-    void make_boxes(const int32_t* faces, const double* verts, Team& team);
-    void find_surfaces(const Topology& topology, Team& team);
+    void make_boxes(const int32_t* faces, const double* verts, ThreadTeam& team);
+    void find_surfaces(const Topology& topology, ThreadTeam& team);
     double spread() const;
 
     // Group i of a level holds the boxes of groups 8 i … 8 i + 7 of the one below.

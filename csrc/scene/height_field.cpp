@@ -283,16 +283,16 @@ class HeightFields::Search {
     std::vector<Crossed>& by_;
 };
 
-HeightFields::HeightFields(const FaceTree& tree, const Topology& topology, Team& team)
+HeightFields::HeightFields(const FaceTree& tree, const Topology& topology, ThreadTeam& team)
     : tree_(&tree), by_(tree.n_leaves(), Crossed::by_any) {
     const int64_t leaves = tree.n_leaves(), nodes = (leaves + most_leaves - 1) / most_leaves;
     std::vector<uint8_t> closed(leaves, 0);  // a bit for each face
-    team.each_block(leaves, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(leaves, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t leaf = first; leaf < last; ++leaf)
             for (int lane = 0; lane < FaceTree::leaf_size; ++lane)
                 if (const int32_t f = tree.face(leaf, lane); f >= 0 && topology.goes_on(f)) closed[leaf] |= 1 << lane;
     });
-    team.each_with(
+    team.parallel_for_with_state(
         nodes, [&] { return std::make_unique<Search>(tree, closed, by_); },
         [&](Search& search, int64_t node) { search.mark(node * most_leaves, most_leaves); });
 }

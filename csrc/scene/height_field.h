@@ -22,7 +22,7 @@ namespace edgegrad {
 
 class HeightFields {
    public:
-    HeightFields(const FaceTree& tree, const Topology& topology, Team& team);
+    HeightFields(const FaceTree& tree, const Topology& topology, ThreadTeam& team);
 
     // Whether any face passes through those of the leaf, as far as this tells.
     bool crossed(int64_t leaf) const { return by_[leaf] != Crossed::by_none; }

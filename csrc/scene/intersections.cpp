@@ -270,9 +270,9 @@ void each_of_several(const Array<uint64_t>& key, Body body) {
 }
 
 // Divides what copies of faces have in common among them, if all are there.
-void share_among_copies(Array<Intersection>& all, const PlacedFaces& faces, Team& team) {
+void share_among_copies(Array<Intersection>& all, const PlacedFaces& faces, ThreadTeam& team) {
     Array<uint64_t> key(all.size());
-    team.each_block(all.size(), [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(all.size(), [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i)
             key[i] = place_of(faces, all[i].face[0]) + place_of(faces, all[i].face[1]);
     });
@@ -280,10 +280,10 @@ void share_among_copies(Array<Intersection>& all, const PlacedFaces& faces, Team
 }
 
 // Of each face what it has of that, by how many of them there are.
-Array<float> shares_of_copies(const PlacedFaces& faces, Team& team) {
+Array<float> shares_of_copies(const PlacedFaces& faces, ThreadTeam& team) {
     Array<uint64_t> key(faces.n_faces);
     Array<float> share(faces.n_faces);
-    team.each_block(faces.n_faces, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(faces.n_faces, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t f = first; f < last; ++f) key[f] = place_of(faces, int32_t(f)), share[f] = 1;
     });
     each_of_several(key, [&](int64_t f, size_t n) { share[f] /= float(n); });
@@ -291,14 +291,14 @@ Array<float> shares_of_copies(const PlacedFaces& faces, Team& team) {
 }
 
 // All parts by ascending faces: those of each lower face side by side, and these, which are few, in order.
-Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, int64_t n_faces, Team& team) {
+Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, int64_t n_faces, ThreadTeam& team) {
     size_t n = 0;
     for (const auto& part : parts) n += part.size();
     Array<Intersection> all{int64_t(n)};
     if (n == 0) return all;
     std::vector<uint32_t> end(n_faces, 0);  // of each face, in `all`
     const auto each = [&](auto body) {
-        team.each(int64_t(parts.size()), [&](int64_t k) {
+        team.parallel_for(int64_t(parts.size()), [&](int64_t k) {
             for (const Intersection& i : parts[k]) body(std::atomic_ref(end[i.face[0]]), i);
         });
     };
@@ -306,7 +306,7 @@ Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, 
     uint32_t sum = 0;
     for (uint32_t& e : end) sum += std::exchange(e, sum);
     each([&](auto at, const Intersection& i) { all[at.fetch_add(1, std::memory_order_relaxed)] = i; });
-    team.each_block(n_faces, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(n_faces, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t f = first; f < last; ++f)
             std::sort(all.begin() + (f ? end[f - 1] : 0), all.begin() + end[f],
                       [](const Intersection& a, const Intersection& b) {
@@ -318,10 +318,10 @@ Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, 
 
 // Those of the drawn faces, by ascending faces.
 Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces,
-                          const DrawnPairs& drawn, Team& team) {
+                          const DrawnPairs& drawn, ThreadTeam& team) {
     const int64_t leaves = tree.n_leaves(), blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
     std::vector<FoundIntersections> of_block(blocks);
-    team.each_with(
+    team.parallel_for_with_state(
         blocks, [&] { return std::make_unique<PairFinder>(tree, fields, faces, drawn); },
         [&](PairFinder& pairs, int64_t block) {
             FoundIntersections part;
@@ -344,12 +344,12 @@ Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, cons
 }  // namespace
 
 // Pairs of some leaves, if there are many leaves.
-std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& faces, Team& team) const {
+std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& faces, ThreadTeam& team) const {
     const int64_t step = tree_->n_leaves() / leaves_in_pilot;
     if (step < 2) return {};
     const DrawnPairs all;
     std::vector<std::vector<Pair>> of_leaf(leaves_in_pilot);
-    team.each_with(
+    team.parallel_for_with_state(
         leaves_in_pilot, [&] { return std::make_unique<PairFinder>(*tree_, *fields_, faces, all); },
         [&](PairFinder& pairs, int64_t i) {
             const int64_t leaf = i * step;
@@ -369,7 +369,7 @@ std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& fa
     return out;
 }
 
-Intersections::Intersections(const PlacedFaces& faces, FaceOrder& order, Team& team) : order_(std::move(order)) {
+Intersections::Intersections(const PlacedFaces& faces, FaceOrder& order, ThreadTeam& team) : order_(std::move(order)) {
     const auto expected = [&] {
         tree_ = std::make_unique<FaceTree>(faces.faces, faces.n_faces, faces.verts, faces.topology, order_, team);
         fields_ = std::make_unique<HeightFields>(*tree_, faces.topology, team);
@@ -396,7 +396,7 @@ Intersections::Intersections(const PlacedFaces& faces, FaceOrder& order, Team& t
 }
 
 Array<Intersection> Intersections::drawn(const PlacedFaces& faces, const Array<float>& share, uint64_t seed,
-                                         Team& team) const {
+                                         ThreadTeam& team) const {
     double expected = 0;
     for (const Pair& p : pilot_) expected += p.stands_for * double(share[p.face[0]]) * double(share[p.face[1]]);
     const double most = double(many + faces.n_faces / faces_for_one_of_many);
@@ -405,7 +405,7 @@ Array<Intersection> Intersections::drawn(const PlacedFaces& faces, const Array<f
                     .copies = copies_.data(),
                     .leaves = expected > most ? most / expected : 1,
                     .seed = seed};
-    team.each_block(tree_->n_leaves(), [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(tree_->n_leaves(), [&](int64_t, int64_t first, int64_t last) {
         for (int64_t leaf = first; leaf < last; ++leaf)
             for (int lane = 0; lane < FaceTree::leaf_size; ++lane) {
                 const int32_t f = tree_->face(leaf, lane);

@@ -38,7 +38,7 @@ struct PlacedFaces {
 class Intersections {
    public:
     // Finds all of them, if they are few. `order` is kept from time to time.
-    Intersections(const PlacedFaces& faces, FaceOrder& order, Team& team);
+    Intersections(const PlacedFaces& faces, FaceOrder& order, ThreadTeam& team);
     Intersections(const Intersections&) = delete;  // the tree points to its order
 
     // A tangle of noise, or a soup of large triangles, has so many that finding them all would take longer than all
@@ -50,7 +50,8 @@ class Intersections {
 
     // Those of drawn faces with one another, by ascending faces. The face f is drawn with the probability share[f]; and
     // where there still would be too many, only some pairs of leaves are.
-    Array<Intersection> drawn(const PlacedFaces& faces, const Array<float>& share, uint64_t seed, Team& team) const;
+    Array<Intersection> drawn(const PlacedFaces& faces, const Array<float>& share, uint64_t seed,
+                              ThreadTeam& team) const;
 
     // Of so many that are found among so many faces, before and after they are sorted, what they are sorted by, and
     // what they are drawn by. Lists double as they grow.
@@ -65,7 +66,7 @@ class Intersections {
         int32_t face[2];
         double stands_for;
     };
-    std::vector<Pair> some_pairs(const PlacedFaces& faces, Team& team) const;
+    std::vector<Pair> some_pairs(const PlacedFaces& faces, ThreadTeam& team) const;
 
     Array<Intersection> all_{0};
     // To draw from; null where all were found.

@@ -102,7 +102,7 @@ class DisjointSets {
 
 }  // namespace
 
-Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team) : part_(n_verts) {
+Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team) : part_(n_verts) {
     DisjointSets sets(n_verts);
     for (int64_t i = 0; i < 3 * n_faces; ++i) {
         if (i % check_every == 0) team.check();
@@ -112,8 +112,8 @@ Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team)
         const int32_t first = sets.first(int32_t(v));
         part_[v] = first == v ? size_++ : part_[first];
     }
-    of_block_.resize(Team::blocks(n_faces));
-    team.each_block(n_faces, [&](int64_t k, int64_t first, int64_t last) {
+    of_block_.resize(ThreadTeam::blocks(n_faces));
+    team.parallel_for_blocks(n_faces, [&](int64_t k, int64_t first, int64_t last) {
         int32_t part = part_[faces[3 * first]];
         for (int64_t f = first; f < last && part >= 0; ++f)
             if (part_[faces[3 * f]] != part) part = -1;
@@ -121,7 +121,7 @@ Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team)
     });
 }
 
-Topology::Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team)
+Topology::Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team)
     : faces_(faces), n_faces_(n_faces), n_verts_(n_verts) {
     build(team);
     std::vector<bool> on_border(n_verts, false);
@@ -136,7 +136,7 @@ Topology::Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team&
         if (on_border[v]) candidates_.push_back(int32_t(v));
 }
 
-void Topology::weld(const double* verts, const Spacing& spacing, Team& team) {
+void Topology::weld(const double* verts, const Spacing& spacing, ThreadTeam& team) {
     if (candidates_.empty()) return;
     // Copies that went through different roundings may lie between others of a coarser spacing, never the other way
     // round: coarse ones come first.
@@ -165,7 +165,7 @@ void Topology::weld(const double* verts, const Spacing& spacing, Team& team) {
     build(team);
 }
 
-void Topology::build(Team& team) {
+void Topology::build(ThreadTeam& team) {
     // Half-edges in buckets of their lower vertex, each bucket sorted by the upper one: linear in the number of faces.
     struct Entry {
         int32_t upper;

@@ -28,12 +28,12 @@ struct HalfEdge {
 // Which faces hang together: those that share a vertex by index, and all that share one with them.
 class Parts {
    public:
-    Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team);
+    Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team);
 
     int64_t size() const { return size_; }
     // The part of a face, by one of its vertices.
     int32_t of(int32_t vertex) const { return part_[vertex]; }
-    // That of all faces in a block (Team::each_block); −1: they are of several.
+    // That of all faces in a block (ThreadTeam::parallel_for_blocks); −1: they are of several.
     int32_t of_block(int64_t block) const { return of_block_[block]; }
 
    private:
@@ -43,10 +43,10 @@ class Parts {
 
 class Topology {
    public:
-    Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team);
+    Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team);
 
     // Welds what coincides at these positions (V, 3).
-    void weld(const double* verts, const Spacing& spacing, Team& team);
+    void weld(const double* verts, const Spacing& spacing, ThreadTeam& team);
 
     // Whether vertices were welded.
     bool welds() const { return !welded_.empty(); }
@@ -77,7 +77,7 @@ class Topology {
     void prefetch(int64_t edge) const { edgegrad::prefetch(&offset_[edge]); }
 
    private:
-    void build(Team& team);
+    void build(ThreadTeam& team);
 
     const int32_t* faces_;
     int64_t n_faces_, n_verts_;

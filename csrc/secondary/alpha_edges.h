@@ -98,14 +98,14 @@ class AlphaEdgeFinder {
     explicit AlphaEdgeFinder(const SceneView<T>& scene) : scene_(scene) {}
 
     // All, but of very many cells or pieces those that a seed draws: these stand for all.
-    std::vector<AlphaEdge> find(uint64_t seed, Team& team) const {
+    std::vector<AlphaEdge> find(uint64_t seed, ThreadTeam& team) const {
         std::vector<AlphaEdge> found;
         if (!scene_.alpha_masks.face) return found;
         double cells = 0;
         for (int64_t f = 0; f < scene_.n_faces; ++f)
             if (scene_.alpha_masks.on(f)) cells += cells_of({scene_, int32_t(f)});
         const double every = std::max(1.0, std::ceil(cells / most_cells));
-        const auto parts = team.of_blocks(scene_.n_faces, [&](int64_t first, int64_t last) {
+        const auto parts = team.map_blocks(scene_.n_faces, [&](int64_t first, int64_t last) {
             std::vector<AlphaEdge> part;
             for (int64_t f = first; f < last; ++f)
                 if (scene_.alpha_masks.on(f)) add(int32_t(f), every, to_unit(hash(seed, uint64_t(f))), part);

@@ -92,7 +92,7 @@ void light_reflectors(const LineLight<T>& light, const std::vector<CurveRecords>
     out.jump.resize(records.size()), out.origin.resize(records.size());
     constexpr int surfaces = CurveRecords::surfaces;
     const int C = light.lit.lit.channels;
-    light.view.team.each_with(
+    light.view.team.parallel_for_with_state(
         int64_t(records.size() - begin), [&] { return path_buffers(light.lit.lit, light.at_reflector); },
         [&](Paths& paths, int64_t block) {
             light.view.team.check();

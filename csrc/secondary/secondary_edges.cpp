@@ -15,9 +15,9 @@
 #include "core/sampler.h"
 #include "core/systematic.h"
 #include "secondary/edge_line_source.h"
-#include "secondary/traced_edge_lines.h"
 #include "secondary/line_ends.h"
 #include "secondary/line_pdf.h"
+#include "secondary/traced_edge_lines.h"
 #include "shading/lit/indirect.h"
 #include "shading/lit/lit.h"
 
@@ -50,7 +50,7 @@ struct LineScene : LineLight<T> {
     Array<double> measure() const {
         const int64_t n = this->view.geometry.topology().n_edges() + int64_t(alpha_edges.size());
         Array<double> out(n);
-        this->view.team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+        this->view.team.parallel_for_blocks(n, [&](int64_t, int64_t first, int64_t last) {
             EdgeLines<T> edge = lines();
             for (int64_t k = first; k < last; ++k) out[k] = edge.set(k);
         });
@@ -183,7 +183,7 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
     };
     std::vector<PilotStatistics> found((n + pilots_of_block - 1) / pilots_of_block);
     const int C = scene.lit.lit.channels;
-    view.team.each_with(
+    view.team.parallel_for_with_state(
         int64_t(found.size()), [&] { return path_buffers(scene.lit.lit, scene.at_reflector); },
         [&](Paths& paths, int64_t block) {
             view.team.check();

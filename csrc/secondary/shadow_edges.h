@@ -46,9 +46,9 @@ struct PartsBall {
 template <class T>
 class FacesBeforeLight {
    public:
-    FacesBeforeLight(const SceneView<T>& scene, const LightParts& light, Team& team)
+    FacesBeforeLight(const SceneView<T>& scene, const LightParts& light, ThreadTeam& team)
         : scene_(scene), light_(light), ball_(light), plane_(scene.n_faces) {
-        team.each_block(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t f = first; f < last; ++f) {
                 const Vec3 v = corner(scene, f, 0), e1 = corner(scene, f, 1) - v, e2 = corner(scene, f, 2) - v;
                 plane_[f] = {cross(e1, e2), v, rounding_of_triple_product({1, 0, 0}, e1, e2)};
@@ -164,7 +164,7 @@ class ShadowEdgeFinder {
 
     std::vector<ShadowPiece> find(int64_t tests) const {
         const int64_t edges = view_.geometry.topology().n_edges();
-        const auto may = view_.team.of_blocks(edges, [&](int64_t begin, int64_t end) {
+        const auto may = view_.team.map_blocks(edges, [&](int64_t begin, int64_t end) {
             std::vector<int64_t> part;
             for (int64_t e = begin; e < end; ++e)
                 if (may_cast(e)) part.push_back(e);
@@ -174,7 +174,7 @@ class ShadowEdgeFinder {
         for (const auto& part : may) asking += int64_t(part.size());
         const int64_t asked = std::clamp<int64_t>(tests / std::max<int64_t>(asking, 1), 1, light_.count);
         std::vector<std::vector<ShadowPiece>> parts(may.size());
-        view_.team.each(int64_t(may.size()), [&](int64_t k) {
+        view_.team.parallel_for(int64_t(may.size()), [&](int64_t k) {
             EdgeWedge<T> wedge(view_, casters_, faces_, alpha_edges_);
             std::vector<ShadowPiece> part;
             for (const int64_t e : may[k]) add(e, asked, wedge, part);
@@ -250,7 +250,7 @@ class ShadowEdgeFinder {
             std::clamp<int64_t>(tests / std::max<int64_t>(int64_t(alpha_edges_.size()), 1), 1, light_.count);
         const Hash random(hash(view_.options.seed, 12, gradient_stream), 0);
         const double step = double(light_.count) / double(asked);
-        return view_.team.of_blocks(int64_t(alpha_edges_.size()), [&](int64_t begin, int64_t end) {
+        return view_.team.map_blocks(int64_t(alpha_edges_.size()), [&](int64_t begin, int64_t end) {
             EdgeWedge<T> wedge(view_, casters_, faces_, alpha_edges_);
             std::vector<ShadowPiece> out;
             for (int64_t k = begin; k < end; ++k) {

@@ -42,7 +42,7 @@ inline std::vector<ShadowPiece> cut(const std::vector<ShadowPiece>& pieces, doub
 // Pieces end to end: positions in [0, 1) along their measure.
 class Pieces {
    public:
-    Pieces(std::vector<ShadowPiece> pieces, Team& team)
+    Pieces(std::vector<ShadowPiece> pieces, ThreadTeam& team)
         : pieces_(std::move(pieces)), measure_(int64_t(pieces_.size())), systematic_(fill(), team) {}
 
     bool empty() const { return !(systematic_.total() > 0); }
@@ -92,7 +92,7 @@ class Places {
    public:
     // density  one number for each interval; becomes its running sum
     // whole    whether pieces get whole numbers of places
-    Places(const Pieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed, Team& team)
+    Places(const Pieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed, ThreadTeam& team)
         : pieces_(pieces), intervals_(density.size()), whole_(whole), seed_(seed), systematic_(density, team) {
         systematic_.draw(n, to_unit(seed));
         spacing_ = systematic_.total() / double(n);
@@ -219,7 +219,7 @@ class ShadowCasters {
     // Has places of each interval asked: body(ask) is called for some at a time, and calls ask(chunk) of a ShadowChunk.
     template <class Body>
     void draw_pilots(uint64_t seed, Body body) const {
-        scene_.view.team.each((intervals_ + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
+        scene_.view.team.parallel_for((intervals_ + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
             const int64_t first = block * intervals_of_block, last = std::min(first + intervals_of_block, intervals_);
             body([&](auto& chunk) {
                 for (int64_t i = first; i < last; ++i) {

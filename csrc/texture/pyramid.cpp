@@ -80,17 +80,17 @@ int64_t PyramidShape::texels() const {
 }
 
 template <class T>
-Array<T> pyramid(const PyramidShape& shape, const T* image, Team& team) {
+Array<T> pyramid(const PyramidShape& shape, const T* image, ThreadTeam& team) {
     const int C = shape.channels;
     Array<T> out(shape.texels() * C);
     const int64_t row = shape.image.width * C;
-    team.each(shape.image.height, [&](int64_t y) { std::copy_n(image + y * row, row, out.data() + y * row); });
+    team.parallel_for(shape.image.height, [&](int64_t y) { std::copy_n(image + y * row, row, out.data() + y * row); });
     TexelGrid last = shape.image;
     for (int left = shape.levels() - 1; left > 0; --left) {
         const Halving at(last);
         const T* fine = out.data() + at.fine.first * C;
         T* coarse = out.data() + at.coarse.first * C;
-        team.each(at.coarse.height, [&](int64_t y) {
+        team.parallel_for(at.coarse.height, [&](int64_t y) {
             dispatch_channels(C, false,
                               [&]<int N>() { mean_row<N>(at, C, y, fine, coarse + y * at.coarse.width * C); });
         });
@@ -100,7 +100,7 @@ Array<T> pyramid(const PyramidShape& shape, const T* image, Team& team) {
 }
 
 template <class T>
-Array<T> pyramid_vjp(const PyramidShape& shape, const T* bar, Team& team) {
+Array<T> pyramid_vjp(const PyramidShape& shape, const T* bar, ThreadTeam& team) {
     const int C = shape.channels;
     std::vector<Halving> all;
     TexelGrid last = shape.image;
@@ -111,7 +111,7 @@ Array<T> pyramid_vjp(const PyramidShape& shape, const T* bar, Team& team) {
         const Halving& at = all.back();
         const int64_t row = at.fine.width * C;
         Array<T> own(at.fine.height * row);
-        team.each(at.fine.height, [&](int64_t y) {
+        team.parallel_for(at.fine.height, [&](int64_t y) {
             T* to = own.data() + y * row;
             std::copy_n(bar + at.fine.first * C + y * row, row, to);
             dispatch_channels(C, false, [&]<int N>() { mean_row_vjp<N>(at, C, y, found.data(), to); });
@@ -121,9 +121,9 @@ Array<T> pyramid_vjp(const PyramidShape& shape, const T* bar, Team& team) {
     return found;
 }
 
-template Array<float> pyramid(const PyramidShape&, const float*, Team&);
-template Array<double> pyramid(const PyramidShape&, const double*, Team&);
-template Array<float> pyramid_vjp(const PyramidShape&, const float*, Team&);
-template Array<double> pyramid_vjp(const PyramidShape&, const double*, Team&);
+template Array<float> pyramid(const PyramidShape&, const float*, ThreadTeam&);
+template Array<double> pyramid(const PyramidShape&, const double*, ThreadTeam&);
+template Array<float> pyramid_vjp(const PyramidShape&, const float*, ThreadTeam&);
+template Array<double> pyramid_vjp(const PyramidShape&, const double*, ThreadTeam&);
 
 }  // namespace edgegrad

@@ -21,9 +21,9 @@ struct PyramidShape {
 
 // (texels, channels)
 template <class T>
-Array<T> pyramid(const PyramidShape& shape, const T* image, Team& team);
+Array<T> pyramid(const PyramidShape& shape, const T* image, ThreadTeam& team);
 // The cotangent of the image, from that of the pyramid.
 template <class T>
-Array<T> pyramid_vjp(const PyramidShape& shape, const T* bar, Team& team);
+Array<T> pyramid_vjp(const PyramidShape& shape, const T* bar, ThreadTeam& team);
 
 }  // namespace edgegrad

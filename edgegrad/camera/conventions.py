@@ -82,9 +82,7 @@ class Conventions(CameraFields):
         K: Vector | None = None,
         fov_x: float | Tensor | None = None,
     ) -> CameraT:
-        """Return a camera from a pose of OpenGL or Blender.
-
-        Raises TypeError or ValueError.
+        """Return a camera from a pose of OpenGL or Blender. Raises TypeError or ValueError.
 
         Parameters
         ----------
@@ -120,9 +118,8 @@ class Conventions(CameraFields):
         principal_point: Vector = (0.0, 0.0),
         in_ndc: bool = True,
     ) -> CameraT:
-        """Return a camera from PyTorch3D's PerspectiveCameras: points are rows, `p R + T`, +X left, +Y up, +Z forward.
-
-        Raises TypeError or ValueError.
+        """Return a camera from PyTorch3D's PerspectiveCameras: points are rows, `p R + T`, +X left, +Y up, +Z forward. Raises
+        TypeError or ValueError.
 
         Parameters
         ----------
@@ -161,9 +158,8 @@ class Conventions(CameraFields):
     def from_colmap(
         cls: type[CameraT], rotation: Vector, translation: Vector, model: str, params: Vector, size: tuple[int, int]
     ) -> CameraT:
-        """Return a camera from an image's pose and its camera in COLMAP; load_cameras() reads whole reconstructions.
-
-        Raises TypeError or ValueError.
+        """Return a camera from an image's pose and its camera in COLMAP; load_cameras() reads whole reconstructions. Raises
+        TypeError or ValueError.
 
         Parameters
         ----------

@@ -24,7 +24,7 @@ class Viewpoints(CameraFields):
         size: tuple[int, int] = (256, 256),
         fov_x: float | Tensor | None = None,
     ) -> CameraT:
-        """Return a perspective camera at `eye` (3,) that looks at `target` (3,), with `up` (3,) upwards in the image.
+        """Return a perspective camera at `eye` (3,) aimed at `target` (3,), with `up` (3,) upwards in the image.
 
         Pixels are square, with the principal point in the middle. Raises TypeError or ValueError.
 
@@ -52,8 +52,7 @@ class Viewpoints(CameraFields):
         height: float | Tensor = 2.0,
         size: tuple[int, int] = (256, 256),
     ) -> CameraT:
-        """Return an orthographic camera that looks from `eye` towards `target` and shows `height` world units from top to
-        bottom."""
+        """Return an orthographic camera from `eye` towards `target` that shows `height` world units from top to bottom."""
         world_to_camera = looking_at(eye, target, up)
         height = as_scalar("height", height, like=world_to_camera)
         if values_visible(height) and not 0.0 < float(height.detach()) < math.inf:

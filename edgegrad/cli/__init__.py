@@ -1,7 +1,5 @@
-"""The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-rig, fit-texture, fit-camera, track, render, bop, demo, doctor.
-
-Each command imports what it uses when it runs: torch takes seconds to import, help and faults of arguments do without it.
-"""
+"""The command line. Each command imports what it uses when it runs, for torch takes seconds to import: help and errors of
+arguments do without it."""
 
 from __future__ import annotations
 
@@ -15,11 +13,11 @@ from contextlib import contextmanager
 from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_rig, fit_shape, fit_texture, render, track
 from .arguments import Parser
 
-INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, as shells have it
+INTERRUPTED = 130  # exit code of shells after Ctrl-C
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs a command; the exit code is 0, 2 after an error, 130 after Ctrl-C."""
+    """Run a command; return 0, 2 after an error, or 130 after Ctrl-C."""
     try:
         args = parser().parse(argv)
         with _ended_by_ctrl_c():
@@ -35,7 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _ended_by_ctrl_c() -> Iterator[None]:
-    """Ctrl-C ends the process at once. As an exception it may be lost while modules are imported, in code that lets none out."""
+    """End the process at once at Ctrl-C. Raised as an exception while modules are imported, it might be lost in code that lets
+    none out."""
     usual = signal.getsignal(signal.SIGINT)
     if usual is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
         yield
@@ -59,22 +58,11 @@ def _one_line(error: Exception) -> str:
 
 
 def parser() -> Parser:
-    """With all commands."""
+    """Return the parser of all commands."""
     found = Parser(prog="edgegrad", description="Differentiable rendering of triangle meshes on the CPU.")
     found.add_argument("--version", action=doctor.Version, nargs=0, help="show the version and exit")
     commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (
-        fit_pose,
-        fit_poses,
-        fit_shape,
-        fit_rig,
-        fit_texture,
-        fit_camera,
-        track,
-        render,
-        bop,
-        demo,
-        doctor,
-    ):
+    fits = fit_pose, fit_poses, fit_shape, fit_rig, fit_texture, fit_camera
+    for module in (*fits, track, render, bop, demo, doctor):
         module.add(commands)
     return found

@@ -1,4 +1,4 @@
-"""What the commands' arguments have in common: errors of one line, numbers, and the view."""
+"""Arguments that several commands have in common, and errors of one line."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-CHECKPOINT = "checkpoint.pt"  # of fits
+CHECKPOINT = "checkpoint.pt"  # file of fits
 
 
 class Parser(argparse.ArgumentParser):
-    """With the nearest name where one is not known."""
+    """A parser that suggests the nearest name for an unknown one."""
 
     def __init__(self, **options: object) -> None:
         super().__init__(**options)  # type: ignore[arg-type]
-        self.set_defaults(parser=self)  # that of the command, since its own default comes last
+        self.set_defaults(parser=self)  # the command's own default comes last and wins
 
     def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
         args, unknown = self.parse_known_args(argv)
@@ -44,29 +44,26 @@ def _nearest(word: str, known: Iterable[str]) -> str:
 def add_mesh(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("mesh", type=Path, metavar="MESH", help="OBJ, glTF, GLB, PLY, STL, OFF or 3MF")
     parser.add_argument(
-        "--texture", type=Path, metavar="IMAGE", help="to lay on its texture coordinates instead of its look"
+        "--texture", type=Path, metavar="IMAGE", help="to lay on its texture coordinates instead of its materials"
     )
     parser.add_argument("--no-materials", action="store_true", help="leave out its textures and materials")
 
 
 def add_view(parser: argparse.ArgumentParser) -> None:
     view = parser.add_argument_group(
-        "view", "a camera file, or a look at the mesh, which is framed as far as nothing is said"
+        "view", "a camera file, or a view of the mesh, which is framed as far as nothing is given"
     )
     view.add_argument(
         "--camera", type=Path, metavar="CAMERA.json", help="world_to_camera 4 × 4, K 3 × 3, size [H, W]; or glTF"
     )
     view.add_argument("--fov", type=float, metavar="DEGREES", help="vertical field of view (40)")
-    for name, help in (
-        ("eye", "where the camera is"),
-        ("target", "what it looks at"),
-        ("up", "up in the image (0 1 0)"),
-    ):
+    points = {"eye": "where the camera is", "target": "what it looks at", "up": "up in the image (0 1 0)"}
+    for name, help in points.items():
         view.add_argument(f"--{name}", type=float, nargs=3, metavar=("X", "Y", "Z"), help=help)
 
 
 def add_views(parser: argparse.ArgumentParser, images: str) -> None:
-    """Several images, and the camera of each."""
+    """Add several images, and the camera of each."""
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help=images)
     parser.add_argument(
         "--camera", type=Path, nargs="+", required=True, metavar="CAMERA.json", help="one for each image, in their order"
@@ -78,7 +75,7 @@ def add_label(parser: argparse.ArgumentParser) -> None:
 
 
 def add_depth(parser: argparse.ArgumentParser) -> None:
-    """inputs.read_depth reads it."""
+    """Add the arguments of inputs.read_depth."""
     parser.add_argument(
         "--depth", type=Path, metavar="IMAGE",
         help="distances along the camera's axis, as the picture's camera sees them; 0 where there is none",
@@ -90,15 +87,32 @@ def add_depth(parser: argparse.ArgumentParser) -> None:
 
 
 def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
-    """What fits by descent have in common; inputs.descent reads it."""
+    """Add the arguments of fits by descent, for inputs.descent."""
     parser.add_argument("--steps", type=count, default=150, help="most steps; of fit-shape on each level (%(default)s)")
     parser.add_argument("--spp", type=count, default=4, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     add_resume(parser)
+    add_out(parser, f"{result}, values.pt, fit.json, history.json, fit.png, loss.png, cameras, {CHECKPOINT}")
+
+
+def add_out(parser: argparse.ArgumentParser, files: str) -> None:
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"for {files}")
+
+
+def add_size(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", type=longer_side, default=256, help="most pixels on the longer side (%(default)s)")
+
+
+def add_steps(parser: argparse.ArgumentParser, default: int = 40) -> None:
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR",
-        help=f"for {result}, values.pt, fit.json, history.json, fit.png, loss.png, cameras, {CHECKPOINT}",
-    )  # fmt: skip
+        "--steps", type=count, default=default, help="most steps on each level of resolution (%(default)s)"
+    )
+
+
+def add_background(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
+    )
 
 
 def add_resume(parser: argparse.ArgumentParser) -> None:
@@ -106,17 +120,12 @@ def add_resume(parser: argparse.ArgumentParser) -> None:
 
 
 def add_live(parser: argparse.ArgumentParser) -> None:
-    """outputs.live opens it."""
+    """Add the arguments of outputs.live_view."""
     parser.add_argument(
         "--view", action="store_true",
         help="watch, pause and stop the fit in a browser; the page stays after the result is saved, until Ctrl-C or its Close",
     )  # fmt: skip
-    parser.add_argument(
-        "--port",
-        type=port,
-        default=8080,
-        help="of the page, on this computer (%(default)s), or the next one that is free",
-    )
+    parser.add_argument("--port", type=port, default=8080, help="of the page (%(default)s), or the next free one")
 
 
 def port(text: str) -> int:
@@ -126,7 +135,7 @@ def port(text: str) -> int:
 
 
 def shape(text: str) -> tuple[int, int]:
-    """(height, width) from 640x480 or 512."""
+    """Return (height, width) from 640x480 or 512."""
     numbers = [count(number) for number in text.lower().split("x")]
     if len(numbers) > 2:
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT or one number, got {text!r}")
@@ -138,7 +147,7 @@ def count(text: str) -> int:
 
 
 def longer_side(text: str) -> int:
-    """Pixels on the longer side of a picture, of which the other follows."""
+    """Return the pixels on the longer side of a picture, which determine the other side."""
     if "x" in text.lower():
         raise argparse.ArgumentTypeError(
             f"expected one number, pixels on the longer side, from which the other follows, got {text!r}"
@@ -150,16 +159,6 @@ def number(text: str, least: int = 0) -> int:
     if not text.isdecimal() or int(text) < least:
         raise argparse.ArgumentTypeError(f"expected a whole number from {least} up, got {text!r}")
     return int(text)
-
-
-def seconds(text: str) -> float:
-    try:
-        found = float(text)
-    except ValueError:
-        found = 0.0
-    if not 0.0 < found < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
-    return found
 
 
 def millimetres(text: str) -> float:

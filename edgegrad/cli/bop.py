@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .arguments import count, millimetres, number
+from .arguments import add_steps, count, millimetres, number
 from .outputs import make_folder
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def add(commands: Any) -> None:
         "--pictures", type=Path, metavar="DIR", help="for a picture a row: target, start, fit and difference"
     )
     better.add_argument("--size", type=count, default=256, help="most pixels of the part of the image (%(default)s)")
-    better.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
+    add_steps(better)
     better.add_argument("--seed", type=number, default=0)
     better.set_defaults(run=_refine)
 
@@ -68,13 +68,13 @@ def _add_files(parser: argparse.ArgumentParser) -> None:
 
 
 def _errors(args: argparse.Namespace) -> int:
-    """Prints recalls as BOP19 defines them (AR of VSD, MSSD and MSPD), of ADD(-S) below 10 % of the diameter, and median errors,
-    by object and of all."""
+    """Print recalls as BOP19 defines them (AR of VSD, MSSD and MSPD), recalls of ADD(-S) below 10 % of the diameter, and median
+    errors, by object and of all."""
     from ..bop import Dataset, evaluate, read_results
-    from ..files.paths import check_suffix, replacing
+    from ..files.paths import check_suffix, write_text
 
     if args.out is not None:
-        check_suffix(args.out, (".json",))  # before the work rather than after it
+        check_suffix(args.out, (".json",))  # an error must not come after the work
     estimates, dataset = read_results(args.results), Dataset(args.dataset, args.split, args.models)
     targets = None if args.targets is None else dataset.targets(args.targets)
     found = evaluate(dataset, estimates, targets, with_vsd=not args.no_vsd, delta=args.delta)
@@ -82,16 +82,15 @@ def _errors(args: argparse.Namespace) -> int:
     if found.ignored:
         print(f"{found.ignored} estimates belong to no target, or exceed the number of its instances")
     if args.out is not None:
-        with replacing(args.out) as temporary:
-            temporary.write_text(found.to_json() + "\n", encoding="utf-8")
+        write_text(args.out, found.to_json() + "\n")
         print(f"wrote {args.out}")
     return 0
 
 
 def _refine(args: argparse.Namespace) -> int:
-    """Fits the mesh of each row to the colour image around where the row has it, and writes the rows with the poses found. A row
-    whose fit does not converge keeps its pose. The file is written after each row, and --resume goes on from there. The time of
-    an image grows by that of all its rows."""
+    """Fit the mesh of each row to the colour image around its pose, and write the rows with the poses found. A row whose fit
+    does not converge keeps its pose. The file is written after each row, and --resume goes on from there. The time of an image
+    grows by that of all its rows."""
     from tqdm import tqdm
 
     from ..bop import Dataset, read_results, refine, write_results
@@ -129,7 +128,7 @@ def _refine(args: argparse.Namespace) -> int:
             write_results(args.out, _timed(done, given, spent))
             if args.pictures is not None:
                 _draw(args.pictures, len(done), found)
-            tqdm.write(_said(found), file=sys.stdout)
+            tqdm.write(_line(found), file=sys.stdout)
             bar.update()
     print(
         f"{len(done)} of {len(given)} rows in {args.out}"
@@ -141,7 +140,7 @@ def _refine(args: argparse.Namespace) -> int:
 
 
 def _done(args: argparse.Namespace, given: Sequence[Estimate]) -> list[Estimate]:
-    """The rows of an earlier run. Raises ValueError."""
+    """Return the rows of an earlier run. Raises ValueError."""
     from ..bop import read_results
 
     if args.out.exists() and args.results.exists() and args.out.samefile(args.results):
@@ -171,17 +170,15 @@ def _key(row: Estimate) -> tuple[int, int, int, float]:
 
 
 def _timed(done: Sequence[Estimate], given: Sequence[Estimate], spent: dict[tuple[int, int], float]) -> list[Estimate]:
-    """BOP wants one time for all rows of an image; it stays unknown where it was."""
+    """Give all rows of an image one time, as BOP wants; an unknown time stays unknown."""
     return [
-        replace(
-            row, seconds=before.seconds + spent[row.scene_id, row.im_id] if before.seconds >= 0.0 else before.seconds
-        )
+        replace(row, seconds=before.seconds + (spent[row.scene_id, row.im_id] if before.seconds >= 0.0 else 0.0))
         for row, before in zip(done, given)  # noqa: B905  the rest is to come
     ]
 
 
 def _draw(folder: Path, number: int, found: Refined) -> None:
-    """Nothing where no step was taken."""
+    """Draw a fit that took a step."""
     from ..fit.pose.pictures import draw_fit
 
     if found.fit is not None and found.fit.history:
@@ -191,7 +188,7 @@ def _draw(folder: Path, number: int, found: Refined) -> None:
         )
 
 
-def _said(found: Refined) -> str:
+def _line(found: Refined) -> str:
     row = found.estimate
     what = f"pose kept, {found.why}" if found.kept else f"turned {found.degrees:.2f}°, moved {found.distance:.2f} mm"
     return f"scene {row.scene_id}, image {row.im_id}, object {row.obj_id}: {what} ({found.seconds:.1f} s)"

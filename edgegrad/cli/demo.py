@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds an airliner in pictures that are rendered at known poses, each from a start up to 20° and 15 % of its size away."""
+    """Find an airliner in pictures that are rendered at known poses, from starts up to 20° and 15 % of its size away."""
     from .. import demo  # imports pyvista when it runs
     from . import INTERRUPTED
 

@@ -12,7 +12,7 @@ from typing import Any
 from .. import __version__
 
 LIBRARIES = ("torch", "numpy", "embreex", "trimesh", "OpenImageIO")
-# Which extra brings what, and what for.
+# The extra that brings a library, and its purpose.
 OPTIONAL = {
     "pillow": "files, figures: textures of meshes, labels of masks, animations",
     "lxml": "files: 3MF",
@@ -28,11 +28,11 @@ OPTIONAL = {
     "xatlas": "fit: unwrapping",
     "torchmetrics": "fit: SSIM",
 }
-TOLERANCE = 0.02  # of the gradient's size; its own error is 0.1 %
+TOLERANCE = 0.02  # of the gradient's size; the sampling error is 0.1 %
 
 
 class Version(argparse.Action):
-    """Print the version and exit."""
+    """Print the version of the installed package, or of one that is only on the path, and end."""
 
     def __call__(self, *_: object) -> None:
         print(f"edgegrad {__version__}")
@@ -45,7 +45,7 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Shows versions, Embree, the processor's instructions and threads, and checks a gradient against its closed form. The exit
+    """Show versions, Embree, the processor's instructions and threads, and check a gradient against its closed form. The exit
     code is 1 if that is wrong."""
     import torch
 
@@ -76,10 +76,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def gradient_error() -> float:
-    """Relative error of the derivative of a triangle's area in the image by its vertices.
+    """Return the relative error of the derivative of a triangle's area in the image by its vertices.
 
-    The sum of an image of a white triangle is its area in pixels, ½ |(b − a) × (c − a)|, of which the derivative by a is half the
-    opposite side, turned by 90°. All of it comes from silhouettes.
+    The sum of an image of a white triangle is its area in pixels, ½ |(b − a) × (c − a)|. Its derivative by a is half the
+    opposite side, rotated by 90°. All of it comes from silhouettes.
     """
     import torch
 

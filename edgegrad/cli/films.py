@@ -1,4 +1,4 @@
-"""Films as `edgegrad track` reads and writes them: a video, or a folder of images."""
+"""Films for `edgegrad track`: videos, or folders of images."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 VIDEO = "edgegrad[video]", "reading or writing a video"
-CODECS = "libx264", "mpeg4"  # of film.mp4; not every build of FFmpeg has the first
-BITS = 2.0  # a pixel, of codecs that do not take a quality
+CODECS = "libx264", "mpeg4"  # for film.mp4; some builds of FFmpeg lack the first
+BITS = 2.0  # per pixel, for codecs without a quality setting
 USUAL_FPS = 25
-MOST_FPS = 1000  # of films: more is an error of a header, or of a finger
+MOST_FPS = 1000  # more is an error in a header, or a typing error
 
 
 class Film(NamedTuple):
-    """Pictures (H, W, 3) of linear radiance, one after the other."""
+    """Pictures (H, W, 3) of linear radiance in their order."""
 
     frames: Iterator[Tensor]
-    fps: Fraction | None  # None of a folder, and of a video that does not tell
+    fps: Fraction | None  # None for a folder, and for a video that has none
 
 
 def read_film(path: Path, camera: Path | None = None) -> Film:
-    """At least one frame, as the camera of a file speaks of it. Raises OSError, ValueError or ImportError, also later."""
+    """Return a film of at least one frame, whose images are upright or stored as the camera file needs. Raises OSError,
+    ValueError or ImportError, also while frames are read."""
     if path.is_dir():
         return _folder(path, camera)
     if not path.is_file():
@@ -45,7 +46,7 @@ def _folder(folder: Path, camera: Path | None) -> Film:
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in READABLE)
     if not paths:
         raise ValueError(f"{folder}: expected a folder with images, got none of {', '.join(READABLE)} in it")
-    kind = type(seen_by(camera, paths[0]))  # of all frames, upright or stored
+    kind = type(seen_by(camera, paths[0]))  # upright or stored, for all frames
     return Film((read_image(kind(path), channels=3) for path in paths), None)
 
 
@@ -83,23 +84,22 @@ def _decoded(path: Path, av: Any) -> Iterator[Tensor]:
 
 
 def _orientation(frame: Any) -> tuple[float, bool]:
-    """Return the degrees to turn a frame by counterclockwise, and whether it is mirrored left to right before.
-
-    A display matrix (a b u; c d v; x y w) takes a pixel (p, q) to (a p + c q, b p + d q), of which y runs down (ISO 14496-12)."""
+    """Return the degrees to rotate a frame by counterclockwise, and whether it is mirrored left to right before. A display
+    matrix (a b u; c d v; x y w) takes a pixel (p, q) to (a p + c q, b p + d q), with y downwards (ISO 14496-12)."""
     import numpy as np
 
     for data in frame.side_data:
         if "DISPLAYMATRIX" in str(data.type):
             a, b, _, c, d = np.frombuffer(data, np.int32)[:5].astype(np.float64)
             mirrored = a * d - b * c < 0.0
-            a, b = (-a, -b) if mirrored else (a, b)  # what turns the mirrored frame
+            a, b = (-a, -b) if mirrored else (a, b)  # the rotation of the mirrored frame
             return -math.degrees(math.atan2(b - c, a + d)), mirrored
     return getattr(frame, "rotation", 0), False
 
 
 def upright(picture: Tensor, degrees: float, mirrored: bool = False) -> Tensor:
-    """A picture (H, W, C) as players show it: mirrored left to right where the file says so, as front cameras do, then turned
-    counterclockwise by the nearest right angle, as phones do."""
+    """Return a picture (H, W, C) as players show it: mirrored left to right, as front cameras do, then rotated counterclockwise
+    by the nearest right angle, as phones do."""
     picture = picture.flip(1) if mirrored else picture
     return picture.rot90(round(degrees / 90) % 4, (0, 1))
 
@@ -109,7 +109,7 @@ def _fault(path: Path, error: Exception) -> ValueError:
 
 
 def write_film(folder: Path, pictures: list[Path], fps: Fraction) -> str | None:
-    """film.mp4, or without the library of videos film.webp; its name. None without the library of pictures as well."""
+    """Write film.mp4, or film.webp without PyAV, and return its name; None without pillow."""
     from ..files.paths import replacing
     from ..optional import DRAWING, require
 
@@ -143,7 +143,7 @@ def _encode(av: Any, path: Path, pictures: Iterator[np.ndarray], fps: Fraction) 
     import numpy as np
 
     first = next(pictures)
-    h, w = (side - side % 2 for side in first.shape[:2])  # colours are of 2 × 2 pixels
+    h, w = (side - side % 2 for side in first.shape[:2])  # colours have blocks of 2 × 2 pixels
     codec = next((name for name in CODECS if name in av.codecs_available), CODECS[-1])
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream(codec, rate=fps, options={"crf": "20"} if codec == "libx264" else {})

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from .arguments import CHECKPOINT, add_live, add_mesh, add_resume, add_view, count, number
+from .arguments import CHECKPOINT, add_background, add_live, add_mesh, add_out, add_resume, add_steps, add_view, number
 from .inputs import read_background, read_picture, read_scene, read_view, seen_by
-from .outputs import linger, live, make_folder, write_outputs
+from .outputs import live_view, make_folder, wait_for_close, write_outputs
 
 
 def add(commands: Any) -> None:
@@ -19,28 +19,19 @@ def add(commands: Any) -> None:
     parser.add_argument("--no-focal", action="store_true", help="keep the focal length")
     parser.add_argument("--principal", action="store_true", help="also find the principal point")
     parser.add_argument(
-        "--distortion",
-        type=number,
-        default=0,
-        metavar="N",
-        help="also find so many coefficients, up to 8 (a fisheye: 4)",
-    )
-    parser.add_argument(
-        "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
-    )
-    parser.add_argument("--steps", type=count, default=60, help="most steps on each level of resolution (%(default)s)")
+        "--distortion", type=number, default=0, metavar="N", help="also find so many coefficients, up to 8 (a fisheye: 4)"
+    )  # fmt: skip
+    add_background(parser)
+    add_steps(parser, 60)
     parser.add_argument("--seed", type=number, default=0)
     add_resume(parser)
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR",
-        help=f"for camera.json, history.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}",
-    )  # fmt: skip
+    add_out(parser, f"camera.json, history.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}")
     add_live(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds pose and focal length of the camera that took a picture of a mesh, from a start within about 30° and 15 % of the
+    """Find pose and focal length of the camera that took a picture of a mesh, from a start within about 30° and 15 % of the
     mesh's size. Ctrl-C keeps the best so far, and --resume goes on from there."""
     from .. import save_camera
     from ..fit import fit_camera
@@ -53,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("--background: expected none with an image that has alpha, got both; leave one out")
     start = read_view(args, scene, (picture.shape[0], picture.shape[1]), None)
     make_folder(args.out)
-    with live(args) as view:
+    with live_view(args) as view:
         fit = fit_camera(
             scene, picture, start, mask=mask, background=read_background(args.background, picture), focal=not args.no_focal,
             principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed, callback=view,
@@ -67,5 +58,5 @@ def run(args: argparse.Namespace) -> int:
         save_camera(args.out / "camera.json", fit.camera)
         names = ["camera.json", fit.write_history(args.out), *write_outputs(args.out, fit.search), CHECKPOINT]
         print(f"wrote {', '.join(names)} in {args.out}")
-        linger(view, fit)
+        wait_for_close(view, fit)
     return INTERRUPTED if fit.interrupted else 0

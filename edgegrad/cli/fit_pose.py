@@ -10,30 +10,31 @@ from typing import TYPE_CHECKING, Any
 from . import outputs
 from .arguments import (
     CHECKPOINT,
+    add_background,
     add_depth,
     add_label,
     add_live,
     add_mesh,
+    add_out,
     add_resume,
+    add_size,
+    add_steps,
     add_view,
-    count,
-    longer_side,
     number,
-)
+)  # fmt: skip
 from .inputs import (
-    assume_fov,
     check_not_black,
     check_size,
     read_background,
     read_coverage,
     read_depth,
+    read_photo_view,
     read_picture,
     read_pose,
     read_scene,
-    read_view,
     read_weight,
     seen_by,
-)
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from ..fit import PoseFit
@@ -47,15 +48,12 @@ def add(commands: Any) -> None:
     add_label(parser)
     add_view(parser)
     parser.add_argument(
-        "--init",
-        type=Path,
-        metavar="POSE",
-        help="pose to start from: a pose.json, or mesh to world 4 × 4 by rows as JSON, text or .npy; as in the mesh file when "
-        "left out",
-    )
+        "--init", type=Path, metavar="POSE",
+        help="pose to start from: a pose.json, or mesh to world 4 × 4 by rows as JSON, text or .npy (as in the mesh file)",
+    )  # fmt: skip
     parser.add_argument(
         "--starts", type=_starts, default=1, metavar="N|global",
-        help="so many starts, around --init or turned in all ways; global looks in the whole picture (%(default)s)",
+        help="so many starts, around --init or in all rotations; global searches the whole picture (%(default)s)",
     )  # fmt: skip
     add_resume(parser)
     parser.add_argument(
@@ -64,24 +62,11 @@ def add(commands: Any) -> None:
     add_depth(parser)
     parser.add_argument("--fit-scale", action="store_true", help="also find the scale; the distance then stays")
     parser.add_argument("--fit-focal", action="store_true", help="also find the focal length")
-    parser.add_argument(
-        "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
-    )
-    parser.add_argument(
-        "--size",
-        type=longer_side,
-        default=256,
-        help="most pixels on the longer side (%(default)s)",
-    )
-    parser.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
+    add_background(parser)
+    add_size(parser)
+    add_steps(parser)
     parser.add_argument("--seed", type=number, default=0)
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help=f"for pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}",
-    )
+    add_out(parser, f"pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}")
     add_live(parser)
     parser.set_defaults(run=run)
 
@@ -93,8 +78,8 @@ def _starts(text: str) -> int | str:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds rotation and translation of a mesh in a picture, from a start within about 30° and 15 % of the mesh's size.
-    Ctrl-C keeps the best pose so far, and --resume goes on from there."""
+    """Find rotation and translation of a mesh in a picture, from a start within about 30° and 15 % of the mesh's size. Ctrl-C
+    keeps the best pose so far, and --resume goes on from there."""
     from ..fit import fit_pose
     from . import INTERRUPTED
 
@@ -117,16 +102,15 @@ def run(args: argparse.Namespace) -> int:
     depth = read_depth(args, picture)
     background = read_background(args.background, picture)
     init = None if args.init is None else read_pose(args.init)
-    assumed = assume_fov(args, args.image, (picture.shape[0], picture.shape[1]), args.init)
-    camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
+    camera, assumed = read_photo_view(args, scene, args.image, picture, args.init)
     outputs.make_folder(args.out)
-    outputs.say(assumed)
+    outputs.print_note(assumed)
 
-    with outputs.live(args) as view:
+    with outputs.live_view(args) as view:
 
         def after_step(fit: PoseFit) -> None:
-            # A step takes far longer than this: whatever ends the process, the best pose so far is on disk.
-            with suppress(OSError):  # the last copy will say what is wrong
+            # Writing takes far less time than a step, and keeps the best pose on disk, whatever ends the process.
+            with suppress(OSError):  # the last copy reports errors
                 outputs.write_pose(args.out, fit)
             if view is not None:
                 view(fit)
@@ -137,22 +121,22 @@ def run(args: argparse.Namespace) -> int:
             weight=weight, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed, starts=args.starts,
             callback=after_step, checkpoint=args.out / CHECKPOINT, resume=args.resume,
         )  # fmt: skip
-        # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
-        # are written also when printing failed.
+        # Neither a full disk nor a closed terminal may lose the result. It is printed before the files are written, and they
+        # are written also if printing fails.
         try:
             _print_fit(fit, args.fit_focal)
         finally:
             written = [*outputs.write_outputs(args.out, fit), CHECKPOINT]
         print(f"wrote {', '.join(written)} in {args.out}")
-        outputs.linger(view, fit)
+        outputs.wait_for_close(view, fit)
     return INTERRUPTED if fit.interrupted else 0
 
 
 def _print_fit(fit: PoseFit, focal: bool) -> None:
-    lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", "mesh to world:"]
-    lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
-    if fit.uncertainty is not None:
-        lines.append(f"standard deviation: {fit.uncertainty.words}")
+    lines = [
+        f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}",
+        *outputs.pose_lines(fit),
+    ]
     if fit.scale != 1.0:
         lines.append(f"scale: {fit.scale:.6g}")
     if focal:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import add_depth, add_view, count, longer_side, number
-from .inputs import assume_fov, check_size, read_depth, read_labels, read_picture, read_pose, read_view, seen_by
+from .arguments import add_depth, add_out, add_size, add_steps, add_view, number
+from .inputs import check_size, read_depth, read_labels, read_photo_view, read_picture, read_pose, seen_by
 
 if TYPE_CHECKING:
     from ..fit import PoseFit
@@ -27,24 +27,20 @@ def add(commands: Any) -> None:
         help="pose to start from, for each mesh in their order; as in the mesh files when left out",
     )  # fmt: skip
     parser.add_argument(
-        "--mask",
-        type=Path,
-        help="image of labels of the picture's size: 1 where the first mesh is seen, 2 the second, …",
-    )
+        "--mask", type=Path, help="image of labels of the picture's size: 1 where the first mesh is seen, 2 the second, …"
+    )  # fmt: skip
     add_view(parser)
     add_depth(parser)
-    parser.add_argument("--size", type=longer_side, default=256, help="most pixels on the longer side (%(default)s)")
-    parser.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
+    add_size(parser)
+    add_steps(parser)
     parser.add_argument("--seed", type=number, default=0)
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="for a folder of each mesh, 1, 2, …, as fit-pose writes it"
-    )  # fmt: skip
+    add_out(parser, "a folder of each mesh, 1, 2, …, as fit-pose writes it")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds the poses of several meshes in a photograph, in which they may cover one another, from starts within about 15° and
-    5 % of their sizes. Ctrl-C keeps the best poses so far."""
+    """Find the poses of several meshes in a photograph, in which they may cover one another, from starts within about 15° and 5
+    % of their sizes. Ctrl-C keeps the best poses so far."""
     from .. import Scene, load_scene
     from ..fit import fit_poses
     from . import INTERRUPTED
@@ -61,10 +57,9 @@ def run(args: argparse.Namespace) -> int:
     depth = read_depth(args, picture)
     init = [read_pose(path).matrix for path in args.init] or None
     everything = Scene([mesh for scene in scenes for mesh in scene.meshes])
-    assumed = assume_fov(args, args.image, (picture.shape[0], picture.shape[1]), args.init[0] if args.init else None)
-    camera = read_view(args, everything, (picture.shape[0], picture.shape[1]), args.init[0] if args.init else None)
+    camera, assumed = read_photo_view(args, everything, args.image, picture, args.init[0] if args.init else None)
     outputs.make_folder(args.out)
-    outputs.say(assumed)
+    outputs.print_note(assumed)
     fits = fit_poses(
         scenes, picture, camera, mask, init, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed
     )  # fmt: skip
@@ -82,11 +77,5 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_fit(path: Path, fit: PoseFit) -> None:
-    lines = [
-        f"{path}: {fit.reason}; {fit.explained:.0%} of the edges, {fit.visible:.0%} of it to be seen",
-        "mesh to world:",
-    ]
-    lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
-    if fit.uncertainty is not None:
-        lines.append(f"standard deviation: {fit.uncertainty.words}")
-    print("\n".join(lines), flush=True)
+    said = f"{path}: {fit.reason}; {fit.explained:.0%} of the edges, {fit.visible:.0%} of it to be seen"
+    print("\n".join([said, *outputs.pose_lines(fit)]), flush=True)

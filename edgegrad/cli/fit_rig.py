@@ -8,11 +8,11 @@ from typing import Any
 
 from .arguments import add_descent, add_label, add_live, add_views, count, number
 from .inputs import descent, read_coverage, read_views
-from .outputs import finish, linger, live, make_folder
+from .outputs import finish, live_view, make_folder, wait_for_close
 
 
 def add(commands: Any) -> None:
-    parser = commands.add_parser("fit-rig", help="find the pose of what bends from masks", description=run.__doc__)
+    parser = commands.add_parser("fit-rig", help="find the pose of a rig from masks", description=run.__doc__)
     parser.add_argument(
         "rig", type=Path, metavar="RIG", help="glTF or GLB with a skin or morph targets, or a robot's URDF"
     )
@@ -28,7 +28,7 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds how a skinned mesh or a robot is posed from masks, from coarse to fine, beginning at rest. Ctrl-C keeps the best so
+    """Find how a skinned mesh or a robot is posed from masks, from coarse to fine, beginning at rest. Ctrl-C keeps the best so
     far, and --resume goes on from there."""
     from .. import load_rig, load_robot
     from ..fit import fit_rig
@@ -37,12 +37,12 @@ def run(args: argparse.Namespace) -> int:
     cameras, _, _ = read_views(args)
     masks = [read_coverage(path, args.label) for path in args.images]
     make_folder(args.out)
-    told = {"joints": args.joints, "tries": args.tries, "coarsest": args.coarsest, **descent(args)}
-    with live(args) as view:
-        found = fit_rig(rig, cameras, masks=masks, callback=view, **told)
+    options = {"joints": args.joints, "tries": args.tries, "coarsest": args.coarsest, **descent(args)}
+    with live_view(args) as view:
+        found = fit_rig(rig, cameras, masks=masks, callback=view, **options)
         code = finish(found.fit, args.out, found.save, found.reason)
         unknown = "" if found.uncertainty is None else found.uncertainty.unknown
         if unknown and unknown not in found.reason:
             print(f"not determined by the masks: {unknown}", flush=True)
-        linger(view, found.fit)
+        wait_for_close(view, found.fit)
     return code

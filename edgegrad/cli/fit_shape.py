@@ -8,12 +8,12 @@ from typing import Any
 
 from .arguments import add_descent, add_label, add_live, add_views, count
 from .inputs import descent, read_coverage, read_views
-from .outputs import finish, linger, live, make_folder
+from .outputs import finish, live_view, make_folder, wait_for_close
 
 
 def add(commands: Any) -> None:
     parser = commands.add_parser("fit-shape", help="find a shape from masks", description=run.__doc__)
-    parser.add_argument("mesh", type=Path, metavar="MESH", help="where to begin; its look does not count")
+    parser.add_argument("mesh", type=Path, metavar="MESH", help="where to begin; its materials do not count")
     add_views(parser, "masks, white on the object, or pictures whose alpha is one")
     add_label(parser)
     parser.add_argument("--levels", type=count, default=3, help="from coarse to fine (%(default)s)")
@@ -24,7 +24,7 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds the shape of an object from masks, beginning with the mesh, which a sphere around the object may be. Ctrl-C keeps
+    """Find the shape of an object from masks, beginning with the mesh, which may be a sphere around the object. Ctrl-C keeps
     the best so far, and --resume goes on from there."""
     from .. import load_mesh
     from ..fit import fit_shape
@@ -33,10 +33,10 @@ def run(args: argparse.Namespace) -> int:
     cameras, _, _ = read_views(args)
     masks = [read_coverage(path, args.label) for path in args.images]
     make_folder(args.out)
-    with live(args) as view:
+    with live_view(args) as view:
         fit = fit_shape(
             mesh, cameras, masks=masks, levels=args.levels, faces=args.faces, callback=view, **descent(args)
         )
         code = finish(fit, args.out)
-        linger(view, fit)
+        wait_for_close(view, fit)
     return code

@@ -7,7 +7,7 @@ from typing import Any
 
 from .arguments import add_descent, add_live, add_mesh, add_views, count
 from .inputs import descent, read_background, read_mesh, read_views
-from .outputs import finish, linger, live, make_folder
+from .outputs import finish, live_view, make_folder, wait_for_close
 
 
 def add(commands: Any) -> None:
@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds the texture of a mesh that has texture coordinates from pictures of it. Ctrl-C keeps the best so far, and --resume
+    """Find the texture of a mesh that has texture coordinates from pictures of it. Ctrl-C keeps the best so far, and --resume
     goes on from there."""
     from ..fit import fit_texture
 
@@ -36,17 +36,10 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("--background: expected none with images that have alpha, got both; leave one out")
     background = read_background(args.background, pictures[0])
     make_folder(args.out)
-    with live(args) as view:
+    with live_view(args) as view:
         fit = fit_texture(
-            mesh,
-            cameras,
-            pictures,
-            args.size,
-            masks=masks or None,
-            background=background,
-            callback=view,
-            **descent(args),
-        )
+            mesh, cameras, pictures, args.size, masks=masks or None, background=background, callback=view, **descent(args)
+        )  # fmt: skip
         code = finish(fit, args.out)
-        linger(view, fit)
+        wait_for_close(view, fit)
     return code

@@ -1,4 +1,4 @@
-"""What commands read: pictures, masks, backgrounds, poses and views."""
+"""Read pictures, masks, backgrounds, poses and views for commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from .arguments import CHECKPOINT
 
-FOV = 40.0  # degrees, the vertical field of view where nothing is said of it
+FOV = 40.0  # degrees, the default vertical field of view
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def read_scene(args: argparse.Namespace) -> Scene:
-    """The mesh file, with --texture and --no-materials. Raises what load_scene raises, in words of the command line."""
+    """Return the mesh file, with --texture and --no-materials. Raises what load_scene raises, in words of the command line."""
     from .. import Scene, load_scene
 
     if args.texture is not None:
@@ -31,7 +31,7 @@ def read_scene(args: argparse.Namespace) -> Scene:
 
 
 def read_mesh(args: argparse.Namespace) -> Mesh:
-    """The mesh file as one mesh; see read_scene."""
+    """Return the mesh file as one mesh, as read_scene reads it."""
     from .. import load_mesh
 
     with _in_words_of_the_shell():
@@ -50,7 +50,7 @@ def _in_words_of_the_shell() -> Iterator[None]:
 
 
 def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
-    """(H, W, 3), and (H, W) from its alpha where that says anything."""
+    """Return (H, W, 3), and (H, W) from its alpha if any is below 1."""
     from .. import read_image
 
     image = read_image(path, channels=4)
@@ -59,8 +59,8 @@ def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
 
 
 def seen_by(camera: Path | None, image: Path) -> Path:
-    """The image as the camera of a file speaks of it: upright, for so commands read pictures whose cameras they write; or as it
-    is stored, where that alone is in proportion to the camera. Tells which, where the EXIF orientation leaves it open."""
+    """Return the image as the camera file refers to it: upright, as commands read pictures whose cameras they write; or as
+    stored, if only that is in proportion to the camera. A note says which if the EXIF orientation leaves it open."""
     from .. import load_camera
     from ..files.formats.views import resized
     from ..files.image import read_orientation, read_size
@@ -80,7 +80,7 @@ def seen_by(camera: Path | None, image: Path) -> Path:
 
 
 def read_coverage(path: Path, label: int | None = None) -> Tensor:
-    """(H, W) as edgegrad.read_mask reads it. Raises what that raises, in words of the command line."""
+    """Return (H, W) as edgegrad.read_mask reads it. Raises what that raises, in words of the command line."""
     from .. import read_mask
 
     with _in_words_of_the_shell():
@@ -88,7 +88,7 @@ def read_coverage(path: Path, label: int | None = None) -> Tensor:
 
 
 def read_labels(path: Path, count: int) -> list[Tensor]:
-    """Of each of so many meshes (H, W), where an image of labels has its number, from 1. Raises what read_mask raises."""
+    """Return (H, W) for each of so many meshes, where an image of labels has its number, from 1. Raises what read_mask raises."""
     from .. import read_mask
 
     found = []
@@ -102,15 +102,15 @@ def read_labels(path: Path, count: int) -> list[Tensor]:
 
 
 def read_weight(path: Path) -> Tensor:
-    """(H, W), how much a pixel counts. Raises what edgegrad.read_mask raises."""
+    """Return (H, W), how much a pixel counts. Raises what edgegrad.read_mask raises."""
     from ..files.mask import read_weight
 
     return read_weight(path)
 
 
 def read_depth(args: argparse.Namespace, picture: Tensor) -> Tensor | None:
-    """(H, W) of --depth and --depth-scale, for a picture (H, W, 3). Raises what edgegrad.read_depth raises, in words of the
-    command line."""
+    """Return (H, W) from --depth and --depth-scale, for a picture (H, W, 3). Raises what edgegrad.read_depth raises, in words
+    of the command line."""
     from .. import read_depth
 
     if args.depth is None:
@@ -130,7 +130,7 @@ def read_depth(args: argparse.Namespace, picture: Tensor) -> Tensor | None:
 
 
 def check_size(image: Tensor, picture: Tensor, path: Path, like: Path) -> None:
-    """Raises ValueError."""
+    """Check that an image has the picture's size. Raises ValueError."""
     if image.shape[:2] != picture.shape[:2]:
         raise ValueError(f"{path}: expected {_size(picture)} pixels like {like}, got {_size(image)}")
 
@@ -140,7 +140,7 @@ def _size(image: Tensor) -> str:
 
 
 def read_background(text: str | None, picture: Tensor) -> Tensor | None:
-    """A colour (3,) from #rrggbb, or an image (H, W, 3)."""
+    """Return a colour (3,) from #rrggbb, or an image (H, W, 3)."""
     import torch
 
     from ..files.image import read_image, srgb_to_linear
@@ -161,7 +161,7 @@ def read_background(text: str | None, picture: Tensor) -> Tensor | None:
 
 
 def check_not_black(mask: Tensor, path: Path) -> None:
-    """Raises ValueError."""
+    """Check that a mask is not black. Raises ValueError."""
     if not bool((mask > 0.0).any()):
         raise ValueError(
             f"{path}: expected a mask, white on the object, got one that is black; is it the object's mask?"
@@ -169,7 +169,7 @@ def check_not_black(mask: Tensor, path: Path) -> None:
 
 
 def read_pose(path: Path) -> Pose:
-    """From what fit-pose or track writes, or mesh to world 4 × 4 by rows: JSON, text or .npy. Raises ValueError or OSError."""
+    """Read what fit-pose or track writes, or mesh to world 4 × 4 by rows as JSON, text or .npy. Raises ValueError or OSError."""
     import numpy as np
 
     from ..files.paths import check_readable
@@ -189,7 +189,7 @@ def read_pose(path: Path) -> Pose:
 
 
 def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | None, pose_file: Path | None) -> Camera:
-    """From --camera; else from the pose file, unless a view is described; else one that frames the mesh."""
+    """Return the camera of --camera; or that of the pose file, unless a view is described; or one that frames the mesh."""
     import torch
 
     from .. import load_camera
@@ -200,9 +200,7 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
     camera, source = None, args.camera
     if args.camera is not None:
         if described:
-            raise ValueError(
-                "--camera: expected none of --fov, --eye, --target, --up beside it, got both; leave one out"
-            )
+            raise ValueError("--camera: expected none of --fov, --eye, --target, --up with it, got both; leave one out")
         by_size = args.camera.suffix.lower() in (".gltf", ".glb")  # which have none of their own
         camera = load_camera(args.camera, torch.float64, (size or (512, 512)) if by_size else None)
     elif pose_file is not None and not described:
@@ -217,9 +215,18 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
     return fitting(camera, size, source)
 
 
+def read_photo_view(
+    args: argparse.Namespace, scene: Scene, photo: Path, picture: Tensor, pose_file: Path | None
+) -> tuple[Camera, str]:
+    """Return the camera of a photograph (H, W, 3), and in words what is assumed of it."""
+    size = picture.shape[0], picture.shape[1]
+    assumed = assume_fov(args, photo, size, pose_file)
+    return read_view(args, scene, size, pose_file), assumed
+
+
 def assume_fov(args: argparse.Namespace, photo: Path, size: tuple[int, int], pose_file: Path | None) -> str:
-    """Where neither --camera nor --fov nor the pose file has a focal length, take --fov from the photograph's EXIF data, or else
-    40°. In words, what is assumed; empty where nothing is."""
+    """Set --fov from the photograph's EXIF data, or else to 40°, if neither --camera nor --fov nor the pose file has a focal
+    length. Return in words what is assumed; empty if nothing is."""
     import math
 
     from ..files.focal import read_focal
@@ -246,20 +253,20 @@ def _has_camera(pose_file: Path) -> bool:
 
 
 def fitting(camera: Camera, size: tuple[int, int], source: Path) -> Camera:
-    """The camera for a picture of that size. Raises ValueError that names its file, unless they are in proportion."""
+    """Return the camera for a picture of that size. Raises ValueError that names its file, unless they are in proportion."""
     from ..files.formats.views import resized
 
     found = resized(camera, size)
     if found is None:
         (H, W), (h, w) = size, camera.size
         raise ValueError(
-            f"{source}: expected a camera for {W} × {H} pixels or in proportion, got {w} × {h}; crop alike"
+            f"{source}: expected a camera for {W} × {H} pixels or in proportion, got {w} × {h}; crop it likewise"
         )
     return found
 
 
 def read_views(args: argparse.Namespace) -> tuple[list[Camera], list[Tensor], list[Tensor | None]]:
-    """Cameras of the images' sizes, images (H, W, 3), and alphas (H, W). Raises ValueError."""
+    """Return cameras of the images' sizes, images (H, W, 3), and alphas (H, W). Raises ValueError."""
     from .. import load_camera
 
     if len(args.camera) != len(args.images):
@@ -275,7 +282,7 @@ def read_views(args: argparse.Namespace) -> tuple[list[Camera], list[Tensor], li
 
 
 def descent(args: argparse.Namespace) -> dict[str, Any]:
-    """What arguments.add_descent asked for, as options of a fit."""
+    """Return the options of a fit that arguments.add_descent asked for."""
     return {
         "steps": args.steps, "spp": args.spp, "seed": args.seed, "checkpoint": args.out / CHECKPOINT, "resume": args.resume,
     }  # fmt: skip

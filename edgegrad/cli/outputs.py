@@ -1,4 +1,4 @@
-"""What commands write."""
+"""Write what commands find."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def make_folder(folder: Path) -> None:
-    """Before the work rather than after it. Raises OSError."""
+    """Make the folder, so that an error does not come after the work. Raises OSError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
@@ -28,15 +28,15 @@ def make_folder(folder: Path) -> None:
         ) from error
 
 
-def say(text: str) -> None:
-    """On standard error, where there is anything to say."""
+def print_note(text: str) -> None:
+    """Print a note on standard error, if there is one."""
     if text:
         print(text, file=sys.stderr)
 
 
 @contextmanager
-def live(args: argparse.Namespace) -> Iterator[Viewer | None]:
-    """The live view that --view asks for. Whoever ends the block has saved the result. Raises ImportError without viser."""
+def live_view(args: argparse.Namespace) -> Iterator[Viewer | None]:
+    """Open the live view that --view asks for. The block has to save the result. Raises ImportError without viser."""
     if not args.view:
         yield None
         return
@@ -47,8 +47,8 @@ def live(args: argparse.Namespace) -> Iterator[Viewer | None]:
         yield view
 
 
-def linger(view: Viewer | None, fit: Fit | PoseFit | CameraFit) -> None:
-    """Shows the result until the user has seen it, unless they ended the fit."""
+def wait_for_close(view: Viewer | None, fit: Fit | PoseFit | CameraFit) -> None:
+    """Show the result until the user closes the page, unless they ended the fit."""
     if view is not None and not fit.interrupted:
         view.show(fit)
         print(f"live view: {view.url} until Ctrl-C or Close", flush=True)
@@ -56,14 +56,21 @@ def linger(view: Viewer | None, fit: Fit | PoseFit | CameraFit) -> None:
 
 
 def write_pose(folder: Path, fit: PoseFit) -> None:
-    from ..files.paths import replacing
+    from ..files.paths import write_text
 
-    with replacing(folder / "pose.json") as temporary:
-        temporary.write_text(fit.to_json() + "\n", encoding="utf-8")
+    write_text(folder / "pose.json", fit.to_json() + "\n")
+
+
+def pose_lines(fit: PoseFit) -> list[str]:
+    """Return the matrix, and how exactly it is known, as lines of text."""
+    rows = ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
+    known = [] if fit.uncertainty is None else [f"standard deviation: {fit.uncertainty.words}"]
+    return ["mesh to world:", *rows, *known]
 
 
 def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
-    """The names of what was written; without the libraries of figures the pose alone. Raises OSError that names what was not."""
+    """Write the result and return the names of the files; without the libraries of figures the pose alone. Raises OSError that
+    names the file."""
     names = ["pose.json"] + ["fit.png", "loss.png", "fit.webp"] * bool(fit.history and _can_draw())
     for name in names:
         try:
@@ -86,7 +93,7 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
 
 
 def finish(fit: Fit, folder: Path, save: Callable[..., list[str]] | None = None, reason: str | None = None) -> int:
-    """Says how a fit by descent ended and writes it all, by its own reason and save() unless others are given; the exit code.
+    """Print how a fit by descent ended and save it, by its own reason and save() unless others are given; return the exit code.
     Raises OSError."""
     from . import INTERRUPTED
     from .arguments import CHECKPOINT

@@ -21,18 +21,15 @@ def add(commands: Any) -> None:
     parser.add_argument("--pose", type=Path, metavar="POSE.json", help="where to put the mesh, as fit-pose writes it")
     parser.add_argument("--background", help="#rrggbb or an image; black when left out")
     parser.add_argument(
-        "--size",
-        type=shape,
-        metavar="WIDTHxHEIGHT",
-        help="pixels; one number for a square (the camera's, or 512x512)",
-    )
+        "--size", type=shape, metavar="WIDTHxHEIGHT", help="pixels; one number for a square (the camera's, or 512x512)"
+    )  # fmt: skip
     parser.add_argument("--spp", type=count, default=64, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Renders a mesh to an image file; one without colours under a headlight."""
+    """Render a mesh to an image file; one without colours under a headlight."""
     import torch
 
     from .. import render, write_image

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Iterator
@@ -14,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import add_mesh, add_view, count, longer_side, number
+from .arguments import add_mesh, add_out, add_size, add_view, count, number
 from .films import MOST_FPS, USUAL_FPS, read_film, write_film
-from .inputs import assume_fov, read_pose, read_scene, read_view
+from .inputs import read_photo_view, read_pose, read_scene
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from ..fit import TrackedPose
     from ..scene.scene import Scene
 
-EVERY = 10  # frames from one poses.json to the next
+EVERY = 10  # frames between two writings of poses.json
 FOUND, LOST = (60, 230, 90), (230, 60, 60)  # colours of contours
 
 
@@ -35,26 +34,17 @@ def add(commands: Any) -> None:
     parser.add_argument("film", type=Path, metavar="VIDEO_OR_FOLDER", help="a video, or a folder of images, by name")
     add_view(parser)
     parser.add_argument(
-        "--init",
-        type=Path,
-        metavar="POSE.json",
-        required=True,
-        help="pose in the first frame, as fit-pose writes it; or the poses.json of a film that this one goes on from: the last "
-        "pose that is not lost",
-    )
-    parser.add_argument("--size", type=longer_side, default=256, help="most pixels on the longer side (%(default)s)")
+        "--init", type=Path, metavar="POSE.json", required=True,
+        help="pose in the first frame, as fit-pose writes it; or the poses.json of a film that this one continues: the last pose "
+        "that is not lost",
+    )  # fmt: skip
+    add_size(parser)
     parser.add_argument("--spp", type=count, default=8, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.add_argument(
         "--fps", type=_rate, help=f"frames a second of the film that is written (the video's; of a folder {USUAL_FPS})"
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="for poses.json, frames with contours, and film.mp4 or .webp",
-    )
+    add_out(parser, "poses.json, frames with contours, and film.mp4 or .webp")
     parser.set_defaults(run=run)
 
 
@@ -65,7 +55,7 @@ def _rate(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Follows a mesh through the frames of a video, from its pose in the first one. poses.json is written every few frames;
+    """Follow a mesh through the frames of a video, from its pose in the first one. poses.json is written every few frames;
     Ctrl-C and broken frames keep the poses so far."""
     from ..fit import track
     from . import INTERRUPTED
@@ -73,10 +63,9 @@ def run(args: argparse.Namespace) -> int:
     scene, init = read_scene(args), read_pose(args.init)
     frames, fps = read_film(args.film, args.camera)
     first = next(frames)
-    assumed = assume_fov(args, args.film, (first.shape[0], first.shape[1]), args.init)
-    camera = read_view(args, scene, (first.shape[0], first.shape[1]), args.init)
+    camera, assumed = read_photo_view(args, scene, args.film, first, args.init)
     outputs.make_folder(args.out)
-    outputs.say(assumed)
+    outputs.print_note(assumed)
     overlays = args.out / "frames"
     overlays.mkdir(exist_ok=True)
     shown: list[Tensor] = []
@@ -93,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         for pose in track(scene, watched(), camera, init.matrix, max_size=args.size, spp=args.spp, seed=args.seed):
             poses.append(pose)
             if pose.index % EVERY == 0:
-                with suppress(OSError):  # the last copy will say what is wrong
+                with suppress(OSError):  # the last copy reports errors
                     _write_poses(args.out, poses)
             state = "lost" if pose.lost else f"{pose.explained:.0%} of the edges"
             print(f"frame {pose.index}: {state}", file=sys.stderr)
@@ -117,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write_poses(folder: Path, poses: list[TrackedPose]) -> None:
-    from ..files.paths import replacing
+    from ..files.paths import write_json
 
     rows = [
         {
@@ -127,12 +116,11 @@ def _write_poses(folder: Path, poses: list[TrackedPose]) -> None:
         }
         for pose in poses
     ]  # fmt: skip
-    with replacing(folder / "poses.json") as temporary:
-        temporary.write_text(json.dumps({"poses": rows}, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / "poses.json", {"poses": rows}, indent=1)
 
 
 def _write_overlay(path: Path, frame: Tensor, scene: Scene, camera: Camera, pose: TrackedPose) -> None:
-    """The frame with the contour of the mesh."""
+    """Write the frame with the contour of the mesh."""
     import torch
 
     from .. import render_aovs, write_image

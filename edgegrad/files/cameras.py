@@ -173,7 +173,6 @@ def load_cameras(
 
 
 def _views(path: PathLike, size: tuple[int, int] | None, images: PathLike | None, unread: UnreadLog) -> dict[str, View]:
-    """Return the views in float64."""
     folder = Path(path) if isinstance(path, (str, os.PathLike)) else None
     if folder is not None and folder.is_dir():
         place = colmap.find(folder)

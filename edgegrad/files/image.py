@@ -108,10 +108,8 @@ def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb
     JPEG, BMP, WebP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1; floating-point pixels (EXR, HDR,
     float TIFF) are linear already. Alpha is the last channel, not gamma-corrected and not multiplied into the colours: a TIFF's
     associated alpha is divided out where it is above 0. EXR files hold colours times alpha, and these stay so. At most 2³⁰
-    pixels times channels are read. read_mask() reads masks.
-
-    Raises FileNotFoundError, PermissionError, TypeError, ValueError (another kind of file, damaged, too large, colours that do
-    not convert) or ImportError without OpenImageIO.
+    pixels times channels are read. read_mask() reads masks. Raises FileNotFoundError, PermissionError, TypeError, ValueError
+    (another kind of file, damaged, too large, colours that do not convert) or ImportError without OpenImageIO.
 
     Parameters
     ----------
@@ -163,7 +161,6 @@ def read_orientation(path: PathLike) -> int:
 
 
 def _header(path: PathLike) -> Any:
-    """Return an ImageBuf of which only the header is read."""
     file = check_readable(path, READABLE)
     stored = require("OpenImageIO", "OpenImageIO", "reading images").ImageBuf(str(file))
     spec = stored.spec()
@@ -177,10 +174,9 @@ def write_image(path: PathLike, img: Tensor) -> None:
 
     PNG, JPEG, BMP and TIFF are clipped to 0 … 1, sRGB, 8 bit, rounded to nearest, with up to 4 channels (of 2 and 4 the last is
     alpha, not gamma-corrected; JPEG holds 1 or 3). HDR is linear with 3 channels. EXR is linear float32 with any number. The
-    file appears whole or not at all; an existing one is replaced, and missing folders are made.
-
-    Raises ValueError (unknown ending, wrong shape, NaN or infinity), TypeError (not floating-point), OSError (cannot write) or
-    ImportError without OpenImageIO.
+    file appears whole or not at all; an existing one is replaced, and missing folders are made. Raises ValueError (unknown
+    ending, wrong shape, NaN or infinity), TypeError (not floating-point), OSError (cannot write) or ImportError without
+    OpenImageIO.
 
     Parameters
     ----------

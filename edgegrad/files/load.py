@@ -65,9 +65,8 @@ def load_mesh(
     coordinates are indexed apart, v running up, and are kept without a texture, too. Where welded vertices had different
     colours, they become `corner_colors`. STL gives the shape only. The top of this module says what colours mean. Parts of one
     appearance (all plain, all with vertex colours, all with face colours, all on one texture; lit, all with one material)
-    become one Mesh. Files that the file names are read from its folder and below, and from nowhere else.
-
-    Raises FileNotFoundError (the file, or one that it names), ValueError (another kind of file, damaged, without triangles, bad
+    become one Mesh. Files that the file names are read from its folder and below, and from nowhere else. Raises
+    FileNotFoundError (the file, or one that it names), ValueError (another kind of file, damaged, without triangles, bad
     indices or positions, or parts of different appearance: use load_scene), TypeError, or ImportError without trimesh, or
     without mapbox_earcut where a file has concave faces with more than four corners.
 

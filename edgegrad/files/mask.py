@@ -163,7 +163,6 @@ def _numbers(path: PathLike, color: Tensor, largest: int | None) -> Tensor:
 
 
 def _whole(grey: Tensor, largest: int) -> Tensor:
-    """Return the integers that are stored, int64."""
     return (grey.double() * largest).round().long()
 
 

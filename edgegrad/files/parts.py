@@ -12,8 +12,7 @@ import numpy as np
 from ..camera.camera import Camera
 from ..scene.material import Material
 from .formats import gltf, gltf_material, gltf_rig, obj, off, ply, stl, threemf
-from .formats.context import LoadContext, linear_colors
-from .formats.file_type import check_file_type
+from .formats.context import LoadContext, check_file_type, linear_colors
 from .formats.geometry import checked, shape, turned, typed
 from .formats.gltf_nodes import cameras, lights
 from .formats.gltf_scene import instances as gltf_instances

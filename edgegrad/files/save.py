@@ -103,23 +103,22 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     and emission of vertices become their mean, because glTF has none. A Lambertian material is one without a highlight
     (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an OBJ also a texture, which is written next to it with
     its .mtl; STL and OFF hold the shape alone. Positions in PLY, STL and GLB are float32; those in OBJ and OFF have all digits
-    of the mesh's type. A warning names what is left out, rounded or clipped. Missing folders are made.
-
-    Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+    of the mesh's type. A warning names what is left out, rounded or clipped. Missing folders are made. Raises TypeError or
+    ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
     """
     file = check_suffix(path, WRITTEN)
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; a Scene is for save_scene")
     _check_channels(mesh)
     kind = file.suffix.lower()[1:]
-    beside = {}
+    extra_files = {}
     if kind == "glb":
         content, lost = to_glb(mesh)
     else:
         made, lost = to_trimesh(mesh, faces_colored=kind != "obj"), _left_out(mesh, kind)
         dtype = _array(mesh.verts).dtype
         if kind == "obj":
-            content, beside = to_obj(made, dtype, file.stem)
+            content, extra_files = to_obj(made, dtype, file.stem)
         else:
             content = to_off(made, dtype) if kind == "off" else made.export(file_type=kind)
     if kind in ("ply", "stl", "glb") and rounding(mesh.verts.detach().cpu().numpy())[1]:
@@ -130,7 +129,7 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
             f"save_mesh: {file.name} holds no {', no '.join(lost)}; "
             "torch.save(Scene(mesh).state_dict(), path) keeps all of a Mesh",
         )
-    for name, data in {**beside, file.name: content}.items():
+    for name, data in {**extra_files, file.name: content}.items():
         with replacing(file.parent / Path(name).name) as temporary:
             temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
@@ -142,9 +141,8 @@ def save_scene(
 
     `load_scene(path, lit=True)` reads the meshes in their order and the lights, load_cameras(path, size) the cameras. A glTF
     has no environments, spherical harmonics, backgrounds or lenses, and no cameras whose principal point is off the middle or
-    whose pixels are not square: a warning names what is left out, rounded or clipped. Missing folders are made.
-
-    Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+    whose pixels are not square: a warning names what is left out, rounded or clipped. Missing folders are made. Raises
+    TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
 
     Parameters
     ----------

@@ -32,7 +32,8 @@ def visual_hull(
     As the start of fit_shape() it has the object's holes, and its parts where some view shows them apart.
 
     cameras     at least two that look at the object from different sides
-    masks       (H, W) each, 1 on the object, 0 elsewhere; where a mask touches a side of its image, the object may go on beyond
+    masks       (H, W) each, 1 on the object, 0 elsewhere; nothing is cut away beyond a side of an image that its mask touches,
+                for the object may go on there
     resolution  cells on the longest side of the box around the object; smaller details are lost
     faces       about so many even triangles; few are best for the first level of fit_shape(). None: those of the cells
     bounds      (2, 3) opposite corners of a box that holds the object; None: found from the cameras

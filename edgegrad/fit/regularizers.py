@@ -13,20 +13,21 @@ from ..scene.rows import areas, unit
 
 def edges(faces: Tensor) -> Tensor:
     """Return every edge (E, 2) int64 once, its smaller vertex first."""
-    f = faces.long()
-    pairs = torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).sort(dim=1).values
-    return torch.unique(pairs, dim=0)
+    return torch.unique(_sides(faces), dim=0)
 
 
 def edge_pairs(faces: Tensor) -> Tensor:
     """Return the two faces (P, 2) int64 of every edge that has two."""
-    f = faces.long()
-    sides = torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).sort(dim=1).values
-    owner = torch.arange(len(f)).repeat(3)
-    _, inverse, counts = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
+    owner = torch.arange(len(faces)).repeat(3)
+    _, inverse, counts = torch.unique(_sides(faces), dim=0, return_inverse=True, return_counts=True)
     inner = (counts == 2)[inverse]
     order = torch.argsort(inverse[inner], stable=True)
     return owner[inner][order].reshape(-1, 2)
+
+
+def _sides(faces: Tensor) -> Tensor:
+    f = faces.long()
+    return torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).sort(dim=1).values
 
 
 def laplacian(verts: Tensor, faces: Tensor) -> Tensor:

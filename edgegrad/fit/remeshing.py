@@ -10,6 +10,7 @@ import torch
 
 from ..optional import require
 from ..scene.mesh import Mesh
+from ..scene.rows import areas
 
 REMESHING_ROUNDS = 5
 
@@ -17,8 +18,7 @@ REMESHING_ROUNDS = 5
 def remeshed(mesh: Mesh, faces: int) -> Mesh:
     """Return a mesh of about so many even triangles on the same surface (Botsch and Kobbelt 2004), by gpytoolbox. Raises
     ImportError."""
-    a, b, c = mesh.verts.double()[mesh.faces.long()].unbind(1)
-    area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+    area = 0.5 * float(areas(mesh.verts.double()[mesh.faces.long()]).norm(dim=1).sum())
     edge = math.sqrt(4.0 * area / (math.sqrt(3.0) * faces))  # of equilateral triangles with that area
     verts, triangles = gpytoolbox("remeshing").remesh_botsch(
         mesh.verts.double().numpy(), mesh.faces.numpy().astype(np.int32), REMESHING_ROUNDS, edge, True

@@ -34,7 +34,7 @@ from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
 from ..scene.texel_borders import TexelBorders
 from ..scene.tree import tensors_in
-from ..shader import Effort, render_shaded, shaded_points
+from ..shader import Effort, Radiance, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
 from .antithetic import SET_SIZE, SETS
@@ -117,7 +117,6 @@ class Lighting(NamedTuple):
         additive = not scene.blends
         effort = Effort(
             points=points,
-            kernel_image=(lambda frame: _kernel_image(frame, *in_image)) if fused and additive else None,
             blended=scene.blends,
             lit=True,
             glossy=scene.is_glossy,
@@ -125,41 +124,23 @@ class Lighting(NamedTuple):
             gives_derivatives=fused and additive,
             additive=additive,
             closer=CLOSER_STEPS if self.bounces > 1 else 1.0,
-            steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
             # The kernel, which finds light that is scattered more than once, reads its texels by itself.
             step_margin=NEXT_TO_TEXELS if self.bounces > 1 else 0.0,
-            # Comparisons see borders, which visibility=False leaves out; and layers behind others have none.
-            near_field=self._sliding if self.bounces > 1 and additive and request.gradient.visibility else None,
-            indirect=self._indirect if self.bounces > 1 else None,
-            watch=watch,
         )
-        image = render_shaded(scene, camera, self, request, creases, False, effort)
+        lit = _LitRadiance(
+            self,
+            in_image if fused and additive else None,
+            declares_steps=additive and _has_moving_steps(scene, camera),
+            # Comparisons see borders, which visibility=False leaves out; and layers behind others have none.
+            near_field=self.bounces > 1 and additive and request.gradient.visibility,
+        )
+        image = render_shaded(scene, camera, lit, request, creases, False, effort, watch)
         if not scene.is_lit:  # as the kernel has it where there are no mipmaps
             image = image.to(image_dtype(scene))
         # A graph from all tensors, whatever is in view and whatever is lit.
         for tensor in unreached(image, tensors_in((scene, camera))):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
-
-    def _indirect(self, frame: Frame, watch: Watch) -> list[Term]:
-        """What samples on the borders of light that is scattered more than once give to the image."""
-        terms: list[Term] = []
-        if self.shadows:
-            with watch.part("unseen shadows"):
-                terms += indirect_shadows(frame, self.bounces, watch)
-        with watch.part("bounce edges"):
-            options = Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces, near=radius(frame))
-            terms += secondary_edges(frame, options)
-        return terms
-
-    def _sliding(self, frame: Frame, hits: Hits) -> tuple[float, Tensor]:
-        """How light from nearby changes as hits slide on their faces, and how near that is."""
-        near, scene = radius(frame), frame.surfaces.scene
-        declare = declare_steps if any(nearest_textures(mesh) for mesh in scene.meshes) else None
-        nearby = NearField(
-            frame, hits, lambda there: in_kernel.indirect(there, self.shadows, self.bounces, near), declare
-        )
-        return near, nearby.slid() if near > 0 else hits._exact.new_zeros((len(hits), 1)).to(frame.dtype)
 
     @staticmethod
     def resamples(scene: Scene) -> bool:
@@ -184,6 +165,56 @@ class Lighting(NamedTuple):
     def __call__(self, hits: Hits) -> Tensor:
         more = AT_CURVES if hits._on_curve and self.resamples(hits._surfaces.scene) else 1
         return radiance(hits, *self._replace(samples=more * self.samples))
+
+
+class _LitRadiance(Radiance):
+    """The radiance of a lit scene."""
+
+    def __init__(
+        self, lighting: Lighting, in_image: tuple[Lighting, int] | None, declares_steps: bool, near_field: bool
+    ) -> None:
+        """`in_image`: the lighting, and the points of a face in a pixel, of an image that the kernel shades at once."""
+        self._lighting, self._in_image, self.declares_steps, self._near_field = (
+            lighting,
+            in_image,
+            declares_steps,
+            near_field,
+        )
+
+    def __call__(self, hits: Hits) -> Tensor:
+        return self._lighting(hits)
+
+    def image(self, frame: Frame) -> Tensor | None:
+        return None if self._in_image is None else _kernel_image(frame, *self._in_image)
+
+    def steps(self, hits: Hits) -> None:
+        declare_steps(hits)
+
+    def near_field(self, frame: Frame, hits: Hits) -> tuple[float, Tensor] | None:
+        if not self._near_field:
+            return None
+        near, scene, shadows, bounces = (
+            radius(frame),
+            frame.surfaces.scene,
+            self._lighting.shadows,
+            self._lighting.bounces,
+        )
+        declare = declare_steps if any(nearest_textures(mesh) for mesh in scene.meshes) else None
+        nearby = NearField(frame, hits, lambda there: in_kernel.indirect(there, shadows, bounces, near), declare)
+        return near, nearby.slid() if near > 0 else hits._exact.new_zeros((len(hits), 1)).to(frame.dtype)
+
+    def indirect(self, frame: Frame, watch: Watch) -> list[Term]:
+        shadows, bounces = self._lighting.shadows, self._lighting.bounces
+        terms: list[Term] = []
+        if bounces == 1:
+            return terms
+        if shadows:
+            with watch.part("unseen shadows"):
+                terms += indirect_shadows(frame, bounces, watch)
+        with watch.part("bounce edges"):
+            options = Options(shadows, samples=1, dark=0.0, bounces=bounces, near=radius(frame))
+            terms += secondary_edges(frame, options)
+        return terms
 
 
 def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:

@@ -14,7 +14,7 @@ from ..aovs import render_aovs
 from ..camera.camera import Camera
 from ..fit import Calibration, CameraFit, Fit, PoseFit, Progress, RigFit
 from ..fit.contour_colors import draw_contour
-from ..fit.pose.photo.shown import shown
+from ..fit.pose.photo.overlay import overlay
 from ..fit.pose.result import Step
 from ..fit.pose.task import PoseTask
 from ..fit.views import Images, Observation, area_mean, cameras_of, displayed, views_of
@@ -111,7 +111,7 @@ def _snapshot_from_pose(task: PoseTask, step: Step) -> Snapshot:
     def render(index: int) -> Tensor:
         one = dataclasses.replace(task, shots=[task.shots[index]])
         factor = min(1.0, MAX_SIDE / max(one.shots[0].camera.size))
-        return shown(one, one.level(factor, blur=0.0, coarseness=1.0, spp=SPP, free=[]), step.pose)[0]
+        return overlay(one, one.level(factor, blur=0.0, coarseness=1.0, spp=SPP, dofs=[]), step.pose)[0]
 
     cameras = [task.lens(shot.camera, step.pose) for shot in task.shots]
     return Snapshot(task.scene, step.pose.matrix, cameras, [shot.target for shot in task.shots], render)

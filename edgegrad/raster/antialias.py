@@ -37,9 +37,8 @@ class TopologyHash:
 
 
 def antialias_construct_topology_hash(tri: Tensor) -> TopologyHash:
-    """Return which triangles share edges, for `antialias`, which otherwise finds it at each call.
-
-    Raises TypeError or ValueError that names the argument.
+    """Return which triangles share edges, for `antialias`, which otherwise finds it at each call. Raises TypeError or
+    ValueError that names the argument.
 
     Parameters
     ----------
@@ -75,9 +74,8 @@ def antialias(
     that of this mean. It is unbiased, also where triangles are small or seen from their edge and no centre shows them. A
     sample's colour is that of the pixel, among the nine around it, that shows its triangle; if none does, of another one that
     does; if none in the image does, of the one of the nine that shows the surface nearest in depth. Background has the colour
-    of the nearest pixel without a triangle. Edges between triangles of one surface count, too.
-
-    Raises TypeError or ValueError that names the argument.
+    of the nearest pixel without a triangle. Edges between triangles of one surface count, too. Raises TypeError or ValueError
+    that names the argument.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..check import as_tensor, check_finite, check_int
+from ..check import as_tensor, check_choice, check_finite, check_int
 from ..library import core
 from .tensors import check_image, contiguous, to_kernel
 
@@ -80,10 +80,8 @@ def texture(
     max_mip_level : int
         The last level that is used.
     """
-    if filter_mode not in FILTERS:
-        raise ValueError(f"filter_mode: expected one of {', '.join(FILTERS)}, got {filter_mode!r}")
-    if boundary_mode not in BORDERS:
-        raise ValueError(f"boundary_mode: expected one of {', '.join(BORDERS)}, got {boundary_mode!r}")
+    check_choice("filter_mode", filter_mode, FILTERS)
+    check_choice("boundary_mode", boundary_mode, BORDERS)
     if filter_mode == "auto":
         filter_mode = "linear" if uv_da is None and mip_level_bias is None else "linear-mipmap-linear"
     by_level = "mipmap" in filter_mode

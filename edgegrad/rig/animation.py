@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ..check import as_double, as_tensor, check_finite, check_shape
+from ..check import as_double, as_tensor, check_choice, check_finite, check_shape
 from .joints import Joints
 from .rotations import roma
 
@@ -43,10 +43,8 @@ class Channel:
     interpolation: str = "LINEAR"
 
     def __post_init__(self) -> None:
-        if self.path not in PATHS:
-            raise ValueError(f"path: expected one of {', '.join(PATHS)}, got {self.path!r}")
-        if self.interpolation not in INTERPOLATIONS:
-            raise ValueError(f"interpolation: expected one of {', '.join(INTERPOLATIONS)}, got {self.interpolation!r}")
+        check_choice("path", self.path, PATHS)
+        check_choice("interpolation", self.interpolation, INTERPOLATIONS)
         times = as_double("times", self.times, ("K",))
         n: int | str = {"rotation": 4, "weights": "n"}.get(self.path, 3)
         shape = (len(times), 3, n) if self.interpolation == "CUBICSPLINE" else (len(times), n)

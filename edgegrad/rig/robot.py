@@ -195,7 +195,6 @@ def _limit(joint: Any, side: str, unread: UnreadLog) -> float:
 
 @contextmanager
 def _errors_with_path(file: Path) -> Iterator[None]:
-    """Name the file in whatever the libraries say of it."""
     try:
         yield
     except Exception as error:

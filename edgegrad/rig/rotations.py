@@ -14,7 +14,6 @@ STRAY = 1e-3  # of a matrix from a rotation, of a quaternion from length 1
 
 
 def roma() -> ModuleType:
-    """Return the module roma. Raises ImportError."""
     return require("roma", "edgegrad[rigs]", "rotations of joints")
 
 

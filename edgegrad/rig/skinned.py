@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..check import check_choice
 from ..scene.mesh import Mesh
 from .control import Control
 from .joints import Joints
@@ -50,8 +51,7 @@ class SkinDeformer:
     def __call__(
         self, values: Mapping[str, Tensor], meshes: Sequence[Mesh], skinning: str = "linear"
     ) -> tuple[list[Tensor], list[Tensor | None], Tensor]:
-        if skinning not in SKINNINGS:
-            raise ValueError(f"skinning: expected one of {', '.join(SKINNINGS)}, got {skinning!r}")
+        check_choice("skinning", skinning, SKINNINGS)
         world = self.joints.world(values.get("rotations"), values.get("joint_translations"), values.get("joint_scales"))
         morphs = values.get("morphs", self.controls["morphs"].rest if "morphs" in self.controls else world.new_zeros(0))
         found = [

@@ -33,7 +33,7 @@ class Affine(NamedTuple):
 
     def vectors(self, v: Tensor) -> Tensor:
         """Return R v of vectors (..., 3)."""
-        # Column by column rather than by a matrix product: each row is then rounded alike, so that copies of
+        # Column by column rather than by a matrix product: each row is then rounded equally, so that copies of
         # one vertex stay equal and its edges stay welded.
         R = self.R
         return v if R is None else v[..., 0:1] * R[:, 0] + v[..., 1:2] * R[:, 1] + v[..., 2:3] * R[:, 2]

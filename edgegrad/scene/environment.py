@@ -71,7 +71,6 @@ class Environment(Light):
 
     @cached_property
     def _magnitude(self) -> Tensor:
-        """Return (h, w) float64."""
         return self.radiance.detach().double().reshape(*self._size, -1).abs().mean(2)
 
     @cached_property

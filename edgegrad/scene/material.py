@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..check import as_index, as_real, as_tensor, check_fields, check_finite, check_float, check_shape
+from ..check import as_index, as_real, as_tensor, check_choice, check_fields, check_finite, check_float, check_shape
 from ..library import core
 from .rows import areas, unit
 
@@ -21,9 +21,8 @@ LARGEST_UV = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """An image on the faces of a mesh, whose tensors may all require gradients.
-
-    Raises TypeError or ValueError that names the argument.
+    """An image on the faces of a mesh, whose tensors may all require gradients. Raises TypeError or ValueError that names the
+    argument.
 
     Parameters
     ----------
@@ -60,8 +59,7 @@ class Texture:
             self._keep("uvs", as_real("uvs", self.uvs, ("T", 2), largest=LARGEST_UV))
             self._keep("uv_faces", as_index("uv_faces", self.uv_faces, ("F", 3), len(self.uvs), "uvs"))
         self._keep("wrap", checked_wrap(self.wrap))
-        if self.filter not in LOOKUPS:
-            raise ValueError(f"filter: expected one of {', '.join(LOOKUPS)}, got {self.filter!r}")
+        check_choice("filter", self.filter, LOOKUPS)
         if self.factor is not None:
             factor = numbers("factor", self.factor)
             self._keep("factor", factor)
@@ -110,9 +108,7 @@ class Material:
     from F0 = 0.04 + (base − 0.04) · metallic. If one of the two is left out, metallic is 0, or roughness is 1. α is at least
     1e-4, because a mirror has no pdf. As in glTF, what the layer reflects and what it takes from the base follow different half
     vectors, so a white dielectric returns more than came at grazing angles (1.14 at 75°, roughness 0.3). Numbers outside of 0 …
-    1 are not refused, because an optimisation may pass there.
-
-    Raises TypeError or ValueError that names the argument.
+    1 are not refused, because an optimisation may pass there. Raises TypeError or ValueError that names the argument.
 
     Parameters
     ----------
@@ -175,8 +171,7 @@ class Material:
         object.__setattr__(self, "normal_scale", scale if scale.dim() == 0 else scale.reshape(()))
         if not isinstance(self.two_sided, bool):
             raise TypeError(f"two_sided: expected True or False, got {type(self.two_sided).__name__}")
-        if self.alpha_mode not in ALPHA_MODES:
-            raise ValueError(f"alpha_mode: expected one of {', '.join(ALPHA_MODES)}, got {self.alpha_mode!r}")
+        check_choice("alpha_mode", self.alpha_mode, ALPHA_MODES)
 
     @property
     def channels(self) -> int | None:

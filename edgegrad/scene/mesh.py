@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..check import (
     as_tensor,
+    check_choice,
     check_countable,
     check_fields,
     check_finite,
@@ -198,8 +199,7 @@ class Mesh:
             raise ValueError(f"alpha_cutoff: expected a finite number, got {self.alpha_cutoff}")
         object.__setattr__(self, "alpha_cutoff", float(self.alpha_cutoff))
         object.__setattr__(self, "wrap", checked_wrap(self.wrap))
-        if self.filter not in LOOKUPS:
-            raise ValueError(f"filter: expected one of {', '.join(LOOKUPS)}, got {self.filter!r}")
+        check_choice("filter", self.filter, LOOKUPS)
 
     @property
     def has_textures(self) -> bool:

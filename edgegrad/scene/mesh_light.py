@@ -127,7 +127,6 @@ class MeshLight(Light):
 
     @property
     def texture(self) -> Texture | None:
-        """Return the texture of its emission."""
         emission = None if self.mesh.material is None else self.mesh.material.emission
         return emission if isinstance(emission, Texture) else None
 
@@ -138,7 +137,6 @@ class MeshLight(Light):
 
     @property
     def coordinates(self) -> Tensor:
-        """Return the coordinates (T, 2) of its texture."""
         return coordinates(self.mesh, self.texture)[0]
 
     def borders(self, u: tuple[float, float]) -> TexelBorders | None:

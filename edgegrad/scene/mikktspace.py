@@ -142,7 +142,6 @@ def _components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Return the dot product of vectors (3, …)."""
     (a0, a1, a2), (b0, b1, b2) = a.unbind(), b.unbind()
     return a0 * b0 + a1 * b1 + a2 * b2
 

@@ -17,8 +17,6 @@ NEIGHBOURS = 12  # faces that are looked at exactly: those of so many samples th
 
 
 class Places(NamedTuple):
-    """Points of the surface."""
-
     position: np.ndarray  # (N, 3) float64
     face: np.ndarray  # (N,) int64, counted through all meshes
     b: np.ndarray  # (N, 3) float64, barycentrics

@@ -52,7 +52,7 @@ class SymmetryAxis:
 
 
 class PoseError(NamedTuple):
-    """How far a pose is from a reference."""
+    """The distance of a pose from a reference."""
 
     degrees: float  # of the rotation between them
     distance: float  # between their translations, in units of the world
@@ -232,7 +232,6 @@ def _skew(a: Tensor) -> Tensor:
 
 
 def _rigid(R: Tensor, t: Tensor) -> Tensor:
-    """Return (N, 4, 4) of (N, 3, 3) and (N, 3)."""
     last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(R), 1, 4)
     return torch.cat([torch.cat([R, t[:, :, None]], 2), last], 1)
 
@@ -247,7 +246,6 @@ def _common_point(axes: Sequence[SymmetryAxis]) -> Tensor:
 
 
 def _pose(name: str, value: object) -> Tensor:
-    """(4, 4) float64. Raises TypeError or ValueError."""
     matrix = as_double(name, getattr(value, "matrix", value), (4, 4)).cpu()
     if matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise ValueError(f"{name}: expected the last row 0, 0, 0, 1, got {matrix[3].tolist()}; is it transposed?")
@@ -257,7 +255,6 @@ def _pose(name: str, value: object) -> Tensor:
 
 
 def _doubles(value: object) -> Tensor:
-    """Return numbers of a file. Raises ValueError."""
     try:
         return torch.tensor(value, dtype=torch.float64)
     except (TypeError, ValueError) as error:

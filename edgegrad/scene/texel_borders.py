@@ -97,8 +97,6 @@ class _Segments(NamedTuple):
 
 
 class _BorderLines(NamedTuple):
-    """Whole borders of faces."""
-
     face: Tensor  # (L,) int64
     axis: Tensor  # (L,) int64
     border: Tensor  # (L,) float64
@@ -146,7 +144,7 @@ class _BorderLines(NamedTuple):
         )
         gradient = (p[:, 1:] - p[:, :1]).norm(dim=1)
         length = (b - a)[:, 1:].norm(dim=1) / gradient
-        # On an edge of the face: moved one way the border enters it, and moved the other way that beside it.
+        # On an edge of the face: moved one way the border enters it, and moved the other way its neighbour.
         on_edge = (p == self.border[:, None]).sum(1) == 2
         share = 2 * length * torch.where(on_edge, 0.5, 1.0) * self.weight
         share = torch.where(gradient > 0, share, 0.0)[line] * (s1 - s0)[:, 0] * weight

@@ -40,14 +40,15 @@ constexpr double edge_on = 1e-3;
 // (F, 3, L): E max(0, n·l) for the normal n on the viewer's side, over the greatest of all. It is the same at both ends
 // of an edge only if it is along all of it, as n·l has the sign, and over 1/|l| the size, of a face's distance to the
 // light.
-inline Array<double> light_on_flat_faces(const FlatFaces& of, const std::vector<PunctualLight>& lights, Team& team) {
+inline Array<double> light_on_flat_faces(const FlatFaces& of, const std::vector<PunctualLight>& lights,
+                                         ThreadTeam& team) {
     const auto at = [&](int32_t v) {
         const double* p = of.verts + 3 * int64_t(v);
         return Vec3{p[0], p[1], p[2]};
     };
     const int64_t L = int64_t(lights.size());
     Array<double> out(3 * of.n_faces * L);
-    const std::vector<double> greatest = team.of_blocks(of.n_faces, [&](int64_t first, int64_t last) {
+    const std::vector<double> greatest = team.map_blocks(of.n_faces, [&](int64_t first, int64_t last) {
         double most = 0;
         for (int64_t f = first; f < last; ++f) {
             const int32_t* v = of.faces + 3 * f;
@@ -71,7 +72,7 @@ inline Array<double> light_on_flat_faces(const FlatFaces& of, const std::vector<
         return most;
     });
     const double scale = 1 / std::max(*std::max_element(greatest.begin(), greatest.end()), 1e-300);
-    team.each_block(out.size(), [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(out.size(), [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) out[i] *= scale;
     });
     return out;

@@ -82,21 +82,21 @@ void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaste
 
 template <class T>
 void indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-              const LitOptions& options, double* out, Team& team) {
+              const LitOptions& options, double* out, ThreadTeam& team) {
     std::fill(out, out + points.size * lit.channels, 0.0);
-    team.each_with((points.size + shaded_at_once - 1) / shaded_at_once, [&] { return path_buffers(lit, options); },
-                   [&](Paths& paths, int64_t block) {
-                       team.check();
-                       const int64_t first = block * shaded_at_once;
-                       add_indirect(lit, scene, caster, points.part(first, shaded_at_once), paths,
-                                    out + first * lit.channels);
-                   });
+    team.parallel_for_with_state(
+        (points.size + shaded_at_once - 1) / shaded_at_once, [&] { return path_buffers(lit, options); },
+        [&](Paths& paths, int64_t block) {
+            team.check();
+            const int64_t first = block * shaded_at_once;
+            add_indirect(lit, scene, caster, points.part(first, shaded_at_once), paths, out + first * lit.channels);
+        });
 }
 
 template <class T>
 void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   const LitOptions& options, const double* bar, const std::vector<TableBar>& to,
-                  LitPlaces<double> places, Team& team) {
+                  LitPlaces<double> places, ThreadTeam& team) {
     clear(places, points.size);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
         Paths paths(lit, options);
@@ -126,52 +126,52 @@ void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
 
 template <class T>
 void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-                  const LitOptions& options, LitPlaces<const double> dot, double* radiance_dot, Team& team) {
-    team.each_with((points.size + shaded_at_once - 1) / shaded_at_once, [&] { return path_buffers(lit, options); },
-                   [&](Paths& paths, int64_t block) {
-                       team.check();
-                       const int64_t first = block * shaded_at_once;
-                       const LitPoints some = points.part(first, shaded_at_once);
-                       paths.find(scene, caster, some, [](int64_t) { return true; });
-                       for (int64_t i = 0; i < some.size; ++i) {
-                           const Path path = paths.path(i);
-                           double* out = radiance_dot + (first + i) * lit.channels;
-                           const auto find = [&](LitPlaces<const double> own, Dual* total) {
-                               const MovingPoint point(lit, points, own, first + i);
-                               const std::vector<Surface<Dual>> surfaces = moving_surfaces(lit, path, point.surface);
-                               const auto at = [&](int k) -> const Surface<Dual>& { return surfaces[k]; };
-                               path_radiance(lit, paths.lights(), path, at, total);
-                           };
-                           Dual total[most_lit_channels], held[most_lit_channels];
-                           find(dot, total);
-                           for (int c = 0; c < lit.channels; ++c) out[c] = total[c].dot;
-                           if (!(options.near > 0) || !dot.b || path.points < 2) continue;
-                           // Without what nearby gives as the point slides, as leave_out_near_field() has it.
-                           const Vec3 d = paths.surface(i, 1).y - paths.surface(i, 0).y;
-                           const NearField near(options.near);
-                           Vec3 slid;
-                           for (int k = 0; k < 3; ++k)
-                               slid += dot.b[3 * (first + i) + k] * paths.surface(i, 0).frame.corner[k];
-                           find({nullptr, dot.spread}, held);
-                           for (int c = 0; c < lit.channels; ++c)
-                               out[c] += near.share(d) * (held[c].dot - total[c].dot) +
-                                         edgegrad::dot(near.slope(d), slid) * total[c].value;
-                       }
-                   });
+                  const LitOptions& options, LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team) {
+    team.parallel_for_with_state(
+        (points.size + shaded_at_once - 1) / shaded_at_once, [&] { return path_buffers(lit, options); },
+        [&](Paths& paths, int64_t block) {
+            team.check();
+            const int64_t first = block * shaded_at_once;
+            const LitPoints some = points.part(first, shaded_at_once);
+            paths.find(scene, caster, some, [](int64_t) { return true; });
+            for (int64_t i = 0; i < some.size; ++i) {
+                const Path path = paths.path(i);
+                double* out = radiance_dot + (first + i) * lit.channels;
+                const auto find = [&](LitPlaces<const double> own, Dual* total) {
+                    const MovingPoint point(lit, points, own, first + i);
+                    const std::vector<Surface<Dual>> surfaces = moving_surfaces(lit, path, point.surface);
+                    const auto at = [&](int k) -> const Surface<Dual>& { return surfaces[k]; };
+                    path_radiance(lit, paths.lights(), path, at, total);
+                };
+                Dual total[most_lit_channels], held[most_lit_channels];
+                find(dot, total);
+                for (int c = 0; c < lit.channels; ++c) out[c] = total[c].dot;
+                if (!(options.near > 0) || !dot.b || path.points < 2) continue;
+                // Without what nearby gives as the point slides, as leave_out_near_field() has it.
+                const Vec3 d = paths.surface(i, 1).y - paths.surface(i, 0).y;
+                const NearField near(options.near);
+                Vec3 slid;
+                for (int k = 0; k < 3; ++k) slid += dot.b[3 * (first + i) + k] * paths.surface(i, 0).frame.corner[k];
+                find({nullptr, dot.spread}, held);
+                for (int c = 0; c < lit.channels; ++c)
+                    out[c] += near.share(d) * (held[c].dot - total[c].dot) +
+                              edgegrad::dot(near.slope(d), slid) * total[c].value;
+            }
+        });
 }
 
 #define EDGEGRAD_INDIRECT(T)                                                                                      \
     template void indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,              \
-                           const LitOptions&, double*, Team&);                                                    \
+                           const LitOptions&, double*, ThreadTeam&);                                              \
     template void shade_whole(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,   \
                               double*, int8_t*);                                                                  \
     template void add_indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,  \
                                double*);                                                                          \
     template void indirect_vjp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,          \
                                const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>, \
-                               Team&);                                                                            \
+                               ThreadTeam&);                                                                      \
     template void indirect_jvp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,          \
-                               const LitOptions&, LitPlaces<const double>, double*, Team&);
+                               const LitOptions&, LitPlaces<const double>, double*, ThreadTeam&);
 EDGEGRAD_INDIRECT(float)
 EDGEGRAD_INDIRECT(double)
 

@@ -17,7 +17,7 @@ namespace edgegrad {
 // (N, channels).
 template <class T>
 void indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-              const LitOptions& options, double* radiance, Team& team);
+              const LitOptions& options, double* radiance, ThreadTeam& team);
 // Adds that of few points, about shaded_at_once, on one thread, which keeps what it needs from one call to the next.
 class Paths;
 std::shared_ptr<Paths> path_buffers(const LitScene& lit, const LitOptions& options);
@@ -33,10 +33,10 @@ void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster
 template <class T>
 void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   const LitOptions& options, const double* bar, const std::vector<TableBar>& to,
-                  LitPlaces<double> places, Team& team);
+                  LitPlaces<double> places, ThreadTeam& team);
 // For the tangents of the tables and of the points.
 template <class T>
 void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-                  const LitOptions& options, LitPlaces<const double> dot, double* radiance_dot, Team& team);
+                  const LitOptions& options, LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -186,10 +186,10 @@ class LightPaths {
 template <class T>
 std::vector<Connections> towards_camera(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                                         const CameraConnections& camera, const Arrivals& arrivals, StepRange steps,
-                                        Team& team) {
+                                        ThreadTeam& team) {
     const int64_t blocks = (arrivals.size + shaded_at_once - 1) / shaded_at_once;
     std::vector<Connections> out(blocks);
-    team.each_with(
+    team.parallel_for_with_state(
         blocks, [&] { return std::make_shared<LightPaths<T>>(lit, scene, caster, camera); },
         [&](LightPaths<T>& paths, int64_t block) {
             team.check();
@@ -200,8 +200,8 @@ std::vector<Connections> towards_camera(const LitScene& lit, const SceneView<T>&
 }
 
 template std::vector<Connections> towards_camera(const LitScene&, const SceneView<float>&, const RayCaster&,
-                                                 const CameraConnections&, const Arrivals&, StepRange, Team&);
+                                                 const CameraConnections&, const Arrivals&, StepRange, ThreadTeam&);
 template std::vector<Connections> towards_camera(const LitScene&, const SceneView<double>&, const RayCaster&,
-                                                 const CameraConnections&, const Arrivals&, StepRange, Team&);
+                                                 const CameraConnections&, const Arrivals&, StepRange, ThreadTeam&);
 
 }  // namespace edgegrad

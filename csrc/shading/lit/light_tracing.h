@@ -55,6 +55,6 @@ struct StepRange {
 template <class T>
 std::vector<Connections> towards_camera(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                                         const CameraConnections& camera, const Arrivals& arrivals, StepRange steps,
-                                        Team& team);
+                                        ThreadTeam& team);
 
 }  // namespace edgegrad

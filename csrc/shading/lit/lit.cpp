@@ -29,19 +29,20 @@ void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster&
 
 template <class T>
 void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-           const LitOptions& options, double* radiance_out, int8_t* seen, Team& team) {
+           const LitOptions& options, double* radiance_out, int8_t* seen, ThreadTeam& team) {
     const size_t K = light_samples(lit, options).size();
-    team.each_with((points.size + shaded_at_once - 1) / shaded_at_once, [&] { return shade_buffers(lit, options); },
-                   [&](ShadeBuffers& buffers, int64_t block) {
-                       const int64_t first = block * shaded_at_once;
-                       shade_some(lit, scene, caster, points.part(first, shaded_at_once), options, buffers,
-                                  radiance_out ? radiance_out + first * lit.channels : nullptr, seen + first * K);
-                   });
+    team.parallel_for_with_state(
+        (points.size + shaded_at_once - 1) / shaded_at_once, [&] { return shade_buffers(lit, options); },
+        [&](ShadeBuffers& buffers, int64_t block) {
+            const int64_t first = block * shaded_at_once;
+            shade_some(lit, scene, caster, points.part(first, shaded_at_once), options, buffers,
+                       radiance_out ? radiance_out + first * lit.channels : nullptr, seen + first * K);
+        });
 }
 
 void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int light,
-                       LightPoint* out, Team& team) {
-    team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
+                       LightPoint* out, ThreadTeam& team) {
+    team.parallel_for_blocks(points.size, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             Surface<double> o;
             set_surface<double>(lit, points.face[i], points.b + 3 * i, points.spread_at(i), o);
@@ -52,7 +53,7 @@ void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOp
 }
 
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, Team& team) {
+               const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, ThreadTeam& team) {
     const std::vector<LightSample> lights = light_samples(lit, options);
     clear(places, points.size);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
@@ -74,7 +75,7 @@ void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& o
 template <class T>
 void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                          const LitPoints& points, const LitOptions& options, const double* bar,
-                         const std::vector<TableBar>& to, LitPlaces<double> places, Team& team) {
+                         const std::vector<TableBar>& to, LitPlaces<double> places, ThreadTeam& team) {
     clear(places, points.size);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
         const auto buffers = shade_buffers(lit, options);
@@ -103,9 +104,9 @@ void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const R
 }
 
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               LitPlaces<const double> dot, double* radiance_dot, Team& team) {
+               LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team) {
     const std::vector<LightSample> lights = light_samples(lit, options);
-    team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
+    team.parallel_for_blocks(points.size, [&](int64_t, int64_t first, int64_t last) {
         std::vector<LightPoint> of_lights(lights.size());
         for (int64_t i = first; i < last; ++i) {
             Dual total[most_lit_channels];
@@ -124,14 +125,14 @@ template void shade_some(const LitScene&, const SceneView<float>&, const RayCast
 template void shade_some(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&,
                          const LitOptions&, ShadeBuffers&, double*, int8_t*);
 template void shade(const LitScene&, const SceneView<float>&, const RayCaster&, const LitPoints&, const LitOptions&,
-                    double*, int8_t*, Team&);
+                    double*, int8_t*, ThreadTeam&);
 template void shade(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&, const LitOptions&,
-                    double*, int8_t*, Team&);
+                    double*, int8_t*, ThreadTeam&);
 template void trace_and_shade_vjp(const LitScene&, const SceneView<float>&, const RayCaster&, const LitPoints&,
                                   const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>,
-                                  Team&);
+                                  ThreadTeam&);
 template void trace_and_shade_vjp(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&,
                                   const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>,
-                                  Team&);
+                                  ThreadTeam&);
 
 }  // namespace edgegrad

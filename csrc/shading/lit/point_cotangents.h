@@ -22,7 +22,7 @@ inline void write(const FacePointBar& bar, LitPlaces<double> places, int64_t i) 
 
 // Calls body(first, last, cotangents) for chunks of points, and adds these up.
 template <class Body>
-void add_cotangents(const LitScene& lit, int64_t points, const std::vector<TableBar>& to, Team& team, Body body) {
+void add_cotangents(const LitScene& lit, int64_t points, const std::vector<TableBar>& to, ThreadTeam& team, Body body) {
     std::vector<Cotangents> chunks;
     double seconds[2] = {};
     scatter_in_waves(

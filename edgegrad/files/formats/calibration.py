@@ -118,9 +118,9 @@ def _stereo(
     """Return the first camera at the origin and the second at R and T. These stand in this file, or in extrinsics next to
     intrinsics, as OpenCV's example of stereo calibration writes them."""
     places = fields
-    beside = file.with_name(f"extrinsics{file.suffix}")
-    if not {"R", "T"} <= fields.values.keys() and file.stem == "intrinsics" and beside.is_file():
-        places = _Fields(read_keys(beside))
+    sibling = file.with_name(f"extrinsics{file.suffix}")
+    if not {"R", "T"} <= fields.values.keys() and file.stem == "intrinsics" and sibling.is_file():
+        places = _Fields(read_keys(sibling))
     R, T = places.matrix("R"), places.matrix("T")
     if R is None or T is None:
         unread.note(f"the pose of {pair[1]}", "R and T are not there, so it stands where the first does")

@@ -99,7 +99,6 @@ def read(folder: Path, images: Path | None, unread: UnreadLog) -> dict[str, View
 
 
 def _file(places: list[Path], name: str) -> Path | None:
-    """Return the image's file below one of the folders."""
     if PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or ".." in PurePosixPath(name).parts:
         return None
     return next((place / name for place in places if isfile(place / name)), None)

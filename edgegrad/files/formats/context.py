@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
+from collections.abc import Container
+from itertools import chain, count
 from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -15,8 +18,25 @@ from ...optional import require
 from ...warnings import warn
 from ..image import srgb_to_linear
 from ..paths import PathLike
-from .file_type import check_file_type
 from .part import FormatError, LoadOptions
+
+PACKED = {b"\x1f\x8b": "data compressed by gzip", b"PK\x03\x04": "an archive of zip", b"BZh": "data compressed by bzip2",
+          b"\xfd7zXZ\0": "data compressed by xz", b"7z\xbc\xaf\x27\x1c": "an archive of 7-Zip"}  # fmt: skip
+PAGE = re.compile(rb"(\xef\xbb\xbf)?\s*<(!doctype html|html)\b", re.IGNORECASE)
+
+
+def check_file_type(data: bytes, what: str) -> None:
+    """Raise FormatError for a git-lfs pointer, a web page or an archive in the place of a file."""
+    if data.startswith(b"version https://git-lfs.github.com/spec"):
+        raise FormatError(f"expected {what}, got a pointer of git-lfs to it; fetch the file itself with: git lfs pull")
+    if PAGE.match(data):
+        raise FormatError(
+            f"expected {what}, got a page of the web (HTML), as servers send with an error; download it again"
+        )
+    for start, name in PACKED.items():
+        if data.startswith(start):
+            raise FormatError(f"expected {what}, got {name}; unpack it first")
+
 
 # Pillow may open these. EPS is not among them, because Pillow runs another program for it.
 TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
@@ -141,7 +161,6 @@ class UnreadLog:
         self.names[name] = instead
 
     def warn(self, path: PathLike, what: str = "not rendered as the file asks") -> None:
-        """Issue one warning for a file."""
         if self.names:
             said = [f"{name} ({instead})" for name, instead in self.names.items()]
             more = [f"{len(said) - MOST_SAID} more"] if len(said) > MOST_SAID else []
@@ -181,3 +200,9 @@ def linear_colors(what: str, values: np.ndarray, srgb: bool) -> Tensor:
         raise FormatError(f"expected {what} colours {allowed}, got {values[bad].tolist()} at {what} {bad}; repair it")
     linear = torch.from_numpy(colors)
     return (srgb_to_linear(linear) if srgb else linear).float()
+
+
+def unique_name(taken: Container[str], *names: str) -> str:
+    """Return the first name that is not taken; where all are, the last one with the first free number from 2 behind it."""
+    numbered = (f"{names[-1]} ({k})" for k in count(2))
+    return next(name for name in chain(names, numbered) if name not in taken)

@@ -106,8 +106,6 @@ class Arrays:
 
 
 class Geometry:
-    """The attributes and triangles of a primitive."""
-
     def __init__(self, arrays: Arrays, given: dict[str, Any]) -> None:
         self.arrays, self.given = arrays, given
         self.decoded = self._decoded()

@@ -37,7 +37,6 @@ class Primitive(NamedTuple):
 
     @property
     def given(self) -> dict[str, Any]:
-        """Return the primitive's JSON."""
         return self.geometry.given
 
     @property
@@ -55,12 +54,10 @@ class Primitive(NamedTuple):
         return tuple(float(f) for f in self.base.get("baseColorFactor", WHITE)[:3])
 
     def lookup(self, field: str, within: dict[str, Any] | None = None) -> Lookup | None:
-        """Return the texture of a field of the material."""
         reference = (self.material if within is None else within).get(field)
         return None if reference is None else Lookup.from_reference(self.images, reference)
 
     def colors(self) -> Tensor | None:
-        """Return the colours (N, 3) of the vertices."""
         values = self.geometry.attribute("COLOR_0")
         return None if values is None else linear_colors("vertex", values, srgb=False)
 

@@ -13,10 +13,9 @@ import torch
 from ...camera.camera import Camera
 from ...optional import require
 from ...scene.lights import DirectionalLight, Light, PointLight, SpotLight
-from .context import LoadContext, UnreadLog
+from .context import LoadContext, UnreadLog, unique_name
 from .gltf import PUNCTUAL, VISIBILITY, entry
 from .gltf_schema import explained
-from .names import unique_name
 from .part import FormatError
 
 ROUNDED = 0.01  # what rounding to normalised bytes may change of a quaternion's length

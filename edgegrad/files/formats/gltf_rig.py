@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...optional import require
-from .context import LoadContext
+from .context import LoadContext, unique_name
 from .gltf import File, entry
 from .gltf_arrays import Arrays, Geometry, normalised
 from .gltf_material import Primitive
 from .gltf_nodes import ROUNDED, Placed, matrix_of, node_name, placed, rotation_of
 from .gltf_scene import primitives
 from .gltf_texture import Images
-from .names import unique_name
 from .part import FormatError
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3, "weights": 0}
@@ -23,8 +22,6 @@ WHOLE = 0.01  # by so much the weights of a vertex may differ from 1 in all, whi
 
 
 class RigNode(NamedTuple):
-    """A node of the scene, as a joint."""
-
     name: str
     parent: int  # among the nodes; −1 of none
     translation: np.ndarray  # (3,)
@@ -44,8 +41,6 @@ class SkinBinding(NamedTuple):
 
 
 class AnimationChannel(NamedTuple):
-    """The keys of an animation for one node."""
-
     path: str  # one of PATHS
     node: int
     times: np.ndarray  # (K,) seconds, ascending
@@ -131,7 +126,6 @@ def _morph_names(rig: RigFile, k: int, mesh: dict[str, Any], count: int) -> list
 
 
 def _morph_weights(at: Placed, mesh: dict[str, Any], count: int, context: LoadContext) -> list[float]:
-    """Return the weights at rest."""
     given = at.node.get("weights", mesh.get("weights", [0.0] * count))
     if len(given) != count:
         what = f"weights of {_mesh_name(at, mesh)!r}, {len(given)} for {count} morph targets"
@@ -141,7 +135,6 @@ def _morph_weights(at: Placed, mesh: dict[str, Any], count: int, context: LoadCo
 
 
 def _names(there: list[Placed]) -> list[str]:
-    """Return a unique name for each node."""
     found: dict[str, None] = {}
     for at in there:
         found[unique_name(found, at.name, f"{at.name} ({at.number})")] = None

@@ -60,7 +60,7 @@ class GltfAppearance:
             self._add("normalTexture", material.normal_map, to_bytes(image * factor, linear=True))
             self.material["normalTexture"] = {"scale": float(material.normal_scale)}
 
-    # -- what it looks like -----------------------------------------------------------------------------------------
+    # -- appearance -------------------------------------------------------------------------------------------------
 
     def _base(self, material: Material) -> tuple[Texture | None, Tensor]:
         """Return texture and factor of the base colour, apart from colours of vertices."""
@@ -108,7 +108,7 @@ class GltfAppearance:
         if base is None and mesh.material is None and self.colors is not None:
             self.lost.append("alpha beside colours of vertices")  # load_mesh() refuses a texture there
             return None
-        if base is not None and not self._alike(base, lies):
+        if base is not None and not self._can_share_image(base, lies):
             self.lost.append("alpha that lies otherwise than the base colour's texture")
             return None
         if base is None:
@@ -118,7 +118,6 @@ class GltfAppearance:
         return 1.0
 
     def _surface(self, material: Material) -> None:
-        """Write the parameters of scattering."""
         base = self.material["pbrMetallicRoughness"]
         if not material.is_glossy:
             base["metallicFactor"] = 0.0
@@ -127,7 +126,7 @@ class GltfAppearance:
         values: dict[str, Any] = {"roughness": material.roughness, "metallic": material.metallic}
         defaults = {"roughness": 1.0, "metallic": 0.0}
         textures = {name: value for name, value in values.items() if isinstance(value, Texture)}
-        if len(textures) == 2 and not self._alike(textures["roughness"], textures["metallic"]):
+        if len(textures) == 2 and not self._can_share_image(textures["roughness"], textures["metallic"]):
             self.lost.append("material.metallic that lies otherwise than material.roughness")
             values["metallic"] = _mean(textures.pop("metallic"))
         image = None
@@ -204,8 +203,7 @@ class GltfAppearance:
         self.sets.append(given)
         return len(self.sets) - 1
 
-    def _alike(self, a: Texture, b: Texture) -> bool:
-        """Return whether both can be channels of one image."""
+    def _can_share_image(self, a: Texture, b: Texture) -> bool:
         same = [(t.image.shape[:2], t.wraps, t.filter) for t in (a, b)]
         return same[0] == same[1] and _are_equal(coordinates(self.mesh, a), coordinates(self.mesh, b))
 
@@ -267,7 +265,7 @@ def split(appearance: GltfAppearance) -> tuple[np.ndarray, np.ndarray, dict[str,
     corners = np.arange(len(index))
     if bool((index == index[:, :1]).all()):  # one already
         kept, faces = np.arange(len(mesh.verts))[:, None].repeat(index.shape[1], 1), index[:, 0]
-    elif bool((index == corners[:, None]).all(0).any()):  # no two corners are alike
+    elif bool((index == corners[:, None]).all(0).any()):  # all corners differ
         kept, faces = index, corners
     else:
         kept, faces = np.unique(index, axis=0, return_inverse=True)

@@ -110,7 +110,6 @@ def matrix(name: str, value: object) -> np.ndarray:
 
 
 def image_size(width: float, height: float) -> tuple[int, int]:
-    """Return (H, W). Raises FormatError."""
     if not all(0 < side <= MOST_PIXELS and side == round(side) for side in (width, height)):  # nor NaN
         raise FormatError(f"size: expected whole numbers of pixels, got width {width:g} and height {height:g}")
     return round(height), round(width)

@@ -204,7 +204,6 @@ def _colors(rows: np.ndarray, widths: np.ndarray, context: LoadContext) -> torch
 
 
 def _groups(lines: ObjLines, origin: np.ndarray, context: LoadContext) -> Iterator[tuple[str, str | None, np.ndarray]]:
-    """Yield name, material and triangles of each part."""
     several = len({material for _, _, material in lines.runs if material is not None}) > 1
     starts = np.array([start for start, _, _ in lines.runs])
     run = np.searchsorted(starts, np.arange(len(lines.faces)), side="right") - 1

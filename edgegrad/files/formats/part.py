@@ -55,8 +55,6 @@ class MeshFile(NamedTuple):
 
 
 class LoadOptions(NamedTuple):
-    """Options of what is read from a mesh file."""
-
     materials: bool = True  # textures and material colours
     lit: bool = False  # materials that scatter light, normals and lights
     split: bool = False  # the objects of an OBJ file apart

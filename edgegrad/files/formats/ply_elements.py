@@ -28,8 +28,6 @@ class Property(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """A list for each row of an element."""
-
     counts: np.ndarray  # (n,) int64
     values: np.ndarray  # those of all rows, one after the other
 
@@ -99,8 +97,6 @@ def read_elements(data: bytes, header: Header) -> int:
 
 
 class _BinaryData(NamedTuple):
-    """The data of a binary file."""
-
     array: np.ndarray
 
     def width(self, kind: np.dtype) -> int:
@@ -111,8 +107,6 @@ class _BinaryData(NamedTuple):
 
 
 class _TextData(NamedTuple):
-    """The numbers of a text."""
-
     array: np.ndarray
 
     def width(self, kind: np.dtype) -> int:
@@ -178,7 +172,6 @@ def _read_even(element: Element, data: _BinaryData | _TextData, at: int) -> int 
 
 
 def _length(element: Element, row: int, data: _BinaryData | _TextData, at: int, kind: np.dtype) -> int:
-    """Return the length of a list. Raises FormatError."""
     width, room = data.width(kind), len(data.array) - at
     if width > room:
         raise _truncated(element, row)

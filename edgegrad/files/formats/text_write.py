@@ -27,19 +27,18 @@ def to_obj(made: Any, dtype: np.dtype, stem: str) -> tuple[str, dict[str, bytes]
             rows = np.column_stack([rows, visual.vertex_colors[:, :3] / 255.0])
         return _rows("v ", rows, dtype) + _rows("f ", faces, faces.dtype), {}
     # Names of materials and images end at a space for many readers.
-    beside, material = visual.material.to_simple().to_obj(name="_".join(stem.split()))
+    extra_files, material = visual.material.to_simple().to_obj(name="_".join(stem.split()))
     name = f"{stem}.mtl"
-    beside[name] = beside.pop(f"{material}.mtl")
+    extra_files[name] = extra_files.pop(f"{material}.mtl")
     corners = np.repeat(faces, 2, axis=1)  # a vertex has one texture coordinate
     text = (
         f"mtllib {name}\nusemtl {material}\n{_rows('v ', rows, dtype)}{_rows('vt ', visual.uv, dtype)}"
         f"{('f' + ' %d/%d' * 3 + chr(10)) * len(faces) % tuple(corners.reshape(-1).tolist())}"
     )
-    return text, beside
+    return text, extra_files
 
 
 def _rows(before: str, values: np.ndarray, dtype: np.dtype) -> str:
-    """Return a line for each row, that begins as given."""
     form = f"%.{DIGITS[dtype.name]}g" if dtype.kind == "f" else "%d"
     line = before + " ".join([form] * values.shape[1]) + "\n"
     return line * len(values) % tuple(np.asarray(values).reshape(-1).tolist())

@@ -44,8 +44,6 @@ class MeshObject(NamedTuple):
 
 
 class ModelPart(NamedTuple):
-    """A model part of a package."""
-
     unit: float  # m
     objects: dict[str, MeshObject]
     items: list[ObjectReference]

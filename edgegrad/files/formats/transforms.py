@@ -13,9 +13,8 @@ import torch
 from ...camera.camera import Camera
 from ..image import IMAGES, read_size
 from ..paths import StoredPath
-from .context import UnreadLog
+from .context import UnreadLog, unique_name
 from .keys import image_size, note_unread
-from .names import unique_name
 from .part import FormatError
 from .views import View
 
@@ -40,10 +39,8 @@ INSTEAD = {
 
 
 class Found(NamedTuple):
-    """The file that a file_path leads to."""
-
     file: Path | None
-    outside: bool  # of the folder, so that nobody looks there
+    outside: bool  # of the folder, which is not searched
 
 
 def read(
@@ -66,7 +63,7 @@ def read(
         try:
             found = Found(None, False)
             if "file_path" in own:
-                found = _beside(folder, name) if images is None else Found(_below(images, name), False)
+                found = _next_to(folder, name) if images is None else Found(_below(images, name), False)
                 if found.file is None:
                     (outside if found.outside else lost).append(name)
             view = View(_camera(own, shared, found, size), found.file)
@@ -103,7 +100,7 @@ def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value is not None}
 
 
-def _beside(folder: Path, name: str) -> Found:
+def _next_to(folder: Path, name: str) -> Found:
     """Look next to the file or below it. The synthetic scenes leave out the ending, and Windows writes backslashes."""
     inside = folder.resolve()
     outside = PureWindowsPath(name).is_absolute() or normpath(name.replace("\\", "/")).startswith(("..", "/"))

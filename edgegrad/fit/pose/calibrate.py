@@ -1,12 +1,11 @@
 """calibrate(): the lens that took several pictures of a known object, and where each of them was taken.
 
-Each picture is first searched by itself, as fit_camera() does it, at half of the resolution. Then Gauss-Newton steps move all
-poses and the one lens together (adjust.py).
+Each picture is first searched alone, as by fit_camera(), at half the resolution. Then Gauss-Newton steps move all poses and
+the one lens together (bundle_adjustment.py).
 """
 
 from __future__ import annotations
 
-import io
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -28,14 +27,14 @@ from ...scene.scene import Scene
 from ..ending import Ending
 from ..history import Record, number_or_none, plain_history
 from ..views import check_image
-from .adjust import Adjusted, adjusted, poses_of
+from .bundle_adjustment import Adjustment, adjust_bundle, poses_of
 from .camera_uncertainty import CameraUncertainty
-from .evidence import Source, source_of
 from .fit_camera import CameraFit, compared_with, ended, fitted, moved, pose_of, with_coefficients
 from .fit_pose import check_callback, search_pose
-from .given import LEAST, Names, check_max_size, one_for_each
-from .result import PoseFit
-from .task import BEND, ZOOM, Lens
+from .inputs import MIN_PICTURE_SIDE, ArgumentNames, check_max_size, one_for_each
+from .loss_model import LossSource, loss_source
+from .result import PoseFit, png
+from .task import DISTORTION, FOCAL_LENGTH, Unknowns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,9 +49,9 @@ class Calibration:
     fits     a CameraFit of each picture: its camera, the search by itself at a lower resolution, and the uncertainty of all
              numbers, None before the lens was found
     ending   why the fit took no more steps
-    history  a Record of each step of all numbers at once: the loss, the norms of its gradient by "world_to_camera" (in radians
-             and sizes of the mesh), "K" (logarithm of the focal length, widths of the image) and "distortion", and the cameras
-             by the names "cameras.0.world_to_camera", "cameras.0.K" and "cameras.0.distortion"
+    history  a Record of each step of all numbers at once: the loss, the norms of its gradient by "world_to_camera" (in
+             radians and sizes of the mesh), "K" (logarithm of the focal length, widths of the image) and "distortion", and
+             the cameras by the names "cameras.0.world_to_camera", "cameras.0.K" and "cameras.0.distortion"
     """
 
     fits: list[CameraFit]
@@ -62,12 +61,12 @@ class Calibration:
 
     @property
     def cameras(self) -> list[Camera]:
-        """One for each picture, at its place."""
+        """The camera of each picture, at its place."""
         return [fit.camera for fit in self.fits]
 
     @property
     def camera(self) -> Camera:
-        """The first: all have its K and distortion."""
+        """The first camera; all have its K and distortion."""
         return self.fits[0].camera
 
     @property
@@ -77,12 +76,12 @@ class Calibration:
 
     @property
     def loss(self) -> float:
-        """The mean over the pictures."""
+        """The mean loss over the pictures."""
         return sum(fit.loss for fit in self.fits) / len(self.fits)
 
     @property
     def explained(self) -> float:
-        """The share of the render's edges that a picture shows too, 0 … 1, of the picture that shows least of them."""
+        """The least share over the pictures, 0 … 1, of the render's edges that a picture shows, too."""
         return min(fit.explained for fit in self.fits)
 
     @property
@@ -101,8 +100,11 @@ class Calibration:
 
     @property
     def reason(self) -> str:
-        """In words: "converged", or what kept the fit from that: "images[2]: edges not explained: …", "not known: …" with
-        numbers that the pictures hardly show, "steps ran out: …", "interrupted"."""
+        """ "converged", or what kept the fit from that, in words.
+
+        These are "images[2]: edges not explained: …", "not known: …" with numbers that the pictures hardly show, "steps ran
+        out: …" and "interrupted".
+        """
         if self.ending is not Ending.FLAT:
             known = self.uncertainty
             if self.ending is Ending.STEPS and known is not None and known.vague:
@@ -117,20 +119,20 @@ class Calibration:
         return "converged"
 
     def plot(self, most: int = 4) -> Figure:
-        """target | start | fit | difference of up to so many pictures, as they were compared."""
+        """Draw target | start | fit | difference of at most so many pictures, as they were compared."""
         n = len(self.fits)
         chosen = sorted({round(k * (n - 1) / max(1, min(most, n) - 1)) for k in range(min(most, n))})
         return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(*(self.fits[k].search for k in chosen))
 
     def plot_history(self) -> Figure:
-        """The loss and the norm of each gradient, step by step."""
+        """Draw the loss and the norm of each gradient, step by step."""
         return require("edgegrad.fit.plots", *DRAWING).curves(self.history)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """Writes all of it to a folder, which is made where it is missing, and gives the files' names:
+        """Write the result to a folder, which is made where it is missing, and return the files' names.
 
-        - calibration.json: focal length, principal point and distortion with their standard deviations, those of the poses, loss
-          and reason
+        - calibration.json: focal length, principal point and distortion with their standard deviations, those of the poses,
+          loss and reason
         - history.json: loss, gradient norms and cameras of each step
         - camera-0.json and so on: the cameras, as load_camera reads them
         - fit.png and loss.png: plot() and plot_history(); not with figures=False
@@ -174,12 +176,10 @@ class Calibration:
         }  # fmt: skip
 
     def _repr_png_(self) -> bytes | None:
-        """In a notebook: the picture of plot()."""
+        """Return the picture of plot() for a notebook."""
         if any(not fit.search.history for fit in self.fits):
             return None
-        file = io.BytesIO()
-        self.plot().savefig(file, format="png", dpi=100)
-        return file.getvalue()
+        return png(self.plot())
 
 
 def calibrate(
@@ -197,80 +197,83 @@ def calibrate(
     checkpoint: PathLike | None = None,
     resume: bool = False,
 ) -> Calibration:
-    """The lens that took several pictures of a known object, and the place of each.
+    """Find the lens that took several pictures of a known object, and the place of each.
 
     mesh        what the pictures show, with its colours; or a Scene, whose background is known if it has one
     images      (H, W, C) linear radiance each, as read_image gives it, of one size; None with masks: these alone are compared
-    cameras     one for each picture, or a batch, with one K and distortion: where the fit starts, each within about 30° and 15 %
-                of the mesh's size
+    cameras     one for each picture, or a batch, with one K and distortion: where the fit starts, each within about 30° and
+                15 % of the mesh's size
     masks       (H, W) or (H, W, 1) each, 1 on the object and 0 elsewhere
-    principal   also find the principal point. The focal length is found always: one factor for both of K
-    distortion  also find so many coefficients, up to 8 (of a fisheye 4): the first of those of OpenCV's model (k1, k2, p1, p2,
-                k3, …) or a fisheye's, as a Camera has them; those that the cameras have beyond stay
+    principal   also find the principal point. The focal length is always found: one factor for both of K
+    distortion  number of coefficients to find, at most 8 (of a fisheye 4): the first of those of OpenCV's model (k1, k2, p1,
+                p2, k3, …) or a fisheye's, as a Camera has them. The cameras' further ones stay
     max_size    larger pictures are reduced to so many pixels on their longer side
-    callback    called after each step with the Calibration as far as it is
-    checkpoint  a path: PATH.0, PATH.1, … hold the search of each picture, from which `resume` goes on
+    callback    called after each step with the Calibration so far
+    checkpoint  a path: PATH.0, PATH.1, … hold the search of each picture, from which `resume` continues
 
-    Pictures that were cropped or zoomed have another lens than the others. The result has the standard deviation of each number
-    (`uncertainty`), and is not `converged` where one is hardly known: `reason` names it. The object should fill the pictures, lie
-    near their corners in some, and be seen from several sides. Seed and progress are as for fit_camera(). KeyboardInterrupt, also
-    from the callback, ends the fit and returns it with `interrupted` set. Raises TypeError or ValueError that names the argument.
+    Pictures that were cropped or zoomed have another lens than the others. The result has the standard deviation of each
+    number (`uncertainty`). It is not `converged` where a number is hardly known, and `reason` names it. The object should
+    fill the pictures, lie near their corners in some, and be seen from several sides. Seed and progress are as for
+    fit_camera(). KeyboardInterrupt, also from the callback, ends the fit and returns it with `interrupted` set. Raises
+    TypeError or ValueError that names the argument.
     """
     began = time.perf_counter()
     given = _cameras(cameras, distortion)
-    lens = Lens(False, True, check_flag("principal", principal), distortion)
+    lens = Unknowns(False, True, check_flag("principal", principal), distortion)
     check_max_size(max_size)
     check_int("seed", seed, 0, 2**32 - 1)
     check_callback(callback, "a Calibration")
     mesh, target = compared_with("images", mesh, images, "masks", masks)
     pictures = one_for_each("masks" if images is None else "images", target, len(given), 2 if images is None else 3)
     shapes = [None] * len(given) if masks is None else one_for_each("masks", masks, len(given), 2)
-    for k, (camera, picture) in enumerate(zip(given, pictures, strict=True)):  # before the first is searched
+    for k, (camera, picture) in enumerate(
+        zip(given, pictures, strict=True)
+    ):  # All are checked before the first search.
         check_image(f"{'masks' if images is None else 'images'}[{k}]", picture, camera.size)
     fits: list[CameraFit] = []
 
-    def told(now: PoseFit) -> None:
+    def report(now: PoseFit) -> None:
         assert callback is not None
         callback(Calibration([*fits, fitted(now)], Ending.STEPS, time.perf_counter() - began, []))
 
     for k, (camera, picture, shape) in enumerate(zip(given, pictures, shapes, strict=True)):
-        names = Names(
+        names = ArgumentNames(
             "mesh", f"masks[{k}]" if images is None else f"images[{k}]", f"cameras[{k}]",
             ("fit_scale", "focal", "principal", "distortion"), f"masks[{k}]",
         )  # fmt: skip
-        smaller = max(LEAST, min(max_size, max(camera.size)) // 2)
+        smaller = max(MIN_PICTURE_SIDE, min(max_size, max(camera.size)) // 2)
         search = search_pose(
             mesh, picture, camera, shape, torch.eye(4, dtype=torch.float64), lens, None, None, None, names, max_size=smaller,
             steps=60, spp=16, tolerance=3e-4, seed=seed, search=True, progress=progress, resume=resume, checkpoint_every=25,
-            callback=None if callback is None else told, checkpoint=None if checkpoint is None else f"{checkpoint}.{k}",
+            callback=None if callback is None else report, checkpoint=None if checkpoint is None else f"{checkpoint}.{k}",
         )  # fmt: skip
         fits.append(fitted(search))
         if search.interrupted:
             return Calibration(fits, Ending.INTERRUPTED, time.perf_counter() - began, [])
-    return _together(fits, given, max_size, seed, progress, callback, began)
+    return _adjust(fits, given, max_size, seed, progress, callback, began)
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def _together(
+def _adjust(
     fits: list[CameraFit], given: list[Camera], max_size: int, seed: int, progress: bool,
     callback: Callable[[Calibration], None] | None, began: float,
 ) -> Calibration:  # fmt: skip
-    """From the fits of single pictures, by steps of all poses and the lens."""
+    """Refine all poses and the lens together, from the fits of single pictures."""
     searches, history = [fit.search for fit in fits], list[Record]()
-    sources: list[Source] = []
+    sources: list[LossSource] = []
     bar = tqdm(desc="calibrate", unit="step", disable=not progress, leave=False)
 
-    def result(end: Adjusted, ending: Ending, judged: Sequence[tuple[float, float]]) -> Calibration:
+    def result(end: Adjustment, ending: Ending, judged: Sequence[tuple[float, float]]) -> Calibration:
         found = [
-            ended(search, source, pose, end.covariance_of(k, source), [camera], ending is Ending.FLAT, *told)
-            for k, (search, source, pose, camera, told) in enumerate(
+            ended(search, source, pose, end.covariance_of(k, source), [camera], ending is Ending.FLAT, *judgement)
+            for k, (search, source, pose, camera, judgement) in enumerate(
                 zip(searches, sources, end.poses, given, judged, strict=True)
             )
         ]
         return Calibration(found, ending, time.perf_counter() - began, list(history))
 
-    def after_step(end: Adjusted) -> None:
+    def after_step(end: Adjustment) -> None:
         nonlocal best
         history.append(_record(len(history), sources, end))
         bar.set_postfix_str(f"loss {history[-1].loss:.3e}", refresh=False)
@@ -284,8 +287,8 @@ def _together(
     try:
         for k, search in enumerate(searches):
             assert search.task is not None
-            sources.append(source_of(search.task, pose_of(search), max_size, 16, (seed + 7919 * k) % 2**32))
-        end = adjusted(sources, [pose_of(search) for search in searches], after_step=after_step)
+            sources.append(loss_source(search.task, pose_of(search), max_size, 16, (seed + 7919 * k) % 2**32))
+        end = adjust_bundle(sources, [pose_of(search) for search in searches], after_step=after_step)
         judged = [source.judged(pose) for source, pose in zip(sources, end.poses, strict=True)]
         return result(end, Ending.FLAT if end.short else Ending.STEPS, judged)
     except KeyboardInterrupt:
@@ -294,29 +297,29 @@ def _together(
         bar.close()
 
 
-def _record(number: int, sources: Sequence[Source], end: Adjusted) -> Record:
+def _record(number: int, sources: Sequence[LossSource], end: Adjustment) -> Record:
     values: dict[str, Tensor] = {}
     squares = {"world_to_camera": 0.0, "K": 0.0, "distortion": 0.0}
     of_lens: Tensor | float = 0.0
     for k, (source, pose, evidence) in enumerate(zip(sources, end.poses, end.evidence, strict=True)):
         camera = moved(source.task.lens(source.task.shots[0].camera, pose), pose.matrix)
-        sought = ("world_to_camera", "K", *(("distortion",) if BEND in source.task.free else ()))
+        sought = ("world_to_camera", "K", *(("distortion",) if DISTORTION in source.task.dofs else ()))
         values |= {f"cameras.{k}.{name}": getattr(camera, name).clone() for name in sought}
         count = len(poses_of(source))
         gradient = evidence.per_loss / len(sources) * evidence.gradient
         squares["world_to_camera"] += float(gradient[:count].square().sum())
         of_lens = of_lens + gradient[count:]
     assert isinstance(of_lens, Tensor)
-    entries = [entry for entry in sources[0].task.free if entry >= ZOOM]
+    entries = [entry for entry in sources[0].task.dofs if entry >= FOCAL_LENGTH]
     for entry, slope in zip(entries, of_lens.tolist(), strict=True):
-        squares["K" if entry < BEND else "distortion"] += slope**2
-    if BEND not in entries:
+        squares["K" if entry < DISTORTION else "distortion"] += slope**2
+    if DISTORTION not in entries:
         del squares["distortion"]
     return Record(number, end.loss / len(sources), {name: square**0.5 for name, square in squares.items()}, values)
 
 
 def _cameras(cameras: object, distortion: object) -> list[Camera]:
-    """One by one, with one lens. Raises TypeError or ValueError."""
+    """Return the cameras one by one, with one lens. Raises TypeError or ValueError."""
     batch = isinstance(cameras, Camera)
     if not batch and (not isinstance(cameras, Sequence) or isinstance(cameras, str)):
         raise TypeError(f"cameras: expected a list of cameras, got {type(cameras).__name__}; give one for each picture")

@@ -10,11 +10,10 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...camera.lens import MOST_COEFFICIENTS, distort
-from .evidence import Source
-from .observed import motion
+from .loss_model import LossSource
 from .pose import Pose
-from .task import BEND, PRINCIPAL, ZOOM, focal_of
-from .uncertainty import ALONE_DEGREES, DEGREES, FOCAL, WIDEST, Uncertainty
+from .task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, focal_of
+from .uncertainty import MAX_CONTOUR_DEGREES, MAX_DEGREES, MAX_FOCAL, PRIOR_DEVIATION, Uncertainty
 
 # Coefficients of distortion, in OpenCV's order; those of a fisheye are k1 … k4.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -22,27 +21,30 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 @dataclass(frozen=True, eq=False)
 class CameraUncertainty(Uncertainty):
-    """Standard deviations of a camera's pose and of its lens, each with all other numbers unknown, too.
+    """Standard deviations of a camera's pose and lens, each with all other numbers unknown, too.
 
     covariance  (6, 6) float64, of a rotation vector in radians and a shift in world units along the world's axes: of the scene
                 before the camera, about the middle of the scene's bounding box, where the scene was given
     size        the diagonal of this box, world units
-    focal       of the focal length, as a part of it; 0 where it was not sought
+    focal       relative to the focal length; 0 where it was not sought
     principal   (2,) of the principal point, pixels; zeros where it was not sought
     distortion  (n,) of the coefficients of distortion that were sought, in the order of Camera.distortion
     """
 
     principal: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     distortion: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
-    vague: Sequence[str] = ()  # numbers of the lens that are not known, in words
-    at_lens: Tensor | None = None  # (6, 6), the covariance with the lens as it was found
-    names: Sequence[str] = ()  # of the coefficients of distortion
+    vague: Sequence[str] = ()  # unknown numbers of the lens, in words
+    at_lens: Tensor | None = None  # (6, 6), the covariance at the lens found
+    names: Sequence[str] = ()  # coefficients of distortion
 
     @property
     def unknown(self) -> str:
-        """In words, what is known less exactly than to 5°, or 5 % of the scene's size with the lens as it was found; and numbers
-        of the lens whose deviation moves a corner of the image by more than 3 % of its distance from the principal point, or
-        about which a guess says as much as the pictures; empty where all is known."""
+        """Numbers known less exactly than to 5°, or 5 % of the scene's size with the lens as it was found; empty where all
+        are known.
+
+        A number of the lens is named where its deviation moves a corner of the image by more than 3 % of its distance from
+        the principal point, or where a guess says as much as the pictures.
+        """
         assert self.at_lens is not None
         pose = Uncertainty(self.at_lens, self.size, self.free, most=self.most).unknown
         return ", ".join([pose, *self.vague] if pose else self.vague)
@@ -57,48 +59,49 @@ class CameraUncertainty(Uncertainty):
         return ", ".join(parts)
 
     @staticmethod
-    def of_entries(source: Source, pose: Pose, covariance: Tensor) -> CameraUncertainty:
-        """From the covariance (m, m) of the entries of a step that the source's task seeks."""
-        task, free = source.task, source.task.free
+    def from_covariance(source: LossSource, pose: Pose, covariance: Tensor) -> CameraUncertainty:
+        """Return the uncertainty from the covariance (m, m) of the entries of a step that the source's task seeks."""
+        task, dofs = source.task, source.task.dofs
         camera = task.lens(task.shots[0].camera, pose)
-        # How each entry moves the scene before the camera at rest; and then as the camera sees it when the scene is at rest.
-        moves = motion(task, source.level._replace(free=free), source.level.shots[0], pose)
+        # Entries move the scene before a camera at rest; `to_world` is the same seen with the scene at rest.
+        moves = task.motion(source.level._replace(dofs=dofs), source.level.shots[0], pose)
         center = pose.matrix[:3, :3] @ task.center + pose.t
         L = 0.5 * (moves.linear - moves.linear.mT)
         rotations = torch.stack([L[:, 2, 1], L[:, 0, 2], L[:, 1, 0]])
         to_world = torch.cat([pose.R.T @ rotations, pose.R.T @ (moves.linear @ center + moves.shift).T])
-        of_pose = [k for k, entry in enumerate(free) if entry < ZOOM]
+        of_pose = [k for k, entry in enumerate(dofs) if entry < FOCAL_LENGTH]
         own = to_world[:, of_pose]
-        deviations = dict(zip(free, covariance.diagonal().clamp(min=0.0).sqrt().tolist(), strict=True))
+        deviations = dict(zip(dofs, covariance.diagonal().clamp(min=0.0).sqrt().tolist(), strict=True))
         principal = [deviations.get(PRINCIPAL + k, 0.0) for k in (0, 1)]
         return CameraUncertainty(
-            to_world @ covariance @ to_world.T, task.size, torch.empty(0, 3, dtype=torch.float64), deviations.get(ZOOM, 0.0),
-            ALONE_DEGREES if task.colourless else DEGREES, camera.size[1] * torch.tensor(principal, dtype=torch.float64),
-            torch.tensor([deviations[entry] for entry in free if entry >= BEND], dtype=torch.float64),
+            to_world @ covariance @ to_world.T, task.size, torch.empty(0, 3, dtype=torch.float64),
+            deviations.get(FOCAL_LENGTH, 0.0), MAX_CONTOUR_DEGREES if task.colourless else MAX_DEGREES,
+            camera.size[1] * torch.tensor(principal, dtype=torch.float64),
+            torch.tensor([deviations[entry] for entry in dofs if entry >= DISTORTION], dtype=torch.float64),
             tuple(vague(camera, deviations)), own @ covariance[of_pose][:, of_pose] @ own.T,
-            tuple(coefficient(camera, entry) for entry in free if entry >= BEND),
+            tuple(coefficient(camera, entry) for entry in dofs if entry >= DISTORTION),
         )  # fmt: skip
 
 
 def coefficient(camera: Camera, entry: int) -> str:
     """Return the name of a coefficient of distortion, by the entry of a step that moves it."""
-    return f"k{entry - BEND + 1}" if camera.projection == "fisheye" else COEFFICIENTS[entry - BEND]
+    return f"k{entry - DISTORTION + 1}" if camera.projection == "fisheye" else COEFFICIENTS[entry - DISTORTION]
 
 
 def vague(camera: Camera, deviations: dict[int, float]) -> list[str]:
-    """In words, the numbers of a lens that are not known, from the standard deviations of the entries of a step."""
+    """Return the unknown numbers of a lens in words, from the standard deviations of the entries of a step."""
     found = []
     for entry, deviation in deviations.items():
-        if entry < ZOOM:
+        if entry < FOCAL_LENGTH:
             continue
         share = deviation * reach(camera, entry)
-        # Where the prior of WIDEST says more than the pictures, the deviation is more than √½ of it.
-        if share <= FOCAL and deviation**2 <= 0.5 * WIDEST**2:
+        # Where the prior says more than the pictures, the deviation exceeds √½ of PRIOR_DEVIATION.
+        if share <= MAX_FOCAL and deviation**2 <= 0.5 * PRIOR_DEVIATION**2:
             continue
         corner = f", {share:.0%} at the corners of the image"
-        if entry == ZOOM:
+        if entry == FOCAL_LENGTH:
             found.append(f"focal length known to ±{deviation:.0%} only")
-        elif entry < BEND:
+        elif entry < DISTORTION:
             found.append(
                 f"principal point known to ±{deviation * camera.size[1]:.2g} pixels in {'xy'[entry - PRINCIPAL]} only"
             )
@@ -108,15 +111,15 @@ def vague(camera: Camera, deviations: dict[int, float]) -> list[str]:
 
 
 def reach(camera: Camera, entry: int) -> float:
-    """How far a unit of an entry of the lens moves the corners of the image, in parts of their distance from the principal
-    point: of the corner that it moves most."""
+    """Return how far a unit of an entry of the lens moves the corner of the image that moves most, relative to its
+    distance from the principal point."""
     H, W = camera.size
     K = camera.K.detach().double()
     corners = torch.tensor([[x, y] for x in (0.0, W) for y in (0.0, H)], dtype=torch.float64) - K[:2, 2]
     distance = corners.norm(dim=1)
-    if entry == ZOOM:
+    if entry == FOCAL_LENGTH:
         return 1.0
-    if entry < BEND:
+    if entry < DISTORTION:
         return float((W / distance).max())
     n = torch.linalg.solve(K[:2, :2], corners.T).T
     ahead = torch.ones(len(n), 1, dtype=torch.float64)
@@ -126,6 +129,6 @@ def reach(camera: Camera, entry: int) -> float:
     q = torch.cat([n, ahead], 1)
     count = MOST_COEFFICIENTS if camera.projection == "perspective" else 4
     unit = torch.zeros(count, dtype=torch.float64)
-    unit[entry - BEND] = 1e-3
+    unit[entry - DISTORTION] = 1e-3
     moved = (distort(camera.projection, q, unit) - distort(camera.projection, q, 0.0 * unit)) / 1e-3
     return float((focal_of(camera) * moved.norm(dim=1) / distance).max())

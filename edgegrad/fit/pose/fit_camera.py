@@ -21,37 +21,37 @@ from ...files.paths import PathLike, replacing
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..history import Record, plain_history
-from .adjust import MOST, adjusted
+from .bundle_adjustment import MAX_ADJUST_STEPS, adjust_bundle
 from .camera_uncertainty import CameraUncertainty
-from .evidence import Colours, Source, source_of
 from .fit_pose import search_pose
-from .given import Names, bare
+from .inputs import ArgumentNames, without_colors
+from .loss_model import ColorLoss, LossSource, loss_source
 from .pose import Pose
 from .result import PoseFit, Step
-from .task import PARTS, Lens
+from .task import STEP_PARTS, Unknowns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Which tensor of a camera each part of a step moves.
-PARTS_OF = {
+# Each part of a step moves one tensor of a camera.
+TENSOR_OF = {
     "rotation": "world_to_camera", "shift": "world_to_camera", "focal": "K", "principal": "K", "distortion": "distortion",
 }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """What fit_camera found: the cameras, and the search for them, in which the scene moved before cameras at rest.
+    """The result of fit_camera(): the cameras, and the search for them, in which the scene moved before cameras at rest.
 
-    `history` has a Record of each step: the loss, which is comparable within one level of the image pyramid; what the cameras
-    were, float64, by the names that fit_scene() has for them ("cameras.0.world_to_camera", and "cameras.0.K" and
-    "cameras.0.distortion" where they are sought); and norms of the gradient by "world_to_camera" (in radians and sizes of the
-    scene), "K" (logarithm of the focal length, widths of the image) and "distortion", which all cameras share: of those that are
-    sought on the level, and none where the loss rose and the step was taken back. The last record is the final comparison.
-    `search.history` has the size of the level and which steps were the best so far.
+    `history` has a Record of each step: the loss, comparable within one level of the image pyramid; the cameras, float64, by
+    the names that fit_scene() has for them ("cameras.0.world_to_camera", and "cameras.0.K" and "cameras.0.distortion" where
+    they are sought); and norms of the gradient by "world_to_camera" (in radians and sizes of the scene), "K" (logarithm of
+    the focal length, widths of the image) and "distortion", which all cameras share. Norms are those of numbers sought on the
+    level; there are none where the loss rose and the step was taken back. The last record is the final comparison.
+    `search.history` has the size of the level and marks the best steps so far.
 
-    `uncertainty` has the standard deviation of each number that was sought; None before the last step and of a fit that was
-    interrupted.
+    `uncertainty` has the standard deviation of each number that was sought; None before the last step and after an
+    interruption.
     """
 
     cameras: list[Camera]
@@ -60,7 +60,7 @@ class CameraFit:
 
     @property
     def camera(self) -> Camera:
-        """Of several the first."""
+        """The first camera."""
         return self.cameras[0]
 
     @property
@@ -100,16 +100,16 @@ class CameraFit:
         return reason_with(replace(self.search, uncertainty=None, converged=True).reason, known)
 
     def plot(self) -> Figure:
-        """target | start | fit | difference."""
+        """Draw target | start | fit | difference."""
         return self.search.plot()
 
     def plot_history(self) -> Figure:
-        """The loss and the norm of each gradient, step by step."""
+        """Draw the loss and the norm of each gradient, step by step."""
         return self.search.plot_history()
 
     def save(self, folder: PathLike) -> list[str]:
-        """Writes history.json, camera.json, as load_camera reads it (of several camera-0.json and so on), and what PoseFit.save
-        writes; gives the names. Raises OSError, or ImportError at last when matplotlib or pillow is missing."""
+        """Write history.json, camera.json for load_camera (of several cameras camera-0.json and so on) and what PoseFit.save
+        writes; return the names. Raises OSError, or at last ImportError when matplotlib or pillow is missing."""
         Path(folder).mkdir(parents=True, exist_ok=True)
         several = len(self.cameras) > 1
         own = [f"camera-{i}.json" if several else "camera.json" for i in range(len(self.cameras))]
@@ -119,7 +119,7 @@ class CameraFit:
         return [*own, *self.search.save(folder)]
 
     def write_history(self, folder: PathLike) -> str:
-        """history.json alone, with loss, gradient norms and cameras of each step; gives its name. Raises OSError."""
+        """Write history.json alone, with loss, gradient norms and cameras of each step; return its name. Raises OSError."""
         with replacing(Path(folder) / "history.json") as temporary:
             temporary.write_text(json.dumps(plain_history(self.history), indent=2) + "\n", encoding="utf-8")
         return "history.json"
@@ -127,14 +127,16 @@ class CameraFit:
     def _record(self, number: int, step: Step) -> Record:
         task = self.search.task
         assert task is not None
-        sought = [PARTS_OF[name] for name, entries in PARTS.items() if any(entry in task.free for entry in entries)]
+        sought = [
+            TENSOR_OF[name] for name, entries in STEP_PARTS.items() if any(entry in task.dofs for entry in entries)
+        ]
         values = {}
         for i, shot in enumerate(task.shots):
             camera = moved(task.lens(shot.camera, step.pose), step.pose.matrix)
             values |= {f"cameras.{i}.{name}": getattr(camera, name).clone() for name in dict.fromkeys(sought)}
         squares: dict[str, float] = {}
         for part, norm in step.gradient.items():
-            squares[PARTS_OF[part]] = squares.get(PARTS_OF[part], 0.0) + norm**2
+            squares[TENSOR_OF[part]] = squares.get(TENSOR_OF[part], 0.0) + norm**2
         return Record(number, step.loss, {name: math.sqrt(square) for name, square in squares.items()}, values)
 
     def _repr_png_(self) -> bytes | None:
@@ -164,31 +166,32 @@ def fit_camera(
     checkpoint_every: int = 25,
     resume: bool = False,
 ) -> CameraFit:
-    """Pose and lens of the camera that took a picture of a known scene.
+    """Find pose and lens of the camera that took a picture of a known scene.
 
     scene       what the picture shows, where it is; unlit, or all colours as they are in the picture
     image       (H, W, C) linear radiance, or a list of pictures; None with a mask: that alone is compared
     camera      of size (H, W), where the fit starts: within about 30° and 15 % of the scene's size; or a list of cameras, one
-                for each picture, which keep their places to one another, as those of a rig, and share what is found of the lens
+                for each picture, which keep their places to one another, as those of a rig, and share what is found of the
+                lens
     focal       also find the focal length: one factor for both of K
     principal   also find the principal point
-    distortion  also find so many coefficients, up to 8 (of a fisheye 4): the first of those of OpenCV's model (k1, k2, p1, p2,
-                k3, …) or a fisheye's, as a Camera has them; those that the camera has beyond stay
+    distortion  number of coefficients to find, at most 8 (of a fisheye 4): the first of those of OpenCV's model (k1, k2, p1,
+                p2, k3, …) or a fisheye's, as a Camera has them. The camera's further ones stay
 
     mask, weight, background, search, checkpoint, resume and the rest are as for fit_pose(), whose search this is. What a
-    picture does not show stays uncertain: focal length against distance where there is hardly any perspective, the
-    principal point against a rotation of the camera. `uncertainty` has the standard deviation of each number. A fit is not
-    `converged` where a number of the lens is hardly known, and `reason` names it: one whose deviation moves a corner of the image
-    by more than 3 % of its distance from the principal point, or about which a guess says as much. Several pictures from
-    different sides say more: see calibrate(). Raises TypeError or ValueError that names the argument.
+    picture does not show stays uncertain: focal length against distance where there is hardly any perspective, the principal
+    point against a rotation of the camera. `uncertainty` has the standard deviation of each number. A fit is not `converged`
+    where a number of the lens is hardly known, and `reason` names it: one whose deviation moves a corner of the image by more
+    than 3 % of its distance from the principal point, or about which a guess says as much. Several pictures from different
+    sides say more: see calibrate(). Raises TypeError or ValueError that names the argument.
     """
     several = isinstance(camera, (list, tuple))
     given = [with_coefficients("camera", one, distortion) for one in (camera if several else [camera])]
-    lens = Lens(False, check_flag("focal", focal), check_flag("principal", principal), distortion)
+    lens = Unknowns(False, check_flag("focal", focal), check_flag("principal", principal), distortion)
     if callback is not None and not callable(callback):
         raise TypeError(f"callback: expected a function of a CameraFit, got {type(callback).__name__}")
     scene, target = compared_with("image", scene, image, "mask", mask)
-    names = Names(
+    names = ArgumentNames(
         "scene", "mask" if image is None else "image", "camera", ("fit_scale", "focal", "principal", "distortion")
     )
 
@@ -204,7 +207,7 @@ def fit_camera(
     )  # fmt: skip
     if found.interrupted:
         return fitted(found)
-    return finished(found, given, max_size, min(MOST, steps), spp, seed)
+    return finished(found, given, max_size, min(MAX_ADJUST_STEPS, steps), spp, seed)
 
 
 @torch.inference_mode(False)
@@ -212,15 +215,15 @@ def fit_camera(
 def finished(
     search: PoseFit, cameras: Sequence[Camera], max_size: int, most: int, spp: int, seed: int
 ) -> CameraFit:  # fmt: skip
-    """The end of a search, after at most so many further steps of all numbers at once, and with their uncertainty."""
+    """Finish a search by at most so many steps of all numbers at once, and add their uncertainty."""
     began, task = time.perf_counter(), search.task
     assert task is not None
     pose, shown = pose_of(search), search.explained >= search.enough
-    source = source_of(task, pose, max_size, spp, seed)
-    # A search by colours holds back numbers that the pictures hardly show; one by the terms of photographs is at its end.
-    further = shown and isinstance(source, Colours)
+    source = loss_source(task, pose, max_size, spp, seed)
+    # A search by colours holds back numbers that the pictures hardly show; one by photographs is at its end.
+    further = shown and isinstance(source, ColorLoss)
     try:
-        end = adjusted([source], [pose], most if further else 0)
+        end = adjust_bundle([source], [pose], most if further else 0)
     except KeyboardInterrupt:
         return fitted(replace(search, interrupted=True, converged=False))
     rests = end.short if further else search.converged or search.reason.startswith("directions unknown")
@@ -231,11 +234,11 @@ def finished(
 
 
 def ended(
-    search: PoseFit, source: Source, pose: Pose, covariance: Tensor, cameras: Sequence[Camera], rests: bool, loss: float,
+    search: PoseFit, source: LossSource, pose: Pose, covariance: Tensor, cameras: Sequence[Camera], rests: bool, loss: float,
     explained: float,
 ) -> CameraFit:  # fmt: skip
-    """The fit whose search came to another pose and lens at last, with the covariance of the entries of a step there."""
-    task, known = source.task, CameraUncertainty.of_entries(source, pose, covariance)
+    """Return a fit whose search reached another pose and lens at last, with the covariance of the entries of a step there."""
+    task, known = source.task, CameraUncertainty.from_covariance(source, pose, covariance)
     lenses = [task.lens(one, pose) for one in cameras]
     last = search.history[-1]
     history = search.history if pose is last.pose else [*search.history, Step(source.level.size, loss, pose, True, {})]
@@ -248,17 +251,17 @@ def ended(
 
 
 def fitted(search: PoseFit, uncertainty: CameraUncertainty | None = None) -> CameraFit:
-    """A search that moved the scene before cameras, as a fit of the cameras."""
+    """Return a search that moved the scene before cameras as a fit of the cameras."""
     return CameraFit([moved(seen, search.matrix) for seen in search.cameras], search, uncertainty)
 
 
 def pose_of(search: PoseFit) -> Pose:
-    """The best so far, with what was found of the lens."""
+    """Return the best pose so far, with what was found of the lens."""
     return next(step.pose for step in reversed(search.history) if step.best)
 
 
 def reason_with(words: str, known: CameraUncertainty) -> str:
-    """The reason of a fit: `words`, or where its end is right otherwise what is not known of poses and lens."""
+    """Return `words`, or what is not known of poses and lens where the end is right otherwise."""
     if words != "converged" or not known.unknown:
         return words
     fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
@@ -268,17 +271,16 @@ def reason_with(words: str, known: CameraUncertainty) -> str:
 def compared_with(
     name: str, scene: Mesh | Scene, image: object, name_of_mask: str, mask: object
 ) -> tuple[Mesh | Scene, object]:  # fmt: skip
-    """The scene and what it is compared with: pictures, or masks alone. Raises ValueError."""
+    """Return the scene and what it is compared with: pictures, or masks alone. Raises ValueError."""
     if image is not None:
         return scene, image
     if mask is None:
         raise ValueError(f"{name}: expected a picture, or a {name_of_mask}, to compare with, got neither")
-    return bare(scene), mask
+    return without_colors(scene), mask
 
 
 def with_coefficients(name: str, camera: object, count: object) -> Camera:
-    """The camera, with as many coefficients of distortion as one that has the first `count` of them may have. Raises TypeError or
-    ValueError."""
+    """Return the camera with room for `count` coefficients of distortion. Raises TypeError or ValueError."""
     if not isinstance(camera, Camera):
         raise TypeError(f"{name}: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
     counts = COEFFICIENT_COUNTS[camera.projection]
@@ -294,6 +296,6 @@ def with_coefficients(name: str, camera: object, count: object) -> Camera:
 
 
 def moved(camera: Camera, matrix: Tensor) -> Camera:
-    """The camera that sees a scene at rest as this one W sees it moved by the matrix M (4, 4): W M."""
+    """Return the camera W M that sees a scene at rest as this one, W, sees it moved by the matrix M (4, 4)."""
     W = camera.world_to_camera
     return camera.replace(world_to_camera=(W.detach().double() @ matrix).to(W))

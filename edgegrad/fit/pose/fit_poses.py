@@ -1,4 +1,4 @@
-"""fit_poses(): where several known meshes stand in a photograph in which they may cover one another."""
+"""fit_poses(): poses of several known meshes in a photograph in which they may cover one another."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...camera.camera import Camera
-from ...check import as_tensor, check_flag, check_int, check_positive_int, check_shape
+from ...check import as_tensor, check_flag, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
-from .fit_pose import check_callback, check_tolerance, depth_images, looks_alike, symmetries_of
-from .given import Names, check_in_front, check_max_size, check_seen, one_for_each
+from .fit_pose import ambiguity, check_callback, depth_images, symmetries_of
+from .inputs import ArgumentNames, check_in_front, check_seen, check_settings, one_for_each
 from .photo.depth import warn_of_units
-from .photo.poses import PosesSearch
+from .photo.poses_search import PosesSearch
 from .pose import Pose, pose_from_matrix
 from .result import PoseFit
-from .task import Lens, PoseTask
+from .task import PoseTask, Unknowns
 from .uncertainty import Uncertainty
 
-INSIDE = 64  # vertices of a mesh that are asked whether they lie in another
-WITHIN = 0.9  # share of the distance from their mean at which they are asked at the end
+INSIDE = 64  # Number of vertices of a mesh that are tested for lying in another.
+WITHIN = 0.9  # At the end, they are tested at this share of their distance from their mean.
 
 
 @torch.inference_mode(False)
@@ -49,49 +49,47 @@ def fit_poses(
     callback: Callable[[list[PoseFit]], None] | None = None,
     symmetries: Sequence[Symmetries | None] | None = None,
 ) -> list[PoseFit]:
-    """Rotation and translation of several known meshes in a picture, or in several, in one fit: a PoseFit for each.
+    """Find rotation and translation of several known meshes in a picture, or in several, in one fit; return a PoseFit for
+    each.
 
     meshes      the objects, each a Mesh, or a Scene whose meshes move together, with colours or without
     target      (H, W, C) linear radiance, as read_image gives it; or a list of pictures
     camera      the camera of the picture, of size (H, W), or a list of them
-    mask        where each object is seen, without what covers it: an image of labels (H, W) of integers, k + 1 where meshes[k] is
-                seen and 0 elsewhere; or a list with a mask (H, W) for each mesh, as read_mask gives it. Of several pictures
-                each of these is a list with one for each picture
-    init        the pose of each mesh to start from, within some 15° and 5 % of its size: earlier fits, or matrices (4, 4), mesh
-                to world, for column vectors; None: where the mesh files put them
+    mask        where each object is seen, without what covers it: an image of labels (H, W) of integers, k + 1 where
+                meshes[k] is seen and 0 elsewhere; or a list with a mask (H, W) for each mesh, as read_mask gives it. Of
+                several pictures each of these is a list with one for each picture
+    init        the pose of each mesh to start from, within some 15° and 5 % of its size: earlier fits, or matrices (4, 4),
+                mesh to world, for column vectors; None: where the mesh files put them
     weight, depth, max_size, steps, spp, tolerance, seed, progress      as of fit_pose
-    search      whether an object that ends where the pictures do not show its edges begins again from other poses
+    search      whether an object whose edges the pictures do not show at its end starts again from other poses
     callback    called after each step with the best fits so far
     symmetries  of each mesh, or None for one without; poses are reported as of fit_pose
 
-    What stands in front of what is part of the fit: an object is compared where the others leave it to be seen, and the contours
-    at which one covers another move both. The light and what stands behind the objects need not be known, and something that is
-    none of the meshes may cover a part of them. Each fit is `converged` and `explained` by itself: one that is wrong does
-    not make others so. `visible` says how much of an object the others leave to be seen. With less than a tenth of it, it
-    is not `converged`, and `reason` says that it is hidden; its pose is then little more than its start. Nor is one that ends
-    inside another one, or whose pose the pictures do not show exactly, as of fit_pose.
+    The fit includes which object stands in front: an object is compared where the others do not hide it, and contours at
+    which one covers another move both. The light and the background need not be known, and something that is none of the
+    meshes may cover a part of them. Each fit is `converged` and `explained` by itself; a wrong one does not make others
+    wrong. `visible` is the share of an object that the others do not hide. Below a tenth, it is not `converged`, and `reason`
+    says that it is hidden; its pose is then little more than its start. Neither is an object that ends inside another one, or
+    whose pose the pictures do not show exactly, as of fit_pose.
 
-    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set. Raises TypeError
-    or ValueError that names the argument, also where an object is out of the picture, or inside another one, at the start.
+    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set. Raises
+    TypeError or ValueError that names the argument, also where an object is out of the picture, or inside another one, at the
+    start.
     """
     began = time.perf_counter()
-    check_max_size(max_size)
-    for name, number in (("steps", steps), ("spp", spp)):
-        check_positive_int(name, number)
-    check_int("seed", seed, 0, 2**32 - 1)
-    check_tolerance(tolerance)
+    check_settings(max_size, steps, spp, seed, tolerance)
     check_callback(callback, "a list of PoseFits")
     count = _counted(meshes)
     starts = _starts(init, count)
     masks = _masks(mask, count, camera)
     known = _each("symmetries", symmetries, count)
-    alike = [
+    known_symmetries = [
         symmetries_of(one, mesh, f"symmetries[{k}]") for k, (one, mesh) in enumerate(zip(known, meshes, strict=True))
     ]
     tasks = [
-        PoseTask.of(
-            mesh, target, camera, own, weight, None, Lens(), float(start.scale),
-            Names(f"meshes[{k}]", init=f"init[{k}]", mask=f"mask[{k}]"),
+        PoseTask.from_arguments(
+            mesh, target, camera, own, weight, None, Unknowns(), float(start.scale),
+            ArgumentNames(f"meshes[{k}]", init=f"init[{k}]", mask=f"mask[{k}]"),
         )
         for k, (mesh, own, start) in enumerate(zip(meshes, masks, starts, strict=True))
     ]  # fmt: skip
@@ -104,25 +102,25 @@ def fit_poses(
         check_seen(task.names.init, task.scene, [shot.camera for shot in task.shots], start)
     moved = [mesh for task, start in zip(tasks, starts, strict=True) for mesh in _moved(task, start)]
     warn_of_units(Scene(moved), [shot.camera for shot in tasks[0].shots], depths, "at the start")
-    ways = PosesSearch(tasks, starts, depths, max_size, spp, steps, tolerance, seed, check_flag("search", search))
+    state = PosesSearch(tasks, starts, depths, max_size, spp, steps, tolerance, seed, check_flag("search", search))
     cameras: list[Camera] = list(camera) if isinstance(camera, Sequence) else [camera]
     interrupted = False
 
     def results() -> list[PoseFit]:
         found = []
         for k, task in enumerate(tasks):
-            own = alike[k]
-            best = ways.best[k] if own is None else ways.best[k].closest(own, starts[k])
-            history, curvature = list(ways.history[k]), ways.known(k)
-            known = None if curvature is None else Uncertainty.of(task, best, curvature, task.free, own)
+            own = known_symmetries[k]
+            best = state.best[k] if own is None else state.best[k].closest(own, starts[k])
+            history, curvature = list(state.history[k]), state.known(k)
+            known = None if curvature is None else Uncertainty.from_curvature(task, best, curvature, task.dofs, own)
             unknown = known is not None and bool(known.unknown)
-            conflict = _conflict(tasks, ways.best, k) if curvature is not None else ""
-            conflict = conflict or ("" if unknown else looks_alike(best, ways.alike[k], own, task))
-            sure = ways.converged[k] and not interrupted and not conflict and not unknown
+            conflict = _conflict(tasks, state.best, k) if curvature is not None else ""
+            conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
+            sure = state.converged[k] and not interrupted and not conflict and not unknown
             found.append(PoseFit(
-                best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), time.perf_counter() - began,
-                sure, interrupted, ways.explained[k], history, task, cameras, known, ways.visible[k], conflict,
-                ways.needed[k],
+                best.R, best.t, float(best.scale), cameras[0], state.loss, len(history), time.perf_counter() - began,
+                sure, interrupted, state.edge_support[k], history, task, cameras, known, state.visible[k], conflict,
+                state.needed[k],
             ))  # fmt: skip
         return found
 
@@ -130,15 +128,15 @@ def fit_poses(
 
     def after_step() -> None:
         bar.set_postfix_str(
-            f"{ways.levels[-1].size[1]} × {ways.levels[-1].size[0]} px, loss {ways.loss:.2e}", refresh=False
+            f"{state.levels[-1].size[1]} × {state.levels[-1].size[0]} px, loss {state.loss:.2e}", refresh=False
         )
         bar.update()
         if callback is not None:
             callback(results())
 
-    ways.after_step = after_step
+    state.after_step = after_step
     try:
-        ways.run()
+        state.run()
     except KeyboardInterrupt:
         interrupted = True
     finally:
@@ -147,7 +145,7 @@ def fit_poses(
 
 
 def _counted(meshes: object) -> int:
-    """Raises TypeError or ValueError."""
+    """Return the number of meshes. Raises TypeError or ValueError."""
     if not isinstance(meshes, Sequence) or isinstance(meshes, str):
         raise TypeError(f"meshes: expected a list of meshes, got {type(meshes).__name__}; for one, call fit_pose")
     if not meshes:
@@ -156,7 +154,7 @@ def _counted(meshes: object) -> int:
 
 
 def _each(name: str, given: object, count: int) -> list[Any]:
-    """One for each mesh, None where none is given. Raises TypeError or ValueError."""
+    """Return one for each mesh, None where none is given. Raises TypeError or ValueError."""
     if given is None:
         return [None] * count
     if not isinstance(given, Sequence) or isinstance(given, str):
@@ -179,9 +177,9 @@ def _starts(init: object, count: int) -> list[Pose]:
 
 
 def _masks(mask: object, count: int, camera: object) -> list[Any]:
-    """What fit_pose calls the mask, of each mesh. Raises TypeError or ValueError."""
+    """Return, for each mesh, what fit_pose calls the mask. Raises TypeError or ValueError."""
     cameras: list[Any] = list(camera) if isinstance(camera, Sequence) else [camera]
-    if hasattr(mask, "ndim"):  # of a tensor or an array
+    if hasattr(mask, "ndim"):
         labels = one_for_each("mask", mask, len(cameras), 2) if isinstance(camera, Sequence) else [mask]
     elif isinstance(camera, Sequence) and isinstance(mask, Sequence) and mask and all(map(_is_labels, mask)):
         labels = one_for_each("mask", mask, len(cameras), 2)
@@ -206,7 +204,7 @@ def _is_labels(given: object) -> bool:
 
 
 def _of_labels(name: str, labels: object, count: int, size: tuple[int, int] | None) -> list[Tensor]:
-    """A mask for each mesh, of a camera of that size."""
+    """Return a mask for each mesh, for a camera of that size."""
     value = as_tensor(name, labels).detach().cpu()
     if not _is_labels(value):
         raise TypeError(
@@ -229,10 +227,23 @@ def _moved(task: PoseTask, pose: Pose) -> list[Mesh]:
     return list(task.scene.transformed(pose.R, pose.t, pose.scale).meshes)
 
 
-def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:
-    """In words, whether an object ends where another one is: half of its vertices or more, or of the other's, lie inside."""
-    import trimesh  # takes longer to import than a step of a fit
+def _inside(points: Tensor, mesh: Mesh) -> Tensor:
+    """Return which points (n, 3) lie inside a closed mesh (n,); none lies inside an open one."""
+    import trimesh  # This import takes longer than a step of a fit.
 
+    low, high = mesh.verts.double().aminmax(dim=0)
+    inside = ((points > low) & (points < high)).all(1)
+    solid = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
+    if not solid.is_watertight:
+        return torch.zeros_like(inside)
+    if bool(inside.any()):
+        inside[inside.clone()] = torch.from_numpy(solid.contains(points[inside].numpy()))
+    return inside
+
+
+def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:
+    """Return in words whether an object ends where another one is: at least half of its vertices, or of the other's, lie
+    inside."""
     bodies = [_moved(task, pose) for task, pose in zip(tasks, poses, strict=True)]
     for other in range(len(bodies)):
         for a, b in ((k, other), (other, k)):
@@ -240,15 +251,9 @@ def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:
                 continue
             points = torch.cat([mesh.verts for mesh in bodies[a]]).double()
             some = points[:: max(1, len(points) // INSIDE)]
-            # A little smaller, so that two that are one count as well.
+            # A little smaller, two coinciding objects are inside one another.
             some = some.mean(0) + WITHIN * (some - some.mean(0))
-            inside = torch.zeros(len(some), dtype=torch.bool)
-            for mesh in bodies[b]:
-                solid = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
-                low, high = mesh.verts.double().aminmax(dim=0)
-                near = ((some > low) & (some < high)).all(1)
-                if solid.is_watertight and bool(near.any()):
-                    inside[near] |= torch.from_numpy(solid.contains(some[near].numpy()))
+            inside = torch.stack([_inside(some, mesh) for mesh in bodies[b]]).any(0)
             if float(inside.double().mean()) >= 0.5:
                 return (
                     f"in one place: meshes[{k}] ends where meshes[{other}] does; leave one out, or start them elsewhere"
@@ -257,9 +262,7 @@ def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:
 
 
 def _check_apart(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
-    """Raises ValueError where an object lies inside another one, or two are one."""
-    import trimesh  # takes longer to import than a step of a fit
-
+    """Raise ValueError where an object lies inside another one, or two coincide."""
     bodies = [_moved(task, start) for task, start in zip(tasks, starts, strict=True)]
     points = [torch.cat([mesh.verts for mesh in body]).double() for body in bodies]
     for k, own in enumerate(points):
@@ -274,9 +277,8 @@ def _check_apart(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
             low, high = points[other].aminmax(dim=0)
             if not bool(((own > low) & (own < high)).all()):
                 continue
-            solid = [trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False) for mesh in body]
-            if any(one.is_watertight and bool(one.contains(some.numpy()).all()) for one in solid):
+            if any(bool(_inside(some, mesh).all()) for mesh in body):
                 raise ValueError(
-                    f"init[{k}]: expected the objects beside one another, got meshes[{k}] inside meshes[{other}], where no "
+                    f"init[{k}]: expected the objects next to one another, got meshes[{k}] inside meshes[{other}], where no "
                     "camera sees it; move one of them, or leave it out"
                 )

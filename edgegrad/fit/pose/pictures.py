@@ -11,21 +11,19 @@ from PIL import Image, ImageDraw, ImageFont
 from ...files.paths import PathLike, replacing
 from ..plots import comparison, draw_gradients
 from ..views import displayed
-from .photo.shown import shown
+from .photo.overlay import overlay
 from .result import PoseFit, Step
-from .task import Level, PoseTask
+from .task import PoseTask, PyramidLevel
 
-PANEL, FRAME = 512, 256  # most pixels on a side of a panel, in draw_fit and in draw_animation
-FRAMES = 30
-SPP = 64
-FAINT = "#c4c4c4"
+PANEL_SIDE, FRAME_SIDE = 512, 256  # largest side of a panel in pixels, in draw_fit and in draw_animation
+MAX_FRAMES = 30
+FIGURE_SPP = 64
+GREY = "#c4c4c4"
 
 
 def draw_fit(path: PathLike, fit: PoseFit) -> None:
-    """Writes target | start | fit | difference as one image; with a mask all over black, as they were compared.
-
-    Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
-    """
+    """Write target | start | fit | difference as one image; with a mask all over black, as they were compared. Raises
+    ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written."""
     figure = sheet(fit)
     with replacing(path) as temporary:
         figure.savefig(temporary)
@@ -36,39 +34,36 @@ def sheet(*fits: PoseFit) -> Figure:
     rows = []
     for fit in fits:
         task = _task(fit)
-        level = _level(task, PANEL)
-        start, end = (shown(task, level, step.pose) for step in (fit.history[0], _way(fit)[-1]))
+        level = _level(task, PANEL_SIDE)
+        start, end = (overlay(task, level, step.pose) for step in (fit.history[0], _best_steps(fit)[-1]))
         rows += [(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)]
     return comparison(rows)
 
 
 def draw_loss(path: PathLike, fit: PoseFit) -> None:
-    """Writes what curves_of() draws. Raises ValueError, or OSError when the file cannot be written."""
+    """Write what curves_of() draws. Raises ValueError, or OSError when the file cannot be written."""
     figure = curves_of(fit)
     with replacing(path) as temporary:
         figure.savefig(temporary)
 
 
 def curves_of(fit: PoseFit) -> Figure:
-    """The loss of every step, one colour for each level of the image pyramid, grey where a search came to nothing; and the norms
-    of the gradient.
-
-    Raises ValueError for a fit that did not take a step or came from JSON.
-    """
+    """Draw the loss of every step, one colour a level of the image pyramid, grey where a search failed, and the norms of the
+    gradient. Raises ValueError for a fit that did not take a step or came from JSON."""
     _task(fit)
-    # The last entry of a whole fit is no step but the final comparison, which has less noise.
+    # The last entry of a whole fit is the final comparison, which has less noise.
     history = fit.history[:-1] if len(fit.history) > 1 and not fit.interrupted else fit.history
     begins = [k for k, step in enumerate(history) if k == 0 or step.size != history[k - 1].size]
     sizes = sorted({step.size for step in history})
     figure = Figure(figsize=(6.4, 4.8), dpi=200, layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
-    above.plot(range(1, len(history) + 1), [step.loss for step in history], ".", color=FAINT, markersize=4)
+    above.plot(range(1, len(history) + 1), [step.loss for step in history], ".", color=GREY, markersize=4)
     labelled = set()
     for begin, end in zip(begins, [*begins[1:], len(history)], strict=True):
         best = [k for k in range(begin, end) if history[k].best]
         h, w = history[begin].size
         color = colormaps["viridis"](0.85 * sizes.index((h, w)) / max(1, len(sizes) - 1))
-        label = None if (h, w) in labelled else f"{w} × {h} px"  # later ones are of second opinions
+        label = None if (h, w) in labelled else f"{w} × {h} px"  # Later ones belong to restarts.
         labelled.add((h, w))
         above.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
     above.set_yscale("log")
@@ -80,17 +75,15 @@ def curves_of(fit: PoseFit) -> Figure:
 
 
 def draw_animation(path: PathLike, fit: PoseFit) -> None:
-    """Writes target | fit | difference on the way from start to end as an animated WebP.
-
-    Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
-    """
+    """Write target | fit | difference from start to end as an animated WebP. Raises ValueError for a fit that did not take a
+    step or came from JSON, OSError when the file cannot be written."""
     task = _task(fit)
-    level = _level(task, FRAME)
+    level = _level(task, FRAME_SIDE)
     target = displayed(level.shots[0].target).numpy()
     font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
     frames = []
-    for step in _frames(_way(fit)):
-        image = displayed(shown(task, level, step.pose)[0]).numpy()
+    for step in _frames(_best_steps(fit)):
+        image = displayed(overlay(task, level, step.pose)[0]).numpy()
         panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
         frame = Image.fromarray((panels * 255.0).round().astype(np.uint8))
         edge = round(0.03 * frame.height)
@@ -111,26 +104,26 @@ def _task(fit: PoseFit) -> PoseTask:
     return fit.task
 
 
-def _way(fit: PoseFit) -> list[Step]:
-    """The best poses in turn; the last one is what the fit returned."""
+def _best_steps(fit: PoseFit) -> list[Step]:
+    """Return the best poses in turn; the last one is what the fit returned."""
     return [step for step in fit.history if step.best]
 
 
-def _frames(way: list[Step]) -> list[Step]:
-    """The steps that moved the mesh by more than a FRAMES-th of the whole way, and the ends."""
-    poses = torch.stack([step.pose.matrix[:3] for step in way])
-    left = poses - poses[-1]
-    # Rotation and translation count alike, each in proportion to the whole way.
-    turn, shift = (part.flatten(1).norm(dim=1) for part in (left[..., :3], left[..., 3:]))
+def _frames(steps: list[Step]) -> list[Step]:
+    """Return the ends, and the steps between that moved the mesh by more than a MAX_FRAMES-th of the whole."""
+    poses = torch.stack([step.pose.matrix[:3] for step in steps])
+    remaining = poses - poses[-1]
+    # Rotation and translation count equally, each in proportion to the whole motion.
+    turn, shift = (part.flatten(1).norm(dim=1) for part in (remaining[..., :3], remaining[..., 3:]))
     far = turn / (turn.max() + 1e-30) + shift / (shift.max() + 1e-30)
     kept = [0]
-    for k in range(1, len(way) - 1):
-        if abs(float(far[k] - far[kept[-1]])) > 2.0 / FRAMES:
+    for k in range(1, len(steps) - 1):
+        if abs(float(far[k] - far[kept[-1]])) > 2.0 / MAX_FRAMES:
             kept.append(k)
-    return [way[k] for k in kept] + ([way[-1]] if len(way) > 1 else [])
+    return [steps[k] for k in kept] + ([steps[-1]] if len(steps) > 1 else [])
 
 
-def _level(task: PoseTask, most: int) -> Level:
-    """The whole picture, at most so many pixels on its longer side."""
+def _level(task: PoseTask, most: int) -> PyramidLevel:
+    """Return the whole picture, at most so many pixels on its longer side."""
     size = task.shots[0].camera.size
-    return task.level(min(1.0, most / max(size)), blur=0.0, coarseness=1.0, spp=SPP, free=[])
+    return task.level(min(1.0, most / max(size)), blur=0.0, coarseness=1.0, spp=FIGURE_SPP, dofs=[])

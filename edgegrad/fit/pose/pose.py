@@ -1,4 +1,4 @@
-"""Poses from matrices, and the angle between two."""
+"""Poses from matrices, and the angle between two rotations."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ..placement import Pose
 
 
 def pose_from_matrix(name: str, matrix: object) -> Pose:
-    """A pose from a 4 × 4 similarity for column vectors. Raises TypeError or ValueError."""
+    """Return the pose of a 4 × 4 similarity for column vectors. Raises TypeError or ValueError."""
     if not isinstance(matrix, Tensor):
         try:
-            matrix = torch.tensor(matrix, dtype=torch.float64)  # lists would become float32
+            matrix = torch.tensor(matrix, dtype=torch.float64)  # Lists would become float32.
         except (TypeError, ValueError) as error:
             raise ValueError(f"{name}: expected 4 × 4 numbers, got something else ({error})") from error
     M = matrix.detach().cpu().double()
@@ -28,7 +28,7 @@ def pose_from_matrix(name: str, matrix: object) -> Pose:
         raise ValueError(f"{name}: expected a rotation times a scale above 0, got determinant {det:.3g}; flip one axis")
     scale = det ** (1 / 3)
     R = M[:3, :3] / scale
-    # 1e-3: far above what writing a matrix with six digits leaves, far below any shear that one means.
+    # 1e-3 is far above what rounding to six digits leaves, and far below any intended shear.
     if (error := float((R @ R.T - torch.eye(3)).abs().max())) > 1e-3:
         raise ValueError(
             f"{name}: expected a rotation times a scale, got |R Rᵀ − 1| up to {error:.2g}; remove the shear"
@@ -39,7 +39,8 @@ def pose_from_matrix(name: str, matrix: object) -> Pose:
 
 
 def angle(A: Tensor, B: Tensor) -> float:
-    """Radians of the rotation that takes A (3, 3) to B. By the sine and the cosine, for the cosine alone has no digits near 0."""
+    """Return the radians of the rotation from A (3, 3) to B. The cosine alone has no digits near 0, so the sine is
+    used, too."""
     R = A.T @ B
     sine = 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]).norm()
     return math.atan2(float(sine), float(0.5 * (R.trace() - 1.0)))

@@ -1,4 +1,4 @@
-"""What fit_pose returns: where the mesh is, the steps that led there, and its JSON form."""
+"""The result of fit_pose: the pose, the steps that led there, and its JSON form."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
+from ...camera.poses import rigid
 from ...files.paths import PathLike, replacing
 from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..ending import Ending, reason_of
+from ..history import number_or_none
 from .pose import Pose, pose_from_matrix
-from .uncertainty import FOCAL, Uncertainty
+from .uncertainty import MAX_FOCAL, Uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,29 +29,29 @@ if TYPE_CHECKING:
     from .task import PoseTask
 
 
-HIDDEN = 0.1  # share of an object that others must leave to be seen for its pose to be believed
+MIN_VISIBLE_SHARE = 0.1  # With a smaller share of the object left by others in front, its pose is not accepted.
 
 
 class Step(NamedTuple):
     """One render of the fit."""
 
     size: tuple[int, int]  # pixels (H, W) of this level of the pyramid
-    loss: float  # mean squared difference, blurred alike; comparable within one level
+    loss: float  # mean squared difference of equally blurred images; comparable within one level
     pose: Pose
-    best: bool  # whether it was the best so far
-    # Norms of the loss's gradient by rotation (radians), shift (object sizes), scale and focal (logarithms), principal (widths of
-    # the image) and distortion, of those that are sought on the level; empty where the loss rose and the step was taken back.
+    best: bool  # It was the best so far.
+    # Norms of the loss's gradient by sought part: rotation (radians), shift (object sizes), scale and focal (logarithms),
+    # principal (widths of the image) and distortion; empty where the loss rose and the step was taken back.
     gradient: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """What fit_pose found.
+    """The result of fit_pose().
 
-    R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given
-    one (of several the first), with the focal length found when that was asked for. `loss` is the mean squared difference to the
-    picture over pixels and channels, at the finest level, in linear radiance of which 1 is the picture's white; where a pixel is
-    far off, it counts no more than a tenth of the picture's range does.
+    R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given one
+    (of several the first), with the focal length found when that was asked for. `loss` is the mean squared difference to the
+    picture over pixels and channels, at the finest level, in linear radiance of which 1 is the picture's white; where a pixel
+    is far off, it counts no more than a tenth of the picture's range does.
     """
 
     R: Tensor
@@ -64,27 +66,25 @@ class PoseFit:
     explained: float = math.nan  # the share of the render's edges that the pictures show too, 0 … 1
     history: list[Step] = field(default_factory=list, repr=False)  # its last `best` step is this pose
     task: PoseTask | None = field(default=None, repr=False)  # what was compared, for pictures; not kept in JSON
-    cameras: list[Camera] = field(
-        default_factory=list, repr=False
-    )  # all that were given, as `camera`; not kept in JSON
-    # How exactly the pictures show the pose; None before the answer.
-    uncertainty: Uncertainty | None = field(default=None, repr=False)
-    # Of a fit of several objects, how much of this one the others leave to be seen, 0 … 1. Not kept in JSON
-    visible: float = 1.0
-    conflict: str = ""  # in words, which other pose or object it cannot be told from; not kept in JSON
-    enough: float = MIN_EDGE_SUPPORT  # of `explained`, for this mesh and picture; not kept in JSON
+    cameras: list[Camera] = field(default_factory=list, repr=False)  # all given ones, as `camera`; not kept in JSON
+    uncertainty: Uncertainty | None = field(default=None, repr=False)  # None before the answer
+    visible: float = 1.0  # share of this object that the others of fit_poses() do not hide; not kept in JSON
+    conflict: str = ""  # the other pose or object that may be the right one, in words; not kept in JSON
+    enough: float = MIN_EDGE_SUPPORT  # least `explained` of a right pose; not kept in JSON
 
     @property
     def matrix(self) -> Tensor:
         """Mesh to world, (4, 4) float64, for column vectors: `scale · R` and `t`."""
-        one = torch.ones((), dtype=torch.float64)
-        return Pose(self.R, self.t, self.scale * one, one).matrix
+        return rigid(self.scale * self.R, self.t)
 
     @property
     def reason(self) -> str:
-        """In words: "converged", or what kept the fit from that: "edges not explained: …", "hidden: …", "in one place: …",
-        "looks alike: …", "directions unknown: …", "steps ran out: …", "interrupted"."""
-        if not self.interrupted and not self.converged and self.visible < HIDDEN:
+        """ "converged", or what kept the fit from that, in words.
+
+        These are "edges not explained: …", "hidden: …", "in one place: …", "ambiguous: …", "directions unknown: …", "steps
+        ran out: …" and "interrupted".
+        """
+        if not self.interrupted and not self.converged and self.visible < MIN_VISIBLE_SHARE:
             return f"hidden: the other objects leave {self.visible:.0%} of it to be seen; its pose is about its start's"
         if self.conflict and not self.interrupted:
             return self.conflict
@@ -93,70 +93,64 @@ class PoseFit:
         if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < self.enough:
             return words
         fix = "give the mesh's colours, symmetries of the mesh, depth, or another picture"
-        if self.uncertainty.focal > FOCAL:
+        if self.uncertainty.focal > MAX_FOCAL:
             fix = "give a picture from nearer, where perspective shows, or the lens as it was calibrated"
         return f"directions unknown: {self.uncertainty.unknown}; {fix}"
 
     def plot(self) -> Figure:
-        """target | start | fit | difference, a row for each picture; with a mask all over black, as they were compared."""
+        """Draw target | start | fit | difference, a row for each picture; with a mask all over black, as they were
+        compared."""
         return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(self)
 
     def plot_history(self) -> Figure:
-        """The loss and the norm of each gradient, step by step."""
+        """Draw the loss and the norm of each gradient, step by step."""
         return require("edgegrad.fit.pose.pictures", *DRAWING).curves_of(self)
 
     def save(self, folder: PathLike) -> list[str]:
-        """Writes pose.json, fit.png, loss.png (plot_history()) and fit.webp to a folder, which is made where it is missing, each
-        whole or not at all, and gives their names; of a fit that took no step, pose.json alone. Raises OSError, or ImportError
-        once pose.json is written when matplotlib or pillow is missing."""
+        """Write pose.json, fit.png, loss.png (plot_history()) and fit.webp to a folder, and return their names.
+
+        The folder is made where it is missing, and each file is written whole or not at all. A fit that took no step writes
+        pose.json alone. Raises OSError, or ImportError once pose.json is written when matplotlib or pillow is missing.
+        """
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         with replacing(out / "pose.json") as temporary:
             temporary.write_text(self.to_json() + "\n", encoding="utf-8")
         if not self.history:
             return ["pose.json"]
-        report = require("edgegrad.fit.pose.pictures", *DRAWING)
-        draw = {"fit.png": report.draw_fit, "loss.png": report.draw_loss, "fit.webp": report.draw_animation}
+        pictures = require("edgegrad.fit.pose.pictures", *DRAWING)
+        draw = {"fit.png": pictures.draw_fit, "loss.png": pictures.draw_loss, "fit.webp": pictures.draw_animation}
         for name, function in draw.items():
             function(out / name, self)
         return ["pose.json", *draw]
 
     def _repr_png_(self) -> bytes | None:
-        """In a notebook: the picture of plot()."""
+        """Return the picture of plot() for a notebook."""
         if self.task is None or not self.history:
             return None
-        file = io.BytesIO()
-        self.plot().savefig(file, format="png", dpi=100)
-        return file.getvalue()
+        return png(self.plot())
 
     def to_json(self) -> str:
-        """The pose as JSON text: `mesh_to_world` 4 × 4 by rows, for column vectors; camera and figures of the fit beside it."""
-        return json.dumps(
-            {
-                "mesh_to_world": self.matrix.tolist(),
-                "scale": self.scale,
-                "camera": {
-                    "world_to_camera": self.camera.world_to_camera.tolist(),
-                    "K": self.camera.K.tolist(),
-                    "size": list(self.camera.size),
-                    "projection": self.camera.projection,
-                    "distortion": None if self.camera.distortion is None else self.camera.distortion.tolist(),
-                },
-                "loss": self.loss if math.isfinite(self.loss) else None,  # none yet when interrupted at once
-                "steps": self.steps,
-                "seconds": round(self.seconds, 3),
-                "converged": self.converged,
-                "reason": self.reason,
-                "interrupted": self.interrupted,
-                "explained": self.explained if math.isfinite(self.explained) else None,
-                "uncertainty": None if self.uncertainty is None else self.uncertainty.plain(),
+        """Return JSON text with the pose, `mesh_to_world` 4 × 4 by rows for column vectors, the camera, and figures of the
+        fit."""
+        camera = self.camera
+        content = {
+            "mesh_to_world": self.matrix.tolist(), "scale": self.scale,
+            "camera": {
+                "world_to_camera": camera.world_to_camera.tolist(), "K": camera.K.tolist(), "size": list(camera.size),
+                "projection": camera.projection,
+                "distortion": None if camera.distortion is None else camera.distortion.tolist(),
             },
-            indent=2,
-        )
+            "loss": number_or_none(self.loss), "steps": self.steps, "seconds": round(self.seconds, 3),
+            "converged": self.converged, "reason": self.reason, "interrupted": self.interrupted,
+            "explained": number_or_none(self.explained),
+            "uncertainty": None if self.uncertainty is None else self.uncertainty.plain(),
+        }  # fmt: skip
+        return json.dumps(content, indent=2)
 
     @staticmethod
     def from_json(text: str) -> PoseFit:
-        """From what to_json wrote; the history is not kept. Raises ValueError that names what is missing or wrong."""
+        """Read what to_json wrote; the history is not kept. Raises ValueError that names what is missing or wrong."""
         data = _parsed(text)
         _check_entries(data, "mesh_to_world", "camera", "loss", "steps", "seconds", "converged", "interrupted")
         pose = pose_from_matrix("mesh_to_world", data["mesh_to_world"])
@@ -176,10 +170,17 @@ class PoseFit:
         return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags, share, uncertainty=known)
 
 
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=100)
+    return file.getvalue()
+
+
 def pose_from_json(text: str) -> Pose:
-    """The pose alone, from a JSON object with `mesh_to_world`, 4 × 4 by rows, or from such a matrix alone; or from an object with
-    `poses`, as `edgegrad track` writes them, of which the last one that is not `lost`. Raises ValueError."""
-    data = _parsed(text, bare=True)
+    """Read a pose from a JSON object with `mesh_to_world`, 4 × 4 by rows, or from such a matrix alone. An object with `poses`,
+    as `edgegrad track` writes them, gives the last one that is not `lost`. Raises ValueError."""
+    data = _parsed(text, without_colors=True)
     if "poses" not in data:
         _check_entries(data, "mesh_to_world")
         return pose_from_matrix("mesh_to_world", data["mesh_to_world"])
@@ -192,12 +193,12 @@ def pose_from_json(text: str) -> Pose:
     return pose_from_matrix("mesh_to_world", seen[-1]["mesh_to_world"])
 
 
-def _parsed(text: str, bare: bool = False) -> dict[str, Any]:
+def _parsed(text: str, without_colors: bool = False) -> dict[str, Any]:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise ValueError(f"pose: expected JSON, got text that is not ({error})") from None
-    if bare and isinstance(data, list) and data:
+    if without_colors and isinstance(data, list) and data:
         return {"mesh_to_world": data}
     if not isinstance(data, dict):
         raise ValueError(f'pose: expected a JSON object, got {type(data).__name__}; write {{"mesh_to_world": …}}')

@@ -1,4 +1,4 @@
-"""What fit_pose compares, on each level of an image pyramid, and how a step moves the pose."""
+"""The task of a pose search: pictures on each level of an image pyramid, and how a step moves the pose."""
 
 from __future__ import annotations
 
@@ -19,34 +19,36 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..region import VISIBLE
 from ..views import area_mean, check_image, check_without_alpha, has_levels, over_black, warn_of_faint, white_level
-from .given import LEAST, Names, depth_of, shots_of
+from .inputs import MIN_PICTURE_SIDE, ArgumentNames, depth_of, shots_of
+from .jacobian import Motion, cross_matrices
 from .pose import Pose
 
-COARSEST = 24  # pixels across the object where the fit begins: 15 % of its size is then a few pixels
-SMALLEST = 12  # pixels on the shorter side of the coarsest level
-BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on the finer ones
-MOST_SPP = 64  # samples a pixel on coarse levels
-FADED = 0.25  # of a picture behind the render, where the background is not known
-# A border is clutter when more than 0.3 of it is farther from its median than 0.1 of the range.
-EVEN = (0.1, 0.3)
+COARSEST_OBJECT = 24  # Pixels across the object on the coarsest level, where 15 % of its size is a few pixels.
+SMALLEST_SIDE = 12  # pixels on the shorter side of the coarsest level
+PYRAMID_BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on finer ones
+MAX_COARSE_SPP = 64  # samples a pixel on coarse levels
+FADED = 0.25  # brightness of the picture behind a render, where the background is unknown
+# A border is clutter when more than 0.3 of it is further from its median than 0.1 of the range.
+UNIFORM_BORDER = (0.1, 0.3)
 
-# A step has these entries: a rotation vector about the centre and a shift, both along the first camera's axes, logarithms
-# of scale and focal length, the principal point in widths of the image, and the lens's distortion. The first of each:
-TURN, SHIFT, GROW, ZOOM, PRINCIPAL, BEND = 0, 3, 6, 7, 8, 10
-ENTRIES = 18
-PARTS = {  # of a step, by name
-    "rotation": range(TURN, SHIFT), "shift": range(SHIFT, GROW), "scale": range(GROW, ZOOM), "focal": range(ZOOM, PRINCIPAL),
-    "principal": range(PRINCIPAL, BEND), "distortion": range(BEND, ENTRIES),
+# A step has these entries, and a constant for the first of each: a rotation vector about the centre and a shift, both along
+# the first camera's axes, logarithms of scale and focal length, the principal point in widths of the image, and distortion.
+ROTATION, TRANSLATION, SCALE, FOCAL_LENGTH, PRINCIPAL, DISTORTION = 0, 3, 6, 7, 8, 10
+STEP_SIZE = 18
+STEP_PARTS = {
+    "rotation": range(ROTATION, TRANSLATION), "shift": range(TRANSLATION, SCALE), "scale": range(SCALE, FOCAL_LENGTH),
+    "focal": range(FOCAL_LENGTH, PRINCIPAL), "principal": range(PRINCIPAL, DISTORTION),
+    "distortion": range(DISTORTION, STEP_SIZE),
 }  # fmt: skip
 
 
-class Lens(NamedTuple):
-    """What is sought beside the pose."""
+class Unknowns(NamedTuple):
+    """Numbers that are sought in addition to the pose."""
 
     scale: bool = False
     focal: bool = False
     principal: bool = False
-    distortion: int = 0  # coefficients
+    distortion: int = 0  # number of coefficients
 
 
 class Shot(NamedTuple):
@@ -58,49 +60,49 @@ class Shot(NamedTuple):
     weight: Tensor | None  # (h, w, 1)
 
 
-class Level(NamedTuple):
+class PyramidLevel(NamedTuple):
     """The task at one resolution."""
 
     shots: list[Shot]
     blur: float  # pixels
     coarseness: float  # size of a pixel, relative to the finest level's
     spp: int
-    free: list[int]  # entries of a step that are sought
-    soft: float = 0.0  # pixels: the blur of the pictures themselves, which the renders are given
+    dofs: list[int]  # sought entries of a step
+    image_blur: float = 0.0  # pixels: blur of the pictures themselves, which renders get, too
 
     @property
     def size(self) -> tuple[int, int]:
-        """(h, w) of the first picture."""
+        """The size (h, w) of the first picture."""
         return self.shots[0].camera.size
 
 
 @dataclass(frozen=True)
 class PoseTask:
-    """What is compared, and how a pose moves. Geometry is float64."""
+    """Pictures that are compared with renders, and how a pose moves. Geometry is float64."""
 
     scene: Scene
-    aovs: tuple[str, ...]  # what is compared, one after the other: "image", "alpha" or both
-    shots: list[Shot]  # the pictures, whole
-    clutter: bool  # what stands behind the object is not known: where it is not seen, nothing is compared
-    colourless: bool  # the meshes have no colours, and no mask says where they are: pictures show them grey
+    aovs: tuple[str, ...]  # what is compared, in order: "image", "alpha" or both
+    shots: list[Shot]  # whole pictures
+    clutter: bool  # The background is unknown: where the object is not seen, nothing is compared.
+    colourless: bool  # The meshes have no colours, and no mask shows them: pictures show them grey.
     extent: float  # norm over the channels of the pictures' range, of colours where there are any
     center: Tensor  # (3,) of the bounding box, in the mesh's units
-    size: float  # its diagonal at the start, world units
-    free: list[int]  # entries of a step that are sought
-    names: Names
-    white: float = 1.0  # radiance that the given pictures have where these have 1
+    size: float  # diagonal of the bounding box at the start, world units
+    dofs: list[int]  # sought entries of a step
+    names: ArgumentNames
+    white: float = 1.0  # radiance in the given pictures of what is 1 here
 
     @staticmethod
-    def of(
+    def from_arguments(
         mesh: Mesh | Scene, target: Any, camera: Any, mask: Any, weight: Any, background: Tensor | float | None,
-        lens: Lens, scale: float, names: Names,
+        lens: Unknowns, scale: float, names: ArgumentNames,
     ) -> PoseTask:  # fmt: skip
-        """`scale` is the mesh's at the start. Raises TypeError or ValueError."""
+        """Check a fit's arguments; `scale` is the mesh's at the start. Raises TypeError or ValueError."""
         if not isinstance(mesh, Mesh | Scene):
             raise TypeError(
                 f"{names.mesh}: expected a Mesh or a Scene, got {type(mesh).__name__}; load one with load_mesh(path)"
             )
-        # Copies, for autograd does not keep tensors that were made in torch.inference_mode().
+        # Autograd does not keep tensors that were made in torch.inference_mode(), so they are copied.
         scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu", copy=True)
         plain = all(part.channels is None for part in scene.meshes)
         if mask is not None and background is not None:
@@ -109,10 +111,10 @@ class PoseTask:
         for name, view, picture, shape, count in shots_of(camera, target, mask, weight, names):
             image = check_image(f"{names.target}{name}", picture, view.size)
             levels = levels and has_levels(image)
-            if min(view.size) < LEAST:
+            if min(view.size) < MIN_PICTURE_SIDE:
                 raise ValueError(
-                    f"{names.target}{name}: expected a picture of {LEAST} × {LEAST} pixels or more, got {view.size[1]} × "
-                    f"{view.size[0]}; take a larger one"
+                    f"{names.target}{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
+                    f"{view.size[1]} × {view.size[0]}; take a larger one"
                 )
             if plain and mask is None:
                 check_without_alpha(f"{names.target}{name}", image)
@@ -135,7 +137,7 @@ class PoseTask:
                 image = shape if plain else torch.cat([over_black(image, shape)[0], shape], -1)
             else:
                 behind = background if background is not None else scene.background
-                clutter = clutter or plain  # colours that nobody knows cannot be compared
+                clutter = clutter or plain  # Unknown colours cannot be compared.
                 if behind is None:
                     clutter = clutter or is_clutter(image)
                 behind = _background(behind, image)
@@ -164,19 +166,17 @@ class PoseTask:
             raise ValueError(
                 f"{names.mesh}: expected vertices apart from one another, got all in one place; check the file's units"
             )
-        # One picture tells size from distance only together, and a parallel projection shows no distance at all.
+        # One picture shows the ratio of size and distance only, and a parallel projection no distance at all.
         orthographic = all(shot.camera.projection == "orthographic" for shot in shots)
         depth = len(shots) > 1 or (not orthographic and not lens.scale)
         if lens.scale and lens.focal and orthographic:
             raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
-        free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * lens.scale + [ZOOM] * lens.focal
-        free += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(BEND, BEND + lens.distortion))
-        # What is brighter than white, as a lamp or a broken pixel, says nothing of the range of the others.
+        dofs = [0, 1, 2, 3, 4] + [5] * depth + [SCALE] * lens.scale + [FOCAL_LENGTH] * lens.focal
+        dofs += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(DISTORTION, DISTORTION + lens.distortion))
+        # Pixels brighter than white, as of a light source or a defect, say nothing of the range of the others, nor does a mask.
         seen = torch.cat([shot.target.flatten(0, 1) for shot in shots]).clamp(max=1.0)
-        colours = (
-            seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
-        )  # a mask's range says nothing of theirs
-        # A black object before nothing has no range of colours.
+        colours = seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
+        # A black object before black has no range of colours, but its mask has.
         extent = next((r for x in (colours, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
         if masks and not any(bool((one > 0.0).any()) for one in masks):
             raise ValueError(
@@ -192,11 +192,13 @@ class PoseTask:
             raise ValueError(
                 f"{names.mask}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
             )
-        bare = scene.replace(meshes=double, background=None)
-        return PoseTask(bare, aovs, shots, clutter, colourless, extent, (low + high) / 2, size, free, names, white)
+        without_colors = scene.replace(meshes=double, background=None)
+        return PoseTask(
+            without_colors, aovs, shots, clutter, colourless, extent, (low + high) / 2, size, dofs, names, white
+        )
 
-    def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:
-        """From coarse to fine. Raises ValueError when the object is behind the camera."""
+    def pyramid(self, start: Pose, max_size: int, spp: int) -> list[PyramidLevel]:
+        """Return the levels from coarse to fine. Raises ValueError when the object is behind the camera."""
         camera = self.shots[0].camera
         H, W = camera.size
         finest = min(1.0, max_size / max(H, W))
@@ -206,22 +208,22 @@ class PoseTask:
             raise ValueError(
                 f"{self.names.init}: expected the object in front of the camera, got its centre at depth {depth:.3g}"
             )
-        across = finest * focal_of(camera) * self.size / (depth if perspective else 1.0)  # pixels
-        halvings = round(math.log2(max(1.0, min(across / COARSEST, finest * min(H, W) / SMALLEST))))
+        across = finest * focal_of(camera) * self.size / (depth if perspective else 1.0)
+        halvings = round(math.log2(max(1.0, min(across / COARSEST_OBJECT, finest * min(H, W) / SMALLEST_SIDE))))
         factors = [finest / 2**n for n in range(halvings, -1, -1)]
-        factors += [finest] * (len(BLURS) + 1 - len(factors))
-        blurs = [*BLURS, *[0.0] * (len(factors) - len(BLURS))]
-        # Perspective shows in fine detail only: on a blurred level the focal length would run away.
-        without_lens = [entry for entry in self.free if entry < ZOOM]
+        factors += [finest] * (len(PYRAMID_BLURS) + 1 - len(factors))
+        blurs = [*PYRAMID_BLURS, *[0.0] * (len(factors) - len(PYRAMID_BLURS))]
+        # Perspective shows in fine detail only: on a blurred level the focal length would diverge.
+        without_lens = [entry for entry in self.dofs if entry < FOCAL_LENGTH]
         levels = []
         for factor, blur in zip(factors, blurs, strict=True):
             coarseness = finest / factor
-            samples = max(spp, min(MOST_SPP, round(spp * coarseness**2)))
-            levels.append(self.level(factor, blur, coarseness, samples, without_lens if blur else self.free))
+            samples = max(spp, min(MAX_COARSE_SPP, round(spp * coarseness**2)))
+            levels.append(self.level(factor, blur, coarseness, samples, without_lens if blur else self.dofs))
         return levels
 
     def turned_over(self) -> PoseTask:
-        """With the pictures upside down."""
+        """Return the task with the pictures upside down."""
         shots = [
             Shot(
                 shot.camera, shot.target.flip(0),
@@ -232,65 +234,100 @@ class PoseTask:
         ]  # fmt: skip
         return replace(self, shots=shots)
 
-    def level(self, factor: float, blur: float, coarseness: float, spp: int, free: list[int]) -> Level:
-        """The task with the pictures' sides multiplied by `factor`."""
+    def level(self, factor: float, blur: float, coarseness: float, spp: int, dofs: list[int]) -> PyramidLevel:
+        """Return the task with the pictures' sides multiplied by `factor`."""
         shots = []
         for camera, target, behind, weight in self.shots:
-            H, W = camera.size
-            size = max(1, round(H * factor)), max(1, round(W * factor))
+            size = scaled(camera.size, factor)
             if behind is not None and behind.dim() == 3:
                 behind = area_mean(behind, size)
             weight = None if weight is None else area_mean(weight, size)
             shots.append(Shot(camera.resized(size), blurred(area_mean(target, size), blur), behind, weight))
-        return Level(shots, blur, coarseness, spp, free)
+        return PyramidLevel(shots, blur, coarseness, spp, dofs)
 
-    def moved(self, pose: Pose, free: list[int], p: Tensor) -> Pose:
-        """The pose after a step whose entries `free` are p, the others zero; differentiable in p."""
-        step = p.new_zeros(ENTRIES).index_put((torch.tensor(free),), p)
+    def moved(self, pose: Pose, dofs: list[int], p: Tensor) -> Pose:
+        """Return the pose after a step whose entries `dofs` are p, the others zero; differentiable in p."""
+        step = p.new_zeros(STEP_SIZE).index_put((torch.tensor(dofs),), p)
         camera = self.shots[0].camera
         view = camera.world_to_camera
-        R = rotation(view[:3, :3].T @ step[TURN:SHIFT]) @ pose.R
+        R = rotation(view[:3, :3].T @ step[ROTATION:TRANSLATION]) @ pose.R
         center = (
-            view[:3, :3] @ (pose.scale * (pose.R @ self.center) + pose.t) + view[:3, 3] + self.size * step[SHIFT:GROW]
+            view[:3, :3] @ (pose.scale * (pose.R @ self.center) + pose.t)
+            + view[:3, 3]
+            + self.size * step[TRANSLATION:SCALE]
         )
-        scale, zoom = pose.scale * step[GROW].exp(), step[ZOOM].exp()
+        scale, zoom = pose.scale * step[SCALE].exp(), step[FOCAL_LENGTH].exp()
         perspective = camera.projection != "orthographic"
-        if PRINCIPAL in free and perspective:
-            # Undone by a shift, what is left is the change of perspective, and the entries hardly disturb one another.
-            aside = step[PRINCIPAL:BEND] * camera.size[1] / focal_of(camera) / pose.focal.detach()
+        if PRINCIPAL in dofs and perspective:
+            # A shift compensates for the moved point, so that only perspective changes and the entries hardly interact.
+            aside = step[PRINCIPAL:DISTORTION] * camera.size[1] / focal_of(camera) / pose.focal.detach()
             center = torch.cat([center[:2] - aside * center[2:].detach(), center[2:]])
-        if ZOOM in free and perspective:
-            # A longer lens enlarges the object. Undone by distance, or by scale where that is sought, what is left of
-            # the zoom is the change of perspective.
-            if GROW in free:
+        if FOCAL_LENGTH in dofs and perspective:
+            # A longer lens enlarges the object. Distance compensates, or scale where that is sought, so that only
+            # perspective changes.
+            if SCALE in dofs:
                 scale = scale / zoom
             else:
                 center = torch.cat([center[:2], center[2:] * zoom])
         t = view[:3, :3].T @ (center - view[:3, 3]) - scale * (R @ self.center)
-        bend = pose.distortion + step[BEND:]
-        return Pose(R, t, scale, pose.focal * zoom, pose.principal + step[PRINCIPAL:BEND], bend)
+        coefficients = pose.distortion + step[DISTORTION:]
+        return Pose(R, t, scale, pose.focal * zoom, pose.principal + step[PRINCIPAL:DISTORTION], coefficients)
+
+    def motion(self, level: PyramidLevel, shot: Shot, pose: Pose) -> Motion:
+        """Return how each entry of a step that the level seeks moves what the shot sees. These are the derivatives of moved()
+        and lens() at a zero step. The object's centre moves along the first camera's axes, and the object rotates and scales
+        about it."""
+        camera = self.shots[0].camera
+        view = camera.world_to_camera.double()
+        center = pose.matrix[:3, :3] @ self.center + pose.t
+        depth = (view[:3, :3] @ center + view[:3, 3])[2]
+        perspective = camera.projection != "orthographic"
+        linear, path = torch.zeros(STEP_SIZE, 3, 3, dtype=torch.float64), torch.zeros(STEP_SIZE, 3, dtype=torch.float64)
+        K, lens_change = torch.zeros_like(linear), torch.zeros(STEP_SIZE, STEP_SIZE - DISTORTION, dtype=torch.float64)
+        one = torch.eye(3, dtype=torch.float64)
+        linear[ROTATION:TRANSLATION] = cross_matrices(view[:3, :3])
+        path[TRANSLATION:SCALE] = self.size * one
+        linear[SCALE] = one
+        K[FOCAL_LENGTH, :2, :2] = pose.focal * shot.camera.K[:2, :2]
+        if perspective and SCALE in level.dofs:
+            linear[FOCAL_LENGTH] = -one
+        elif perspective:
+            path[FOCAL_LENGTH, 2] = depth
+        for axis in (0, 1):
+            K[PRINCIPAL + axis, axis, 2] = shot.camera.size[1]
+            if perspective:
+                path[PRINCIPAL + axis, axis] = -camera.size[1] / focal_of(camera) / pose.focal * depth
+        lens_change[DISTORTION:] = torch.eye(STEP_SIZE - DISTORTION)
+        dofs = torch.tensor(level.dofs)
+        shift: Tensor = path @ view[:3, :3] - linear @ center
+        lens = {"K": K[dofs]} if bool(K[dofs].any()) else {}
+        if (dofs >= DISTORTION).any():
+            lens["distortion"] = lens_change[dofs]
+        return Motion(linear[dofs], shift[dofs], **lens)
 
     def between(self, one: Pose, other: Pose) -> float:
-        """How far apart the object's centres are, in parts of its size."""
-        ways = [pose.scale * (pose.R @ self.center) + pose.t for pose in (one, other)]
-        return float((ways[0] - ways[1]).norm()) / self.size
+        """Return the distance of the object's centres at two poses, relative to its size."""
+        return float((self.center_at(one) - self.center_at(other)).norm()) / self.size
+
+    def center_at(self, pose: Pose) -> Tensor:
+        return pose.scale * (pose.R @ self.center) + pose.t
 
     def lens(self, camera: Camera, pose: Pose) -> Camera:
-        """The camera with what was found of its lens."""
-        if ZOOM not in self.free and PRINCIPAL not in self.free and BEND not in self.free:
+        """Return the camera with what was found of its lens."""
+        if FOCAL_LENGTH not in self.dofs and PRINCIPAL not in self.dofs and DISTORTION not in self.dofs:
             return camera
         K = zoomed(camera.K, pose.focal.to(camera.K))
-        if PRINCIPAL in self.free:
+        if PRINCIPAL in self.dofs:
             across = torch.zeros_like(K)
             across[0, 2] = across[1, 2] = camera.size[1]
             K = K + across * torch.cat([pose.principal, pose.principal.new_zeros(1)]).to(K)[:, None]
         fields: dict[str, Any] = {"K": K}
-        if BEND in self.free:
-            bend = pose.distortion[: self.free[-1] + 1 - BEND].to(K)
+        if DISTORTION in self.dofs:
+            change = pose.distortion[: self.dofs[-1] + 1 - DISTORTION].to(K)
             given = camera.distortion
-            if given is not None and len(given) > len(bend):
-                bend = torch.cat([bend, bend.new_zeros(len(given) - len(bend))])
-            fields["distortion"] = bend if given is None else bend + F.pad(given, (0, len(bend) - len(given)))
+            if given is not None and len(given) > len(change):
+                change = torch.cat([change, change.new_zeros(len(given) - len(change))])
+            fields["distortion"] = change if given is None else change + F.pad(given, (0, len(change) - len(given)))
         return camera.replace(**fields)
 
     @property
@@ -301,7 +338,7 @@ class PoseTask:
 
     @property
     def backed(self) -> bool:
-        """Whether something that is not black stands behind the object, and is known."""
+        """Whether a known background that is not black stands behind the object."""
         return any(shot.background is not None and bool((shot.background != 0.0).any()) for shot in self.shots)
 
     @property
@@ -311,28 +348,28 @@ class PoseTask:
 
     @property
     def reverse_alone(self) -> bool:
-        """Whether renders have no forward mode: radiance of a lit scene changes in ways that torch alone knows."""
+        """Whether renders have no forward mode: only torch knows how the radiance of a lit scene changes."""
         return self.scene.is_shaded and "image" in self.aovs
 
-    def views(self, level: Level, pose: Pose, seed: int) -> list[tuple[Scene, Camera, int]]:
-        """The scene, the camera and the seed of each render, before black."""
+    def views(self, level: PyramidLevel, pose: Pose, seed: int) -> list[tuple[Scene, Camera, int]]:
+        """Return the scene, the camera and the seed of each render, before black."""
         moved = self.scene.transformed(pose.R, pose.t, pose.scale)
         return [(moved, self.lens(shot.camera, pose), (seed + 977 * k) % 2**32) for k, shot in enumerate(level.shots)]
 
-    def layers(self, level: Level, shot: Shot, channels: Mapping[str, Tensor], slopes: bool = False) -> Tensor:
-        """What a picture is a sum of (…, h, w, n), blurred like the pictures: the object before black, what is seen of the
-        background, if there is one, and alpha, if it is compared. `slopes`: the channels are derivatives."""
+    def layers(self, level: PyramidLevel, shot: Shot, channels: Mapping[str, Tensor], slopes: bool = False) -> Tensor:
+        """Return the summands (…, h, w, n) of a picture, blurred like the pictures. These are the object before black, the
+        visible part of a known background, and alpha, if it is compared. `slopes`: the channels are derivatives."""
         parts = [channels["image"]] if "image" in self.aovs else []
         if self.backed:
             covered = channels["alpha"]
-            assert shot.background is not None  # where one picture has a background, all have
+            assert shot.background is not None  # If one picture has a background, all have.
             seen = -covered if slopes else 1.0 - covered
             parts.append(seen * shot.background.to(seen))
         parts += [channels["alpha"]] if "alpha" in self.aovs else []
-        return blurred(torch.cat(parts, -1), math.hypot(level.blur, level.soft))
+        return blurred(torch.cat(parts, -1), math.hypot(level.blur, level.image_blur))
 
-    def images(self, level: Level, pose: Pose, spp: int, seed: int) -> list[Tensor]:
-        """The layers (h, w, n) of each picture, differentiable in the pose."""
+    def images(self, level: PyramidLevel, pose: Pose, spp: int, seed: int) -> list[Tensor]:
+        """Render the layers (h, w, n) of each picture, differentiable in the pose."""
         return [
             self.layers(level, shot, render_aovs(scene, camera, self.channels, spp=spp, seed=at))
             for shot, (scene, camera, at) in zip(level.shots, self.views(level, pose, seed), strict=True)
@@ -340,7 +377,7 @@ class PoseTask:
 
 
 def _in_units_of_white(shots: list[Shot], masked: bool) -> tuple[list[Shot], float]:
-    """Pictures whose white is 1, and the radiance that it was. `masked`: the last channel is a mask."""
+    """Return pictures whose white is 1, and its radiance before. `masked`: the last channel is a mask."""
     pixels = torch.cat([shot.target.flatten(0, 1) for shot in shots])
     white = white_level(pixels[pixels[:, -1] > 0.0, :-1] if masked else pixels)
     found = []
@@ -357,16 +394,16 @@ def _grey(mesh: Mesh, channels: int) -> Mesh:
 
 
 def focal_of(camera: Camera) -> float:
-    """Pixels, the geometric mean of both axes."""
+    """Return the focal length in pixels, the geometric mean of both axes."""
     return float(torch.linalg.det(camera.K[:2, :2].double()).abs().sqrt())
 
 
 def is_clutter(picture: Tensor) -> bool:
-    """Whether the border of (H, W, C) is of many colours, so that none of them is the background."""
+    """Return whether the border of a picture (H, W, C) has many colours, so that none of them is the background."""
     border = _border(picture)
     extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
     off = ((border - border.median(dim=0).values).abs() / extent).amax(1)
-    return float((off > EVEN[0]).float().mean()) > EVEN[1]
+    return float((off > UNIFORM_BORDER[0]).float().mean()) > UNIFORM_BORDER[1]
 
 
 def _border(picture: Tensor) -> Tensor:
@@ -374,7 +411,7 @@ def _border(picture: Tensor) -> Tensor:
 
 
 def _background(value: Tensor | float | None, picture: Tensor) -> Tensor:
-    """(C,) or (H, W, C). Raises TypeError or ValueError."""
+    """Return the background (C,) or (H, W, C). Raises TypeError or ValueError."""
     H, W, C = picture.shape
     if value is None:
         return _border(picture).median(dim=0).values
@@ -387,21 +424,26 @@ def _background(value: Tensor | float | None, picture: Tensor) -> Tensor:
     return behind.float()
 
 
+def scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    """Return the size of a picture whose sides are multiplied by a factor, at least one pixel."""
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
 def zoomed(K: Tensor, factor: Tensor) -> Tensor:
-    """K with its focal lengths multiplied; the principal point stays."""
+    """Return K with its focal lengths multiplied; the principal point stays."""
     lens = torch.zeros_like(K)
     lens[:2, :2] = K[:2, :2].detach()
     return K + (factor - 1.0) * lens
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of (…, h, w, C) by `sigma` pixels; the border's pixels are repeated outwards."""
+    """Return a Gaussian blur of images (…, h, w, C) by `sigma` pixels, which repeats the border's pixels outwards."""
     if sigma == 0.0:
         return image
     radius = math.ceil(3.0 * sigma)
     kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1).to(image) / sigma) ** 2)
     kernel = kernel / kernel.sum()
-    # Channels as groups of one image: as images of a batch, their backward pass takes up to seven times as long.
+    # Channels are groups of one image: as images of a batch, their backward pass takes up to seven times as long.
     rows = image.movedim(-1, -3).flatten(0, -3)[None]
     count = rows.shape[1]
     rows = F.pad(rows, (radius, radius, radius, radius), mode="replicate")

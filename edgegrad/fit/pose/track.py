@@ -1,9 +1,9 @@
-"""track(): where a known mesh stands in each picture of a film.
+"""track(): the pose of a known mesh in each picture of a film.
 
-Where the object was and how it moved says about where it is. From there a few Gauss-Newton steps over the terms of photographs
-(region, contour, light and depth) find it, on two levels of resolution around the object alone. Where they do not end at edges
-of the picture, more steps begin on the coarsest level, from where the object was as well; where that fails for some pictures
-the object is lost, and is searched for in the whole picture, in the light that it was seen in.
+Position and motion in the last pictures predict the pose. From there a few Gauss-Newton steps over the terms of photographs
+(region, contour, light and depth) refine it, on two levels of resolution around the object alone. Where they do not end at
+edges of the picture, more steps begin on the coarsest level, also from the last good pose. Where that fails for some
+pictures, the object is lost, and is searched for in the whole picture, in the light in which it was seen.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
+from ...camera.poses import rigid
 from ...check import check_int, check_positive_int
 from ...files.image import read_image
 from ...files.paths import PathLike
@@ -25,56 +26,54 @@ from ...scene.scene import Scene
 from ..region import Palette, palette
 from ..views import check_image
 from .fit_pose import depth_image
-from .gauss_newton import Normal
-from .given import Names, check_in_front, check_max_size, check_seen, depth_of
+from .gauss_newton import NormalEquations
+from .inputs import ArgumentNames, check_in_front, check_max_size, check_seen, depth_of
 from .photo.depth import warn_of_units
-from .photo.level import PhotoLevel, Seen, photo_levels
-from .photo.match import ACROSS, places
+from .photo.level import PhotoLevel, PictureComparison, photo_levels
+from .photo.light_history import LightHistory
+from .photo.match import VIEW_PIXELS, places
+from .photo.photo_search import PHOTO_SUPPORT, enough_support
 from .photo.picture import Picture
-from .photo.remembered import Remembered
-from .photo.views import Views, across, ball
-from .photo.ways import ALONE_ENOUGH, DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST
+from .photo.template_views import TemplateViews, across, ball
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
-from .task import Lens, PoseTask
+from .task import PoseTask, Unknowns
 
-Frame = Tensor | PathLike
-STEPS = 4  # on the last level but one and on the last, where the prediction is good
-MORE_STEPS = 8  # on each level, where it is not
-# Standard deviation of the motion from that of constant velocity, radians and object sizes: at first, and at least.
+FrameLike = Tensor | PathLike
+TRACK_STEPS = 4  # steps on each of the last two levels, where the prediction is good
+RETRY_STEPS = 8  # steps on each level, where it is not
+# The standard deviation from constant velocity, in radians and object sizes, has this first and this least value.
 STEADY, STEADIEST = 0.03, 0.005
-SHORT = 1e-3  # of a step on the last level: radians and object sizes
-POOR = 0.45  # of the render's edges: a picture that shows fewer hardly shows the object there
-PATIENCE = 4  # such pictures one after the other, and the object is lost
-AGAIN = 5  # pictures from one search for a lost object to the next
-RATE = 0.1  # of a picture, in how steadily the object moves
-LEARNT = 0.8  # of the edges, in pictures that light is learnt from
-SUDDEN = 0.3  # more of it covered than in the picture before
-HARDLY, MOSTLY = 0.2, 0.6  # of the object covered: the rest tells little
-# The search for a lost object: views, by so many radians at most from the last good pose, and by such a factor in size;
-# matches that are followed for a few steps, and of them to the end.
-VIEWS, TURNED, SIZES = 160, 1.1, 1.2
-CANDIDATES, FOLLOWED = 20, 4
-FARTHEST = 0.25  # radians and object sizes that steps lead from where they begin
+SHORT_STEP = 1e-3  # length of a short step on the last level, radians and object sizes
+POOR = 0.45  # share of edges below which a picture hardly shows the object
+PATIENCE = 4  # successive poor pictures after which the object is lost
+SEARCH_INTERVAL = 5  # pictures from one search for a lost object to the next
+STEADINESS_RATE = 0.1  # weight of a picture in `steady`
+LEARNING_SUPPORT = 0.8  # share of edges in pictures that light is learnt from
+SUDDEN = 0.3  # increase of the covered share that is not believed
+HARDLY, MOSTLY = 0.2, 0.6  # covered shares of the object
+# A search for a lost object renders views up to so many radians from the last good pose and this much larger or smaller,
+# takes a few steps from some matches, and refines the best.
+SEARCH_VIEWS, SEARCH_RADIUS, SIZE_FACTOR = 160, 1.1, 1.2
+CANDIDATES, REFINED_CANDIDATES = 20, 4
+MAX_DRIFT = 0.25  # longest path of the steps from their start, radians and object sizes
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedPose:
-    """Where the mesh is in one picture: `world = scale · R v + t`."""
+    """The mesh's pose in one picture: `world = scale · R v + t`."""
 
-    index: int  # of the picture, from 0
+    index: int  # number of the picture, from 0
     R: Tensor  # (3, 3) float64
     t: Tensor  # (3,) float64, world units
-    scale: float  # that of `init`
-    explained: (
-        float  # the share of the render's edges that the picture shows too, 0 … 1, where nothing covers the object
-    )
-    lost: bool  # the pose is the last one at which the object was seen
-    covered: float = 0.0  # the share of the object that the light of the pictures before does not explain, 0 … 1
+    scale: float  # as of `init`
+    explained: float  # share of the render's visible edges that the picture shows, 0 … 1
+    lost: bool  # The pose is the last one at which the object was seen.
+    covered: float = 0.0  # share of the object that does not match in the light of earlier pictures, 0 … 1
 
     @property
     def reason(self) -> str:
-        """In words, how well the pose is known: "seen", or "lost: …", "hardly seen: …" or "covered: …"."""
+        """How well the pose is known, in words: "seen", or "lost: …", "hardly seen: …" or "covered: …"."""
         if self.lost:
             return "lost: where the object was seen last, since pictures one after the other hardly show it"
         if self.explained < POOR:
@@ -82,19 +81,18 @@ class TrackedPose:
                 f"hardly seen: where its motion leads, for the picture shows {self.explained:.0%} of the render's edges"
             )
         if self.covered > MOSTLY:
-            return f"covered: {self.covered:.0%} of the object is not what it looked like before"
+            return f"covered: {self.covered:.0%} of the object is not what it was before"
         return "seen"
 
     @property
     def matrix(self) -> Tensor:
         """Mesh to world, (4, 4) float64, for column vectors: `scale · R` and `t`."""
-        one = torch.ones((), dtype=torch.float64)
-        return Pose(self.R, self.t, self.scale * one, one).matrix
+        return rigid(self.scale * self.R, self.t)
 
 
 def track(
     mesh: Mesh | Scene,
-    frames: Iterable[Frame],
+    frames: Iterable[FrameLike],
     camera: Camera,
     init: PoseFit | Tensor,
     *,
@@ -103,29 +101,29 @@ def track(
     spp: int = 8,
     seed: int = 0,
 ) -> Iterator[TrackedPose]:
-    """The pose of a known mesh in each picture of a film, one after the other as they are asked for.
+    """Yield the pose of a known mesh in each picture of a film, one after the other.
 
     mesh      what the pictures show, with its colours or without; the meshes of a Scene move together
-    frames    pictures (H, W, C) of linear radiance with the mesh's channels, or paths of image files; a list, a tensor
-              (T, H, W, C), or any iterable, of which no more is read than what is asked for
+    frames    pictures (H, W, C) of linear radiance with the mesh's channels, or paths of image files; a list, a tensor (T, H,
+              W, C), or any iterable, which is read only as far as poses are asked for
     camera    the camera of all pictures, of size (H, W)
-    init      the pose in the first picture, within about 10° and 5 % of the object's size: what fit_pose found, or mesh to world
-              as a matrix (4, 4) for column vectors
-    depth     of each picture (H, W) or (H, W, 1), as a depth camera measures it from where the picture was taken: distances along
-              +Z of the camera in world units, 0 or NaN where there is none; None for pictures without
-    max_size  what is used of a larger picture, about the object, is reduced to so many pixels on its longer side
+    init      the pose in the first picture, within about 10° and 5 % of the object's size: what fit_pose found, or mesh to
+              world as a matrix (4, 4) for column vectors
+    depth     of each picture (H, W) or (H, W, 1), as a depth camera measures it from where the picture was taken: distances
+              along +Z of the camera in world units, 0 or NaN where there is none; None for pictures without
+    max_size  the part around the object of a larger picture is reduced to so many pixels on its longer side
     spp       samples a pixel of each render
     seed      the same seed gives the same poses
 
-    The light and what stands behind the object need not be known. The mesh may move by some 10° and a fifth of its size from a
-    picture to the next, more where it moves evenly; something may pass before it. Where four pictures in a row hardly show the
-    object (`explained` below 0.45), it is `lost`, and is searched for until it is found again: where it was seen last in each
-    picture, and in every fifth all over it, turned by up to some 60° and up to a fifth larger or smaller, by perspective and
+    The light and the background need not be known. The mesh may move by some 10° and a fifth of its size from a picture to
+    the next, more where it moves evenly; something may pass before it. Where four pictures in a row hardly show the object
+    (`explained` below 0.45), it is `lost`, and is searched for until it is found again: where it was seen last in each
+    picture, and in every fifth all over it, rotated by up to some 60° and up to a fifth larger or smaller, by perspective and
     orthographic cameras.
 
-    Arguments are checked at once; an `init` at which the camera sees nothing of the object is refused. A picture that cannot be
-    used (another size, numbers that are not finite, a file that is not there) is an error, ValueError, TypeError or OSError,
-    that names it as `frames[k]`, raised when it is asked for; the poses of those before it have been given by then.
+    Arguments are checked at once; an `init` at which the camera sees nothing of the object is refused. A picture that cannot
+    be used (another size, numbers that are not finite, a missing file) raises ValueError, TypeError or OSError that names it
+    as `frames[k]`, when it is asked for; the poses before it have been given by then.
     """
     if not isinstance(camera, Camera) or camera.batch is not None:
         got = type(camera).__name__ if not isinstance(camera, Camera) else f"a batch of {camera.batch}"
@@ -154,7 +152,9 @@ def track(
     return _poses(Tracker(mesh, camera, start, max_size, spp, seed), frames, depth)
 
 
-def _poses(tracker: Tracker, frames: Iterable[Frame], depth: Iterable[Tensor | None] | None) -> Iterator[TrackedPose]:
+def _poses(
+    tracker: Tracker, frames: Iterable[FrameLike], depth: Iterable[Tensor | None] | None
+) -> Iterator[TrackedPose]:
     depths = None if depth is None else iter(depth)
     for index, frame in enumerate(frames):
         measured = None
@@ -166,13 +166,13 @@ def _poses(tracker: Tracker, frames: Iterable[Frame], depth: Iterable[Tensor | N
         yield tracker.follow(index, frame, measured)
 
 
-class End(NamedTuple):
-    """Where a way down ended."""
+class FrameCandidate(NamedTuple):
+    """A refined pose in one picture."""
 
     pose: Pose
-    share: float  # of the render's edges, where nothing covers it
+    share: float  # visible edges of the render that the picture shows
     covered: float  # share of the object
-    views: list[Seen]
+    views: list[PictureComparison]
 
     @property
     def shown(self) -> float:
@@ -181,25 +181,25 @@ class End(NamedTuple):
 
 
 class Tracker:
-    """What is known of a film so far."""
+    """The state of tracking through a film."""
 
     def __init__(self, mesh: Mesh | Scene, camera: Camera, start: Pose, max_size: int, spp: int, seed: int) -> None:
         self.mesh, self.camera = mesh, camera
         self.max_size, self.spp, self.seed = max_size, spp, seed
-        self.pose = self.good = start  # the last one, and the last one at which the object was seen
-        self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)  # a picture
-        self.poor = self.lost = 0  # pictures one after the other that hardly show the object, and in which it is lost
-        self.first, self.moves = True, False  # whether the velocity is known
+        self.pose = self.good = start  # last pose, and last one at which the object was seen
+        self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+        self.poor = self.lost = 0  # successive pictures that hardly show the object, and in which it is lost
+        self.first, self.moves = True, False  # `moves`: the velocity is known.
         self.task: PoseTask | None = None
         self.palettes: list[Palette] = []
         self.steady = STEADY
-        self.covered = 0.0  # share of the object in the last picture
-        self.remembered = Remembered()
+        self.covered = 0.0  # share in the last picture
+        self.light = LightHistory()
 
     @torch.inference_mode(False)
     @torch.enable_grad()
     def follow(self, index: int, frame: object, measured: object) -> TrackedPose:
-        """The pose in the next picture. Raises TypeError, ValueError or OSError."""
+        """Return the pose in the next picture. Raises TypeError, ValueError or OSError."""
         name = f"frames[{index}]"
         picture = self._picture(name, frame)
         if self.task is None:
@@ -217,129 +217,129 @@ class Tracker:
             self.poor += 1
         lost = self.poor >= PATIENCE
         self.lost = self.lost + 1 if lost else 0
-        if lost and self.lost % AGAIN == 0:
+        if lost and self.lost % SEARCH_INTERVAL == 0:
             again = self._searched(task, near)
-            if again.share >= (ALONE_ENOUGH if task.colourless else ENOUGH) and again.covered < MOSTLY:
+            if again.share >= enough_support(task) and again.covered < MOSTLY:
                 pose, share, self.covered, _ = again
                 lost, self.poor, self.lost = False, 0, 0
         self._move(pose, share, lost)
         where = self.pose.R, self.pose.t, float(self.pose.scale)
         return TrackedPose(index, *where, share, lost, self.covered)
 
-    def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> End:
-        """Where the object is."""
-        best = End(predicted, 0.0, 1.0, [])
+    def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> FrameCandidate:
+        """Find the object near the predicted or the last good pose."""
+        best = FrameCandidate(predicted, 0.0, 1.0, [])
         if not self.first and not self.lost:
             levels = self._levels(task, depth, predicted)
-            offset = torch.zeros(len(levels[-1].plain.free), dtype=torch.float64) if self.moves else None
-            best = self._believed(self._down(levels[-2:], predicted, STEPS, offset), predicted)
-            if offset is not None and best.share >= LEARNT and best.covered < HARDLY:
-                variance = (1.0 - RATE) * self.steady**2 + RATE * float(offset.square().mean())
+            offset = torch.zeros(len(levels[-1].plain.dofs), dtype=torch.float64) if self.moves else None
+            best = self._believed(self._down(levels[-2:], predicted, TRACK_STEPS, offset), predicted)
+            if offset is not None and best.share >= LEARNING_SUPPORT and best.covered < HARDLY:
+                variance = (1.0 - STEADINESS_RATE) * self.steady**2 + STEADINESS_RATE * float(offset.square().mean())
                 self.steady = max(variance**0.5, STEADIEST)
-        if best.share < ENOUGH or best.covered > self.covered + SUDDEN:  # for what covers an object comes gradually
+        if best.share < PHOTO_SUPPORT or best.covered > self.covered + SUDDEN:  # Occlusion grows gradually.
             for start in [predicted] if self.first or predicted is self.good else [predicted, self.good]:
-                again = self._believed(self._down(self._levels(task, depth, start), start, MORE_STEPS), start)
+                again = self._believed(self._down(self._levels(task, depth, start), start, RETRY_STEPS), start)
                 if again.shown > best.shown:
                     best = again
-                if best.share >= ENOUGH and best.covered < MOSTLY:
+                if best.share >= PHOTO_SUPPORT and best.covered < MOSTLY:
                     break
-        if self.first and best.share < ENOUGH:  # the coarsest level leads aside from some starts that are near
-            again = self._down(self._levels(task, depth, predicted)[-2:], predicted, MORE_STEPS)
+        if self.first and best.share < PHOTO_SUPPORT:  # The coarsest level spoils some near starts.
+            again = self._down(self._levels(task, depth, predicted)[-2:], predicted, RETRY_STEPS)
             best = max(best, again, key=lambda end: end.shown)
-        if best.share >= LEARNT and best.covered < MOSTLY:
-            self.remembered.learn(best.views)
+        if best.share >= LEARNING_SUPPORT and best.covered < MOSTLY:
+            self.light.learn(best.views)
         return best if best.share >= POOR else best._replace(pose=predicted)
 
-    def _down(self, levels: list[PhotoLevel], start: Pose, most: int, offset: Tensor | None = None) -> End:
-        """Through the levels, with so many steps on each at most; `offset` as of _stepped()."""
-        cover = self.remembered.cover(levels[-2].see(start, self.seed)) if offset is not None else None
+    def _down(self, levels: list[PhotoLevel], start: Pose, most: int, offset: Tensor | None = None) -> FrameCandidate:
+        """Refine through the levels, with at most so many steps on each; `offset` as of _stepped()."""
+        occluder = self.light.occluder(levels[-2].comparisons(start, self.seed)) if offset is not None else None
         pose, views = start, []
         for level in levels:
-            pose, views = self._stepped(level if cover is None else cover.left_out(level), pose, most, offset)
-            cover = self.remembered.cover(views) or cover
-        share = levels[-1].explained(pose, self.seed, views)
-        return End(pose, share, 0.0 if cover is None else cover.share, views)
+            pose, views = self._stepped(level if occluder is None else occluder.left_out(level), pose, most, offset)
+            occluder = self.light.occluder(views) or occluder
+        share = levels[-1].edge_support(pose, self.seed, views)
+        return FrameCandidate(pose, share, 0.0 if occluder is None else occluder.share, views)
 
-    def _believed(self, end: End, start: Pose) -> End:
-        """Steps that lead far from where they began follow something else than the object, whatever they explain there."""
+    def _believed(self, end: FrameCandidate, start: Pose) -> FrameCandidate:
+        """Reject a candidate far from its start: such steps follow something other than the object, whatever they match
+        there."""
         assert self.task is not None
-        near = angle(start.R, end.pose.R) < FARTHEST and self._way(start, end.pose) < FARTHEST * self.task.size
-        return end if near or self.first else End(start, 0.0, 1.0, [])
-
-    def _way(self, a: Pose, b: Pose) -> float:
-        """Between the object's centres."""
-        return float((self._center(a) - self._center(b)).norm())
+        moved = float((self._center(start) - self._center(end.pose)).norm())
+        near = angle(start.R, end.pose.R) < MAX_DRIFT and moved < MAX_DRIFT * self.task.size
+        return end if near or self.first else FrameCandidate(start, 0.0, 1.0, [])
 
     def _center(self, pose: Pose) -> Tensor:
         assert self.task is not None
-        return pose.scale * (pose.R @ self.task.center) + pose.t
+        return self.task.center_at(pose)
 
     def _stepped(
         self, level: PhotoLevel, pose: Pose, most: int, offset: Tensor | None = None
-    ) -> tuple[Pose, list[Seen]]:  # fmt: skip
-        """After so many Gauss-Newton steps at most, or a short one, and what was seen before the last, which is short where the
-        way ends well. `offset` (n,): how far the steps have led from the prediction, which they add to; the object is taken to
-        be near that, as far as the picture shows little of it."""
-        views: list[Seen] = []
+    ) -> tuple[Pose, list[PictureComparison]]:  # fmt: skip
+        """Take at most so many Gauss-Newton steps, until a short one; return the pose and the comparisons before the last
+        step. `offset` (n,) is how far the steps have led from the prediction, which they add to. Where the picture shows
+        little, the pose is pulled to the prediction."""
+        views: list[PictureComparison] = []
         for step in range(most):
-            views = level.see(pose, self.seed)
+            views = level.comparisons(pose, self.seed)
             if level.last and step == 0:
                 level = level.focused(views)
             normal, _loss = level.equations(pose, self.seed, views)
             if not float(normal.curvature.trace()) > 0.0:
-                break  # the prior below would hide that
+                break  # The prior below would hide that.
             if offset is not None:
                 known = torch.eye(len(offset), dtype=torch.float64) / self.steady**2
-                normal = Normal(normal.curvature + known, normal.gradient + known @ offset)
-            move = normal.damped(LAST_DAMPING if level.last else DAMPING, FLOOR, LONGEST)
+                normal = NormalEquations(normal.curvature + known, normal.gradient + known @ offset)
+            move = level.step(normal)
             assert move is not None
-            pose = level.task.moved(pose, level.plain.free, move)
+            pose = level.task.moved(pose, level.plain.dofs, move)
             if offset is not None:
                 offset += move
-            if float(move.abs().max()) < SHORT * level.plain.coarseness:
+            if float(move.abs().max()) < SHORT_STEP * level.plain.coarseness:
                 break
         return pose, views
 
     def _levels(self, task: PoseTask, depth: Tensor | None, pose: Pose) -> list[PhotoLevel]:
         return photo_levels(task, pose, [depth], self.max_size, self.spp, self.seed, self.palettes)
 
-    def _searched(self, task: PoseTask, depth: Tensor | None) -> End:
-        """Where the whole picture looks like the object, as large about as it was, and turned by up to some 60°."""
-        camera, scale, best = task.shots[0].camera, self.good.scale, End(self.good, 0.0, 1.0, [])
+    def _searched(self, task: PoseTask, depth: Tensor | None) -> FrameCandidate:
+        """Search the whole picture for the object, about as large as it was, and rotated by up to some 60°."""
+        camera, scale, best = task.shots[0].camera, self.good.scale, FrameCandidate(self.good, 0.0, 1.0, [])
         if camera.projection not in ("perspective", "orthographic"):
             return best
         unit = replace(
             task, scene=task.scene.transformed(torch.eye(3), torch.zeros(3), scale), center=scale * task.center
         )
-        rotations = ball(VIEWS, TURNED) @ (camera.world_to_camera[:3, :3] @ self.good.R)
+        rotations = ball(SEARCH_VIEWS, SEARCH_RADIUS) @ (camera.world_to_camera[:3, :3] @ self.good.R)
         far = self._distance(self.good)
         size = across(unit, camera, far) / min(camera.size)
-        views = self.remembered.shone_on(Views.of(unit, rotations, ACROSS, self.seed), camera)
-        lit = self.remembered.light is not None
-        poses = [pose._replace(scale=scale) for pose in places(unit, views, (size / SIZES, size * SIZES), lit)]
-        if camera.projection == "orthographic":  # which does not show it
+        views = self.light.illuminated(TemplateViews.from_rotations(unit, rotations, VIEW_PIXELS, self.seed), camera)
+        lit = self.light.light is not None
+        poses = [
+            pose._replace(scale=scale) for pose in places(unit, views, (size / SIZE_FACTOR, size * SIZE_FACTOR), lit)
+        ]
+        if camera.projection == "orthographic":  # The match does not show depth.
             axis = camera.world_to_camera[2, :3]
             poses = [pose._replace(t=pose.t + (far - self._distance(pose)) * axis) for pose in poses]
         found = []
         for pose in poses[:CANDIDATES]:
             level = self._levels(task, depth, pose)[0]
-            pose, views = self._stepped(level, pose, STEPS)
-            found.append((level.explained(pose, self.seed, views), pose))
+            pose, views = self._stepped(level, pose, TRACK_STEPS)
+            found.append((level.edge_support(pose, self.seed, views), pose))
         found.sort(key=lambda one: -one[0])
-        for _, pose in found[:FOLLOWED]:
-            again = self._down(self._levels(task, depth, pose), pose, MORE_STEPS)
+        for _, pose in found[:REFINED_CANDIDATES]:
+            again = self._down(self._levels(task, depth, pose), pose, RETRY_STEPS)
             best = max(best, again, key=lambda end: end.shown)
-            if best.share >= LEARNT and best.covered < HARDLY:
+            if best.share >= LEARNING_SUPPORT and best.covered < HARDLY:
                 break
         return best
 
     def _distance(self, pose: Pose) -> float:
-        """Of the object's centre from the camera, world units; along the view, as sizes in the picture have it."""
+        """Return the distance of the object's centre from the camera along its axis, world units."""
         assert self.task is not None
         return float(depth_of(self.camera.to(torch.float64), pose, self.task.center))
 
     def _predicted(self) -> Pose:
-        """By constant velocity."""
+        """Predict the pose by constant velocity."""
         assert self.task is not None
         if self.lost:
             return self.good
@@ -348,36 +348,36 @@ class Tracker:
         return self.pose._replace(R=R, t=where - self.pose.scale * (R @ self.task.center))
 
     def _move(self, pose: Pose, share: float, lost: bool) -> None:
-        """Takes in where the object is now."""
+        """Update position and velocity."""
         if not (self.first or lost) and (share < POOR or self.covered > MOSTLY):
-            self.pose = pose  # and goes on as it went
+            self.pose = pose  # The velocity stays.
             return
         moved, self.moves = self.moves, not (self.first or lost)
-        if lost:  # where it went is not known
+        if lost:  # The velocity is not known.
             self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
         elif not self.first:
-            far = angle(self.pose.R, pose.R) > FARTHEST  # found again
+            far = angle(self.pose.R, pose.R) > MAX_DRIFT  # It was found again.
             turn = torch.eye(3, dtype=torch.float64) if far else pose.R @ self.pose.R.T
             shift = torch.zeros(3, dtype=torch.float64) if far else self._center(pose) - self._center(self.pose)
-            # The difference of two poses has the errors of both, and predictions by it alone add them up.
+            # A difference of two poses has the errors of both, so velocities are averaged.
             known = moved and not far
             self.turn, self.shift = (_between(self.turn, turn), 0.5 * (self.shift + shift)) if known else (turn, shift)
         self.pose, self.first = self.good if lost else pose, False
-        if share >= ENOUGH and not lost:
+        if share >= PHOTO_SUPPORT and not lost:
             self.good = pose
 
     def _task(self, name: str, picture: Tensor) -> PoseTask:
-        task = PoseTask.of(
-            self.mesh, picture, self.camera, None, None, None, Lens(), float(self.pose.scale), Names(target=name)
-        )
-        # Whatever stands behind the object: a film shows it from more than one side.
+        task = PoseTask.from_arguments(
+            self.mesh, picture, self.camera, None, None, None, Unknowns(), float(self.pose.scale), ArgumentNames(target=name)
+        )  # fmt: skip
+        # The background counts as unknown, since a film shows more than one.
         task = replace(task, clutter=True, shots=[task.shots[0]._replace(background=None)])
-        whole = Picture.of(task.shots[0], False, None, self.camera.size)
+        whole = Picture.from_shot(task.shots[0], False, None, self.camera.size)
         self.palettes = [palette(whole.outlined, self.seed)]
         return task
 
     def _picture(self, name: str, frame: object) -> Tensor:
-        """(H, W, C). Raises TypeError, ValueError or OSError."""
+        """Return the frame (H, W, C). Raises TypeError, ValueError or OSError."""
         if isinstance(frame, (str, OsPath)):
             try:
                 frame = read_image(frame, channels=3)
@@ -390,6 +390,6 @@ class Tracker:
 
 
 def _between(A: Tensor, B: Tensor) -> Tensor:
-    """The rotation in the middle of two (3, 3)."""
+    """Return the rotation midway between two (3, 3)."""
     U, _, Vh = torch.linalg.svd(A + B)
     return U @ Vh

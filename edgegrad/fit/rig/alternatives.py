@@ -1,6 +1,7 @@
-"""Poses that outlines hardly tell from another one, and that no descent from that one reaches.
+"""Ambiguous poses: those that outlines hardly separate from another one, and that no descent from that one reaches.
 
-Two limbs of one build, as two legs, may each be where the other one is; joints in a row may share a twist in another way.
+Two limbs of one build, as two legs, may each be where the other one is; joints in a row may share a rotation about their axes
+otherwise.
 """
 
 from __future__ import annotations
@@ -15,45 +16,46 @@ from ...rig.joints import Joints
 from ...rig.rig import Rig
 from ...rig.rotations import roma
 from ...rig.skinned import SkinDeformer
-from .sought import Sought
+from .free_parameters import FreeParameters
 
 
 @dataclass(frozen=True, eq=False)
-class Twist:
-    """A turn of a row about the line to its child, which is turned back; about its own limb where nothing hangs on it."""
+class AxialRotation:
+    """A rotation of a joint about the line to its child, which is rotated back; without a child, about its own limb."""
 
     row: int
     child: int | None
-    axis: Tensor  # (3,) among its own, of length 1
+    axis: Tensor  # (3,) along the joint's own axes, of length 1
 
 
 @dataclass(frozen=True)
 class Alternatives:
-    """Of values that are sought, other ones of the value `name`, which are rotation vectors."""
+    """Other values of the rotation vectors `name`, given those that are sought."""
 
     rig: Rig
-    sought: Sought
+    free: FreeParameters
     name: str
 
     @property
     def joints(self) -> Joints | None:
-        """None where a rig does not say how they hang."""
+        """The joints; None where a rig does not say how they hang."""
         return self.rig.deformer.joints if isinstance(self.rig.deformer, SkinDeformer) else None
 
     def exchanged(self, values: Mapping[str, Tensor], one: Sequence[int], other: Sequence[int]) -> Tensor:
-        """Two groups of rows, each where the other one is. Without joints each row takes its counterpart's rotation vector."""
+        """Put two groups of rows each where the other one is. Without joints, rows take their counterparts' rotation
+        vectors."""
         both = [*one, *other]
         if self.joints is None:
             value = values[self.name].clone()
             value[both] = value[[*other, *one]]
             return value
-        rotations, every = self._rotations(values), self.sought.all(values)
+        rotations, every = self._rotations(values), self.free.all(values)
         ours, theirs = (self._places(values)[list(limb)].tolist() for limb in (one, other))
         found = exchanged(self.joints, rotations, ours, theirs, every["joint_translations"], every["joint_scales"])
         return self._changed(values, found, both)
 
-    def twists(self, values: Mapping[str, Tensor]) -> list[Twist]:
-        """Of each joint on which one other hangs, of those that are sought, or none."""
+    def axial_rotations(self, values: Mapping[str, Tensor]) -> list[AxialRotation]:
+        """Return those of each sought joint on which one other hangs, of those that are sought, or none."""
         if self.joints is None:
             return []
         places = self._places(values).tolist()
@@ -71,30 +73,30 @@ class Alternatives:
             if not branches:
                 along = self._middle(place)
             elif len(branches) == 1 and branches[0] in row_of:
-                along = self.sought.all(values)["joint_translations"][branches[0]]
+                along = self.free.all(values)["joint_translations"][branches[0]]
             else:
                 continue
             if float(along.norm()) > 0.0:
-                found.append(Twist(row, row_of[branches[0]] if branches else None, along / along.norm()))
+                found.append(AxialRotation(row, row_of[branches[0]] if branches else None, along / along.norm()))
         return found
 
-    def twisted(self, values: Mapping[str, Tensor], twist: Twist, angle: float) -> Tensor:
-        """By so many radians. What hangs on it stays as it is."""
+    def with_rotation(self, values: Mapping[str, Tensor], rotation: AxialRotation, angle: float) -> Tensor:
+        """Rotate by so many radians. What hangs on the child stays as it is."""
         assert self.joints is not None
         places, rotations = self._places(values), self._rotations(values)
-        at, rows = int(places[twist.row]), [twist.row]
-        Q = roma().rotvec_to_rotmat(angle * twist.axis)
+        at, rows = int(places[rotation.row]), [rotation.row]
+        Q = roma().rotvec_to_rotmat(angle * rotation.axis)
         found = rotations.clone()
         found[at] = rotations[at] @ Q
-        if twist.child is not None:
-            below = int(places[twist.child])
+        if rotation.child is not None:
+            below = int(places[rotation.child])
             hung = self.joints.rotations[below]
             found[below] = hung.mT @ Q.mT @ hung @ rotations[below]
-            rows.append(twist.child)
+            rows.append(rotation.child)
         return self._changed(values, found, rows)
 
     def _middle(self, place: int) -> Tensor:
-        """(3,) of the vertices that hang on a joint, by their weights, from it, along its own axes at rest."""
+        """Return the weighted mean (3,) of the vertices that hang on a joint, from it, along its own axes at rest."""
         assert isinstance(self.rig.deformer, SkinDeformer)
         total, count = torch.zeros(3, dtype=torch.float64), 0.0
         for skin, mesh in zip(self.rig.deformer.skins, self.rig.meshes, strict=True):
@@ -105,12 +107,12 @@ class Alternatives:
         return total / max(count, 1e-12)
 
     def _places(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Among all joints, of the rows."""
-        return self.sought.rows.get(self.name, torch.arange(len(values[self.name])))
+        """Return the places of the rows among all joints."""
+        return self.free.rows.get(self.name, torch.arange(len(values[self.name])))
 
     def _rotations(self, values: Mapping[str, Tensor]) -> Tensor:
-        """(J, 3, 3)"""
-        return roma().rotvec_to_rotmat(self.sought.all(values)[self.name].double())
+        """Return the rotation matrices (J, 3, 3)."""
+        return roma().rotvec_to_rotmat(self.free.all(values)[self.name].double())
 
     def _changed(self, values: Mapping[str, Tensor], rotations: Tensor, rows: list[int]) -> Tensor:
         value = values[self.name].clone()
@@ -122,11 +124,11 @@ def exchanged(
     joints: Joints, rotations: Tensor, one: Sequence[int], other: Sequence[int],
     translations: Tensor | None = None, scales: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
-    """(J, 3, 3) rotations of all joints, as Joints.world() takes them.
+    """Return the rotations (J, 3, 3) of all joints, as Joints.world() takes them, with two limbs exchanged.
 
     one, other   joints of the two limbs, each with its parents before it, in one order
 
-    Each joint turns from rest as its counterpart does, and then by the smallest rotation that points it to where the
+    Each joint rotates from rest as its counterpart does, and then by the smallest rotation that points it to where the
     counterpart's children are.
     """
     rest, before = (joints.world(R, translations, scales) for R in (None, rotations))
@@ -148,12 +150,12 @@ def exchanged(
 
 
 def _orientations(world: Tensor) -> Tensor:
-    """(J, 3, 3) without what stretches."""
+    """Return the rotations (J, 3, 3) without stretch."""
     return roma().special_procrustes(world[:, :3, :3])
 
 
 def _smallest(along: Tensor, wanted: Tensor) -> Tensor:
-    """(3, 3), the rotation by the smallest angle that turns one direction (3,) to another."""
+    """Return the rotation (3, 3) by the smallest angle from one direction (3,) to another."""
     axis = torch.linalg.cross(along, wanted)
     angle = torch.atan2(axis.norm(), along @ wanted)
     return roma().rotvec_to_rotmat(angle * axis / axis.norm().clamp(min=1e-12))

@@ -11,16 +11,16 @@ from ...camera.camera import Camera
 from ...check import as_tensor
 from ...rig.rig import Rig
 
-OFF = 1e-9  # radians
-WIDE = 0.02  # of the picture's diagonal: distances beyond count by themselves rather than by their squares
+NONZERO_ANGLE = 1e-9  # radians
+KEYPOINT_WIDTH = 0.02  # Share of the picture's diagonal: larger distances count linearly.
 
 
 def keypoint_term(
     rig: Rig, cameras: Sequence[Camera], keypoints: Mapping[str, Tensor], weight: float
 ) -> Callable[[Mapping[str, Tensor]], Tensor]:
-    """weight · mean of ρ(d² / σ²) over all that are seen, of distances d in pixels, σ = WIDE of the picture's diagonal and
-    ρ(x) = 2 √(1 + x) − 2 (Charbonnier et al. 1997), which pulls from afar and no wrong one more than others; as a function of all
-    values. Raises TypeError or ValueError."""
+    """Return weight · mean of ρ(d² / σ²) over all visible keypoints, as a function of all values. d are distances in pixels, σ
+    is KEYPOINT_WIDTH of the picture's diagonal, and ρ(x) = 2 √(1 + x) − 2 (Charbonnier et al. 1997), which pulls from afar and
+    gives no wrong point more weight than others. Raises TypeError or ValueError."""
     names = rig.deformer.names
     if not names:
         raise ValueError("keypoints: expected a rig with joints, got one without; give from_function(…, joints=…)")
@@ -44,11 +44,11 @@ def keypoint_term(
     if not bool(seen.any()):
         raise ValueError("keypoints: expected numbers for one at least, got none; leave them out")
 
-    turning = {name for name, control in rig.controls.items() if control.rotates} | {"orientation"}
+    rotating = {name for name, control in rig.controls.items() if control.rotates} | {"orientation"}
 
     def term(values: Mapping[str, Tensor]) -> Tensor:
-        # The length of a rotation vector has no second derivative at 0, which Gauss-Newton asks for.
-        values = {name: value + OFF if name in turning else value for name, value in values.items()}
+        # Gauss-Newton needs the second derivative of a rotation vector's length, which does not exist at 0.
+        values = {name: value + NONZERO_ANGLE if name in rotating else value for name, value in values.items()}
         own = {name: value for name, value in values.items() if name in rig.controls}
         place = {name: value for name, value in values.items() if name not in rig.controls}
         joints = rig.shape(own, **place).joints
@@ -58,7 +58,7 @@ def keypoint_term(
             if not bool(there.any()):
                 continue
             shown = camera.project(joints[rows].to(camera.K.dtype)).double()[there]
-            sigma = WIDE * float(torch.tensor(camera.size, dtype=torch.float64).norm())
+            sigma = KEYPOINT_WIDTH * float(torch.tensor(camera.size, dtype=torch.float64).norm())
             x = (shown - pixels[there]).square().sum(-1) / sigma**2
             total = total + 2.0 * ((1.0 + x).sqrt() - 1.0).sum()
         return weight * total / int(seen.sum())

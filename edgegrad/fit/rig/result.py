@@ -1,4 +1,4 @@
-"""What a fit of a rig returns."""
+"""The result of a fit of a rig."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ from ..edge_support import MIN_EDGE_SUPPORT
 from ..history import Record
 from .uncertainty import JointUncertainty
 
-REGION = 0.01  # of a mask's area: a region of it is a limb that is missed
-BESIDE_OTHERS = 0.85  # of the median joint's share of edges, which a wrong place has less of
+MISSED_REGION = 0.01  # A region of a larger share of a mask is a missed limb.
+SHARE_OF_MEDIAN = 0.85  # A joint in a wrong place shows a smaller share of edges, relative to the median joint.
 
 
 @dataclass(frozen=True, eq=False)
 class RigFit:
-    """What fit_rig() found.
+    """The result of fit_rig().
 
     values       all that posed() takes, by name: rig.posed(**values); rotations as rotation vectors
     fit          the numbers that were sought, loss, views and history
-    explained    by the name of each joint that was sought and that pictures can show, the share of its edges that they do, 0 … 1
-    left_out     the largest share of a mask's area that lies in regions which the fit does not cover, or has too much
-    uncertainty  how exactly the pictures show each joint; None where nothing tells: of a rig whose controls have no names, or
-                 one that PyTorch does not differentiate in forward mode
+    explained    by the name of each joint that was sought and that pictures can show, the share of its edges that they do, 0
+                 … 1
+    left_out     the largest share of a mask's area in regions that the fit does not cover, or covers wrongly
+    uncertainty  how exactly the pictures show each joint; None where that is unknown: of a rig whose controls have no names,
+                 or one that PyTorch does not differentiate in forward mode
     """
 
     rig: Rig
@@ -48,18 +49,17 @@ class RigFit:
 
     @property
     def bones(self) -> Tensor | None:
-        """See Rig.bones()."""
+        """The bones, see Rig.bones()."""
         return self.rig.bones(self.values)
 
     @property
     def converged(self) -> bool:
-        """Further steps lead no further, and the pictures show what the fit has found, each joint of it, and how it is turned;
-        see Fit.converged."""
-        return self.fit.converged and not self.missed and self.left_out < REGION and not self._unknown
+        """Whether Fit.converged holds, and the pictures show each joint of the fit, and how it is rotated."""
+        return self.fit.converged and not self.missed and self.left_out < MISSED_REGION and not self._unknown
 
     @property
     def reason(self) -> str:
-        """In words: "converged", or what kept the fit from that; see Fit.reason."""
+        """ "converged", or what kept the fit from that, in words; see Fit.reason."""
         if not self.fit.converged:
             return self.fit.reason
         if self.missed:
@@ -69,9 +69,9 @@ class RigFit:
                 f"edges not explained: the pictures show too few of the edges of {len(self.missed)} joints ({said}); start "
                 "nearer, give more tries or keypoints, or look for what covers them"
             )
-        if self.left_out >= REGION:
+        if self.left_out >= MISSED_REGION:
             return (
-                f"masks not explained: a region of {self.left_out:.0%} of one is without the fit, or of the fit beside it; give "
+                f"masks not explained: a region of {self.left_out:.0%} of one is without the fit, or of the fit outside it; give "
                 "more tries or keypoints, or look for what else the masks show"
             )
         if self._unknown:
@@ -84,10 +84,10 @@ class RigFit:
 
     @property
     def missed(self) -> list[str]:
-        """Joints of whose edges the pictures show too few: they lie in another place."""
+        """The joints of whose edges the pictures show too few: they lie in another place."""
         if not self.explained:
             return []
-        least = max(MIN_EDGE_SUPPORT, BESIDE_OTHERS * statistics.median(self.explained.values()))
+        least = max(MIN_EDGE_SUPPORT, SHARE_OF_MEDIAN * statistics.median(self.explained.values()))
         return [name for name, share in self.explained.items() if share < least]
 
     @property
@@ -99,9 +99,11 @@ class RigFit:
         return self.fit.history
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """What Fit.save() writes, pose.json: all values by name, as lists, posed.glb: the meshes so posed, and joints.json: of
-        each joint how much of its edges the pictures show, and to how many degrees it is known. Raises OSError, or at last
-        ImportError."""
+        """Write what Fit.save() writes, and pose.json, posed.glb and joints.json; return the names.
+
+        pose.json has all values by name, as lists, posed.glb the meshes so posed, and joints.json how much of each joint's
+        edges the pictures show, and to how many degrees it is known. Raises OSError, or at last ImportError.
+        """
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         content = {name: value.tolist() for name, value in self.values.items()}

@@ -15,8 +15,8 @@ from ..priors import near, towards
 from .fit_rig import fit_rig
 from .result import RigFit
 
-ONWARD = (
-    0.5  # of the last frame's motion, that the next begins with: all of it would add up errors that no picture shows
+MOTION_SHARE = (
+    0.5  # share of the last frame's motion to start with: all of it would add up errors that no picture shows
 )
 
 
@@ -30,13 +30,13 @@ def track_rig(
     again: int = 10,
     **arguments: Any,
 ) -> Iterator[RigFit]:
-    """The pose in each picture of a sequence, one after the other: each begins on the way of the last two, and stays near it.
+    """Yield the pose in each picture of a sequence: each starts from an extrapolation of the last two, and stays near it.
 
-    frames     of each moment the arguments of fit_rig() that belong to it: {"masks": …}, or {"images": …, "keypoints": …}
-    start      of the first; without one it is searched for
+    frames     the arguments of fit_rig() for each moment: {"masks": …}, or {"images": …, "keypoints": …}
+    start      of the first pose; without one it is searched for
     smooth     the weight of edgegrad.fit.priors.near()
-    again      how often at most limbs are drawn anew in a frame that shows too few of the edges of one, as fit_rig() does `tries`
-               times in the first; where it is missed still, not in the next frames
+    again      largest number of draws of limbs in a frame that shows too few edges of one, as fit_rig() takes `tries` in the
+               first; a limb that is still missed is not drawn in the next frames
     arguments  the others of fit_rig(); of a `checkpoint` each frame has a file of its own, with its number in the name
 
     Raises what fit_rig() raises.
@@ -48,22 +48,22 @@ def track_rig(
     for k, frame in enumerate(frames):
         if not isinstance(frame, Mapping):
             raise TypeError(f'frames[{k}]: expected arguments by name, as {{"masks": …}}, got {type(frame).__name__}')
-        told = {**arguments, **frame}
-        if told.get("checkpoint") is not None:
-            path = Path(told["checkpoint"])
-            told["checkpoint"] = path.with_name(f"{path.stem}-{k + 1:04d}{path.suffix}")
+        given = {**arguments, **frame}
+        if given.get("checkpoint") is not None:
+            path = Path(given["checkpoint"])
+            given["checkpoint"] = path.with_name(f"{path.stem}-{k + 1:04d}{path.suffix}")
         if not before:
-            found = fit_rig(rig, cameras, start=start, **told)
+            found = fit_rig(rig, cameras, start=start, **given)
         else:
             last = before[-1]
-            ahead = last if len(before) < 2 else {n: v + ONWARD * (v - before[-2][n]) for n, v in last.items()}
+            ahead = last if len(before) < 2 else {n: v + MOTION_SHARE * (v - before[-2][n]) for n, v in last.items()}
             ahead = {n: rig.controls[n].within(v) if n in rig.controls else v for n, v in ahead.items()}
             still = towards({name: control.rest for name, control in rig.controls.items()})
-            terms = [near(ahead, smooth), *(told.get("priors") or [still])]
-            whole = {"coarsest": 48, **told, "priors": terms, "tries": 0}
+            terms = [near(ahead, smooth), *(given.get("priors") or [still])]
+            whole = {"coarsest": 48, **given, "priors": terms, "tries": 0}
             found = fit_rig(rig, cameras, start=ahead, **whole)
             if again and set(found.missed) - missed and not found.fit.interrupted:
-                # A limb in another place would stay there in the frames to come.
+                # A limb in a wrong place would stay there in later frames.
                 anew = {**whole, "tries": again, "checkpoint": None, "resume": False}
                 other = fit_rig(rig, cameras, start=found.values, **anew)
                 found = other if other.fit.interrupted or other.loss < found.loss else found

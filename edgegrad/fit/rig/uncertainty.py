@@ -1,10 +1,9 @@
 """How exactly pictures show what a fit of a rig sought, joint by joint.
 
-With the loss L = Σ ρ(r_p) over pixels p, its curvature H = Σ w_p J_p J_pᵀ and the score s_p = w_p r_p J_p of each, the numbers
-have the covariance H⁻¹ (Σ s_p s_pᵀ) H⁻¹ (Huber, The Behavior of Maximum Likelihood Estimates under Nonstandard Conditions, 1967;
-White, A Heteroskedasticity-Consistent Covariance Matrix Estimator, 1980). It asks for no noise level: pixels at contours, which
-differ by more than those inside, tell theirs. It speaks of the place where the fit is: of another pose that looks alike it knows
-nothing.
+With the loss L = Σ ρ(r_p) over pixels p, its curvature H = Σ w_p J_p J_pᵀ and the score s_p = w_p r_p J_p of each, the
+numbers have the covariance H⁻¹ (Σ s_p s_pᵀ) H⁻¹ (Huber, The Behavior of Maximum Likelihood Estimates under Nonstandard
+Conditions, 1967; White, A Heteroskedasticity-Consistent Covariance Matrix Estimator, 1980). It needs no noise level, since
+residuals show it pixel by pixel. It is local: it does not know of other poses that match the pictures as well.
 """
 
 from __future__ import annotations
@@ -18,10 +17,12 @@ from torch import Tensor
 
 from ..descent.curvature import scores
 from ..descent.objective import Objective
-from .shown import STEPS, places_of
+from .joint_support import SUPPORT_STEPS, places_of
 
-WIDEST = 1.0  # radian, or as many learning rates as make one: the deviation of what the pictures do not show at all
-DEGREES = 5.0  # a joint that is known less exactly is unknown
+JOINT_PRIOR_DEVIATION = (
+    1.0  # radian, or as many learning rates as make one: the deviation of what the pictures do not show at all
+)
+MAX_JOINT_DEGREES = 5.0  # A joint known less exactly counts as unknown.
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +40,10 @@ class JointUncertainty:
 
     @property
     def unknown(self) -> str:
-        """In words, the joints that are known less exactly than to 5°, the worst first; empty where there are none."""
-        worst = sorted((name for name, d in self.degrees.items() if d > DEGREES), key=lambda name: -self.degrees[name])
+        """The joints that are known less exactly than to 5°, in words, the worst first; empty where there are none."""
+        worst = sorted(
+            (name for name, d in self.degrees.items() if d > MAX_JOINT_DEGREES), key=lambda name: -self.degrees[name]
+        )
         return ", ".join(f"{name} known to ±{self.degrees[name]:.0f}°{self._about(name)} only" for name in worst)
 
     def _about(self, name: str) -> str:
@@ -55,25 +58,27 @@ def uncertainty_of(
     rates: Mapping[str, float],
     joints: Mapping[str, tuple[str, ...]],
 ) -> JointUncertainty:
-    """At these values.
+    """Return the uncertainty at these values.
 
-    rates   of each, of which 1 / 0.03 make as much as a radian does
-    joints  of the values that are turns of joints, their names
+    rates   of each value, of which 1 / 0.03 make as much as a radian does
+    joints  names of joints, by the values that are their rotations
     """
-    H, S = scores(objective, tensors, STEPS[0])
+    H, S = scores(objective, tensors, SUPPORT_STEPS[0])
     unit = torch.cat([torch.full((v.numel(),), rates[name] / 0.03, dtype=torch.float64) for name, v in tensors.items()])
     H, S = H * unit * unit[:, None], S * unit * unit[:, None]
-    # What the pictures do not show: as if one more picture, of the pixels' own noise, had told it to WIDEST.
+    # The prior is one more picture, of the pixels' own noise, that shows all to JOINT_PRIOR_DEVIATION.
     noise = float(S.diagonal().sum() / H.diagonal().sum().clamp(min=1e-300))
-    inverse = torch.linalg.pinv(H + noise / WIDEST**2 * torch.eye(len(H), dtype=torch.float64), hermitian=True)
-    known = S + noise**2 / WIDEST**2 * torch.eye(len(H), dtype=torch.float64)
+    inverse = torch.linalg.pinv(
+        H + noise / JOINT_PRIOR_DEVIATION**2 * torch.eye(len(H), dtype=torch.float64), hermitian=True
+    )
+    known = S + noise**2 / JOINT_PRIOR_DEVIATION**2 * torch.eye(len(H), dtype=torch.float64)
     covariance = inverse @ known @ inverse
     covariance = covariance * unit * unit[:, None]
     degrees: dict[str, float] = {}
     axes: dict[str, Tensor] = {}
     for joint, place in places_of(tensors, joints).items():
-        size, ways = torch.linalg.eigh(covariance[place, place])
+        size, directions = torch.linalg.eigh(covariance[place, place])
         degrees[joint] = math.degrees(math.sqrt(max(float(size[-1]), 0.0)))
         if len(size) == 3:
-            axes[joint] = ways[:, -1] * float(ways[ways[:, -1].abs().argmax(), -1].sign())
+            axes[joint] = directions[:, -1] * float(directions[directions[:, -1].abs().argmax(), -1].sign())
     return JointUncertainty(covariance, degrees, axes)

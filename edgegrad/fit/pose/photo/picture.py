@@ -17,20 +17,20 @@ from ..task import Shot
 
 @dataclass(frozen=True)
 class Picture:
-    """What the terms compare renders with. `display` is in sRGB values, in which noise, blur and compression of photographs are
-    nearly even."""
+    """A picture to compare renders with. `display` has sRGB values, in which noise, blur and compression of photographs are
+    nearly uniform."""
 
     camera: Camera
-    radiance: Tensor  # (h, w, C), linear, of which 1 is white
+    radiance: Tensor  # (h, w, C), linear; white is 1
     display: Tensor  # (h, w, C)
     mask: Tensor | None  # (h, w), 1 on the object
-    weight: Tensor  # (h, w), how much a pixel counts
+    weight: Tensor  # (h, w)
     depth: Tensor | None  # (h, w), NaN where it was not measured
-    noise: float = PIXEL_NOISE  # standard deviation of what `outlined` shows, where it is mixed
+    noise: float = PIXEL_NOISE  # standard deviation of mixed pixels of `outlined`
 
     @staticmethod
-    def of(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int]) -> Picture:
-        """`masked`: the last channel of what the shot has is a mask."""
+    def from_shot(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int]) -> Picture:
+        """Return the picture of a shot; `masked`: its last channel is a mask."""
         radiance, mask = area_mean(shot.target, size), None
         if masked:
             radiance, mask = radiance[..., :-1], radiance[..., -1].clamp(0.0, 1.0)
@@ -43,16 +43,16 @@ class Picture:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(h, w)."""
+        """The size (h, w)."""
         return self.camera.size
 
     def part(self, rows: slice, columns: slice, camera: Camera) -> Picture:
-        """What lies in so many rows and columns, which the camera sees."""
+        """Return the part in such rows and columns, which the camera sees."""
         mask, depth = (None if one is None else one[rows, columns] for one in (self.mask, self.depth))
         radiance, display, weight = (one[rows, columns] for one in (self.radiance, self.display, self.weight))
         return Picture(camera, radiance, display, mask, weight, depth, self.noise)
 
     @property
     def outlined(self) -> Tensor:
-        """(h, w, c), what shows the outline of the object: the mask, or else the colours."""
+        """The channels (h, w, c) that show the outline of the object: the mask, or else the colours."""
         return self.display if self.mask is None else self.mask[..., None]

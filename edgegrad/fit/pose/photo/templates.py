@@ -1,11 +1,11 @@
-"""Views of an object as templates: how likely parts of a picture show them, in a light that nobody knows.
+"""Views of an object as templates: how likely parts of a picture show them, in unknown light.
 
-A view explains a part of a picture by the mesh's colours in the light that fits them best there. With the basis B of colours
-times harmonics inside the silhouette, the squared error is Σy² − bᵀA⁻¹b, with b = Σ B y and A = Σ B Bᵀ (a matched subspace
-filter, Scharf and Friedlander 1994). A does not depend on the place, and b is a correlation, so all places are had at once.
+A view predicts a part of a picture by the mesh's colours in the light that fits best there. With the basis B of colours times
+harmonics inside the silhouette, the squared error is Σy² − bᵀA⁻¹b, with b = Σ B y and A = Σ B Bᵀ (a matched subspace filter,
+Scharf and Friedlander 1994). A does not depend on the place, and b is a correlation, so all places are computed at once.
 
-What a view has to beat is one colour for all of the part, while it has one for what is around the object, and that the pixels
-are drawn from the colours of the whole picture. The first finds contours and patterns, the second rare colours.
+A view competes with one colour for the whole part, while it has one for its surroundings, and with pixels drawn from the
+colours of the whole picture. The first finds contours and patterns, the second rare colours.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .views import Views
+from .template_views import TemplateViews
 
-AT_ONCE = 64  # views
-NOISE = 0.06  # standard deviation of a pixel, sRGB values: of noise, and of what views lack by their spacing
-SHADE = 0.3  # of the light's slopes, relative to its constant
-WHITE = 0.15  # of the light's colour
-SHAPE = 0.25  # of a mask's error beside that of colours
-ALIKE = 0.08  # standard deviation of colours that look alike, sRGB values
-COUNTED = 1500  # pixels that tell how frequent colours are
+VIEWS_PER_BATCH = 64
+TEMPLATE_NOISE = 0.06  # standard deviation of a pixel in sRGB values, by noise and by the views' spacing
+LIGHT_SLOPE = 0.3  # slopes of the light, relative to its constant
+LIGHT_TINT = 0.15  # colour of the light
+MASK_WEIGHT = 0.25  # weight of a mask's error relative to that of colours
+COLOR_BANDWIDTH = 0.08  # standard deviation of similar colours, sRGB values
+SAMPLED_PIXELS = 1500  # number of pixels that estimate the density of colours
 
 
 class Templates:
     """Views as filters of pictures with the channels C, which may be none."""
 
-    def __init__(self, views: Views, rare: float, shown: Tensor | None = None) -> None:
-        """`rare`: how much the ratio to the picture's colours counts beside that to one colour. `shown` (n, T, T): 0 where views
-        are not compared, 1 elsewhere."""
+    def __init__(self, views: TemplateViews, rare: float, shown: Tensor | None = None) -> None:
+        """`rare` weights the ratio to the picture's colours against that to one colour. `shown` (n, T, T) is 0 where views
+        are not compared."""
         self.rare = rare
         alpha, colours, normals = views.alpha, views.colours, views.normals
         self.C = colours.shape[-1]
@@ -50,12 +50,12 @@ class Templates:
         self.filters = weighted.permute(0, 3, 4, 1, 2)  # (n, C, 4, T, T)
 
     def everywhere(self, picture: Tensor, stride: int) -> Tensor:
-        """(n, h, w) log likelihood ratios, of a picture (C + 1, H, W) whose last channel is surprise()."""
+        """Return log likelihood ratios (n, h, w), of a picture (C + 1, H, W) whose last channel is surprise()."""
         parts = []
         sides = torch.stack([self.inside, self.around], 1)
         colours, surprise = picture[:-1], picture[-1]
-        for at in range(0, len(self.inside), 2 * AT_ONCE):
-            rows = slice(at, at + 2 * AT_ONCE)
+        for at in range(0, len(self.inside), 2 * VIEWS_PER_BATCH):
+            rows = slice(at, at + 2 * VIEWS_PER_BATCH)
             n = len(self.inside[rows])
             b, sums = [], []
             for c in range(self.C):
@@ -71,11 +71,12 @@ class Templates:
         return torch.cat(parts)
 
     def near(self, crops: Tensor, masked: bool) -> Tensor:
-        """(n, k, k) of a crop (n, C + 1, T + k − 1, T + k − 1) for each view, at k × k shifts. The last channel is surprise(), or
-        a mask; then it is how likely colours and mask are, for a view of the same size."""
+        """Return the scores (n, k, k) of a crop (n, C + 1, T + k − 1, T + k − 1) for each view, at k × k shifts. The last
+        channel is surprise(), or a mask. With a mask, the score is the likelihood of colours and mask, for a view of the same
+        size."""
         parts = []
-        for at in range(0, len(crops), AT_ONCE):
-            rows = slice(at, at + AT_ONCE)
+        for at in range(0, len(crops), VIEWS_PER_BATCH):
+            rows = slice(at, at + VIEWS_PER_BATCH)
             colours, last = crops[rows, :-1], crops[rows, -1:]
             sides = torch.stack([self.inside[rows], self.around[rows]], 1)
             n, k = len(sides), crops.shape[-1] - sides.shape[-1] + 1
@@ -87,33 +88,36 @@ class Templates:
                 alpha = self.alpha[rows, None]
                 of_masks = _one_by_one(last[:, 0].square(), torch.ones_like(alpha))
                 shape = of_masks - 2.0 * _one_by_one(last[:, 0], alpha) + alpha.square().sum((2, 3), keepdim=True)
-                error = self._error(b, squares[:, 0], rows) + SHAPE * shape[:, 0].clamp(min=0.0)
-                parts.append(-torch.log(error / self.alpha[rows].sum((1, 2)).clamp(min=1.0)[:, None, None] + NOISE**2))
+                error = self._error(b, squares[:, 0], rows) + MASK_WEIGHT * shape[:, 0].clamp(min=0.0)
+                parts.append(
+                    -torch.log(error / self.alpha[rows].sum((1, 2)).clamp(min=1.0)[:, None, None] + TEMPLATE_NOISE**2)
+                )
                 continue
             rare = _one_by_one(last[:, 0], sides[:, :1])[:, 0]
             parts.append(self._ratios(b, sums, squares, rare, rows))
         return torch.cat(parts)
 
     def _error(self, b: Tensor, squares: Tensor, rows: slice) -> Tensor:
-        """(n, h, w), inside."""
+        """Return the squared error (n, h, w) inside."""
         return (squares - (b * torch.einsum("nkl,nlhw->nkhw", self.inverse[rows], b)).sum(1)).clamp(min=0.0)
 
     def _ratios(self, b: Tensor, sums: Tensor, squares: Tensor, rare: Tensor, rows: slice) -> Tensor:
-        """b (n, 4C, h, w); sums (n, 2, C, h, w) and squares (n, 2, h, w) of what is inside and around; rare (n, h, w)."""
+        """Return the ratios from b (n, 4C, h, w); sums (n, 2, C, h, w) and squares (n, 2, h, w) inside and around; rare (n,
+        h, w)."""
         inside, around = (x[rows].sum((1, 2)).clamp(min=1e-3)[:, None, None] for x in (self.inside, self.around))
         error = self._error(b, squares[:, 0], rows)
-        beside = (squares[:, 1] - sums[:, 1].square().sum(1) / around).clamp(min=0.0)
+        outside = (squares[:, 1] - sums[:, 1].square().sum(1) / around).clamp(min=0.0)
         even = (squares.sum(1) - sums.sum(1).square().sum(1) / (inside + around)).clamp(min=0.0)
-        noise = NOISE**2 * self.C * (inside + around)
-        to_one = 0.5 * self.C * (inside + around) * torch.log((even + noise) / (error + beside + noise))
-        variance = error / (self.C * inside) + NOISE**2
+        noise = TEMPLATE_NOISE**2 * self.C * (inside + around)
+        to_one = 0.5 * self.C * (inside + around) * torch.log((even + noise) / (error + outside + noise))
+        variance = error / (self.C * inside) + TEMPLATE_NOISE**2
         to_all = rare - 0.5 * self.C * inside * (variance.log() + math.log(2.0 * math.pi) + 1.0)
         return to_one + self.rare * to_all
 
 
 def _one_by_one(pictures: Tensor, filters: Tensor) -> Tensor:
-    """(n, f, k, k), the correlations of each picture (n, h, w) with filters of its own (n, f, T, T)."""
-    if not len(pictures):  # of masks without colours
+    """Return the correlations (n, f, k, k) of each picture (n, h, w) with its own filters (n, f, T, T)."""
+    if not len(pictures):  # Masks without colours have no pictures.
         k = pictures.shape[-1] - filters.shape[-1] + 1
         return pictures.new_zeros(*filters.shape[:2], k, k)
     found = F.conv2d(pictures[None], filters.flatten(0, 1)[:, None], groups=len(pictures))
@@ -121,21 +125,25 @@ def _one_by_one(pictures: Tensor, filters: Tensor) -> Tensor:
 
 
 def surprise(picture: Tensor) -> Tensor:
-    """(H, W), −log of the density of each pixel's colour in (C, H, W)."""
+    """Return −log of the density (H, W) of each pixel's colour in a picture (C, H, W)."""
     C, H, W = picture.shape
     pixels = picture.flatten(1).T
-    some = pixels[torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[:COUNTED]]
-    log = (-0.5 * (torch.cdist(pixels, some) / ALIKE).square()).logsumexp(1) - math.log(len(some))
-    return (C * math.log(ALIKE * math.sqrt(2.0 * math.pi)) - log).reshape(H, W)
+    some = pixels[torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[:SAMPLED_PIXELS]]
+    log = (-0.5 * (torch.cdist(pixels, some) / COLOR_BANDWIDTH).square()).logsumexp(1) - math.log(len(some))
+    return (C * math.log(COLOR_BANDWIDTH * math.sqrt(2.0 * math.pi)) - log).reshape(H, W)
 
 
 def _with_prior(A: Tensor) -> Tensor:
-    """(n, 4C, 4C) of (n, C, 4, 4): the light is about white, and its slopes are smaller than its constant."""
+    """Return (n, 4C, 4C) of (n, C, 4, 4): the light is about white, and its slopes are smaller than its constant."""
     n, C = A.shape[:2]
     full = torch.zeros(n, C, 4, C, 4, dtype=A.dtype)
     differ = torch.eye(C, dtype=A.dtype) - 1.0 / max(C, 1)
-    full += (NOISE / WHITE) ** 2 * differ[None, :, None, :, None] * torch.eye(4, dtype=A.dtype)[None, None, :, None, :]
-    slopes = torch.tensor([1e-3, 1.0, 1.0, 1.0], dtype=A.dtype) * (NOISE / SHADE) ** 2
+    full += (
+        (TEMPLATE_NOISE / LIGHT_TINT) ** 2
+        * differ[None, :, None, :, None]
+        * torch.eye(4, dtype=A.dtype)[None, None, :, None, :]
+    )
+    slopes = torch.tensor([1e-3, 1.0, 1.0, 1.0], dtype=A.dtype) * (TEMPLATE_NOISE / LIGHT_SLOPE) ** 2
     for c in range(C):
         full[:, c, :, c] += A[:, c] + torch.diag(slopes)
     return full.reshape(n, 4 * C, 4 * C)

@@ -1,21 +1,23 @@
-"""Where a pose search starts when nobody says."""
+"""The pose at which a search starts when none is given."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from .given import depth_of
+from .inputs import depth_of
 from .pose import Pose
 from .task import PoseTask, Shot, focal_of
 
-FILLS = 0.5  # of the picture's shorter side, an object of which nothing else is known
-AGREES = 0.3  # smallest intersection over union of the object's box with the mask's at which the mesh file is believed
+DEFAULT_FILL = 0.5  # Share of the picture's shorter side that an object fills when nothing else is known.
+MIN_OVERLAP = (
+    0.3  # Least intersection over union of the object's box and the mask's at which the file's pose is accepted.
+)
 
 
-def placed(task: PoseTask) -> Pose:
-    """Where the mesh file puts the object, if the first camera sees it there and the mask agrees; else turned as in the file, in
-    the middle of the mask, or of the picture, and as large as the mask."""
+def initial_pose(task: PoseTask) -> Pose:
+    """Return the mesh file's own pose if the first camera sees the object there and the mask agrees. Otherwise the object
+    keeps the file's rotation and goes to the middle of the mask, as large as the mask, or of the picture."""
     one = torch.ones((), dtype=torch.float64)
     identity = Pose(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), one, one)
     shot = task.shots[0]
@@ -23,19 +25,19 @@ def placed(task: PoseTask) -> Pose:
     H, W = camera.size
     perspective = camera.projection != "orthographic"
     if camera.projection not in ("perspective", "orthographic"):
-        return identity  # all around: nothing is out of view
+        return identity  # A camera that sees all around has nothing out of view.
     seen = _box(task, shot, identity) if not perspective or _before(task, shot, identity) else None
     wanted = _mask_box(shot) if "alpha" in task.aovs and not task.clutter else None
     if seen is not None:
         inside = bool((seen[1] > 0).all()) and bool((seen[0] < torch.tensor([W, H])).all())
-        if inside and (wanted is None or _overlap(seen, wanted) > AGREES):
+        if inside and (wanted is None or _overlap(seen, wanted) > MIN_OVERLAP):
             return identity
     if wanted is None:
         middle = torch.tensor([0.5 * W, 0.5 * H], dtype=torch.float64)
-        across = FILLS * min(H, W)
+        across = DEFAULT_FILL * min(H, W)
     else:
         middle, across = (wanted[0] + wanted[1]) / 2, float((wanted[1] - wanted[0]).max())
-    # A box seen from a random side is about 0.8 of its diagonal wide.
+    # From a random side, a box is about 0.8 of its diagonal wide.
     depth = focal_of(camera) * 0.8 * task.size / max(across, 1.0) if perspective else 2.0 * task.size
     view, K = camera.world_to_camera, camera.K
     ray = torch.linalg.solve(K[:2, :2], middle - K[:2, 2])
@@ -48,7 +50,7 @@ def _before(task: PoseTask, shot: Shot, pose: Pose) -> bool:
 
 
 def _box(task: PoseTask, shot: Shot, pose: Pose) -> tuple[Tensor, Tensor]:
-    """Corners (2,) of the object's box in the image, in pixels; distortion is left out."""
+    """Return opposite corners (2,) of the object's box in the image, in pixels, without distortion."""
     verts = torch.cat([mesh.verts for mesh in task.scene.meshes])
     view, K = shot.camera.world_to_camera, shot.camera.K
     q = (verts @ pose.R.T + pose.t) @ view[:3, :3].T + view[:3, 3]
@@ -66,6 +68,6 @@ def _mask_box(shot: Shot) -> tuple[Tensor, Tensor] | None:
 
 
 def _overlap(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> float:
-    """Intersection over union of two boxes."""
+    """Return the intersection over union of two boxes."""
     both = (torch.minimum(a[1], b[1]) - torch.maximum(a[0], b[0])).clamp(min=0.0).prod()
     return float(both / ((a[1] - a[0]).prod() + (b[1] - b[0]).prod() - both))

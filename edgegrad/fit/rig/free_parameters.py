@@ -1,4 +1,4 @@
-"""The numbers that a fit of a rig seeks, of all that the rig has."""
+"""The free parameters of a fit of a rig."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ F64 = torch.float64
 
 
 @dataclass(frozen=True, eq=False)
-class Sought:
-    """The numbers that are sought, and all others."""
+class FreeParameters:
+    """The values that are sought, and all others."""
 
     rig: Rig
     fixed: dict[str, Tensor]  # all values at the start
     parameters: dict[str, Parameter]
-    rows: dict[str, Tensor]  # of which rows a parameter is, where not of all
-    looks: tuple[str, ...] = ()  # parameters that are none of the rig, but of how it looks
+    rows: dict[str, Tensor]  # rows that a parameter has, where not all
+    appearance: tuple[str, ...] = ()  # parameters of `look`
 
     @staticmethod
-    def of(
+    def from_arguments(
         rig: Rig,
         seek: Sequence[str] | None,
         joints: Sequence[str] | None,
         start: Mapping[str, Any],
-        looks: Mapping[str, Parameter],
-    ) -> Sought:
-        """Raises TypeError or ValueError."""
+        appearance: Mapping[str, Parameter],
+    ) -> FreeParameters:
+        """Check what is sought. Raises TypeError or ValueError."""
         place = {
             "translation": torch.zeros(3, dtype=F64),
             "orientation": torch.zeros(3, dtype=F64),
@@ -76,7 +76,7 @@ class Sought:
                 value, low, high = (None if x is None else x[chosen] for x in (value, low, high))
             assert value is not None
             parameters[name] = Parameter(_rate(rig, name, control), value.clone(), low, high).checked(name)
-        for name, parameter in looks.items():
+        for name, parameter in appearance.items():
             if name in known:
                 raise ValueError(
                     f"parameters: expected names that the rig does not have, got {name!r}; seek=[{name!r}]"
@@ -90,7 +90,7 @@ class Sought:
             )
         if not parameters:
             raise ValueError("seek: expected a name or more of what is sought, got none")
-        return Sought(rig, fixed, parameters, rows, tuple(looks))
+        return FreeParameters(rig, fixed, parameters, rows, tuple(appearance))
 
     @property
     def start(self) -> dict[str, Tensor]:
@@ -98,7 +98,7 @@ class Sought:
 
     @property
     def joints(self) -> dict[str, tuple[str, ...]]:
-        """Of the sought values that are turns of joints, their names."""
+        """The names of joints, by the sought values that are their rotations."""
         found = {}
         for name in self.parameters:
             control = self.rig.controls.get(name)
@@ -108,17 +108,17 @@ class Sought:
         return found
 
     def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Of all of the rig that is sought, with the rows that are not; differentiable. Of one or of a batch."""
+        """Return all sought values of the rig, of one pose or a batch, with the rows that are fixed; differentiable."""
         return {
             name: self._whole(name, tensor) if name in self.rows else tensor
             for name, tensor in tensors.items()
-            if name not in self.looks
+            if name not in self.appearance
         }
 
-    def look(self, tensors: Mapping[str, Tensor], index: int | None = None) -> dict[str, Tensor]:
-        """What it looks like, of one or of that place in a batch."""
+    def appearance_of(self, tensors: Mapping[str, Tensor], index: int | None = None) -> dict[str, Tensor]:
+        """Return the parameters of `look`, of one pose or of that place in a batch."""
         found = {}
-        for name in self.looks:
+        for name in self.appearance:
             value, own = tensors[name], self.parameters[name].value
             assert own is not None
             found[name] = value[index] if index is not None and value.dim() > own.dim() else value
@@ -130,7 +130,7 @@ class Sought:
         return fixed.expand(*tensor.shape[:at], *fixed.shape).index_copy(at, self.rows[name], tensor)
 
     def all(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-        """As posed() takes them."""
+        """Return all values, as posed() takes them."""
         return {**self.fixed, **self.values(tensors)}
 
 
@@ -143,7 +143,7 @@ def _free(rig: Rig, name: str, control: Control, joints: Sequence[str] | None) -
 
 
 def _rate(rig: Rig, name: str, control: Control) -> float:
-    """Of a step, in the value's own units."""
+    """Return the size of a step, in the value's own units."""
     if control.rotates or name in ("orientation", "angles"):
         return 0.03
     if name in ("translation", "joint_translations"):

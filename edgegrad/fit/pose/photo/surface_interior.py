@@ -1,4 +1,4 @@
-"""What is seen of a surface's inside, away from its contours: how its points move in the image, and the image's slope there."""
+"""The inside of a rendered surface, away from its contours: how its points move in the image, and the image's slope there."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch import Tensor
 from ....camera.camera import Camera
 from ..jacobian import Motion
 
-COVERED = 0.98  # share of a pixel of the inside, and of its neighbours
-STEP = 1e-4  # of differences, in units of a motion
+MIN_PIXEL_ALPHA = 0.98  # least alpha of an inner pixel and its neighbours
+DIFFERENCE_STEP = 1e-4  # step of central differences, in units of a motion
 AOVS = ("image", "alpha", "normal", "position", "depth")
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfaceInterior:
     """The inside of a rendered surface."""
 
     camera: Camera
@@ -27,19 +27,21 @@ class Surface:
     motion: Motion
 
     @staticmethod
-    def of(camera: Camera, channels: dict[str, Tensor], motion: Motion, visible: Tensor | None = None) -> Surface:
-        """`visible` (h, w): the surface's alpha where something else that is rendered may cover it."""
+    def from_channels(
+        camera: Camera, channels: dict[str, Tensor], motion: Motion, visible: Tensor | None = None
+    ) -> SurfaceInterior:
+        """Return the interior; `visible` (h, w) is the surface's alpha where something else that is rendered may cover it."""
         alpha = channels["alpha"][..., 0]
-        open_ = ((alpha if visible is None else visible) < COVERED).float()
-        return Surface(camera, channels, F.max_pool2d(open_[None, None], 3, 1, 1)[0, 0] == 0.0, motion)
+        open_ = ((alpha if visible is None else visible) < MIN_PIXEL_ALPHA).float()
+        return SurfaceInterior(camera, channels, F.max_pool2d(open_[None, None], 3, 1, 1)[0, 0] == 0.0, motion)
 
     @property
     def points(self) -> Tensor:
-        """(N, 3) float64, those inside, world coordinates."""
+        """The points (N, 3) inside, float64 world coordinates."""
         return self.channels["position"][self.inside].double() / self.channels["alpha"][self.inside].double()
 
     def flow(self) -> Tensor:
-        """(D, N, 2) how the N points inside move in the image by the motion, pixels; by central differences, for any lens."""
+        """Return the motion (D, N, 2) in the image of the N points inside, pixels; by central differences, for any lens."""
         points, camera = self.points, self.camera
         if camera.K.dtype != torch.float64:
             camera = camera.to(torch.float64)
@@ -57,7 +59,7 @@ class Surface:
 
     @property
     def normals(self) -> Tensor:
-        """(h, w, 3), of length 1."""
+        """The unit normals (h, w, 3)."""
         return F.normalize(self.channels["normal"].float(), dim=-1, eps=1e-6)
 
     def _moved(self, camera: Camera, k: int, step: float) -> Camera:
@@ -65,16 +67,16 @@ class Surface:
         if self.motion.K is not None:
             fields["K"] = camera.K + step * self.motion.K[k]
         if self.motion.distortion is not None and camera.distortion is not None:
-            bend = F.pad(self.motion.distortion[k], (0, 8))[: len(camera.distortion)]
-            fields["distortion"] = camera.distortion + step * bend
+            coefficients = F.pad(self.motion.distortion[k], (0, 8))[: len(camera.distortion)]
+            fields["distortion"] = camera.distortion + step * coefficients
         return camera.replace(**fields) if fields else camera
 
 
 def _difference(f: Callable[[float], Tensor]) -> Tensor:
-    return (f(STEP) - f(-STEP)) / (2.0 * STEP)
+    return (f(DIFFERENCE_STEP) - f(-DIFFERENCE_STEP)) / (2.0 * DIFFERENCE_STEP)
 
 
 def slope(image: Tensor) -> Tensor:
-    """(2, n, h, w), by columns and rows, central differences per pixel of images (n, h, w)."""
+    """Return central differences (2, n, h, w), by columns and rows, of images (n, h, w)."""
     p = F.pad(image[None], (1, 1, 1, 1), mode="replicate")[0]
     return 0.5 * torch.stack([p[:, 1:-1, 2:] - p[:, 1:-1, :-2], p[:, 2:, 1:-1] - p[:, :-2, 1:-1]])

@@ -1,8 +1,8 @@
 """Several objects in one photograph: what is compared at one resolution, and the normal equations of a step of all poses.
 
-One render has a channel for each object, which is 1 where it is seen: its alpha behind and before the others, with derivatives by
-the motion of each, for where one covers another the contour moves with what is in front. The region term asks for each pixel
-which object it shows, or what lies behind them all; light and depth are those of each object where it is seen.
+One render has a channel for each object, which is 1 where it is seen: its alpha behind and before the others. Derivatives are
+by the motion of each, for where one covers another the contour moves with the front one. The region term decides for each
+pixel which object it shows, or the background; light and depth are compared for each object where it is seen.
 """
 
 from __future__ import annotations
@@ -20,22 +20,21 @@ from ....render import render
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
 from ...region import RADIUS, Windows, smoothed
-from ..gauss_newton import Normal
-from ..given import bare
+from ..gauss_newton import NormalEquations
+from ..inputs import without_colors
 from ..jacobian import Motions, Rendered
-from ..observed import motion
 from ..pose import Pose
 from ..task import PoseTask
 from .contour import contour_term
-from .cover import BESIDE, covers, weighted
 from .depth import depth_term
-from .level import MASKED, Crop, PhotoLevel, Seen, photo_levels, sharpest
-from .region import posteriors, regions_term
+from .level import MASK_ERROR, Crop, PhotoLevel, PictureComparison, photo_levels, sharpest
+from .occluders import OCCLUDER_MARGIN, occluder_weights, weighted
+from .region_term import posteriors, regions_term
 
 
 @dataclass(frozen=True)
-class Together:
-    """The same pictures at one resolution, as they are compared with each object."""
+class JointLevel:
+    """Pictures at one resolution, as they are compared with each of several objects."""
 
     objects: list[PhotoLevel]
 
@@ -48,41 +47,37 @@ class Together:
         return self.objects[0].size
 
     def parts(self) -> list[slice]:
-        """The entries of a step that each object has."""
+        """Return the entries of a step that each object has."""
         found, first = [], 0
         for level in self.objects:
-            found.append(slice(first, first := first + len(level.plain.free)))
+            found.append(slice(first, first := first + len(level.plain.dofs)))
         return found
 
-    def see(self, poses: Sequence[Pose], seed: int) -> list[list[Seen]]:
-        """Of each object, each picture; tangents (D, h, w) by the entries of all."""
+    def comparisons(self, poses: Sequence[Pose], seed: int) -> list[list[PictureComparison]]:
+        """Return the comparisons of each object with each picture; tangents (D, h, w) are by the entries of all."""
         scenes = [
             level.task.scene.transformed(pose.R, pose.t, pose.scale)
             for level, pose in zip(self.objects, poses, strict=True)
         ]
         labelled = _labelled(scenes)
         counts = [sum(len(mesh.verts) for mesh in scene.meshes) for scene in scenes]
-        found: list[list[Seen]] = [[] for _ in scenes]
+        found: list[list[PictureComparison]] = [[] for _ in scenes]
         first = self.objects[0]
         for n, shot in enumerate(first.plain.shots):
-            ways = [
-                motion(level.task, level.plain, level.plain.shots[n], pose)
-                for level, pose in zip(self.objects, poses, strict=True)
-            ]
+            pairs = [*zip(self.objects, poses, strict=True)]
+            motions = [level.task.motion(level.plain, level.plain.shots[n], pose) for level, pose in pairs]
             rendered = Rendered(labelled, shot.camera, ["image"], first.plain.spp, seed)
             alphas = rendered.images["image"].float().movedim(-1, 0)
-            tangents = rendered.derivatives(Motions(ways, counts))["image"].float().movedim(-1, 1)
+            tangents = rendered.derivatives(Motions(motions, counts))["image"].float().movedim(-1, 1)
             for k, level in enumerate(self.objects):
-                found[k].append(
-                    level.beside(
-                        scenes[k], shot.camera, ways[k], level.pictures[n], alphas[k], tangents[:, k], seed, others=True
-                    )
-                )
+                seen = scenes[k], shot.camera, motions[k], level.pictures[n], alphas[k], tangents[:, k]
+                found[k].append(level.comparison(*seen, seed, others=True))
         return found
 
-    def equations(self, poses: Sequence[Pose], seed: int) -> tuple[Normal, float]:
-        """Of all terms and pictures by the entries of all objects, and the mean loss of the region term."""
-        views, parts = self.see(poses, seed), self.parts()
+    def equations(self, poses: Sequence[Pose], seed: int) -> tuple[NormalEquations, float]:
+        """Return the equations of all terms and pictures by the entries of all objects, and the mean loss of the region
+        term."""
+        views, parts = self.comparisons(poses, seed), self.parts()
         D = parts[-1].stop
         curvature, gradient = torch.zeros(D, D, dtype=torch.float64), torch.zeros(D, dtype=torch.float64)
         losses = []
@@ -94,7 +89,7 @@ class Together:
             tangents = torch.stack([one.tangents for one in seen], 1)
             region, loss = regions_term(self._posteriors(n, seen, near), alphas, tangents, near, self.objects[0].blur)
             losses.append(loss)
-            terms: list[tuple[slice, Normal | None]] = [(slice(0, D), region)]
+            terms: list[tuple[slice, NormalEquations | None]] = [(slice(0, D), region)]
             for part, level, one in zip(parts, self.objects, seen, strict=True):
                 if one.lit is not None:
                     terms.append((part, one.lit.term()))
@@ -107,42 +102,44 @@ class Together:
                 if term is not None:
                     curvature[part, part] += term.curvature
                     gradient[part] += term.gradient
-        return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
+        return NormalEquations(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
 
-    def focused(self, poses: Sequence[Pose], seed: int) -> Together:
-        """As PhotoLevel.focused(), with one blur for the contours of all objects."""
-        views = self.see(poses, seed)
+    def focused(self, poses: Sequence[Pose], seed: int) -> JointLevel:
+        """Return the level with one blur for the contours of all objects, as of PhotoLevel.focused()."""
+        views = self.comparisons(poses, seed)
         blur = sharpest([one for view in views for one in view])
-        return Together([replace(level, blur_of_contours=blur) for level in self.objects])
+        return JointLevel([replace(level, blur_of_contours=blur) for level in self.objects])
 
-    def explained(self, poses: Sequence[Pose], seed: int) -> list[float]:
-        """Of each object, PhotoLevel.explained() where it is seen."""
-        views = self.see(poses, seed)
-        return [level.explained(pose, seed, view) for level, pose, view in zip(self.objects, poses, views, strict=True)]
+    def edge_support(self, poses: Sequence[Pose], seed: int) -> list[float]:
+        """Return PhotoLevel.edge_support() of each object where it is seen."""
+        views = self.comparisons(poses, seed)
+        return [
+            level.edge_support(pose, seed, view) for level, pose, view in zip(self.objects, poses, views, strict=True)
+        ]
 
     def visible(self, poses: Sequence[Pose], seed: int) -> list[float]:
-        """Of each object, how much of what it covers of the pictures by itself the others leave to be seen, 0 … 1."""
-        views = self.see(poses, seed)
+        """Return, for each object, the share, 0 … 1, of its own pixels that the others do not hide."""
+        views = self.comparisons(poses, seed)
         found = []
         for level, pose, view in zip(self.objects, poses, views, strict=True):
             alone = level.covered(pose, seed)
             found.append(min(1.0, sum(float(one.alpha.sum()) for one in view) / alone) if alone > 0.0 else 0.0)
         return found
 
-    def uncovered(self, poses: Sequence[Pose], seed: int) -> Together:
-        """Without what covers the objects and is none of them."""
+    def unoccluded(self, poses: Sequence[Pose], seed: int) -> JointLevel:
+        """Return the level without what covers the objects and is none of them."""
         weights = [torch.ones(picture.size) for picture in self.objects[0].pictures]
-        for view in self.see(poses, seed):
-            if (own := covers(view)) is not None:
+        for view in self.comparisons(poses, seed):
+            if (own := occluder_weights(view)) is not None:
                 weights = [torch.minimum(a, b) for a, b in zip(weights, own, strict=True)]
-        return Together([weighted(level, weights) for level in self.objects])
+        return JointLevel([weighted(level, weights) for level in self.objects])
 
-    def _posteriors(self, n: int, seen: list[Seen], near: Tensor) -> Tensor:
-        """(N + 1, h, w) of picture n: by the masks, or else by colours."""
+    def _posteriors(self, n: int, seen: list[PictureComparison], near: Tensor) -> Tensor:
+        """Return the posteriors (N + 1, h, w) of picture n: by the masks, or else by colours."""
         masks = [one.picture.mask for one in seen if one.picture.mask is not None]
         if masks:
             shares = torch.stack(masks)
-            likely = torch.cat([shares, 1.0 - shares.sum(0, keepdim=True)]).clamp(min=MASKED)
+            likely = torch.cat([shares, 1.0 - shares.sum(0, keepdim=True)]).clamp(min=MASK_ERROR)
             return likely / likely.sum(0)
         extents = [one.extent for one in seen if one.extent > 0.0]
         middle = math.exp(sum(map(math.log, extents)) / len(extents))
@@ -153,8 +150,8 @@ class Together:
         ]
         return posteriors(windows, torch.stack([one.alpha for one in seen]), near)
 
-    def _contours(self, seen: list[Seen]) -> list[Normal | None]:
-        """The contour term of each object. Where two of them meet, each has half a say."""
+    def _contours(self, seen: list[PictureComparison]) -> list[NormalEquations | None]:
+        """Return the contour term of each object. Where two of them meet, each has half the weight."""
         blur = self.objects[0].blur_of_contours
         sides = [one.sides(blur) for one in seen]
         count = torch.zeros(seen[0].picture.size)
@@ -170,24 +167,24 @@ class Together:
 
 
 def without_fronts(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int, spp: int, seed: int) -> PoseTask:
-    """The task of one object, with a weight of 0 where others that cover a part of it are seen, and a little beside them."""
+    """Return the task of one object, with a weight of 0 where others that cover a part of it are seen, with a margin."""
     moved = [task.scene.transformed(pose.R, pose.t, pose.scale) for task, pose in zip(tasks, poses, strict=True)]
     shots = []
     for shot in tasks[k].shots:
         with torch.no_grad():
             seen = render(_labelled(moved), shot.camera, spp, seed)
-            alone = render_aovs(bare(moved[k]), shot.camera, ["alpha"], spp, seed)["alpha"][..., 0]
+            alone = render_aovs(without_colors(moved[k]), shot.camera, ["alpha"], spp, seed)["alpha"][..., 0]
         hidden = alone - seen[..., k] > 0.5
         fronts = [j for j in range(len(moved)) if j != k and float(seen[hidden][:, j].sum()) > 1.0]
         before = seen[..., fronts].sum(-1)[None, None]
-        before = F.max_pool2d(before, 2 * BESIDE + 1, 1, BESIDE)[0, 0, ..., None].float()
+        before = F.max_pool2d(before, 2 * OCCLUDER_MARGIN + 1, 1, OCCLUDER_MARGIN)[0, 0, ..., None].float()
         weight = 1.0 - before if shot.weight is None else shot.weight * (1.0 - before)
         shots.append(shot._replace(weight=weight.clamp(min=0.0)))
     return replace(tasks[k], shots=shots)
 
 
 def _labelled(scenes: Sequence[Scene]) -> Scene:
-    """All objects in one, each with a channel of its own, which is 1 on it."""
+    """Return all objects in one scene, each with a channel of its own, which is 1 on it."""
     labels = torch.eye(len(scenes), dtype=torch.float64)
     return Scene([
         Mesh(mesh.verts, mesh.faces, colors=label.expand(len(mesh.verts), -1))
@@ -195,15 +192,15 @@ def _labelled(scenes: Sequence[Scene]) -> Scene:
     ])  # fmt: skip
 
 
-def together_levels(
+def joint_levels(
     tasks: Sequence[PoseTask],
     poses: Sequence[Pose],
     depths: Sequence[Tensor | None],
     max_size: int,
     spp: int,
     seed: int,
-) -> list[Together]:
-    """From coarse to fine, of what surrounds the objects."""
+) -> list[JointLevel]:
+    """Return the levels from coarse to fine, of what surrounds the objects."""
     crops = [Crop.around(tasks[0], shot, poses[0]) for shot in tasks[0].shots]
     for task, pose in zip(tasks[1:], poses[1:], strict=True):
         own = [Crop.around(task, shot, pose) for shot in task.shots]
@@ -212,4 +209,4 @@ def together_levels(
         photo_levels(task, pose, depths, max_size, spp, seed, crops=crops)
         for task, pose in zip(tasks, poses, strict=True)
     ]
-    return [Together(list(objects)) for objects in zip(*columns, strict=True)]
+    return [JointLevel(list(objects)) for objects in zip(*columns, strict=True)]

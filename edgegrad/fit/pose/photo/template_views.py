@@ -18,15 +18,15 @@ from ....scene.scene import Scene
 from ..pose import Pose
 from ..task import PoseTask, focal_of
 
-RING = 0.1  # around the object's box, in its diagonal: shows what the object stands before
-SIDES, TURNS = 96, 18  # of views: directions, and turns about each; some 20° apart
-FILLS = 0.6  # of the picture's shorter side, an object as views see its perspective
-SPP = 4
-LEAST_DEPTH = 1.2  # of the object's centre, in sizes of it
+RING_SHARE = 0.1  # margin around the object's box, in its diagonal, for the background
+DIRECTIONS, ROLLS = 96, 18  # directions of views, and rotations about each; some 20° apart
+VIEW_FILL = 0.6  # share of the picture's shorter side that an object fills for the perspective of its views
+VIEW_SPP = 4
+MIN_VIEW_DEPTH = 1.2  # depth of the object's centre, in its sizes
 
 
 @dataclass(frozen=True)
-class Views:
+class TemplateViews:
     """Renders at n rotations, of the object's centre in the middle of the image."""
 
     rotations: Tensor  # (n, 3, 3) float64, mesh to camera
@@ -37,17 +37,17 @@ class Views:
 
     @property
     def ring(self) -> int:
-        """Pixels around the object's box."""
-        return round(RING * self.across)
+        """The number of pixels around the object's box."""
+        return round(RING_SHARE * self.across)
 
     @staticmethod
-    def of(task: PoseTask, rotations: Tensor, pixels: int, seed: int) -> Views:
-        """As the first picture's camera would see the object on its axis, so many pixels large."""
-        camera, side = task.shots[0].camera, pixels + 2 * round(RING * pixels)
+    def from_rotations(task: PoseTask, rotations: Tensor, pixels: int, seed: int) -> TemplateViews:
+        """Render the object so many pixels large, as on the axis of the first picture's camera."""
+        camera, side = task.shots[0].camera, pixels + 2 * round(RING_SHARE * pixels)
         perspective = camera.projection != "orthographic"
         depth = 2.0 * task.size
         if perspective:
-            depth = task.size * max(focal_of(camera) / (FILLS * min(camera.size)), LEAST_DEPTH)
+            depth = task.size * max(focal_of(camera) / (VIEW_FILL * min(camera.size)), MIN_VIEW_DEPTH)
         K = torch.eye(3, dtype=torch.float64)
         K[:2, :2] = camera.K[:2, :2] * (pixels / across(task, camera, depth))
         K[:2, 2] = 0.5 * side
@@ -60,24 +60,24 @@ class Views:
         if plain:
             scene = Scene([Mesh(mesh.verts, mesh.faces) for mesh in scene.meshes])
         with torch.no_grad():
-            seen = render_aovs(scene, cameras, names if plain else [*names, "image"], SPP, seed)
+            seen = render_aovs(scene, cameras, names if plain else [*names, "image"], VIEW_SPP, seed)
         alpha = seen["alpha"].float()
         normals = F.normalize(seen["normal"].float(), dim=-1, eps=1e-6)
         channels = task.shots[0].target.shape[-1] - ("alpha" in task.aovs and not task.clutter)
         colours = torch.ones(*alpha.shape[:3], channels)
         if not plain:
             colours = linear_to_srgb((seen["image"].float() / alpha.clamp(min=1e-3)).clamp(0.0, 1.0))
-        return Views(rotations, pixels, alpha[..., 0], colours, normals)
+        return TemplateViews(rotations, pixels, alpha[..., 0], colours, normals)
 
 
 def across(task: PoseTask, camera: Camera, depth: float) -> float:
-    """Pixels across the object, the diagonal of its box, at a depth."""
+    """Return the pixels of the object's diagonal, that of its box, at a depth."""
     return focal_of(camera) * task.size / (1.0 if camera.projection == "orthographic" else depth)
 
 
 def pose_at(task: PoseTask, R: Tensor, position: Tensor, depth: float) -> Pose:
-    """Where the first camera sees the object's centre at `position` (2,) in pixels and at `depth`, and the object as a view of
-    the rotation R has it: off the axis the object is turned like the ray to it. Distortion is left out."""
+    """Return the pose whose centre the first camera sees at `position` (2,), in pixels, and at `depth`, as a view of the
+    rotation R shows it. Off the axis, the object is rotated like the ray to it. Distortion is left out."""
     camera = task.shots[0].camera
     view, K = camera.world_to_camera.double(), camera.K.double()
     ray = torch.linalg.solve(K[:2, :2], position.double() - K[:2, 2])
@@ -92,7 +92,7 @@ def pose_at(task: PoseTask, R: Tensor, position: Tensor, depth: float) -> Pose:
 
 
 def seen_at(task: PoseTask, pose: Pose) -> tuple[Tensor, Tensor, float]:
-    """What pose_at() makes a pose of: rotation (3, 3) of a view, position (2,) and depth."""
+    """Return what pose_at() makes a pose of: rotation (3, 3) of a view, position (2,) and depth."""
     camera = task.shots[0].camera
     view, K = camera.world_to_camera.double(), camera.K.double()
     center = view[:3, :3] @ (pose.R @ task.center + pose.t) + view[:3, 3]
@@ -104,20 +104,20 @@ def seen_at(task: PoseTask, pose: Pose) -> tuple[Tensor, Tensor, float]:
 
 
 def all_sides() -> Tensor:
-    """(SIDES · TURNS, 3, 3): directions on Fibonacci's sphere, each turned about itself."""
-    k = torch.arange(SIDES, dtype=torch.float64)
-    z = 1.0 - (2.0 * k + 1.0) / SIDES
+    """Return the rotations (DIRECTIONS · ROLLS, 3, 3): directions on Fibonacci's sphere, each rotated about itself."""
+    k = torch.arange(DIRECTIONS, dtype=torch.float64)
+    z = 1.0 - (2.0 * k + 1.0) / DIRECTIONS
     longitude = math.pi * (3.0 - math.sqrt(5.0)) * k
     first = _rotations(torch.stack([torch.zeros_like(k), torch.acos(z), torch.zeros_like(k)], -1))
     second = _rotations(torch.stack([torch.zeros_like(k), torch.zeros_like(k), longitude], -1))
-    turn = torch.arange(TURNS, dtype=torch.float64) * (2.0 * math.pi / TURNS)
+    turn = torch.arange(ROLLS, dtype=torch.float64) * (2.0 * math.pi / ROLLS)
     turns = _rotations(torch.stack([torch.zeros_like(turn), torch.zeros_like(turn), turn], -1))
     return (turns[None] @ (first @ second)[:, None]).flatten(0, 1)
 
 
 def spread(count: int) -> Tensor:
-    """(count, 3, 3) rotations all over SO(3), evenly (Alexa, Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3),
-    2022)."""
+    """Return rotations (count, 3, 3) evenly over SO(3) (Alexa, Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of
+    SO(3), 2022)."""
     s = torch.arange(count, dtype=torch.float64) + 0.5
     inner, outer = (s / count).sqrt(), (1.0 - s / count).sqrt()
     a, b = 2.0 * math.pi * s / math.sqrt(2.0), 2.0 * math.pi * s / 1.533751168755204288118041
@@ -128,20 +128,20 @@ def spread(count: int) -> Tensor:
 
 
 def ball(count: int, radius: float) -> Tensor:
-    """(count, 3, 3) rotations by up to `radius` radians, the first by none, the others evenly: about axes on Fibonacci's sphere,
-    by angles as their volume grows."""
+    """Return rotations (count, 3, 3) by up to `radius` radians, the first by none, the others evenly. Axes lie on Fibonacci's
+    sphere, and angles follow the growth of volume."""
     k = torch.arange(count, dtype=torch.float64)
     z = 1.0 - (2.0 * k + 1.0) / count
     around = (1.0 - z * z).sqrt()
     longitude = math.pi * (3.0 - math.sqrt(5.0)) * k
     axes = torch.stack([around * longitude.cos(), around * longitude.sin(), z], -1)
-    # Multiples of the golden ratio, so that angles have nothing to do with axes.
+    # Multiples of the golden ratio make angles independent of axes.
     share = torch.where(k > 0, (k * 0.6180339887498949) % 1.0, torch.zeros_like(k))
     return _rotations(axes * (radius * share.pow(1.0 / 3.0))[:, None])
 
 
 def _towards(ray: Tensor) -> Tensor:
-    """(3, 3), the rotation that takes the axis (0, 0, 1) to the direction (x, y, 1) of ray (2,)."""
+    """Return the rotation (3, 3) from the axis (0, 0, 1) to the direction (x, y, 1) of a ray (2,)."""
     aside = ray.norm()
     axis = torch.stack([-ray[1], ray[0], ray.new_zeros(())]) / aside.clamp(min=1e-300)
     return rotation(axis * torch.atan(aside))

@@ -1,16 +1,16 @@
-"""A loss in which what covers the object hardly counts, for Gauss-Newton.
+"""A robust loss for Gauss-Newton, in which what covers the object hardly counts.
 
-Of a pixel whose channels differ by r in all, ρ(r) = r² / (1 + r²/c²) (Geman and McClure 1987): the squared difference while it
-is small beside c, and c² however large it is. A step minimises Σ w r² with w = (1 + r²/c²)⁻², which has ρ's gradient (iteratively
-reweighted least squares). c follows the median difference on the render's edges: wide while the object lies wrong, and narrow
-where at least half of them are found.
+A pixel whose channels differ by r in all costs ρ(r) = r² / (1 + r²/c²) (Geman and McClure 1987): the squared difference where
+it is small against c, and at most c². A step minimises Σ w r² with w = (1 + r²/c²)⁻², which has ρ's gradient (iteratively
+reweighted least squares). c follows the median difference on the render's edges: wide while the object lies wrong, narrow
+once half of them match.
 
-The unit of a picture's radiance, or its exposure, is not known: the object has in each picture a gain, and so has the background.
-The render is linear in them, so the best ones of a pose are known in closed form, and are eliminated from the normal equations
-(variable projection, Golub and Pereyra 1973, as Kaufman 1975 has it). Without them, a picture that is brighter than the render
-would be compared best at a wrong pose.
+The unit of a picture's radiance, or its exposure, is unknown: in each picture the object has a gain, and so has the
+background. The render is linear in them, so a pose's best gains have a closed form and are eliminated from the normal
+equations (variable projection, Golub and Pereyra 1973, in Kaufman's form, 1975). Otherwise a brighter picture would match
+best at a wrong pose.
 
-Where the background is not known, pixels are compared only as far as the object covers them, image − α · picture, and (1 − α)²
+Before an unknown background, pixels are compared only as far as the object covers them, image − α · picture, and (1 − α)²
 c²/2 is added: to cover a pixel pays if that matches better than by chance.
 """
 
@@ -24,29 +24,29 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..edge_support import edge_strength
-from .task import Level, PoseTask, Shot
+from .task import PoseTask, PyramidLevel, Shot
 
-NARROWEST = 0.1  # c, as a part of the pictures' range
-MEDIANS = 2.5  # c, in medians
-PAYS = 0.5  # of c², what covering a pixel pays
-NOISE = 0.03  # a loss that rises by a smaller part may have risen by the noise of its samples
-FAINT = 0.03  # the noise of the area that is covered, beside it
-REWEIGHTED = 2  # times, for gains
-BLOCK = 8  # pixels, whose errors are taken to have one cause
-UNSEEN = 1e-9  # of the curvature of gains: keeps one that the picture does not show near 1
+MIN_WIDTH = 0.1  # Least c, relative to the pictures' range.
+WIDTH_MEDIANS = 2.5  # c, in medians
+COVERAGE_REWARD = 0.5  # reward for covering a pixel, relative to c²
+LOSS_NOISE = 0.03  # A loss that rises by a smaller share may have risen by sample noise.
+COVERAGE_NOISE = 0.03  # Noise of the covered area, relative to LOSS_NOISE.
+GAIN_ITERATIONS = 2
+CORRELATED_BLOCK = 8  # pixels whose errors are taken to have one cause
+GAIN_RIDGE = 1e-9  # Relative to the curvature of gains: keeps one that the picture does not show near 1.
 
 
 class Comparison:
     """The differences between pictures and renders at one pose."""
 
-    def __init__(self, task: PoseTask, level: Level, layers: list[Tensor]) -> None:
-        """`layers` (h, w, n) of each picture: what PoseTask.layers() gives."""
+    def __init__(self, task: PoseTask, level: PyramidLevel, layers: list[Tensor]) -> None:
+        """`layers` (h, w, n) of each picture come from PoseTask.layers()."""
         self.task, self.level, self.layers = task, level, layers
         self.gains = [layer.new_ones(1 + task.backed) for layer in layers]
         self.renders: list[Tensor] = []  # (h, w, C) of each picture
         self.differences: list[Tensor] = []
         self.open: list[Tensor] = []
-        self._width = math.inf  # of the loss that the gains are fitted by
+        self._width = math.inf  # width of the loss that the gains minimise
         self._compose()
         if self._has_gains:
             self._fit_gains(math.inf, 1)
@@ -57,7 +57,7 @@ class Comparison:
         return self.task.colours > 0 and not self.task.colourless
 
     def _compose(self) -> None:
-        """The renders with the gains as they are, and how far they are from the pictures."""
+        """Apply the gains to the renders, and take their differences to the pictures."""
         task, C = self.task, self.task.colours
         self.renders, self.differences, self.open = [], [], []
         for shot, layer, gains in zip(self.level.shots, self.layers, self.gains, strict=True):
@@ -71,39 +71,39 @@ class Comparison:
                 self.differences.append(self.renders[-1] - shot.target)
 
     def _parts(self, layer: Tensor) -> list[Tensor]:
-        """What has a gain, (…, h, w, C) each."""
+        """Return the parts of a layer (…, h, w, C) that have a gain each."""
         C = self.task.colours
         return [layer[..., k * C : (k + 1) * C] for k in range(1 + self.task.backed)]
 
-    def _fit_gains(self, c: float, rounds: int = REWEIGHTED) -> None:
-        """Make the renders by the gains that make the loss of width c least (iteratively reweighted least squares)."""
+    def _fit_gains(self, c: float, rounds: int = GAIN_ITERATIONS) -> None:
+        """Find the gains that minimise the loss of width c, by iteratively reweighted least squares, and apply them."""
         C, found = self.task.colours, []
         for shot, layer, gains, r in zip(self.level.shots, self.layers, self.gains, self.differences, strict=True):
-            left = r.detach().flatten(0, 1)
+            residual = r.detach().flatten(0, 1)
             rows = torch.stack([part.detach().flatten(0, 1) for part in self._parts(layer)])
-            wanted = (gains[:, None, None] * rows).sum(0) - left[:, :C]
+            wanted = (gains[:, None, None] * rows).sum(0) - residual[:, :C]
             for _ in range(rounds):
-                weighted = (rows * self._weights(shot, left, c)).flatten(1)
+                weighted = (rows * self._weights(shot, residual, c)).flatten(1)
                 A, b = (weighted @ rows.flatten(1).T).double(), (weighted @ wanted.flatten()).double()
-                ridge = UNSEEN * A.diagonal() + 1e-30
+                ridge = GAIN_RIDGE * A.diagonal() + 1e-30
                 gains = torch.linalg.solve(A + torch.diag(ridge), b + ridge).to(gains)
-                left = torch.cat([(gains[:, None, None] * rows).sum(0) - wanted, left[:, C:]], 1)
+                residual = torch.cat([(gains[:, None, None] * rows).sum(0) - wanted, residual[:, C:]], 1)
             found.append(gains)
         self.gains, self._width = found, c
         self._compose()
 
     def _settle(self, c: float) -> None:
-        """The gains as of the loss of width c."""
+        """Fit the gains for the loss of width c."""
         if self._has_gains and c != self._width:
             self._fit_gains(c)
 
     def _weights(self, shot: Shot, r: Tensor, c: float) -> Tensor:
-        """(…, 1) of differences r (…, C) of all pixels."""
+        """Return the weights (…, 1) of differences r (…, C) of all pixels."""
         w = (1.0 + r.square().sum(-1, keepdim=True) / c**2).pow(-2)
         return w if shot.weight is None else w * shot.weight.reshape(w.shape)
 
     def _without_gains(self, k: int, w: Tensor, images: Tensor) -> Tensor:
-        """Images (…, h, w, n) without what a change of the gains of picture k does, where each pixel counts w (h, w, 1)."""
+        """Project images (…, h, w, n) onto what no change of picture k's gains makes, where each pixel counts w (h, w, 1)."""
         C = self.task.colours
         if not self._has_gains:
             return images
@@ -111,8 +111,8 @@ class Comparison:
         pinv = torch.linalg.pinv(moved @ moved.T, rtol=1e-9, hermitian=True)
         colours = images[..., :C]
         rows = colours.flatten(-3).double()
-        left = rows - (rows @ moved.T @ pinv) @ moved
-        return torch.cat([left.reshape(colours.shape).to(images), images[..., C:]], -1)
+        projected = rows - (rows @ moved.T @ pinv) @ moved
+        return torch.cat([projected.reshape(colours.shape).to(images), images[..., C:]], -1)
 
     @property
     def channels(self) -> int:
@@ -120,7 +120,7 @@ class Comparison:
 
     @property
     def count(self) -> float:
-        """Of numbers that are compared, weighted."""
+        """The weighted number of values that are compared."""
         weights = (
             r.numel() // self.channels if shot.weight is None else float(shot.weight.sum())
             for r, shot in zip(self.differences, self.level.shots, strict=True)
@@ -128,11 +128,11 @@ class Comparison:
         return max(self.channels * sum(weights), 1e-30)
 
     def scale(self) -> float:
-        """c that the median difference suggests."""
+        """Return the width c that the median difference suggests."""
         size, order = torch.cat([r.detach().norm(dim=-1).flatten() for r in self.differences]).sort()
         share = self._edges[order].cumsum(0)
         middle = size[int(torch.searchsorted(share, 0.5 * share[-1]).clamp(max=len(size) - 1))]
-        return max(MEDIANS * float(middle), NARROWEST * self.task.extent, 1e-12)
+        return max(WIDTH_MEDIANS * float(middle), MIN_WIDTH * self.task.extent, 1e-12)
 
     @cached_property
     def _edges(self) -> Tensor:
@@ -146,7 +146,7 @@ class Comparison:
         return torch.cat(found)
 
     def loss(self, c: float) -> tuple[float, float]:
-        """The mean over pixels and channels, and by how much that of another render may be higher by its noise."""
+        """Return the mean over pixels and channels, and its possible rise by noise in another render."""
         self._settle(c)
         total = near = paid = spread = 0.0
         for k, r in enumerate(self.differences):
@@ -154,15 +154,17 @@ class Comparison:
             weight = self.level.shots[k].weight
             w = torch.ones_like(square) if weight is None else weight
             total += float((w * square / (1.0 + square / c**2)).sum())
-            close = w * square / (1.0 + square / c**2).square()  # what is far off is so in any samples
+            close = w * square / (1.0 + square / c**2).square()  # Large differences do not depend on samples.
             near += float(close.sum())
-            spread += float(close.square().sum())  # its variance, where all that is left is noise
+            spread += float(close.square().sum())  # This is its variance where noise alone remains.
             if self.open:
-                paid += float((w * (1.0 - self.open[k].detach().square())).sum()) * PAYS * c**2
-        return (total - paid) / self.count, (max(NOISE * near, math.sqrt(spread)) + NOISE * FAINT * paid) / self.count
+                paid += float((w * (1.0 - self.open[k].detach().square())).sum()) * COVERAGE_REWARD * c**2
+        return (total - paid) / self.count, (
+            max(LOSS_NOISE * near, math.sqrt(spread)) + LOSS_NOISE * COVERAGE_NOISE * paid
+        ) / self.count
 
     def residuals(self, c: float) -> list[Tensor]:
-        """Whose squares sum up to the loss's approximation for one step."""
+        """Return residuals whose squares sum to the loss's approximation for one step."""
         self._settle(c)
         found = []
         for k, (r, shot) in enumerate(zip(self.differences, self.level.shots, strict=True)):
@@ -175,7 +177,7 @@ class Comparison:
         return found
 
     def tangents(self, c: float, dots: list[Tensor]) -> list[Tensor]:
-        """Of the residuals, from those (D, h, w, n) of the layers."""
+        """Return the tangents of the residuals, from those (D, h, w, n) of the layers."""
         found = []
         for k, (shot, dot, r) in enumerate(zip(self.level.shots, dots, self.differences, strict=True)):
             w = self._weights(shot, r.detach(), c)
@@ -191,15 +193,14 @@ class Comparison:
         return found
 
     def variance(self, c: float) -> float:
-        """The variance of a residual on the renders' edges, as if all were independent.
-
-        Errors of neighbouring pixels have a common cause: the light, the lens, the mesh. So the residuals of a block of pixels
-        are summed up, and the squares of these sums are what the squares of independent residuals would be in sum."""
+        """Return the variance of a residual on the renders' edges, as if all were independent. Errors of neighbouring pixels
+        have common causes: the light, the lens, the mesh. So the residuals of a block are summed, and the squares of these
+        sums stand for those of independent residuals."""
         total = count = 0.0
         for k, (shot, residual) in enumerate(zip(self.level.shots, self.residuals(c), strict=True)):
             H, W, C = residual.shape
             edges = edge_strength(self.renders[k].detach()).norm(dim=-1, keepdim=True)
-            side = min(BLOCK, H, W)
+            side = min(CORRELATED_BLOCK, H, W)
             sums = F.avg_pool2d(
                 (edges * residual.detach()).movedim(-1, 0)[None], side, ceil_mode=True, divisor_override=1
             )
@@ -208,6 +209,6 @@ class Comparison:
         return total / max(count, 1e-30)
 
     def _open(self, shot: Shot, c: float) -> Tensor:
-        """Of what is open, in the residual of a picture."""
+        """Return the weight of uncovered shares in the residual of a picture."""
         count = torch.ones(()) if shot.weight is None else shot.weight
-        return count.sqrt() * math.sqrt(PAYS) * c
+        return count.sqrt() * math.sqrt(COVERAGE_REWARD) * c

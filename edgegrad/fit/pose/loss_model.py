@@ -1,0 +1,135 @@
+"""Quadratic models of a fit's loss at one pose and lens: slope, curvature and noise.
+
+The loss L = Σ ρ(r_p) over pixels p has the curvature H = Σ w_p J_p J_pᵀ and the gradient g = Σ s_p with scores s_p = w_p r_p
+J_p. Noise of the pictures gives g the covariance S = Σ E[s_p s_qᵀ] over pairs of pixels, and the numbers that minimise L the
+covariance H⁻¹ S H⁻¹ (Huber, The Behavior of Maximum Likelihood Estimates under Nonstandard Conditions, 1967). Errors of
+edges, blur and shadows correlate in pixels nearby. So pairs less than CORRELATION_LENGTH pixels apart count, with Bartlett's
+weights, which keep S positive (Newey and West, A Simple, Positive Semi-Definite, Heteroskedasticity and Autocorrelation
+Consistent Covariance Matrix, 1987).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ...render import jvp
+from .blur_estimate import estimate_blur
+from .color_search import JUDGE_SPP, ColorSearch
+from .gauss_newton import NormalEquations
+from .jacobian import Rendered
+from .photo.level import PhotoLevel, photo_levels
+from .photo.occluders import occluder_weights, weighted
+from .photo.photo_search import UNCHANGED_COLORS
+from .pose import Pose
+from .robust_loss import MIN_WIDTH, Comparison
+from .task import PoseTask
+from .uncertainty import CORRELATION_LENGTH
+
+
+class LossModel(NamedTuple):
+    """The quadratic model of a loss at one pose, by the entries of a step that the task seeks."""
+
+    curvature: Tensor  # H (n, n)
+    gradient: Tensor  # g (n,)
+    scores: Tensor  # S (n, n), covariance of g
+    loss: float  # comparable between poses
+    slack: float  # rise of the loss that noise alone may explain
+    per_loss: float  # gradient of `loss` relative to g
+
+
+class ColorLoss:
+    """The loss that ColorSearch minimises, for masks and for pictures that show the mesh's colours unlit."""
+
+    def __init__(self, task: PoseTask, pose: Pose, max_size: int, spp: int, seed: int) -> None:
+        self.task, self.seed = task, seed
+        finest = min(1.0, max_size / max(task.shots[0].camera.size))
+        sharp = task.level(finest, 0.0, 1.0, max(spp, JUDGE_SPP), task.dofs)
+        with torch.no_grad():
+            both = [task.images(sharp, pose, sharp.spp, (seed + k) % 2**32) for k in (0, 1)]
+        self.level = sharp._replace(image_blur=estimate_blur(task, sharp, *both))
+        self.c = MIN_WIDTH * task.extent
+
+    def at(self, pose: Pose) -> LossModel:
+        """Return the model at a pose, from the same samples at each."""
+        task, level = self.task, self.level
+        images, tangents = [], []
+        for shot, (scene, camera, seed) in zip(level.shots, task.views(level, pose, self.seed), strict=True):
+            moves = task.motion(level, shot, pose)
+            if task.reverse_alone:
+                W = camera.world_to_camera
+                moved = F.pad(torch.cat([moves.linear, moves.shift[..., None]], -1), (0, 0, 0, 1))
+                by_tensor = {W: W @ moved, camera.K: moves.K, camera.distortion: moves.distortion}
+                own = {tensor: dot for tensor, dot in by_tensor.items() if tensor is not None and dot is not None}
+                channels, dots = jvp(scene, camera, _padded(own), level.spp, seed, aovs=task.channels)
+            else:
+                rendered = Rendered(scene, camera, task.channels, level.spp, seed)
+                channels, dots = rendered.images, rendered.derivatives(moves)
+            images.append(task.layers(level, shot, channels))
+            tangents.append(task.layers(level, shot, dots, slopes=True))
+        compared = Comparison(task, level, images)
+        residuals, tangents = compared.residuals(self.c), compared.tangents(self.c, tangents)
+        normal = NormalEquations.from_tangents(residuals, tangents)
+        scores = torch.zeros_like(normal.curvature)
+        for r, J in zip(residuals, tangents, strict=True):
+            scores += score_covariance((J * r).sum(-1).double())
+        return LossModel(*normal, scores, *compared.loss(self.c), 2.0 / compared.count)
+
+    def judged(self, pose: Pose) -> tuple[float, float]:
+        """Return the loss, and the share of the render's edges that the pictures show."""
+        found = ColorSearch(self.task, [self.level], pose, 1, 0.5, self.seed)._judged(pose, self.level)
+        return found.loss, found.edge_support
+
+
+class PhotoLoss:
+    """The terms of PhotoSearch, which are log likelihoods, for pictures in unknown light or before unknown things."""
+
+    def __init__(self, task: PoseTask, pose: Pose, levels: Sequence[PhotoLevel], seed: int) -> None:
+        self.task, self.seed = task, seed
+        last = levels[-1]
+        views = last.comparisons(pose, seed)
+        last, weights = last.focused(views), occluder_weights(views)
+        self.photo = last if weights is None else weighted(last, weights)
+        self.level = self.photo.plain
+
+    def at(self, pose: Pose) -> LossModel:
+        """Return the model at a pose, from the same samples at each."""
+        normal, loss = self.photo.equations(pose, self.seed)
+        return LossModel(*normal, CORRELATION_LENGTH**2 * normal.curvature, loss, abs(loss), 1.0)
+
+    def judged(self, pose: Pose) -> tuple[float, float]:
+        """Return the loss, and the share of the render's edges that the pictures show."""
+        return self.photo.equations(pose, self.seed)[1], self.photo.edge_support(pose, self.seed)
+
+
+LossSource = ColorLoss | PhotoLoss
+
+
+def loss_source(task: PoseTask, pose: Pose, max_size: int, spp: int, seed: int) -> LossSource:
+    """Return the loss that suits the pictures best, by what light does to the mesh's colours at a pose."""
+    if task.aovs != ("alpha",):
+        levels = photo_levels(task, pose, [None] * len(task.shots), max_size, spp, seed)
+        lit = [] if task.colourless else [seen.lit for seen in levels[-1].comparisons(pose, seed)]
+        # A surface too small to show its light is compared by colours where the background is known.
+        changes = [one.change() for one in lit if one is not None]
+        if (task.clutter and not changes) or max(changes, default=0.0) > UNCHANGED_COLORS:
+            return PhotoLoss(task, pose, levels, seed)
+    return ColorLoss(task, pose, max_size, spp, seed)
+
+
+def score_covariance(scores: Tensor) -> Tensor:
+    """Return S (n, n) from the scores (n, h, w) of one picture's pixels."""
+    side = round(CORRELATION_LENGTH)
+    # Products of sums over windows count a pair of pixels once for each window that holds both: Bartlett's weights.
+    padded = F.pad(scores[None], (side - 1,) * 4)
+    sums = side * F.avg_pool2d(padded, side, stride=1)[0].flatten(1)
+    return sums @ sums.T
+
+
+def _padded(tangents: dict[Tensor, Tensor]) -> dict[Tensor, Tensor]:
+    """Return derivatives of a part of the last axis, padded with zeros for the rest."""
+    return {tensor: F.pad(dot, (0, tensor.shape[-1] - dot.shape[-1])) for tensor, dot in tangents.items()}

@@ -1,0 +1,497 @@
+"""The search of fit_pose in photographs: Gauss-Newton over their terms, from coarse to fine and from several starts.
+
+Colours are counted anew after each step, inside and around the current silhouette. Where the start does not lead to edges of
+the picture, the search restarts from poses rotated aside. Where the light leaves the mesh's colours unchanged, ColorSearch
+has the last word, which is more precise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..color_search import ColorSearch, distinct, norms_of
+from ..pose import Pose, angle
+from ..replay_log import DescentState, ReplayLog
+from ..result import Step
+from ..task import PoseTask, PyramidLevel
+from ..uncertainty import CORRELATION_LENGTH, Uncertainty
+from .level import PhotoLevel, photo_levels
+from .nearby import comparable, nearby, turns
+from .occluders import FULLY_VISIBLE, OCCLUDER_SIDES, at_one_side, occluder_weights, visible_share, weighted
+
+PHOTO_SUPPORT = 0.65  # Wrong poses show up to 0.57 of the render's edges, right ones 0.83 and more.
+CONTOUR_SUPPORT = 0.85  # By the contour alone, wrong places in clutter show up to 0.81, right ones 0.87 and more.
+# Steps on a level when the user's `steps` are USUAL_STEPS or fewer; more of these make it more.
+COARSE_STEPS, FINE_STEPS, LAST_STEPS, USUAL_STEPS = 12, 8, 20, 40
+FULL_LENGTH_STEPS = 8  # on the last level
+# A step that makes the pictures more likely by a smaller factor than exp(this / 2) is short: noise moves poses as far.
+SHORT_STEP_NATS = 0.1
+DOUBTFUL_SUPPORT = 0.75  # Of twenty poses with colours, a wrong one reached 0.73, right ones 0.79 and more.
+SURE_SUPPORT = 0.85  # share of edges at which no other candidate is sought
+REFINED_STARTS, REFINED_OCCLUDERS = 3, 4  # best ones on the coarsest level
+REFINED_MATCHES = 6  # best poses around the start
+MIN_SUPPORT = 0.1  # Noise shows no edges at all on the coarsest level, clutter 0.3.
+LAST_LEVEL_ROUNDS = 2  # Each round leaves out what covers the object in the light of the one before.
+DISTINCT_ANGLE = 0.05  # radians between distinct poses
+UNCHANGED_COLORS = 0.05  # largest mean relative change of colours that counts as none
+UNOCCLUDED = 0.85  # With a smaller visible share, something covers the object.
+OCCLUDED_SUPPORT = 0.7  # least share of edges where a side of the object is left out
+ARRIVED = 0.01  # A descent this near to another one's end, in radians and object sizes, will end there, too.
+SAME_POSE_ANGLE = 0.1  # A refined pose further off, in radians, is another one.
+# Other poses may be the answer if they are within so many radians of the start. They are ambiguous if they are less likely by a
+# smaller factor than exp(this).
+AMBIGUITY_REACH, AMBIGUITY_NATS = 0.7, 3.0
+# The same for contours alone, after convergence: wrong results were up to exp(19) times less likely than the right pose, which no
+# descent had reached, and exp(5) times likelier than the next; next to right results, others were exp(10) times less likely.
+CONTOUR_AMBIGUITY_NATS = 8.0
+SHARP_DEGREES = 1.0  # With colours, ambiguous poses are sought where the rotation is known less exactly.
+
+
+class PhotoCandidate(NamedTuple):
+    """A refined pose."""
+
+    edge_support: float
+    pose: Pose
+    short: bool  # The last step was short.
+    visible_share: float = 1.0  # of the object
+
+
+class PhotoSearch:
+    """The state of a search, with the attributes of ColorSearch."""
+
+    def __init__(
+        self, task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, steps: int,
+        tolerance: float, seed: int, log: ReplayLog | None = None, further: bool = True,
+    ) -> None:  # fmt: skip
+        """`further`: try other starts where the refinement of the given one does not end well."""
+        self.task, self.start, self.depths = task, start, depths
+        self.enough = enough_support(task)
+        self.levels = photo_levels(task, start, depths, max_size, spp, seed)
+        self.max_size, self.spp, self.steps, self.tolerance, self.seed = max_size, spp, steps, tolerance, seed
+        self.further = further
+        # Before a uniform background, unlit colours are compared first.
+        self.colours_first = not task.clutter and "alpha" not in task.aovs and all(depth is None for depth in depths)
+        self.best, self.loss, self.converged, self.edge_support = start, math.nan, False, math.nan
+        self.curvature: Tensor | None = None  # JᵀJ at the answer
+        self.ambiguous: list[Pose] = []  # poses that may be the answer, too
+        self.history: list[Step] = []
+        self.log = log or ReplayLog()
+        self.after_step: Callable[[], Any] = lambda: None
+        self._answered = False  # Later candidates do not show until they win.
+        self._judged_poses: list[Pose] = []  # ends of the first descent
+
+    def run(self) -> None:
+        """Search; raise ValueError when nothing in the pictures depends on the pose."""
+        if self.colours_first:
+            self._colours_first()
+        else:
+            self._photograph_first()
+        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
+
+    def _colours_first(self) -> None:
+        """Search by unlit colours, and by the terms of photographs where these do not fit."""
+        colours = self._by_colours(self.start, self.task.pyramid(self.start, self.max_size, self.spp), self.further)
+        self._adopt(colours)
+        if colours.edge_support >= colours.enough or not self.further:
+            return
+        begins = len(self.history)
+        best = self._photograph()
+        won = best.edge_support >= self.enough
+        self._forget(slice(0, begins) if won else slice(begins, None))
+        if won:
+            # Convergence then needs more, since the terms of photographs match much that is no photograph.
+            self.enough = SURE_SUPPORT
+            self._take(best)
+        else:
+            self.ambiguous = []
+
+    def _photograph_first(self) -> None:
+        """Search by the terms of photographs; colours refine an unlit result, or search a mask where the terms find
+        nothing."""
+        task, best = self.task, self._photograph()
+        if best.edge_support >= self.enough and not task.colourless and self._is_unlit(best.pose):
+            colours = self._by_colours(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-2:], False)
+            better = colours.converged and angle(colours.best.R, best.pose.R) < SAME_POSE_ANGLE
+        elif best.edge_support < self.enough and not task.clutter and self.further:
+            colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), True)
+            better = colours.converged
+        else:
+            return
+        if better:
+            self._adopt(colours)
+        else:
+            self._forget(slice(len(self.history) - len(colours.history) + 1, None))
+
+    def _photograph(self) -> PhotoCandidate:
+        """Return the best candidate by the terms of photographs."""
+        begins = len(self.history)
+        found = self._judge(*self._down(self.start, self.levels))
+        if not self.history:
+            raise ValueError(
+                f"{self.task.names.init}: expected a pose at which the picture changes when the object moves, got one at which "
+                "it does not; is the object out of view?"
+            )
+        stays = found.short and len(distinct([found.pose, self.start], 2, DISTINCT_ANGLE)) == 1
+        start = self._judge(self.start, stays)
+        best = max(found, start, key=lambda end: end.edge_support)
+        self._judged_poses = [found.pose, start.pose]
+        if not self.colours_first:
+            self._take(best)
+        if self.further and best.edge_support < self.enough:
+            best = self._from_occluders(best, begins)
+        if (
+            self.further
+            and best.edge_support < max(self.enough, DOUBTFUL_SUPPORT)
+            and comparable(self.task, self.start)
+        ):
+            best = self._from_nearby(best, begins)
+        if self.further and best.edge_support < self.enough:
+            best = self._from_aside(best, begins)
+        if best.edge_support < self.enough:
+            return best
+        if best is not start:
+            best = self._refine_surrounded(best)
+            if self.further and best.edge_support < SURE_SUPPORT and best.visible_share < UNOCCLUDED:
+                again = self._from_occluders(best, begins)
+                best = best if again is best else self._refine_surrounded(again)
+        alone = self.further and all(depth is None for depth in self.depths)
+        if alone and (self.task.colourless or self._vague(best.pose)):
+            best = self._resolve_ambiguity(best, begins)
+        return best
+
+    def _from_aside(self, best: PhotoCandidate, begins: int) -> PhotoCandidate:
+        """Refine other starts until the pictures show an end's edges. Steps of this search begin in the history at
+        `begins`."""
+        first, *finer = self._of_turned()
+        answered = self._answered
+        self._answered = True
+        ends = [self._follow(first, self.task.moved(self.start, *turn))[0] for turn in turns()]
+        scores = self.log.replay(lambda: [first.edge_support(pose, self.seed) for pose in ends])
+        order = sorted((k for k in range(len(ends)) if scores[k] >= MIN_SUPPORT), key=lambda k: -scores[k])
+        for pose in distinct([ends[k] for k in order], REFINED_STARTS, DISTINCT_ANGLE):
+            before = len(self.history)
+            best = self._better(best, self._judge(*self._down(pose, finer)), slice(begins, before), answered)
+            if best.edge_support >= self.enough:
+                break
+        return best
+
+    def _of_turned(self) -> list[PhotoLevel]:
+        """Return the levels for starts rotated aside. With colours they begin on the coarsest level, which shows the light. A
+        contour shows so little there that different starts would meet."""
+        return self.levels[1:] if self.task.colourless else self.levels
+
+    def likeliest(self, pose: Pose, short: bool) -> tuple[PhotoCandidate | None, list[Pose]]:
+        """Compare a pose that was found otherwise with ambiguous ones; `short` as of its last step. Return the one that makes
+        the pictures likelier, if there is one, and the others that these hardly separate from the answer."""
+        last = photo_levels(self.task, pose, self.depths, self.max_size, self.spp, self.seed)[-1]
+        views = last.comparisons(pose, self.seed)
+        last, weights = last.focused(views), occluder_weights(views)
+        self.levels = [*self.levels[:-1], last]
+        kept = 1.0 if weights is None else visible_share(views, weights)
+        here = self._judge(pose, short, last if weights is None else weighted(last, weights))._replace(
+            visible_share=kept
+        )
+        answer = self._resolve_ambiguity(here, 0)
+        return None if answer is here else answer, self.ambiguous
+
+    def _resolve_ambiguity(self, best: PhotoCandidate, begins: int) -> PhotoCandidate:
+        """Return the most likely of ambiguous poses. From afar, a mirror-symmetric object has the contour that it has behind a
+        mirror, so one contour in two poses. A bottle that shows hardly more than its bottom, a disc of one colour, is
+        ambiguous in many."""
+        plain = self.task.colourless
+        first, *finer = self._of_turned()
+        turned = [self.task.moved(self.start if plain else best.pose, *turn) for turn in turns()]
+        before = len(self.history)
+        self._answered = True
+        here, *ends = (self._follow(first, pose)[0] for pose in [best.pose, *turned])
+        costs = self.log.replay(lambda: first.negative_log_likelihoods([here, *ends], self.seed))
+        sure, doubt = (
+            AMBIGUITY_NATS * CORRELATION_LENGTH**2,
+            (CONTOUR_AMBIGUITY_NATS if plain else AMBIGUITY_NATS) * CORRELATION_LENGTH**2,
+        )
+        order = sorted(range(len(ends)), key=lambda k: costs[1 + k])
+        if not plain:  # Colours that separate poses in so few pixels do so in more.
+            order = [k for k in order if costs[1 + k] - costs[0] < sure]
+        found = [best]
+        level = self._unoccluded_level(best)
+        for pose in distinct([here, *(ends[k] for k in order)], 1 + REFINED_STARTS, DISTINCT_ANGLE)[1:]:
+            if (reached := self._apart(pose, finer, best.pose)) is None:
+                continue
+            end = self._judge(*reached, level)
+            if (
+                end.edge_support >= min(self.enough, DOUBTFUL_SUPPORT)
+                and angle(end.pose.R, self.start.R) < AMBIGUITY_REACH
+            ):
+                found.append(end)
+        costs = self.log.replay(lambda: level.negative_log_likelihoods([end.pose for end in found], self.seed))
+        k = min((k for k, end in enumerate(found) if end.edge_support >= self.enough), key=costs.__getitem__, default=0)
+        # Taking one that is hardly likelier would make answers depend on the start.
+        won = costs[0] - costs[k] > sure and (plain or found[k].edge_support > best.edge_support)
+        answer, cost = (found[k], costs[k]) if won else (best, costs[0])
+        self.ambiguous = [
+            end.pose for end, other in zip(found, costs, strict=True) if end is not answer and other - cost < doubt
+        ]
+        if not won:
+            self._forget(slice(before, None))
+            return best
+        self._forget(slice(begins, len(self.history)))
+        if not self.colours_first:
+            self._take(answer)
+        return self._refine_surrounded(answer)
+
+    def _apart(self, pose: Pose, levels: list[PhotoLevel], other: Pose) -> tuple[Pose, bool] | None:
+        """Refine like _down(), but return None as soon as the other pose is reached."""
+
+        def there(pose: Pose) -> bool:
+            return angle(pose.R, other.R) < ARRIVED and self.task.between(pose, other) < ARRIVED
+
+        short = False
+        for level in levels:
+            pose, short = self._follow(level, pose, there)
+            if there(pose) or (not self.task.colourless and angle(pose.R, other.R) < DISTINCT_ANGLE):
+                return None
+        return pose, short
+
+    def _unoccluded_level(self, end: PhotoCandidate) -> PhotoLevel:
+        """Return the last level, without what covers the object at an end, if something does."""
+        last = self.levels[-1]
+        weights = occluder_weights(last.comparisons(end.pose, self.seed)) if end.visible_share < UNOCCLUDED else None
+        return last if weights is None else weighted(last, weights)
+
+    def _vague(self, pose: Pose) -> bool:
+        """Return whether the pictures show the pose's rotation so little that it may be ambiguous."""
+        (degrees,) = self.log.replay(lambda: [self._degrees(pose)])
+        return degrees > SHARP_DEGREES
+
+    def _degrees(self, pose: Pose) -> float:
+        curvature = self.levels[-1].equations(pose, self.seed)[0].curvature
+        return Uncertainty.from_curvature(self.task, pose, curvature, self.task.dofs, None).degrees
+
+    def _better(self, best: PhotoCandidate, found: PhotoCandidate, earlier: slice, answered: bool) -> PhotoCandidate:
+        """Return the candidate with more edge support. The history keeps its steps alone as best; `earlier` ones led to
+        `best`."""
+        if found.edge_support <= best.edge_support:
+            self._forget(slice(earlier.stop, None))
+            return best
+        self._forget(earlier)
+        if answered:
+            self._take(found)
+        return found
+
+    def _from_occluders(self, best: PhotoCandidate, begins: int) -> PhotoCandidate:
+        """Refine with possible occluders at one side left out, until the pictures surely show an end's edges."""
+        answered = self._answered
+        self._answered = True
+        coarse = self.levels[0]
+        first = coarse.comparisons(self.start, self.seed)
+        all_weights = [[at_one_side(seen.alpha, side) for seen in first] for side in range(OCCLUDER_SIDES)]
+        ends = [self._follow(weighted(coarse, weights), self.start)[0] for weights in all_weights]
+        scores = self.log.replay(
+            lambda: [
+                weighted(coarse, weights).edge_support(pose, self.seed)
+                for pose, weights in zip(ends, all_weights, strict=True)
+            ]
+        )
+        hopeful = [k for k in range(OCCLUDER_SIDES) if scores[k] >= MIN_SUPPORT]
+        order = sorted(hopeful, key=lambda k: -scores[k])[:REFINED_OCCLUDERS]
+        return self._refine_occluded(best, ((ends[k], all_weights[k]) for k in order), begins, answered)
+
+    def _from_nearby(self, best: PhotoCandidate, begins: int) -> PhotoCandidate:
+        """Refine poses around the start that the picture shows, as a whole or at all sides but one."""
+        answered = self._answered
+        self._answered = True
+        coarse, first, *_ = self.levels
+        size = len(self.start.numbers)
+
+        def hopeful(pose: Pose) -> bool:
+            return coarse.edge_support(pose, self.seed) >= MIN_SUPPORT
+
+        def compared() -> list[float]:
+            if not (hopeful(self.start) or hopeful(best.pose)):
+                return []
+            found = nearby(self.task, self.start, self.seed)[:REFINED_MATCHES]
+            return [number for pose, side in found if hopeful(pose) for number in (*pose.numbers, float(side))]
+
+        def starts() -> Iterator[tuple[Pose, list[Tensor]]]:
+            flat = self.log.replay(compared)
+            for at in range(0, len(flat), size + 1):
+                pose, side = Pose.from_numbers(flat[at : at + size]), int(flat[at + size])
+                yield pose, [at_one_side(seen.alpha, side) for seen in first.comparisons(pose, self.seed)]
+
+        return self._refine_occluded(best, starts(), begins, answered)
+
+    def _refine_occluded(
+        self, best: PhotoCandidate, starts: Iterable[tuple[Pose, list[Tensor]]], begins: int, answered: bool
+    ) -> PhotoCandidate:  # fmt: skip
+        """Refine poses with initial weights (h, w) of the pictures, until one is sure; return the best."""
+        for pose, weights in starts:
+            before = len(self.history)
+            found = self._unoccluded(pose, weights, self.levels[1:])
+            # Of so many candidates, one may match something by chance.
+            if found.edge_support < OCCLUDED_SUPPORT:
+                self._forget(slice(before, None))
+                continue
+            best = self._better(best, found, slice(begins, before), answered)
+            if best.edge_support >= SURE_SUPPORT:
+                break
+        return best
+
+    def _refine_surrounded(self, best: PhotoCandidate) -> PhotoCandidate:
+        """Refine once more by the surroundings of the end, and without occluders, so that the result does not depend on the
+        start."""
+        *_, coarser, last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)
+        last = last.focused(last.comparisons(best.pose, self.seed))
+        before = len(self.history)
+        weights = occluder_weights(last.comparisons(best.pose, self.seed)) or [
+            torch.ones(picture.size) for picture in last.pictures
+        ]
+        # On the last level steps are small and may stop early. From nearer, those of the level before lead on by colours inside.
+        levels = [last] * LAST_LEVEL_ROUNDS if self.task.colourless else [coarser, *[last] * LAST_LEVEL_ROUNDS]
+        found = self._unoccluded(best.pose, weights, levels)
+        if found.edge_support < self.enough:
+            self._forget(slice(before, None))
+            return best
+        self.levels = [*self.levels[:-1], last]
+        if not self.colours_first:
+            self._take(found)
+        return found
+
+    def _is_unlit(self, pose: Pose) -> bool:
+        """Return whether the light leaves the mesh's colours as they are. This holds for pictures, not for a pose. At a wrong
+        pose the fitted light makes up for a part of the error, so the least change counts: at this pose, and where the first
+        descent began and ended."""
+        poses = [pose, *self._judged_poses]
+        (least,) = self.log.replay(lambda: [min(self._change(one) for one in poses)])
+        return least < UNCHANGED_COLORS
+
+    def _change(self, pose: Pose) -> float:
+        """Return the largest change of the mesh's colours by the light over the pictures, relative to the colours."""
+        seen = self.levels[-1].comparisons(pose, self.seed)
+        return max(math.inf if one.lit is None else one.lit.change() for one in seen)
+
+    def _by_colours(self, start: Pose, levels: list[PyramidLevel], further: bool) -> ColorSearch:
+        """Search by unlit colours from a start, with its steps added to the history."""
+        search = ColorSearch(self.task, levels, start, self.steps, self.tolerance, self.seed, self.log, further)
+        before = list(self.history)
+
+        def after_step() -> None:
+            self.history = [*before, *search.history]
+            if not before:
+                self.best, self.loss, self.edge_support = search.best, search.loss, search.edge_support
+            self.after_step()
+
+        search.after_step = after_step
+        search.run()
+        self.history = [*before, *search.history[:-1]]  # The last entry is the final comparison.
+        return search
+
+    def _adopt(self, search: ColorSearch) -> None:
+        self.best, self.loss, self._answered = search.best, search.loss, True
+        self.edge_support, self.converged, self.curvature = search.edge_support, search.converged, search.curvature
+
+    @property
+    def planned(self) -> int:
+        """The largest number of steps of the first descent."""
+        return sum(self._most(level) for level in self.levels)
+
+    def first_end(self) -> float:
+        """Return the share of the render's edges that the pictures show where the start alone leads."""
+        return self._judge(*self._down(self.start, self.levels)).edge_support
+
+    def _unoccluded(self, pose: Pose, weights: list[Tensor], levels: list[PhotoLevel]) -> PhotoCandidate:
+        """Refine a pose, with `weights` (h, w) of each picture until the light shows what covers the object."""
+        short, last = False, levels[-1]
+        for level in levels:
+            if level.last:
+                weights = occluder_weights(weighted(level, weights).comparisons(pose, self.seed)) or weights
+            pose, short = self._follow(last := weighted(level, weights), pose)
+        weights = occluder_weights(last.comparisons(pose, self.seed)) or weights
+        share, kept = self.log.replay(
+            lambda: [
+                weighted(levels[-1], weights).edge_support(pose, self.seed),
+                visible_share(levels[-1].comparisons(pose, self.seed), weights),
+            ]
+        )
+        return PhotoCandidate(share * min(1.0, kept / FULLY_VISIBLE), pose, short, kept)
+
+    def _down(self, pose: Pose, levels: list[PhotoLevel]) -> tuple[Pose, bool]:
+        """Refine through the levels; return the pose, and whether the last step was short."""
+        short = False
+        for level in levels:
+            pose, short = self._follow(level, pose)
+        return pose, short
+
+    def _follow(
+        self, level: PhotoLevel, origin: Pose, until: Callable[[Pose], bool] = lambda _: False
+    ) -> tuple[Pose, bool]:
+        """Take steps on one level, `until` a pose where no more are needed; return the pose, and whether the last step was
+        short."""
+        state = self.log.next_descent() or DescentState(origin, origin, math.inf, search={})
+        for step in state.steps:
+            self._note(step)
+        while not state.done:
+            # Each step has the same samples, so that steps come to rest.
+            normal, loss = level.equations(state.pose, self.seed)
+            move = level.step(normal)
+            if move is None:
+                self.log.record(state := state._replace(done=True))
+                break
+            if level.last and len(state.steps) > FULL_LENGTH_STEPS:
+                move = 0.5 * move  # Full steps would oscillate, as weights are solved anew at each.
+            far = float(move.abs().max()) >= self.tolerance * level.plain.coarseness
+            short = not far or float(move @ normal.curvature @ move) < SHORT_STEP_NATS
+            step = Step(level.size, loss, state.pose, True, norms_of(level.plain.dofs, normal.gradient))
+            steps = (*state.steps, step)
+            state = state._replace(
+                pose=self.task.moved(state.pose, level.plain.dofs, move), here=state.pose, lowest=loss, short=short,
+                done=short or len(steps) >= self._most(level), steps=steps,
+            )  # fmt: skip
+            state = state._replace(done=state.done or until(state.pose))
+            self.log.record(state)
+            self._note(step)
+            self.after_step()
+        return state.pose, state.short
+
+    def _most(self, level: PhotoLevel) -> int:
+        return most_steps(self.steps, level.last, level.plain.coarseness == self.levels[0].plain.coarseness)
+
+    def _note(self, step: Step) -> None:
+        if not self._answered:
+            self.best, self.loss = step.pose, step.loss
+        self.history.append(step)
+
+    def _forget(self, lost: slice) -> None:
+        self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
+
+    def _judge(self, pose: Pose, short: bool, level: PhotoLevel | None = None) -> PhotoCandidate:
+        """Rate a pose by the last level, or another one like it."""
+        (share,) = self.log.replay(lambda: [(level or self.levels[-1]).edge_support(pose, self.seed)])
+        return PhotoCandidate(share, pose, short)
+
+    def _take(self, end: PhotoCandidate) -> None:
+        self.loss, *curvature = self.log.replay(lambda: self._at(end.pose))
+        self.curvature = torch.tensor(curvature, dtype=torch.float64).reshape((len(self.task.dofs),) * 2)
+        self.edge_support, self.best, self._answered = end.edge_support, end.pose, True
+        self.converged = end.short and end.edge_support >= self.enough
+
+    def _at(self, pose: Pose) -> list[float]:
+        """Return the loss, and the curvature by rows."""
+        normal, loss = self.levels[-1].equations(pose, self.seed)
+        return [loss, *normal.curvature.flatten().tolist()]
+
+
+def enough_support(task: PoseTask) -> float:
+    """Return the least edge support of a right pose."""
+    return CONTOUR_SUPPORT if task.colourless else PHOTO_SUPPORT
+
+
+def most_steps(steps: int, last: bool, coarsest: bool) -> int:
+    """Return the number of steps on a level, of what the user allows. Few lead from one level to the next, and where they do
+    not come to rest, more do not help either, unless somebody asks for them."""
+    usual = LAST_STEPS if last else COARSE_STEPS if coarsest else FINE_STEPS
+    return min(steps, round(usual * max(1.0, steps / USUAL_STEPS)))
