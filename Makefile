@@ -31,7 +31,7 @@ test-browser: $(VENV)/.ready
 	@command -v chromedriver >/dev/null || \
 	  { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -y -qq chromium chromium-driver; } >/dev/null 2>&1 || \
 	  echo "make test-browser: skipped without Chromium and its chromedriver; on Debian: apt-get install chromium chromium-driver"
-	$(BIN)/python -m pytest tests/test_browser.py
+	$(BIN)/python -m pytest tests/live/test_browser.py
 
 # What builds the kernel again in another way needs what pip would fetch for the build alone.
 TOOLS := $(BIN)/uv pip install --quiet --python $(BIN)/python "cmake>=3.26" ninja "nanobind>=3.1"
@@ -47,12 +47,12 @@ SANITIZE := build/sanitize
 # Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick; without tests marked
 # `unwatched`.
 WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows lens_boundary wide_fisheye aovs lit_kernel glossy_light derivative_points shadow_alpha_edges secondary_edges forward_mode samples messages raster raster_texture raster_antialias
-WATCHED_TESTS := $(WATCHED:%=tests/test_%.py)
+WATCHED_TESTS = $(foreach name,$(WATCHED),$(wildcard tests/*/test_$(name).py))
 CHOSEN := not slow and not unwatched
 # Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for
 # longer; tests of load measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
 WITHOUT := 3mf_files browser cli derivatives distributed docs fit fit_faults late_imports format_variants hostile_files malformed_files mesh_files unusual_files gltf_arrays gltf_files images saved_cameras load notebooks oracles polygons error_time viewer world_coordinates
-sanitize-all: WATCHED_TESTS := $(WITHOUT:%=--ignore=tests/test_%.py)
+sanitize-all: WATCHED_TESTS := $(WITHOUT:%=--ignore-glob=*/test_%.py)
 sanitize-all: CHOSEN := not slow
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
 sanitize sanitize-all: $(VENV)/.ready

@@ -2,7 +2,7 @@
 
     python -m benchmarks.fit_methods
 
-The pose of a lit mesh (6 numbers), a sun and eight colours (27), a camera and a roughness (7): of tests/small_fits.py.
+The pose of a lit mesh (6 numbers), a sun and eight colours (27), a camera and a roughness (7): of tests/fit/small_fits.py.
 """
 
 from __future__ import annotations

@@ -12,10 +12,9 @@ import pytest
 import torch
 
 ROOT = Path(__file__).parents[1]
-sys.path += [
-    str(ROOT),
-    str(ROOT / "examples"),
-]  # Tests use scenes and references of benchmarks/, and objects of examples/.
+# Tests use scenes and references of benchmarks/, objects of examples/, and helpers of any folder of tests/.
+FOLDERS = sorted(path for path in Path(__file__).parent.iterdir() if path.is_dir())
+sys.path += map(str, (ROOT, ROOT / "examples", *FOLDERS))
 torch.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # what started the tests may have it ignored, as nohup does
 

@@ -64,7 +64,7 @@ def main() -> None:
         "-m",
         "not slow and not unwatched",
         "--deselect",
-        "tests/test_sanitizers.py",
+        "tests/kernel/test_sanitizers.py",
         *sys.argv[1:],
     ]
     if subprocess.run(tests, cwd=ROOT, env=environment).returncode:

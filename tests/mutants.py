@@ -52,6 +52,12 @@ class Change(NamedTuple):
     mutants: dict[str, list[str]]  # by name: the tests
 
 
+def path_of(file: str) -> Path:
+    """Return the path of a file of tests, whose name stands in one folder alone."""
+    (path,) = TESTS.rglob(file)
+    return path
+
+
 def changes() -> list[Change]:
     found = []
     for block in (TESTS / "mutants.txt").read_text().split("\n\n"):
@@ -132,7 +138,7 @@ def run(mutant: str, tests: list[str], *options: str) -> tuple[list[str], int]:
         silent = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silent, 1), os.dup2(silent, 2)
         outcome = Outcome()
-        names = [str(TESTS / test) for test in tests]
+        names = ["::".join([str(path_of(file)), *rest]) for file, *rest in (test.split("::") for test in tests)]
         code = pytest.main(["-q", "-m", "not slow", "-p", "no:cacheprovider", *options, *names], plugins=[outcome])
         if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
             outcome.failed.append(f"pytest ended with {code!r}")

@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 import torch
 
-FOLDER = Path(__file__).parents[1] / "examples"
+FOLDER = Path(__file__).parents[2] / "examples"
 sys.path.append(str(FOLDER))  # where they find one another
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 pytest_plugins = ["pytester"]
+CONFTEST = Path(__file__).parents[1] / "conftest.py"
 
 TESTS = """
 import time
@@ -34,7 +35,7 @@ def test_slow():
 
 
 def test_a_test_over_budget_fails(pytester: pytest.Pytester) -> None:
-    pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text(encoding="utf-8"))
+    pytester.makeconftest(CONFTEST.read_text(encoding="utf-8"))
     pytester.makepyfile(TESTS)
     pytester.makeini("[pytest]\nmarkers = slow")
     pytester.runpytest_inprocess().assert_outcomes(passed=4)
@@ -57,7 +58,7 @@ def test_is_ended():
 
 def test_failures_are_left_by_a_run_that_is_ended(pytester: pytest.Pytester) -> None:
     """They are written and shown as they come."""
-    pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text(encoding="utf-8"))
+    pytester.makeconftest(CONFTEST.read_text(encoding="utf-8"))
     pytester.makepyfile(FAILING)
     result = pytester.runpytest_subprocess("--failures", "out/failures.txt")
     assert result.ret == -signal.SIGKILL

@@ -15,7 +15,7 @@ from edgegrad.fit import fit_rig
 
 yourdfpy = pytest.importorskip("yourdfpy")
 pytest.importorskip("pytorch_kinematics")
-sys.path.append(str(Path(__file__).parents[1] / "examples"))
+sys.path.append(str(Path(__file__).parents[2] / "examples"))
 import arm  # noqa: E402
 
 GRIPPER = """<?xml version="1.0"?>

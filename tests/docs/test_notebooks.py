@@ -17,7 +17,7 @@ import torch
 from nbclient.exceptions import CellExecutionError
 from nbformat import NotebookNode
 
-FOLDER = Path(__file__).parents[1] / "notebooks"
+FOLDER = Path(__file__).parents[2] / "notebooks"
 NAMES = sorted(path.stem for path in FOLDER.glob("[0-9]*_*.py"))
 QUICK = "1_images_and_gradients"
 LARGEST = 300_000  # bytes

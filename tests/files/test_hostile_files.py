@@ -140,7 +140,7 @@ def test_what_is_only_announced_takes_no_memory(tmp_path):
     harmful = {**huge(), "z.exr": exr_of(tmp_path, 100_000), "ok.obj": GOOD}
     for name, content in harmful.items():
         write(tmp_path, name, content)
-    command = [sys.executable, "-c", LOAD_ALL, str(Path(__file__).parent), str(tmp_path)]
+    command = [sys.executable, "-c", LOAD_ALL, str(Path(__file__).parents[1] / "support"), str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]
     report = json.loads(done.stdout.splitlines()[-1])

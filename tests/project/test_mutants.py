@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import mutants
 import pytest
@@ -16,7 +15,7 @@ def test_lines_stand_once_and_tests_exist() -> None:
     assert len(names) == len(set(names)) > 80
     for test in {test for change in every for tests in change.mutants.values() for test in tests}:
         file, function = test.split("::")
-        assert re.search(rf"^def {function}\(", (Path(__file__).parent / file).read_text(), re.MULTILINE), test
+        assert re.search(rf"^def {function}\(", mutants.path_of(file).read_text(), re.MULTILINE), test
     for change in every:
         assert not re.search(r"\boff\b", change.changed), f"hides off<>, which is what OFF is: {change}"
         assert all(f'OFF("{name}")' in change.changed for name in change.mutants), change

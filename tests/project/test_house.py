@@ -14,7 +14,7 @@ from PIL import Image
 
 from edgegrad.files.load import load_mesh
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "docs"))
 import house  # noqa: E402
 

@@ -27,7 +27,7 @@ import edgegrad.bop
 import edgegrad.fit
 import edgegrad.raster
 
-FOLDER = Path(__file__).parents[1] / "docs"
+FOLDER = Path(__file__).parents[2] / "docs"
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
 LONG = ("how-to/shape-from-depth.md", "how-to/bop.md", "how-to/training-loop.md")
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

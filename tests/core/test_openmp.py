@@ -13,7 +13,7 @@ import pytest
 
 from edgegrad import cli
 
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mapped files as on Linux")
 
@@ -84,7 +84,7 @@ ORDERS = {
 
 
 def lines_of(code: str, **variables: str) -> list[str]:
-    environment = {**os.environ, "PYTHONPATH": f"{TESTS}:{TESTS.parent}", **variables}
+    environment = {**os.environ, "PYTHONPATH": f"{TESTS}/support:{TESTS.parent}", **variables}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr
     return run.stdout.split()

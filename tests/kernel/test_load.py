@@ -17,7 +17,7 @@ from scenes import cube, front_camera, icosphere
 
 import edgegrad as eg
 
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 posix = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals and processes as in POSIX")
 
 # What the scripts below share. `step(k)` tells the bits of an image and of its gradients; k moves the vertices.
@@ -44,7 +44,7 @@ def script(code, *arguments, timeout=120, folder=None, silent=False):
     file.write_text(textwrap.dedent(COMMON) + textwrap.dedent(code))
     run = subprocess.run(
         [sys.executable, str(file), *map(str, arguments)],
-        env={**psutil.Process().environ(), "PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
+        env={**psutil.Process().environ(), "PYTHONPATH": f"{TESTS}/support:{TESTS.parent}"},
         capture_output=True, text=True, timeout=timeout,
     )  # fmt: skip
     assert run.returncode == 0 and not (silent and run.stderr), run.stderr

@@ -1,6 +1,6 @@
-"""Random scenes with extreme numbers and degenerate topology, for tests/test_extreme.py. From the shell, many of them:
+"""Random scenes with extreme numbers and degenerate topology, for tests/rays/test_extreme.py. From the shell, many of them:
 
-python tests/extreme_scenes.py FIRST COUNT
+python tests/support/extreme_scenes.py FIRST COUNT
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ def test_in_a_module_with_an_optimiser():
 
 def test_the_loop_in_the_readme(monkeypatch):
     """Each step draws samples of its own: with one seed for all, their error would not average out."""
-    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
     (loop,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "optimizer.step()" in block)
     target = eg.render(MESH.transformed(t=[0.05, -0.03, 0.0]), CAMERA, 64, seed=1 << 40)
     seeds, render = [], eg.render
@@ -122,7 +122,7 @@ def test_the_loop_in_the_readme(monkeypatch):
 
 
 def test_the_light_in_the_readme():
-    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
     (lit,) = (
         block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "eg.DirectionalLight(sun" in block
     )

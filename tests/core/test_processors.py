@@ -41,7 +41,7 @@ def results() -> dict[str, Tensor]:
 @pytest.mark.parametrize("options", [pytest.param("max_isa=avx2", marks=pytest.mark.slow), "max_isa=sse4.2"])
 def test_narrow_packets(options: str, tmp_path: Path) -> None:
     file = tmp_path / "results.pt"
-    environment = {**os.environ, "EDGEGRAD_EMBREE": options, "PYTHONPATH": str(Path(__file__).parent)}
+    environment = {**os.environ, "EDGEGRAD_EMBREE": options, "PYTHONPATH": os.pathsep.join(sys.path)}
     program = (
         "import sys, torch, test_processors as t\n"
         "assert t.core.packet_width() == 8\n"

@@ -18,7 +18,7 @@ from edgegrad.fit.rig.limbs import Limb, LimbSearch, Values, limbs
 from edgegrad.fit.views import views_of
 
 roma = pytest.importorskip("roma")
-sys.path.append(str(Path(__file__).parents[1] / "examples"))
+sys.path.append(str(Path(__file__).parents[2] / "examples"))
 import body  # noqa: E402
 import figure  # noqa: E402
 
