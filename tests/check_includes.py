@@ -12,8 +12,8 @@ from pathlib import Path
 # Each layer may include itself and the layers before it. Folders of one layer do not know one another.
 LAYERS = (
     ("core",),
-    ("scene",),
-    ("texture", "camera"),
+    ("scene", "texture"),
+    ("camera",),
     ("rays",),
     ("film",),
     ("accumulate",),

@@ -25,7 +25,7 @@ struct Slots {
 
     bool geometry() const { return verts || world_to_camera || K || distortion; }
     // Returns whether discontinuities within faces move.
-    bool steps() const { return geometry() || uvs || alphas; }
+    bool discontinuities() const { return geometry() || uvs || alphas; }
     bool appearance() const { return colors || uvs || texels || vertex_attributes || face_attributes; }
 };
 

@@ -131,12 +131,12 @@ inline void append_intrinsics(std::vector<double>& to, const Camera& sub_camera,
 // Appends the ray to n in a sub-camera's image, in the frame of the camera, with its derivatives at fixed x.
 inline void append_ray(const Camera& sub_camera, Vec2 n, std::vector<double>& along, std::vector<double>* along_by_k,
                        std::vector<double>* along_by_x = nullptr) {
-    const Mat3& turn = sub_camera.turn;
-    const Vec3 direction = transposed_times(turn, {n.x, n.y, 1});
+    const Mat3& rotation = sub_camera.rotation;
+    const Vec3 direction = transposed_times(rotation, {n.x, n.y, 1});
     append(along, {direction.x, direction.y, direction.z});
     if (!along_by_k && !along_by_x) return;
-    for (const Vec2 by_n :
-         {Vec2{turn.row[0].x, turn.row[1].x}, Vec2{turn.row[0].y, turn.row[1].y}, Vec2{turn.row[0].z, turn.row[1].z}}) {
+    for (const Vec2 by_n : {Vec2{rotation.row[0].x, rotation.row[1].x}, Vec2{rotation.row[0].y, rotation.row[1].y},
+                            Vec2{rotation.row[0].z, rotation.row[1].z}}) {
         if (along_by_k) {
             IntrinsicsGrad bar;
             normalised_vjp(sub_camera, n, by_n, bar);

@@ -35,9 +35,9 @@ inline Direction make_direction(const Tangents& tangents, const Camera& sub_came
             if (const double* dot = tangents.verts) q_dot += sub_camera.R * at(dot + 3 * v);
             if (const double* dot = tangents.world_to_camera) {
                 const Vec3 p = at(verts + 3 * v);
-                q_dot += sub_camera.turn * Vec3{dot[0] * p.x + dot[1] * p.y + dot[2] * p.z + dot[3],
-                                                dot[4] * p.x + dot[5] * p.y + dot[6] * p.z + dot[7],
-                                                dot[8] * p.x + dot[9] * p.y + dot[10] * p.z + dot[11]};
+                q_dot += sub_camera.rotation * Vec3{dot[0] * p.x + dot[1] * p.y + dot[2] * p.z + dot[3],
+                                                    dot[4] * p.x + dot[5] * p.y + dot[6] * p.z + dot[7],
+                                                    dot[8] * p.x + dot[9] * p.y + dot[10] * p.z + dot[11]};
             }
             out.q[v] = q_dot;
         }

@@ -52,11 +52,11 @@ struct Terms {
     bool motion;      // interior term of motion
     bool appearance;  // interior term of colours and textures
     bool boundary;
-    bool lens_boundary;  // lens boundary, in addition to other curves
-    bool steps;          // discontinuities within faces
+    bool lens_boundary;    // lens boundary, in addition to other curves
+    bool discontinuities;  // discontinuities within faces
 
     bool interior() const { return motion || appearance; }
-    bool any() const { return interior() || boundary || steps; }
+    bool any() const { return interior() || boundary || discontinuities; }
 };
 
 template <class Number>
@@ -66,7 +66,7 @@ Terms terms_of(const Slots<Number>& slots, const GradientOptions& o) {
             .appearance = slots.appearance(),
             .boundary = moves && o.boundary,
             .lens_boundary = (slots.K || slots.distortion) && o.boundary && o.intrinsics,
-            .steps = slots.steps() && o.steps};
+            .discontinuities = slots.discontinuities() && o.discontinuities};
 }
 
 // Returns the terms of everything that may move.
@@ -75,7 +75,7 @@ Terms all_motion(const GradientOptions& o) {
             .appearance = false,
             .boundary = o.boundary,
             .lens_boundary = o.boundary && o.intrinsics,
-            .steps = o.steps};
+            .discontinuities = o.discontinuities};
 }
 
 // InImage holds what all sub-cameras share of the image and its adjoint.
@@ -205,7 +205,7 @@ void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const
         add_boundary(view, *curves, n.edge, accumulation, to, profile);
         if (!curves->x_bar.empty()) add_places(view, curves->x_bar, to);
     }
-    if (terms.steps) add_steps(view, accumulation, to, profile);
+    if (terms.discontinuities) add_discontinuities(view, accumulation, to, profile);
 }
 
 // Returns the options of each sub-camera. The samples of one image are divided in proportion to what each wants. A
@@ -246,7 +246,7 @@ std::vector<GradientOptions> options_of_sub_cameras(const BackwardInput<T>& inpu
 template <class T>
 void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, ThreadTeam& team,
                const std::type_identity_t<ViewBody<T>>& body) {
-    const std::vector<Camera> sub_cameras = sub_cameras_of(input.camera, InImage<T>::margin_of(input.image));
+    const std::vector<Camera> sub_cameras = sub_cameras_for_points(input.camera, InImage<T>::margin_of(input.image));
     const InImage<T> in_image(input, team);
     const std::vector<GradientOptions> options = options_of_sub_cameras(input, sub_cameras, in_image, o, terms, team);
     for (size_t k = 0; k < sub_cameras.size(); ++k)
@@ -257,7 +257,7 @@ void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Te
 template <class T>
 void with_any_sub_camera(const BackwardInput<T>& input, const GradientOptions& o, ThreadTeam& team,
                          const std::type_identity_t<ViewBody<T>>& body) {
-    const Camera sub_camera = sub_cameras_of(input.camera, InImage<T>::margin_of(input.image)).front();
+    const Camera sub_camera = sub_cameras_for_points(input.camera, InImage<T>::margin_of(input.image)).front();
     with_view<T>(input, sub_camera, InImage<T>(input, team), o, Terms{}, team, body);
 }
 
@@ -285,8 +285,9 @@ BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
     silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections,
         lens_boundary += o.lens_boundary;
     measure += o.measure, curves += o.curves, view += o.view, world += o.world;
-    step_lines += o.step_lines, shadow_samples += o.shadow_samples;
-    for (int i = 0; i < 2; ++i) surface[i] += o.surface[i], edge[i] += o.edge[i], step[i] += o.step[i];
+    discontinuity_lines += o.discontinuity_lines, shadow_samples += o.shadow_samples;
+    for (int i = 0; i < 2; ++i)
+        surface[i] += o.surface[i], edge[i] += o.edge[i], discontinuity[i] += o.discontinuity[i];
     return *this;
 }
 
@@ -313,7 +314,7 @@ void add_world(const Camera& sub_camera, const double* verts, const Array<double
         for (const auto& sum : parts)
             for (int j = 0; j < 4; ++j) {
                 const double* column = sum.data() + j;
-                const Vec3 m = transposed_times(sub_camera.turn, {column[0], column[4], column[8]});
+                const Vec3 m = transposed_times(sub_camera.rotation, {column[0], column[4], column[8]});
                 double* to = grad.world_to_camera + j;
                 to[0] += m.x, to[4] += m.y, to[8] += m.z;
             }
@@ -355,7 +356,8 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions o, ThreadTea
     for (const Tangents& t : tangents) {
         const Terms own = terms_of(t, o);
         terms.motion |= own.motion, terms.appearance |= own.appearance;
-        terms.boundary |= own.boundary, terms.lens_boundary |= own.lens_boundary, terms.steps |= own.steps;
+        terms.boundary |= own.boundary, terms.lens_boundary |= own.lens_boundary,
+            terms.discontinuities |= own.discontinuities;
     }
     add_background_tangent(input, tangents, team, image_dot);
     if (!terms.any()) return;

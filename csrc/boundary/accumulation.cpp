@@ -177,7 +177,7 @@ class BoundaryRecorder final : public CurveAccumulation {
             records_.row_of.push_back(sample_index);
             records_.vertex.push_back(int32_t(vertex));
             // by_q is rotated from the frame of the sub-camera to that of the camera.
-            const Vec3 q = transposed_times(camera_.turn, {by_q[0], by_q[1], by_q[2]});
+            const Vec3 q = transposed_times(camera_.rotation, {by_q[0], by_q[1], by_q[2]});
             append(records_.by_q, {q.x, q.y, q.z});
         });
         form_.uvs.each([&](int64_t row, const double* by_uv) {
@@ -196,7 +196,7 @@ class BoundaryRecorder final : public CurveAccumulation {
             }
         if (const LightMotion& light = form_.light; light.part >= 0) {
             records_.light.push_back(light.part), append(records_.light_uv, {light.uv.x, light.uv.y});
-            const Vec3 place = transposed_times(camera_.turn, light.by_place);
+            const Vec3 place = transposed_times(camera_.rotation, light.by_place);
             append(records_.by_light, {place.x, place.y, place.z});
         }
     }

@@ -206,7 +206,7 @@ class CurveFinder {
     const Array<int8_t>& facing() const { return facing_; }
 
     // Returns the side of its edge on which a face lies in the image; see side_of.
-    int turn_of(const HalfEdge& h) const { return side_of(h, facing_); }
+    int facing_of(const HalfEdge& h) const { return side_of(h, facing_); }
 
     // EarlyOut tells what is known of an edge between two faces. `done`: there is no curve, or nothing more to do.
     // `differs`: the faces differ along it. `unknown`: nothing.
@@ -282,9 +282,9 @@ class CurveFinder {
         HalfEdge side[2];  // minus, plus
         side[0].face = side[1].face = -1;
         for (const HalfEdge& h : halves) {
-            const int turn = side_of(h, facing_);
-            if (turn == 0) continue;
-            HalfEdge& seen = side[turn > 0 ? 0 : 1];
+            const int facing = side_of(h, facing_);
+            if (facing == 0) continue;
+            HalfEdge& seen = side[facing > 0 ? 0 : 1];
             if (seen.face < 0 || !in_front(view_, seen, h, c.a, c.b)) seen = h;
         }
         if (side[0].face < 0 && side[1].face < 0) return false;

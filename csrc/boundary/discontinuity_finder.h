@@ -18,9 +18,9 @@
 
 namespace edgegrad {
 
-// A StepCrossing is where a line across a face meets a discontinuity F = 0, at u in the undistorted image. F is affine
-// in the texture coordinates near there. An alpha-tested face is opaque where F > 0.
-struct StepCrossing {
+// A DiscontinuityCrossing is where a line across a face meets a discontinuity F = 0, at u in the undistorted image. F
+// is affine in the texture coordinates near there. An alpha-tested face is opaque where F > 0.
+struct DiscontinuityCrossing {
     int32_t face = -1;
     bool is_alpha_edge = false;  // whether it is an alpha edge; else a border of texels
     bool vertical = false;       // whether the line is vertical
@@ -74,12 +74,12 @@ void each_sign_change(double c0, double c1, double c2, double rounding, Visit vi
 }
 
 template <class T>
-class StepFinder {
+class DiscontinuityFinder {
    public:
-    explicit StepFinder(const BackwardView<T>& view) : view_(view) {}
+    explicit DiscontinuityFinder(const BackwardView<T>& view) : view_(view) {}
 
     // Returns whether there may be discontinuities in a face.
-    static bool may_step(const SceneView<T>& scene, int64_t face) {
+    static bool may_have_discontinuities(const SceneView<T>& scene, int64_t face) {
         return scene.alpha_masks.on(face) || takes_nearest(scene, face);
     }
 
@@ -99,7 +99,8 @@ class StepFinder {
     void find(Vec2 a, Vec2 b, bool vertical, int most, uint64_t random, Visit visit) const {
         Segment s;
         if (!clip(a, b, s)) return;
-        StepCrossing crossing{.face = face_, .is_alpha_edge = false, .vertical = vertical, .u = {}, .slope = {}};
+        DiscontinuityCrossing crossing{
+            .face = face_, .is_alpha_edge = false, .vertical = vertical, .u = {}, .slope = {}};
         const auto at = [&](double tau) {
             const double t = tau * s.w[0] / ((1 - tau) * s.w[1] + tau * s.w[0]);
             crossing.u = s.u[0] + t * (s.u[1] - s.u[0]);

@@ -143,15 +143,15 @@ Box2 normalised_box(const Camera& c, Vec2 low, Vec2 high) {
 }  // namespace
 
 double Camera::stretch(Vec2 low, Vec2 high) const {
-    return with_side_lens(lens, 1.0, [&](const auto& l) { return l.stretch(normalised_box(*this, low, high)); });
+    return with_cube_face_lens(lens, 1.0, [&](const auto& l) { return l.stretch(normalised_box(*this, low, high)); });
 }
 
 // Uses the mean value theorem from a point of the box, or from the nearest visible one.
 std::pair<Vec2, Vec2> Camera::image_box(Vec2 low, Vec2 high) const {
     if (is_undistorted()) return {low, high};
-    if (has_sides(lens)) {
+    if (has_cube_faces(lens)) {
         const Box2 n = normalised_box(*this, low, high);
-        const Box2 box = with_side_lens(lens, n, [&](const auto& l) { return l.image_box(n); });
+        const Box2 box = with_cube_face_lens(lens, n, [&](const auto& l) { return l.image_box(n); });
         return {box.low, box.high};
     }
     Vec2 n = normalised(*this, 0.5 * (low + high));

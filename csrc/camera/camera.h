@@ -44,7 +44,7 @@ struct LensView {
 
 struct Camera {
     // It rotates from the frame of world_to_camera to that of this sub-camera.
-    Mat3 turn{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
+    Mat3 rotation{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
     Mat3 R;
     Vec3 t;
     double k[6];  // These are the upper two rows of K: x = k0 n.x + k1 n.y + k2, y = k3 n.x + k4 n.y + k5.
@@ -67,8 +67,8 @@ struct Camera {
         t = {world_to_camera[3], world_to_camera[7], perspective ? world_to_camera[11] : 0.0};
         std::copy(K, K + 6, k);
         set_inverses();
-        if (!is_undistorted() && !has_sides(lens)) look_through_lens();
-        with_side_lens(lens, 0, [&](const auto& l) { return set_scale(l.scale()), 0; });
+        if (!is_undistorted() && !has_cube_faces(lens)) look_through_lens();
+        with_cube_face_lens(lens, 0, [&](const auto& l) { return set_scale(l.scale()), 0; });
     }
 
     // Sets K to the scale of a cube face's undistorted image.
@@ -162,18 +162,18 @@ struct Camera {
 
     // Returns the point of the undistorted image around which areas grow as 1 / distance; most cameras have none.
     std::optional<Vec2> pole() const {
-        const bool there = with_side_lens(lens, false, [](const auto& l) { return l.has_pole(); });
+        const bool there = with_cube_face_lens(lens, false, [](const auto& l) { return l.has_pole(); });
         return there ? std::optional(Vec2{k[2], k[5]}) : std::nullopt;
     }
 
     // Returns whether a sub-camera may show something within `reach` px of x.
     bool may_show(Vec2 x, double reach) const {
-        return with_side_lens(lens, true, [&](const auto& l) { return l.may_show(x, reach); });
+        return with_cube_face_lens(lens, true, [&](const auto& l) { return l.may_show(x, reach); });
     }
 
     // Bounds the depth of a face's points in every sub-camera that shows it.
     double greatest_depth(const Vec3 q[3]) const {
-        if (!has_sides(lens)) return std::max({q[0].z, q[1].z, q[2].z});
+        if (!has_cube_faces(lens)) return std::max({q[0].z, q[1].z, q[2].z});
         return std::max({length(q[0]), length(q[1]), length(q[2])});
     }
 

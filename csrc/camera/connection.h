@@ -20,7 +20,7 @@ class CameraConnections {
    public:
     // The pixel filter widens the image by `reach` px beyond its borders.
     CameraConnections(const Camera& camera, double reach) {
-        for (const Camera& sub_camera : sub_cameras_of(camera, reach))
+        for (const Camera& sub_camera : sub_cameras_for_points(camera, reach))
             sub_cameras_.push_back({sub_camera, {sub_camera, reach}});
     }
 

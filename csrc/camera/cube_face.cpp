@@ -35,7 +35,7 @@ Box2 sector_box(double inner, double outer, double from, double to) {
 
 // Two faces that share a border compute the same numbers, except for signs, so every direction has one face.
 std::optional<Vec2> CubeFace::place(Vec3 d) const {
-    const Vec3 q = turn * d;
+    const Vec3 q = rotation * d;
     const bool inside =
         closed ? std::fabs(q.x) <= q.z && std::fabs(q.y) <= q.z : q.x >= -q.z && q.x < q.z && std::fabs(q.y) < q.z;
     if (!(inside && q.z > 0)) return {};
@@ -43,7 +43,7 @@ std::optional<Vec2> CubeFace::place(Vec3 d) const {
 }
 
 double CubeFace::outside(Vec3 d) const {
-    const Vec3 q = turn * d;
+    const Vec3 q = rotation * d;
     return std::max(std::fabs(q.x), std::fabs(q.y)) - q.z;
 }
 
@@ -54,13 +54,13 @@ Box2 CubeFace::angles(Box2 n) const {
         const auto latitude = [&](double x, double y) { return std::atan(y / std::sqrt(1 + x * x)); };
         Box2 out{{std::atan(low.x), latitude(low.y <= 0 ? nearest : farthest, low.y)},
                  {std::atan(high.x), latitude(high.y >= 0 ? nearest : farthest, high.y)}};
-        const double ahead = std::atan2(turn.row[2].x, turn.row[2].z);
+        const double ahead = std::atan2(rotation.row[2].x, rotation.row[2].z);
         out.low.x += ahead, out.high.x += ahead;
         if (out.low.x >= M_PI) out.low.x -= 2 * M_PI, out.high.x -= 2 * M_PI;
         if (out.high.x > M_PI) out.low.x = -M_PI, out.high.x = M_PI;  // It lies on both sides of the seam.
         return out;
     }
-    const double sign = turn.row[2].y, nearest = nearest_radius(n), farthest = farthest_radius(n);
+    const double sign = rotation.row[2].y, nearest = nearest_radius(n), farthest = farthest_radius(n);
     Box2 out{{-M_PI, 0}, {M_PI, 0}};
     const double outer = 0.5 * M_PI - std::atan(farthest), inner = 0.5 * M_PI - std::atan(nearest);
     out.low.y = sign > 0 ? outer : -inner, out.high.y = sign > 0 ? inner : -outer;
@@ -81,7 +81,7 @@ std::optional<Box2> CubeFace::box(Vec2 from, Vec2 to) const {
         return angle >= 0.5 * M_PI ? infinite : angle <= -0.5 * M_PI ? -infinite : std::tan(angle);
     };
     if (!pole()) {
-        const double ahead = std::atan2(turn.row[2].x, turn.row[2].z);
+        const double ahead = std::atan2(rotation.row[2].x, rotation.row[2].z);
         for (const double around : {0.0, 2 * M_PI}) {  // The face behind is seen at both ends.
             const double low = std::max(from.x - ahead + around, -0.25 * M_PI),
                          high = std::min(to.x - ahead + around, 0.25 * M_PI);
@@ -96,7 +96,7 @@ std::optional<Box2> CubeFace::box(Vec2 from, Vec2 to) const {
             out.add({a, y(lowest, lowest < 0)}), out.add({b, y(highest, highest > 0)});
         }
     } else {
-        const double sign = turn.row[2].y;
+        const double sign = rotation.row[2].y;
         // These are distances from the pole.
         const double near = 0.5 * M_PI - (sign > 0 ? to.y : -from.y), far = 0.5 * M_PI - (sign > 0 ? from.y : -to.y);
         const double inner = std::max(0.0, slope(near)), outer = std::min(slope(far), 2.0);

@@ -26,13 +26,13 @@ Box2 sector_box(double inner, double outer, double from, double to);
 // Describes one cube face. Directions d have a longitude λ = atan2(d.x, d.z) and a latitude φ = atan2(d.y, hypot(d.x,
 // d.z)). Two faces look at the poles, where only d.y is not zero.
 struct CubeFace {
-    Mat3 turn{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};  // It rotates directions to this face's frame.
+    Mat3 rotation{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};  // It rotates directions to this face's frame.
     // Says whether all of its borders belong to it, or only that at the least n.x.
     bool closed = false;
 
-    bool pole() const { return turn.row[2].y != 0; }
+    bool pole() const { return rotation.row[2].y != 0; }
 
-    Vec3 direction(Vec2 n) const { return transposed_times(turn, {n.x, n.y, 1}); }
+    Vec3 direction(Vec2 n) const { return transposed_times(rotation, {n.x, n.y, 1}); }
     // Returns the n of a direction, if it belongs to this face.
     std::optional<Vec2> place(Vec3 d) const;
     // Returns how far a unit direction lies outside. Rotating it changes this by at most twice the angle.

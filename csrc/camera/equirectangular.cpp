@@ -13,8 +13,8 @@ Vec3 direction_of(Vec2 angles) {
 
 }  // namespace
 
-Equirectangular::Equirectangular(const double* K, const CubeFace& side, const Place& place)
-    : side_(side), place_(place) {
+Equirectangular::Equirectangular(const double* K, const CubeFace& cube_face, const Place& place)
+    : cube_face_(cube_face), place_(place) {
     std::copy(K, K + 6, k_);
     const double det = k_[0] * k_[4] - k_[1] * k_[3], size = std::sqrt(std::fabs(det));
     inverse_[0] = k_[4] / det, inverse_[1] = -k_[1] / det, inverse_[2] = -k_[3] / det, inverse_[3] = k_[0] / det;
@@ -34,20 +34,20 @@ Vec2 Equirectangular::angles_of_pixel(Vec2 x) const {
 }
 
 Vec2 Equirectangular::distort(Vec2 n) const {
-    const Vec2 a = angles_at(side_.direction(n));
+    const Vec2 a = angles_at(cube_face_.direction(n));
     return {(k_[0] * a.x + k_[1] * a.y + k_[2]) / scale_.x, (k_[3] * a.x + k_[4] * a.y + k_[5]) / scale_.y};
 }
 
 // Uses ∂λ/∂d = (d.z, 0, −d.x) / h² and ∂φ/∂d = (−d.y d.x / h, h, −d.y d.z / h) / |d|². At the pole, where these do not
 // exist, it returns zero.
 Mat2 Equirectangular::jacobian(Vec2 n) const {
-    const Vec3 d = side_.direction(n);
+    const Vec3 d = cube_face_.direction(n);
     const double h2 = d.x * d.x + d.z * d.z, h = std::sqrt(h2), all = h2 + d.y * d.y;
     if (!(h2 > 0)) return {0, 0, 0, 0};
     const double sign = place_.over % 2 ? -1 : 1;
     const Vec3 longitude = (1 / h2) * Vec3{d.z, 0, -d.x},
                latitude = (sign / all) * Vec3{-d.y * d.x / h, h, -d.y * d.z / h};
-    const Vec3 along[2] = {side_.turn.row[0], side_.turn.row[1]};  // It is ∂d/∂n.
+    const Vec3 along[2] = {cube_face_.rotation.row[0], cube_face_.rotation.row[1]};  // It is ∂d/∂n.
     double a[2][2];
     for (int i = 0; i < 2; ++i) a[0][i] = dot(longitude, along[i]), a[1][i] = dot(latitude, along[i]);
     const auto row = [&](int r, int i) { return k_[3 * r] * a[0][i] + k_[3 * r + 1] * a[1][i]; };
@@ -56,7 +56,7 @@ Mat2 Equirectangular::jacobian(Vec2 n) const {
 
 void Equirectangular::distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) const {
     n_bar += transposed_times(jacobian(n), bar);
-    const Vec2 a = angles_at(side_.direction(n));
+    const Vec2 a = angles_at(cube_face_.direction(n));
     const double x = bar.x / scale_.x, y = bar.y / scale_.y;
     k_bar[0] += x * a.x, k_bar[1] += x * a.y, k_bar[2] += x;
     k_bar[3] += y * a.x, k_bar[4] += y * a.y, k_bar[5] += y;
@@ -65,7 +65,7 @@ void Equirectangular::distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) 
 std::optional<Vec2> Equirectangular::undistort(Vec2 m) const {
     const Vec2 a = angles_of_pixel({scale_.x * m.x, scale_.y * m.y}), from = place_.from, to = place_.to;
     if (!(a.x >= from.x && a.x < to.x && a.y >= from.y && a.y < to.y)) return {};
-    return side_.place(direction_of(a));
+    return cube_face_.place(direction_of(a));
 }
 
 namespace {
@@ -78,7 +78,7 @@ struct Near {
     double to_angles[4];    // It maps m − m0 to angles.
     Vec2 m0, sine, cosine;  // They belong to both angles at m0.
     Vec2 from, to;          // They bound this position's angles, relative to those at m0.
-    CubeFace side;
+    CubeFace cube_face;
 };
 
 // These return sin δ and cos δ by their series.
@@ -93,8 +93,8 @@ struct Near {
 
 EDGEGRAD_VECTORIZED void undistort_samples(const Near& p, int k, double* x, double* y) {
     const Near l = p;
-    const Mat3 turn = l.side.turn;
-    const double open = l.side.closed ? 0 : 1;
+    const Mat3 rotation = l.cube_face.rotation;
+    const double open = l.cube_face.closed ? 0 : 1;
     constexpr double nan = std::numeric_limits<double>::quiet_NaN();
     for (int i = 0; i < k; ++i) {
         const double dx = x[i] - l.m0.x, dy = y[i] - l.m0.y;
@@ -104,9 +104,9 @@ EDGEGRAD_VECTORIZED void undistort_samples(const Near& p, int k, double* x, doub
         const double c = l.cosine.y * cy - l.sine.y * sy;
         const double d0 = c * (l.sine.x * cx + l.cosine.x * sx), d1 = l.sine.y * cy + l.cosine.y * sy,
                      d2 = c * (l.cosine.x * cx - l.sine.x * sx);
-        const double q0 = turn.row[0].x * d0 + turn.row[0].y * d1 + turn.row[0].z * d2;
-        const double q1 = turn.row[1].x * d0 + turn.row[1].y * d1 + turn.row[1].z * d2;
-        const double q2 = turn.row[2].x * d0 + turn.row[2].y * d1 + turn.row[2].z * d2;
+        const double q0 = rotation.row[0].x * d0 + rotation.row[0].y * d1 + rotation.row[0].z * d2;
+        const double q1 = rotation.row[1].x * d0 + rotation.row[1].y * d1 + rotation.row[1].z * d2;
+        const double q2 = rotation.row[2].x * d0 + rotation.row[2].y * d1 + rotation.row[2].z * d2;
         // The tests are those of CubeFace::place.
         const bool within = (q2 > 0) & (std::fabs(q0) <= q2) & (std::fabs(q1) <= q2);
         const bool foreign = (open > 0) & ((q0 == q2) | (std::fabs(q1) == q2));
@@ -125,7 +125,7 @@ void Equirectangular::undistort_near(Vec2 m0, int k, double* x, double* y) const
               {},
               {},
               {},
-              side_};
+              cube_face_};
     const double* A = near.to_angles;
     double farthest = 0;
     for (int i = 0; i < k; ++i) farthest = std::max({farthest, std::fabs(x[i] - m0.x), std::fabs(y[i] - m0.y)});
@@ -150,11 +150,11 @@ bool Equirectangular::may_show(Vec2 x, double reach) const {
     const Vec2 step{(std::fabs(inverse_[0]) + std::fabs(inverse_[1])) * reach,
                     (std::fabs(inverse_[2]) + std::fabs(inverse_[3])) * reach};
     if (a.x + step.x < from.x || a.x - step.x > to.x || a.y + step.y < from.y || a.y - step.y > to.y) return false;
-    return side_.outside(direction_of(a)) <= 2 * length(step) + 1e-9;
+    return cube_face_.outside(direction_of(a)) <= 2 * length(step) + 1e-9;
 }
 
 Box2 Equirectangular::image_box(Box2 n) const {
-    Box2 a = side_.angles(n);
+    Box2 a = cube_face_.angles(n);
     a.low.x += M_PI * place_.across, a.high.x += M_PI * place_.across;
     const double shift = M_PI * place_.over;
     const Vec2 y = place_.over % 2 ? Vec2{shift - a.high.y, shift - a.low.y} : Vec2{shift + a.low.y, shift + a.high.y};
@@ -176,7 +176,7 @@ Box2 Equirectangular::angles(const double* K, Box2 x) {
     return out;
 }
 
-std::optional<Box2> Equirectangular::side_box(Box2 x) const {
+std::optional<Box2> Equirectangular::cube_face_box(Box2 x) const {
     constexpr double rounding = 1e-12;  // It is a generous bound for angles.
     const Box2 seen = angles(k_, x);
     // These are λ and φ of what is seen.
@@ -186,13 +186,13 @@ std::optional<Box2> Equirectangular::side_box(Box2 x) const {
     from = {from.x - rounding, std::max(from.y, -0.5 * M_PI) - rounding};
     to = {to.x + rounding, std::min(to.y, 0.5 * M_PI) + rounding};
     if (!(from.x < to.x && from.y < to.y)) return {};
-    return side_.box(from, to);
+    return cube_face_.box(from, to);
 }
 
 // The image draws parallels as long as the equator, stretched by 1 / cos φ. This is 1 / r next to a pole, and 2 / r in
 // the mean over a disc around it.
 double Equirectangular::stretch(Box2 n) const {
-    if (!side_.pole()) return 1;
+    if (!cube_face_.pole()) return 1;
     const double r = std::max(length(middle(n)), 0.5 * farthest_radius(n));
     return r > 0 ? std::sqrt(1 + 1 / (r * r)) : 1;
 }

@@ -31,15 +31,15 @@ class Equirectangular {
         Vec2 from{-infinite, -infinite}, to{infinite, infinite};
     };
 
-    Equirectangular(const double* K, const CubeFace& side, const Place& place);
+    Equirectangular(const double* K, const CubeFace& cube_face, const Place& place);
 
     // Returns the focal lengths of the undistorted image, px; they keep positive areas positive.
     Vec2 scale() const { return scale_; }
     const double* K() const { return k_; }
-    const CubeFace& side() const { return side_; }
-    Mat3 turn() const { return side_.turn; }  // It rotates from the camera's frame to the face's.
+    const CubeFace& cube_face() const { return cube_face_; }
+    Mat3 rotation() const { return cube_face_.rotation; }  // It rotates from the camera's frame to the face's.
     // Returns whether areas grow as 1 / distance around some point.
-    bool has_pole() const { return side_.pole(); }
+    bool has_pole() const { return cube_face_.pole(); }
 
     Vec2 distort(Vec2 n) const;
     Mat2 jacobian(Vec2 n) const;
@@ -57,7 +57,7 @@ class Equirectangular {
     // Returns a box of pixel positions that contains the image of a box of n.
     Box2 image_box(Box2 n) const;
     // Returns a box of n of all that a box of pixel positions shows of this face and position; none if nothing.
-    std::optional<Box2> side_box(Box2 x) const;
+    std::optional<Box2> cube_face_box(Box2 x) const;
 
     // Returns how much lengths grow from the undistorted image to the image in a box of n, approximately and at most.
     // Areas grow by about the same factor.
@@ -73,7 +73,7 @@ class Equirectangular {
     Vec2 angles_of_pixel(Vec2 x) const;
 
     double k_[6], inverse_[4];
-    CubeFace side_;
+    CubeFace cube_face_;
     Place place_;
     Vec2 scale_;
 };

@@ -159,8 +159,8 @@ double undistorted_radius(const AnyLens& lens, double fold, double m) {
 }
 
 std::optional<Vec2> undistort(const AnyLens& lens, const LensDisc& disc, Vec2 m) {
-    if (has_sides(lens))
-        return with_side_lens(lens, std::optional<Vec2>(), [&](const auto& l) { return l.undistort(m); });
+    if (has_cube_faces(lens))
+        return with_cube_face_lens(lens, std::optional<Vec2>(), [&](const auto& l) { return l.undistort(m); });
     return with_radial_lens(lens, [&](const auto& l) { return undistort(l, disc, m); });
 }
 

@@ -32,18 +32,18 @@ concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_
 
 // Names a lens that sees through a face of a cube (cube_face.h). Each face is a sub-camera (sub_cameras.h).
 template <class L>
-concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 box) {
+concept CubeFaceLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 box) {
     { lens.scale() } -> std::same_as<Vec2>;
-    { lens.side() } -> std::same_as<const CubeFace&>;
-    { lens.turn() } -> std::same_as<Mat3>;
+    { lens.cube_face() } -> std::same_as<const CubeFace&>;
+    { lens.rotation() } -> std::same_as<Mat3>;
     { lens.has_pole() } -> std::same_as<bool>;
     { lens.undistort(x) } -> std::same_as<std::optional<Vec2>>;
     { lens.may_show(x, reach) } -> std::same_as<bool>;
     { lens.image_box(box) } -> std::same_as<Box2>;
-    { lens.side_box(box) } -> std::same_as<std::optional<Box2>>;
+    { lens.cube_face_box(box) } -> std::same_as<std::optional<Box2>>;
     { lens.stretch(box) } -> std::same_as<double>;
 };
-static_assert(SideLens<Equirectangular> && SideLens<WideFisheye>);
+static_assert(CubeFaceLens<Equirectangular> && CubeFaceLens<WideFisheye>);
 
 // Names a radial or nearly radial lens. Its functions give the radial part of |m| at |n| = r, its derivative, and the
 // radii up to r where either changes its sign. is_radial() says whether no other part exists.
@@ -72,7 +72,7 @@ auto with_radial_lens(const AnyLens& lens, F f) {
     return f(*std::get_if<Fisheye>(&lens));
 }
 template <class Result, class F>
-Result with_side_lens(const AnyLens& lens, Result otherwise, F f) {
+Result with_cube_face_lens(const AnyLens& lens, Result otherwise, F f) {
     if (const auto* l = std::get_if<Equirectangular>(&lens)) return f(*l);
     if (const auto* l = std::get_if<WideFisheye>(&lens)) return f(*l);
     return otherwise;
@@ -83,8 +83,8 @@ auto with_lens(const AnyLens& lens, F f) {
     if (const auto* l = std::get_if<WideFisheye>(&lens)) return f(*l);
     return with_radial_lens(lens, f);
 }
-inline bool has_sides(const AnyLens& lens) {
-    return with_side_lens(lens, false, [](const auto&) { return true; });
+inline bool has_cube_faces(const AnyLens& lens) {
+    return with_cube_face_lens(lens, false, [](const auto&) { return true; });
 }
 
 class RadialInverse;

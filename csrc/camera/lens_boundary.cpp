@@ -71,7 +71,7 @@ std::optional<LensBoundary::Point> LensBoundary::at(double angle) const {
     const Vec2 e = direction(angle);
     p.n = camera_.lens_view.disc.fold * e;
     if (const auto* wide = std::get_if<WideFisheye>(&camera_.lens)) {
-        const std::optional<Vec2> n = wide->side().place(wide->lens_boundary_direction(e));
+        const std::optional<Vec2> n = wide->cube_face().place(wide->lens_boundary_direction(e));
         if (!n) return {};
         p.n = *n;
     }
@@ -85,7 +85,7 @@ bool LensBoundary::box(Arc arc, Vec2& low, Vec2& high) const {
     if (const auto* wide = std::get_if<WideFisheye>(&camera_.lens)) {
         // Directions lie at most half the arc from the middle one.
         const Vec3 middle = wide->lens_boundary_direction(direction(0.5 * (arc.from + arc.to)));
-        if (wide->side().outside(middle) > turn + 1e-9) return false;
+        if (wide->cube_face().outside(middle) > turn + 1e-9) return false;
     }
     const Vec2 a = place(arc.from), b = place(arc.to), more = 0.5 * turn * turn * half_;
     low = Vec2{std::min(a.x, b.x), std::min(a.y, b.y)} - more;

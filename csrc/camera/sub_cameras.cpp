@@ -14,12 +14,12 @@ Box2 frame(const Camera& camera, double reach) {
     return {{-reach, -reach}, {camera.width + reach, camera.height + reach}};
 }
 
-template <SideLens L>
+template <CubeFaceLens L>
 Camera sub_camera(const Camera& camera, const L& lens, Box2 n) {
     Camera out = camera;
-    out.turn = lens.turn();
-    for (int i = 0; i < 3; ++i) out.R.row[i] = transposed_times(camera.R, out.turn.row[i]);
-    out.t = out.turn * camera.t;
+    out.rotation = lens.rotation();
+    for (int i = 0; i < 3; ++i) out.R.row[i] = transposed_times(camera.R, out.rotation.row[i]);
+    out.t = out.rotation * camera.t;
     out.lens = lens;
     const Vec2 scale = lens.scale();
     out.set_scale(scale);
@@ -28,7 +28,7 @@ Camera sub_camera(const Camera& camera, const L& lens, Box2 n) {
     out.lens_view.end = camera.lens_view.end;
     out.lens_view.low = {scale.x * n.low.x, std::min(y[0], y[1])};
     out.lens_view.high = {scale.x * n.high.x, std::max(y[0], y[1])};
-    if (!lens.side().closed)
+    if (!lens.cube_face().closed)
         for (int i = 1; i < 4; ++i) out.lens_view.open[i] = true;
     return out;
 }
@@ -46,17 +46,17 @@ Range covering(double low, double high, double half, double least) {
 
 }  // namespace
 
-std::vector<Camera> sides_of(const Camera& camera) {
+std::vector<Camera> sub_cameras_for_rays(const Camera& camera) {
     const Box2 whole{{-1, -1}, {1, 1}};
     std::vector<Camera> out;
     if (const Equirectangular* lens = panorama(camera)) {
-        for (const auto& side : cube_faces)
-            out.push_back(sub_camera(camera, Equirectangular(lens->K(), side, {}), whole));
+        for (const auto& cube_face : cube_faces)
+            out.push_back(sub_camera(camera, Equirectangular(lens->K(), cube_face, {}), whole));
         return out;
     }
     if (const auto* fisheye = std::get_if<WideFisheye>(&camera.lens)) {
-        for (const auto& side : cube_faces)
-            if (const WideFisheye lens = fisheye->through(side); lens.side_box(frame(camera, 1)))
+        for (const auto& cube_face : cube_faces)
+            if (const WideFisheye lens = fisheye->through(cube_face); lens.cube_face_box(frame(camera, 1)))
                 out.push_back(sub_camera(camera, lens, whole));
         // The image lies beyond the lens boundary.
         if (out.empty()) out.push_back(sub_camera(camera, *fisheye, whole));
@@ -65,13 +65,13 @@ std::vector<Camera> sides_of(const Camera& camera) {
     return {camera};
 }
 
-std::vector<Camera> sub_cameras_of(const Camera& camera, double reach) {
+std::vector<Camera> sub_cameras_for_points(const Camera& camera, double reach) {
     const Box2 image = frame(camera, reach);
     std::vector<Camera> out;
     if (const auto* fisheye = std::get_if<WideFisheye>(&camera.lens)) {
-        for (const auto& side : cube_faces) {
-            const WideFisheye lens = fisheye->through(side);
-            if (const auto box = lens.side_box(image)) out.push_back(sub_camera(camera, lens, *box));
+        for (const auto& cube_face : cube_faces) {
+            const WideFisheye lens = fisheye->through(cube_face);
+            if (const auto box = lens.cube_face_box(image)) out.push_back(sub_camera(camera, lens, *box));
         }
         return out;
     }
@@ -94,9 +94,10 @@ std::vector<Camera> sub_cameras_of(const Camera& camera, double reach) {
                 {across == first ? -infinite : M_PI * (across - 1),
                  over == over_first ? -infinite : M_PI * (over - 0.5)},
                 {across == last ? infinite : M_PI * (across + 1), over == over_last ? infinite : M_PI * (over + 0.5)}};
-            for (const auto& side : cube_faces) {
-                const Equirectangular of_side(lens->K(), side, place);
-                if (const auto box = of_side.side_box(image)) out.push_back(sub_camera(camera, of_side, *box));
+            for (const auto& cube_face : cube_faces) {
+                const Equirectangular of_cube_face(lens->K(), cube_face, place);
+                if (const auto box = of_cube_face.cube_face_box(image))
+                    out.push_back(sub_camera(camera, of_cube_face, *box));
             }
         }
     }
@@ -112,21 +113,21 @@ bool is_too_wide(const Camera& camera) {
 }
 
 void add_intrinsics(const Camera& sub_camera, const IntrinsicsGrad& bar, double* K, double* distortion) {
-    const bool side = has_sides(sub_camera.lens);
-    const double *of_k = side ? bar.distortion : bar.k, *of_lens = bar.distortion + (side ? 6 : 0);
+    const bool on_cube_face = has_cube_faces(sub_camera.lens);
+    const double *of_k = on_cube_face ? bar.distortion : bar.k, *of_lens = bar.distortion + (on_cube_face ? 6 : 0);
     if (K)
         for (int i = 0; i < 6; ++i) K[i] += of_k[i];
     if (distortion)
-        for (int i = 0; i < (side ? most_parameters - 6 : most_coefficients); ++i) distortion[i] += of_lens[i];
+        for (int i = 0; i < (on_cube_face ? most_parameters - 6 : most_coefficients); ++i) distortion[i] += of_lens[i];
 }
 
 IntrinsicsGrad sub_camera_intrinsics(const Camera& sub_camera, const double* K, const double* distortion) {
     IntrinsicsGrad out;
-    const bool side = has_sides(sub_camera.lens);
-    if (K) std::copy(K, K + 6, side ? out.distortion : out.k);
+    const bool on_cube_face = has_cube_faces(sub_camera.lens);
+    if (K) std::copy(K, K + 6, on_cube_face ? out.distortion : out.k);
     if (distortion)
-        std::copy(distortion, distortion + (side ? most_parameters - 6 : most_coefficients),
-                  out.distortion + (side ? 6 : 0));
+        std::copy(distortion, distortion + (on_cube_face ? most_parameters - 6 : most_coefficients),
+                  out.distortion + (on_cube_face ? 6 : 0));
     return out;
 }
 

@@ -10,11 +10,11 @@
 namespace edgegrad {
 
 // Returns sub-cameras for rays: each pixel position is seen through one of them.
-std::vector<Camera> sides_of(const Camera& camera);
+std::vector<Camera> sub_cameras_for_rays(const Camera& camera);
 
 // Returns sub-cameras for points. Each point has one position in the image through one of them, as often as the image,
 // widened by `reach` px, shows it. Their rectangles hold no more than the image shows.
-std::vector<Camera> sub_cameras_of(const Camera& camera, double reach);
+std::vector<Camera> sub_cameras_for_points(const Camera& camera, double reach);
 
 // A panorama may reach around this often, either way.
 constexpr int most_turns = 4;

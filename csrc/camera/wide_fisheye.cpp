@@ -39,7 +39,7 @@ std::vector<double> angles_at_steps(const Fisheye& fisheye, double lens_boundary
 
 WideFisheye::WideFisheye(const double* K, const Fisheye& fisheye)
     : fisheye_(fisheye),
-      side_(cube_faces[5]),
+      cube_face_(cube_faces[5]),
       lens_boundary_(lens_boundary_of(fisheye)),
       reach_(fisheye.at_angle(lens_boundary_)),
       angles_(std::make_shared<const std::vector<double>>(angles_at_steps(fisheye, lens_boundary_, reach_))) {
@@ -49,16 +49,16 @@ WideFisheye::WideFisheye(const double* K, const Fisheye& fisheye)
     scale_ = {size, det < 0 ? -size : size};
 }
 
-WideFisheye WideFisheye::through(const CubeFace& side) const {
+WideFisheye WideFisheye::through(const CubeFace& cube_face) const {
     WideFisheye out = *this;
-    out.side_ = side;
+    out.cube_face_ = cube_face;
     return out;
 }
 
-Mat3 WideFisheye::turn() const {
+Mat3 WideFisheye::rotation() const {
     Mat3 out;
     for (int i = 0; i < 3; ++i) {
-        const Vec3 d = side_.turn.row[i];
+        const Vec3 d = cube_face_.rotation.row[i];
         out.row[i] = {d.x, d.z, -d.y};
     }
     return out;
@@ -84,14 +84,14 @@ Vec2 WideFisheye::scaled(Vec2 m) const {
 }
 
 Vec2 WideFisheye::distort(Vec2 n) const {
-    const Polar p = polar(side_.direction(n));
+    const Polar p = polar(cube_face_.direction(n));
     return scaled(fisheye_.at_angle(p.angle) * p.along) + Vec2{k_[2] / scale_.x, k_[5] / scale_.y};
 }
 
 // Uses e = m / |m| and ρ = |(d.x, d.z)|: δm = e ∂θ'/∂θ δθ + θ'/ρ (1 − e eᵀ) (δd.x, δd.z), where δθ = (ρ δd.y − d.y e ·
 // (δd.x, δd.z)) / |d|². On the axis δm = (δd.x, δd.z) / −d.y.
 Mat2 WideFisheye::jacobian(Vec2 n) const {
-    const Vec3 d = side_.direction(n);
+    const Vec3 d = cube_face_.direction(n);
     const Polar p = polar(d);
     if (!(p.angle < lens_boundary_)) return {0, 0, 0, 0};
     const auto column = [&](Vec3 dot) {
@@ -102,13 +102,13 @@ Mat2 WideFisheye::jacobian(Vec2 n) const {
         return scaled((fisheye_.slope_at_angle(p.angle) * angle_dot) * p.along +
                       (fisheye_.at_angle(p.angle) / p.sine) * (across - outwards * p.along));
     };
-    const Vec2 x = column(side_.turn.row[0]), y = column(side_.turn.row[1]);  // It is ∂d/∂n.
+    const Vec2 x = column(cube_face_.rotation.row[0]), y = column(cube_face_.rotation.row[1]);  // It is ∂d/∂n.
     return {x.x, y.x, x.y, y.y};
 }
 
 void WideFisheye::distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
     n_bar += transposed_times(jacobian(n), bar);
-    const Polar p = polar(side_.direction(n));
+    const Polar p = polar(cube_face_.direction(n));
     const Vec2 m = fisheye_.at_angle(p.angle) * p.along;
     const double x = bar.x / scale_.x, y = bar.y / scale_.y;
     c_bar[0] += x * m.x, c_bar[1] += x * m.y, c_bar[2] += x;
@@ -133,7 +133,7 @@ std::optional<Vec2> WideFisheye::undistort(Vec2 m) const {
     const Vec2 at = m_of_pixel({scale_.x * m.x, scale_.y * m.y});
     const double size = length(at);
     if (!(size < reach_)) return {};
-    return side_.place(direction_of(angle(size), size > 0 ? (1 / size) * at : Vec2{}));
+    return cube_face_.place(direction_of(angle(size), size > 0 ? (1 / size) * at : Vec2{}));
 }
 
 // Directions within the circle are at most half the range of angles plus the arc from the middle one.
@@ -145,11 +145,12 @@ bool WideFisheye::may_show(Vec2 x, double reach) const {
     const double low = angle_below(std::max(0.0, size - step)), high = angle_above(size + step);
     const double arc = step < size ? std::asin(step / size) : M_PI;
     const double far = 0.5 * (high - low) + arc * std::min(high, 1.0);
-    return side_.outside(direction_of(0.5 * (low + high), size > 0 ? (1 / size) * m : Vec2{0, 1})) <= 2 * far + 1e-9;
+    return cube_face_.outside(direction_of(0.5 * (low + high), size > 0 ? (1 / size) * m : Vec2{0, 1})) <=
+           2 * far + 1e-9;
 }
 
 Box2 WideFisheye::image_box(Box2 n) const {
-    const Box2 a = side_.angles(n);
+    const Box2 a = cube_face_.angles(n);
     const auto radius = [&](double latitude) {
         return fisheye_.at_angle(std::clamp(latitude + 0.5 * M_PI, 0.0, lens_boundary_));
     };
@@ -161,7 +162,7 @@ Box2 WideFisheye::image_box(Box2 n) const {
     return out;
 }
 
-std::optional<Box2> WideFisheye::side_box(Box2 x) const {
+std::optional<Box2> WideFisheye::cube_face_box(Box2 x) const {
     const Vec2 corner[4] = {m_of_pixel(x.low), m_of_pixel({x.high.x, x.low.y}), m_of_pixel(x.high),
                             m_of_pixel({x.low.x, x.high.y})};
     const bool around = k_[2] >= x.low.x && k_[2] <= x.high.x && k_[5] >= x.low.y && k_[5] <= x.high.y;
@@ -180,12 +181,12 @@ std::optional<Box2> WideFisheye::side_box(Box2 x) const {
     constexpr double rounding = 1e-12;  // It is a generous bound for angles.
     Vec2 from{first + before, angle_below(nearest) - 0.5 * M_PI}, to{first + after, angle_above(farthest) - 0.5 * M_PI};
     if (around || from.x <= -M_PI || to.x >= M_PI) from.x = -M_PI, to.x = M_PI;
-    return side_.box({from.x - rounding, from.y - rounding}, {to.x + rounding, to.y + rounding});
+    return cube_face_.box({from.x - rounding, from.y - rounding}, {to.x + rounding, to.y + rounding});
 }
 
 // Returns the stretch of an arc around the axis, at half the box's size from the antipode or farther.
 double WideFisheye::stretch(Box2 n) const {
-    const Polar p = polar(side_.direction(middle(n)));
+    const Polar p = polar(cube_face_.direction(middle(n)));
     const double least = has_pole() ? 0.5 * farthest_radius(n) : 1e-9;
     return std::max(1.0, fisheye_.at_angle(std::min(p.angle, lens_boundary_)) / std::max(p.sine, least));
 }

@@ -27,14 +27,14 @@ class WideFisheye {
     // Makes the face ahead.
     WideFisheye(const double* K, const Fisheye& fisheye);
     // Returns another face of the same lens.
-    WideFisheye through(const CubeFace& side) const;
+    WideFisheye through(const CubeFace& cube_face) const;
 
     Vec2 scale() const { return scale_; }
-    const CubeFace& side() const { return side_; }
-    Mat3 turn() const;                                       // It rotates from the camera's frame to the face's.
+    const CubeFace& cube_face() const { return cube_face_; }
+    Mat3 rotation() const;                                   // It rotates from the camera's frame to the face's.
     double lens_boundary() const { return lens_boundary_; }  // radians
     // Returns whether the antipode of the axis lies ahead, around which areas grow as 1 / distance.
-    bool has_pole() const { return side_.turn.row[2].y > 0; }
+    bool has_pole() const { return cube_face_.rotation.row[2].y > 0; }
 
     Vec2 distort(Vec2 n) const;
     Mat2 jacobian(Vec2 n) const;  // It is zero beyond the lens boundary.
@@ -44,7 +44,7 @@ class WideFisheye {
     std::optional<Vec2> undistort(Vec2 m) const;
     bool may_show(Vec2 x, double reach) const;
     Box2 image_box(Box2 n) const;
-    std::optional<Box2> side_box(Box2 x) const;
+    std::optional<Box2> cube_face_box(Box2 x) const;
     double stretch(Box2 n) const;
 
     // These return m of a lens boundary point, its derivative with respect to the image angle of e, and its direction.
@@ -72,7 +72,7 @@ class WideFisheye {
 
     double k_[6], inverse_[4];
     Fisheye fisheye_;
-    CubeFace side_;
+    CubeFace cube_face_;
     Vec2 scale_;
     double lens_boundary_, reach_;                       // They are θ and θ' at the boundary.
     std::shared_ptr<const std::vector<double>> angles_;  // They are taken at equal steps of |m| up to the reach.

@@ -50,9 +50,9 @@ static_assert(sizeof(LinedFace) * 3 <= lined_face_bytes);
 constexpr int fewest_cells = 32, cells_a_spacing = 2;
 
 template <class T>
-class StepLines {
+class DiscontinuityLines {
    public:
-    explicit StepLines(const BackwardView<T>& view)
+    explicit DiscontinuityLines(const BackwardView<T>& view)
         : view_(view),
           shift_{to_unit(hash(view.options.seed, 5, gradient_stream)),
                  to_unit(hash(view.options.seed, 6, gradient_stream))} {
@@ -61,7 +61,7 @@ class StepLines {
             std::vector<LinedFace> part;
             VisiblePolygon polygon;
             for (int64_t f = first; f < last; ++f)
-                if (StepFinder<T>::may_step(scene, f) &&
+                if (DiscontinuityFinder<T>::may_have_discontinuities(scene, f) &&
                     polygon.set(view.camera, view.volume, view.vertices, scene.faces + 3 * f))
                     add(int32_t(f), polygon, part);
             return part;
@@ -97,7 +97,7 @@ class StepLines {
     void add(int32_t face, const VisiblePolygon& polygon, std::vector<LinedFace>& to) const {
         const auto [low, high] = view_.camera.image_box(polygon.low, polygon.high);
         if (!(view_.importance.mean(low, high) > 0)) return;
-        double spacing = view_.options.step_spacing / view_.camera.stretch(polygon.low, polygon.high);
+        double spacing = view_.options.discontinuity_spacing / view_.camera.stretch(polygon.low, polygon.high);
         if (const int64_t hiding = view_.occlusion.hiding_pixels(low, high, polygon.nearest))
             spacing /= view_.occlusion.factor(occluded, hiding, view_.image.spp);
         LinedFace lined{.face = face,
@@ -118,32 +118,33 @@ class StepLines {
 }  // namespace
 
 template <class T>
-void add_steps(const BackwardView<T>& view, const Accumulation& accumulation, GradientSink& to,
-               BackwardProfile& profile) {
+void add_discontinuities(const BackwardView<T>& view, const Accumulation& accumulation, GradientSink& to,
+                         BackwardProfile& profile) {
     Stopwatch watch;
-    const StepLines<T> lines(view);
-    profile.step_lines = lines.count();
-    profile.step[0] += watch.lap();
+    const DiscontinuityLines<T> lines(view);
+    profile.discontinuity_lines = lines.count();
+    profile.discontinuity[0] += watch.lap();
     if (view.options.dry || lines.count() == 0) return;
     const uint64_t seed = hash(view.options.seed, 7, gradient_stream);
-    view.scatter.add(lines.count(), to, profile.step, [&](int64_t first, int64_t last, LocalGradients& grad) {
-        StepSource<T> source(view);
+    view.scatter.add(lines.count(), to, profile.discontinuity, [&](int64_t first, int64_t last, LocalGradients& grad) {
+        DiscontinuitySource<T> source(view);
         const std::unique_ptr<CurveAccumulation> to_chunk = accumulate_curves(view, accumulation, grad);
         CurveSamples samples(view, source, *to_chunk);
-        StepFinder<T> finder(view);
+        DiscontinuityFinder<T> finder(view);
         lines.each(first, last, [&](const LinedFace& face, Vec2 a, Vec2 b, bool vertical, int64_t line) {
             finder.set(face.face);
             const double spacings = std::min(length(b - a) / face.spacing, 1e6);
             const int most = fewest_cells + int(cells_a_spacing * spacings);
-            finder.find(
-                a, b, vertical, most, hash(seed, uint64_t(line)),
-                [&](const StepCrossing& crossing, double weight) { samples.add(crossing, 0, weight * face.spacing); });
+            finder.find(a, b, vertical, most, hash(seed, uint64_t(line)),
+                        [&](const DiscontinuityCrossing& crossing, double weight) {
+                            samples.add(crossing, 0, weight * face.spacing);
+                        });
         });
         samples.finish(grad);
     });
 }
 
-template void add_steps(const BackwardView<float>&, const Accumulation&, GradientSink&, BackwardProfile&);
-template void add_steps(const BackwardView<double>&, const Accumulation&, GradientSink&, BackwardProfile&);
+template void add_discontinuities(const BackwardView<float>&, const Accumulation&, GradientSink&, BackwardProfile&);
+template void add_discontinuities(const BackwardView<double>&, const Accumulation&, GradientSink&, BackwardProfile&);
 
 }  // namespace edgegrad

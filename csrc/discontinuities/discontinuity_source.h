@@ -24,12 +24,12 @@
 namespace edgegrad {
 
 template <class T>
-class StepSource {
+class DiscontinuitySource {
    public:
-    using Curve = StepCrossing;
+    using Curve = DiscontinuityCrossing;
 
     struct Sample : CurveSample {
-        StepCrossing crossing;
+        DiscontinuityCrossing crossing;
         int32_t face;  // face that the ray ignores
         CurveFaces faces;
         FaceMap map;
@@ -38,7 +38,7 @@ class StepSource {
         double scale;                    // |n_x| / |∇F| or |n_y| / |∇F|, in the undistorted image
     };
 
-    explicit StepSource(const BackwardView<T>& view) : view_(view) {}
+    explicit DiscontinuitySource(const BackwardView<T>& view) : view_(view) {}
 
     Vec2 position(const Curve& curve, double) const { return curve.u; }
 
@@ -94,7 +94,7 @@ class StepSource {
     }
 
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
-        const StepCrossing& crossing = sample.crossing;
+        const DiscontinuityCrossing& crossing = sample.crossing;
         double F_dot = 0;
         if (direction.moves()) {
             const auto corner = corners_of(view_, sample.face);
@@ -116,7 +116,7 @@ class StepSource {
     }
 
     void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) const {
-        const StepCrossing& crossing = sample.crossing;
+        const DiscontinuityCrossing& crossing = sample.crossing;
         const double F_bar = sample.scale * sample.area_scale * jumps.first;
         if (grad.q.is_wanted()) {
             const auto corner = corners_of(view_, sample.face);
@@ -146,7 +146,7 @@ class StepSource {
 
    private:
     static double dot(Vec2 a, Vec2 b) { return a.x * b.x + a.y * b.y; }
-    static bool is_of_alpha(const StepCrossing& c) { return c.is_alpha_edge && c.side == 0; }
+    static bool is_of_alpha(const DiscontinuityCrossing& c) { return c.is_alpha_edge && c.side == 0; }
     int32_t vertex_of(int32_t face, int corner) const { return view_.scene.faces[3 * int64_t(face) + corner]; }
     int32_t uv_row(int32_t face, int corner) const { return view_.scene.uv_corners[3 * int64_t(face) + corner]; }
     Vec2 uv(int32_t face, int corner) const {

@@ -15,12 +15,12 @@ struct GradientOptions {
     uint64_t seed = 0;
     bool interior_geometry = true;  // whether colours vary over faces, so that motion shows inside them
     bool boundary = true;
-    bool intrinsics = true;   // whether intrinsics may move; with `boundary`, the lens boundary then moves, too
-    bool steps = true;        // whether discontinuities within faces move
-    double step_spacing = 1;  // px between the lines that find them
-    bool lit = false;         // whether lights shade the samples, at several times the cost
-    bool dry = false;         // whether to count the samples only
-    bool controls = true;     // whether known integrals serve as control variates, which depend on the adjoint
+    bool intrinsics = true;       // whether intrinsics may move; with `boundary`, the lens boundary then moves, too
+    bool discontinuities = true;  // whether discontinuities within faces move
+    double discontinuity_spacing = 1;  // px between the lines that find them
+    bool lit = false;                  // whether lights shade the samples, at several times the cost
+    bool dry = false;                  // whether to count the samples only
+    bool controls = true;              // whether known integrals serve as control variates, which depend on the adjoint
     int pixel_spp = 0;  // if not zero, the interior term uses this number of samples per pixel only, for benchmarks
 };
 
@@ -30,13 +30,13 @@ struct BackwardProfile {
     int64_t surface_wanted = 0, edge_wanted = 0;              // default samples before the budget (budget.h)
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // number of curves in view
     double lens_boundary = 0;                                 // px of the lens boundary in view
-    int64_t step_lines = 0;                                   // number of lines that find discontinuities within faces
+    int64_t discontinuity_lines = 0;                          // number of lines that find discontinuities within faces
     int64_t shadow_samples = 0;
     double view = 0;                 // time for vertices in camera coordinates
     double measure = 0, curves = 0;  // time to lay triangles and curves end to end
     double surface[2] = {0, 0}, edge[2] = {0, 0},
-           step[2] = {0, 0};  // time for samples with their rays; time to add the results
-    double world = 0;         // time from camera coordinates to the user's arrays
+           discontinuity[2] = {0, 0};  // time for samples with their rays; time to add the results
+    double world = 0;                  // time from camera coordinates to the user's arrays
 
     // Adds the profile of another sub-camera.
     BackwardProfile& operator+=(const BackwardProfile& o);

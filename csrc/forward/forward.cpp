@@ -59,11 +59,11 @@ constexpr int tile = 16;
 template <int N, class T>
 class PixelRow {
    public:
-    PixelRow(const SceneView<T>& scene, const std::deque<Side>& sides, const ImageOptions& options, ThreadTeam& team,
-             T* image, const HitBuffers<T>& out)
+    PixelRow(const SceneView<T>& scene, const std::deque<SubCameraRays>& sub_cameras, const ImageOptions& options,
+             ThreadTeam& team, T* image, const HitBuffers<T>& out)
         : scene_(scene),
-          sides_(sides),
-          side_(&sides.front()),
+          sub_cameras_(sub_cameras),
+          sub_camera_(&sub_cameras.front()),
           spp_(options.spp),
           radius_(options.filter.radius()),
           team_(team),
@@ -71,7 +71,7 @@ class PixelRow {
           out_(out),
           C_(channels_of<N>(scene)),
           direction_(scene.attributes.unit < 0 ? -1 : scene.radiance + direction_of(scene.attributes)),
-          rays_(side_->frame),
+          rays_(sub_camera_->frame),
           sum_(tile * C_),
           radiance_(C_) {}
 
@@ -82,7 +82,7 @@ class PixelRow {
         std::fill(last_, last_ + tile, -1);
         std::fill(farthest_, farthest_ + tile, -std::numeric_limits<double>::infinity());
         x0_ = x0, y_ = y;
-        for (const Side& side : sides_) add_side(side, x0, x1);
+        for (const SubCameraRays& sub_camera : sub_cameras_) add_sub_camera(sub_camera, x0, x1);
         for (int x = 0; x < x1 - x0; ++x) {
             const int64_t pixel = pixel_at(x0 + x, y);
             const double share = double(hits_[x]) / spp_;
@@ -110,28 +110,28 @@ class PixelRow {
     // Holds what the samples on one face share. Some are kept, as faces alternate in a pixel and recur in the next.
     struct alignas(N ? 256 : 8) Shaded {
         int32_t face = -1;
-        bool textured = false, indirect = false;
+        bool textured = false, edge_on = false;
         FaceMap map;
         DepthBound depth;
         AffineRadiance<N> radiance;
     };
     static constexpr unsigned n_kept = 64;
 
-    int64_t pixel_at(int x, int y) const { return int64_t(y) * side_->camera.width + x; }
+    int64_t pixel_at(int x, int y) const { return int64_t(y) * sub_camera_->camera.width + x; }
 
-    // Adds what the pixels of the row see through one side.
-    void add_side(const Side& side, int x0, int x1) {
-        const Camera& camera = side.camera;
+    // Adds what the pixels of the row see through one sub-camera.
+    void add_sub_camera(const SubCameraRays& sub_camera, int x0, int x1) {
+        const Camera& camera = sub_camera.camera;
         if (!camera.may_show({0.5 * (x0 + x1), y_ + 0.5}, 0.5 * (x1 - x0) + radius_)) return;
-        if (&side != side_) {
-            side_ = &side, rays_.look_through(side.frame);
+        if (&sub_camera != sub_camera_) {
+            sub_camera_ = &sub_camera, rays_.look_through(sub_camera.frame);
             for (Shaded& s : kept_) s.face = -1;
         }
         for (int x = x0; x < x1; ++x) {
             if (!camera.may_show({x + 0.5, y_ + 0.5}, radius_)) continue;
             for (int done = 0; done < spp_;) {
                 const int n = std::min(spp_ - done, RayBatch::size - rays_.count);
-                side.pixel_rays.append(x, y_, done, n, rays_);
+                sub_camera.pixel_rays.append(x, y_, done, n, rays_);
                 part_[parts_++] = {x - x0, n};
                 done += n;
                 if (rays_.count == RayBatch::size) trace();
@@ -143,7 +143,7 @@ class PixelRow {
     void trace() {
         if (++traced_ % 16 == 0) team_.check();
         rays_.prepare();
-        side_->frame.cast(rays_);
+        sub_camera_->frame.cast(rays_);
         if (scene_.n_faces > in_cache) prefetch_faces();
         int i = 0;
         for (int p = 0; p < parts_; ++p) {
@@ -155,7 +155,7 @@ class PixelRow {
                     const int first = std::countr_zero(left);
                     const int32_t face = rays_.face[i + first];
                     const Shaded& s = shaded(face);
-                    if (s.indirect) [[unlikely]] {
+                    if (s.edge_on) [[unlikely]] {
                         cast_beyond();
                         left &= ~on_face(rays_.face + i, -1);
                         continue;
@@ -178,7 +178,7 @@ class PixelRow {
                     }
                 }
             for (; i < end; ++i) {
-                if (rays_.face[i] >= 0 && shaded(rays_.face[i]).indirect) [[unlikely]]
+                if (rays_.face[i] >= 0 && shaded(rays_.face[i]).edge_on) [[unlikely]]
                     cast_beyond();
                 if (rays_.face[i] >= 0) hits += add(i, part_[p].column, sum);
             }
@@ -191,8 +191,8 @@ class PixelRow {
     // Records that a pixel hits a face, and its depth.
     void note_hit(const Shaded& s, int column) {
         first_[column] = std::min(first_[column], s.face), last_[column] = std::max(last_[column], s.face);
-        const Vec2 middle = normalised(side_->camera, {x0_ + column + 0.5, y_ + 0.5});
-        farthest_[column] = std::max(farthest_[column], s.depth.farthest(middle, side_->reach));
+        const Vec2 middle = normalised(sub_camera_->camera, {x0_ + column + 0.5, y_ + 0.5});
+        farthest_[column] = std::max(farthest_[column], s.depth.farthest(middle, sub_camera_->reach));
     }
 
     // Adds the sample of ray i, of a pixel in this column, to the sum.
@@ -233,7 +233,7 @@ class PixelRow {
         for (int i = 0; i < rays_.count; ++i)
             if (const int64_t face = rays_.face[i]; face >= 0)
                 for (int k = 0; k < 3; ++k) {
-                    prefetch(&side_->q[scene_.faces[3 * face + k]]);
+                    prefetch(&sub_camera_->q[scene_.faces[3 * face + k]]);
                     if (!is_textured(scene_, face))
                         prefetch(scene_.colors + int64_t(scene_.corners[3 * face + k]) * scene_.radiance);
                 }
@@ -242,26 +242,26 @@ class PixelRow {
     // Casts the rays again, through faces whose plane contains the eye. Other hits stay the same.
     void cast_beyond() {
         rays_.prepare();
-        side_->frame.cast_with_alpha_test(rays_, nullptr, [&](int32_t face) { return !is_indirect(face); });
+        sub_camera_->frame.cast_with_alpha_test(rays_, nullptr, [&](int32_t face) { return !is_edge_on(face); });
     }
 
-    bool is_indirect(int32_t face) const {
+    bool is_edge_on(int32_t face) const {
         const int32_t* v = scene_.faces + 3 * int64_t(face);
-        const Array<Vec3>& q = side_->q;
+        const Array<Vec3>& q = sub_camera_->q;
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-        return side_->camera.passes_through_eye(corner);
+        return sub_camera_->camera.passes_through_eye(corner);
     }
 
     void keep(Shaded& s, int32_t face) {
         s.face = face;
         s.textured = is_textured(scene_, face);
         const int32_t* v = scene_.faces + 3 * int64_t(face);
-        const Camera& camera = side_->camera;
-        const Array<Vec3>& q = side_->q;
+        const Camera& camera = sub_camera_->camera;
+        const Array<Vec3>& q = sub_camera_->q;
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
         s.map = face_map(camera, corner);
-        s.indirect = camera.passes_through_eye(corner);
-        if (s.indirect) return;
+        s.edge_on = camera.passes_through_eye(corner);
+        if (s.edge_on) return;
         s.depth.set(camera, corner, s.map);
         if (!s.textured) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value. Reading first keeps its cache line shared.
@@ -271,8 +271,8 @@ class PixelRow {
     }
 
     const SceneView<T>& scene_;
-    const std::deque<Side>& sides_;
-    const Side* side_;  // The rays pass through this side.
+    const std::deque<SubCameraRays>& sub_cameras_;
+    const SubCameraRays* sub_camera_;  // The rays pass through this sub-camera.
     const int spp_;
     const double radius_;  // It is the filter's radius.
     ThreadTeam& team_;
@@ -297,17 +297,18 @@ class PixelRow {
 };
 
 template <int N, class T>
-void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, const RayCaster& caster,
+void render_pixels(const SceneView<T>& scene, const std::deque<SubCameraRays>& sub_cameras, const RayCaster& caster,
                    const ImageOptions& o, ThreadTeam& team, T* image, const HitBuffers<T>& out) {
-    const Camera& camera = sides.front().camera;
+    const Camera& camera = sub_cameras.front().camera;
     // Tiles are lower where a pixel has many samples, so that the threads end together.
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
     // Only whole batches are skipped, because the rays of a batch also determine how sums are rounded.
     const int unit = std::min(tile, pixels_of_batches(o.spp));
-    const ReachablePixels reachable(camera, caster, sides.front().q, o.filter.radius() - 0.5, team);
+    const ReachablePixels reachable(camera, caster, sub_cameras.front().q, o.filter.radius() - 0.5, team);
     team.parallel_for_with_state(
-        int64_t(tiles_x) * tiles_y, [&] { return std::make_unique<PixelRow<N, T>>(scene, sides, o, team, image, out); },
+        int64_t(tiles_x) * tiles_y,
+        [&] { return std::make_unique<PixelRow<N, T>>(scene, sub_cameras, o, team, image, out); },
         [&](PixelRow<N, T>& row, int64_t t) {
             const int x0 = int(t % tiles_x) * tile, x1 = std::min(x0 + tile, camera.width);
             const int y0 = int(t / tiles_x) * rows, y1 = std::min(y0 + rows, camera.height);
@@ -325,10 +326,10 @@ void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, con
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
                     ThreadTeam& team, T* image, const HitBuffers<T>& out) {
-    const std::deque<Side> sides = make_sides(scene, camera, caster, o, team);
+    const std::deque<SubCameraRays> sub_cameras = make_sub_camera_rays(scene, camera, caster, o, team);
     std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
     dispatch_channels(scene.channels, scene.channels > scene.radiance,
-                      [&]<int N>() { render_pixels<N>(scene, sides, caster, o, team, image, out); });
+                      [&]<int N>() { render_pixels<N>(scene, sub_cameras, caster, o, team, image, out); });
 }
 
 template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&, ThreadTeam&,

@@ -16,9 +16,9 @@ namespace {
 
 constexpr Vec2 nowhere{std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::quiet_NaN()};
 
-// Returns a point of the image in normalised coordinates of a side, or NaN where the side does not show it.
-Vec2 through(const Camera& side, Vec2 x) {
-    return side.may_show(x, 0) ? normalised(side, undistort(side, x)) : nowhere;
+// Returns a point of the image in normalised coordinates of a sub-camera, or NaN where the sub-camera does not show it.
+Vec2 through(const Camera& sub_camera, Vec2 x) {
+    return sub_camera.may_show(x, 0) ? normalised(sub_camera, undistort(sub_camera, x)) : nowhere;
 }
 
 }  // namespace
@@ -28,16 +28,16 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
                   ThreadTeam& team) {
     PlaceHits out;
     out.face.assign(places.size, -1), out.part.assign(places.size, -1), out.b.assign(2 * places.size, 0.0);
-    for (const Camera& side : sides_of(camera)) {
-        const Array<Vec3> q = camera_vertices(side, scene.verts, scene.n_verts, team);
-        const AlphaMasks<T> alpha_masks(scene, side, q.data());
-        const CameraFrame frame(geometry.caster(), side, scene.alpha_masks.face ? &alpha_masks : nullptr);
+    for (const Camera& sub_camera : sub_cameras_for_rays(camera)) {
+        const Array<Vec3> q = camera_vertices(sub_camera, scene.verts, scene.n_verts, team);
+        const AlphaMasks<T> alpha_masks(scene, sub_camera, q.data());
+        const CameraFrame frame(geometry.caster(), sub_camera, scene.alpha_masks.face ? &alpha_masks : nullptr);
         const auto corners = [&](int32_t face) {
             const int32_t* v = scene.faces + 3 * int64_t(face);
             return std::array<Vec3, 3>{q[v[0]], q[v[1]], q[v[2]]};
         };
         // A face whose plane contains the eye is invisible; the image shows what is behind it, too.
-        const auto is_seen = [&](int32_t face) { return !side.passes_through_eye(corners(face).data()); };
+        const auto is_seen = [&](int32_t face) { return !sub_camera.passes_through_eye(corners(face).data()); };
         team.parallel_for_blocks(places.size, [&](int64_t, int64_t first, int64_t last) {
             team.check();
             CameraRays rays(frame);
@@ -48,7 +48,7 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
                 for (int i = 0; i < rays.count; ++i) {
                     const int32_t face = frame.beyond_float(rays.n(i), rays.face[i], {}, is_seen);
                     if (face < 0) continue;
-                    const Barycentrics b = barycentrics_of_hit(face_map(side, corners(face).data()), rays.n(i));
+                    const Barycentrics b = barycentrics_of_hit(face_map(sub_camera, corners(face).data()), rays.n(i));
                     out.face[place[i]] = face;
                     out.part[place[i]] = geometry.parts().of(scene.faces[3 * int64_t(face)]);
                     out.b[2 * place[i]] = b.u, out.b[2 * place[i] + 1] = b.v;
@@ -56,7 +56,7 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
                 rays.count = 0;
             };
             for (int64_t k = first; k < last; ++k) {
-                const Vec2 n = through(side, places[k]);
+                const Vec2 n = through(sub_camera, places[k]);
                 if (!std::isfinite(n.x + n.y)) continue;
                 place[rays.count] = k;
                 rays.n_x[rays.count] = n.x, rays.n_y[rays.count] = n.y;
@@ -69,17 +69,17 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
 }
 
 RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, ThreadTeam& team) {
-    const std::vector<Camera> sides = sides_of(camera);
+    const std::vector<Camera> sub_cameras = sub_cameras_for_rays(camera);
     std::vector<RayRecords> blocks(ThreadTeam::blocks(places.size));
     team.parallel_for_blocks(places.size, [&](int64_t block, int64_t first, int64_t last) {
         RayRecords& to = blocks[block];
         for (int64_t k = first; k < last; ++k) {
-            const Camera* sub_camera = &sides.front();
+            const Camera* shown_by = &sub_cameras.front();
             Vec2 n = nowhere;
-            for (const Camera& side : sides)
-                if (const Vec2 here = through(side, places[k]); std::isfinite(here.x + here.y))
-                    sub_camera = &side, n = here;
-            append_ray(*sub_camera, n, to.along, intrinsics ? &to.along_by_k : nullptr, &to.along_by_x);
+            for (const Camera& sub_camera : sub_cameras)
+                if (const Vec2 here = through(sub_camera, places[k]); std::isfinite(here.x + here.y))
+                    shown_by = &sub_camera, n = here;
+            append_ray(*shown_by, n, to.along, intrinsics ? &to.along_by_k : nullptr, &to.along_by_x);
         }
     });
     RayRecords all;

@@ -31,31 +31,31 @@ Spread spread_at(const Camera& camera, const FaceMap& map, Vec2 n) {
 template <class T>
 class HitRow {
    public:
-    HitRow(const SceneView<T>& scene, const std::deque<Side>& sides, const ImageOptions& options,
+    HitRow(const SceneView<T>& scene, const std::deque<SubCameraRays>& sub_cameras, const ImageOptions& options,
            const PixelChoice& choice, const HitBuffers<T>& out, ThreadTeam& team)
         : scene_(scene),
-          sides_(sides),
-          side_(&sides.front()),
+          sub_cameras_(sub_cameras),
+          sub_camera_(&sub_cameras.front()),
           options_(options),
           choice_(choice),
           out_(out),
           team_(team),
-          rays_(side_->frame) {}
+          rays_(sub_camera_->frame) {}
 
     // Finds the hits in pixels first … end − 1 of row y; the others have none.
     void find(int y, int first, int end, std::vector<PixelHit>& to) {
         to.reserve(expected_);
-        const int width = side_->camera.width;
+        const int width = sub_camera_->camera.width;
         row_.assign(width, {});
         y_ = y;
-        for (const Side& side : sides_) {
-            if (&side != side_) look_through(side);
+        for (const SubCameraRays& sub_camera : sub_cameras_) {
+            if (&sub_camera != sub_camera_) look_through(sub_camera);
             for (int x = first; x < end; ++x) {
                 if (choice_.only && !choice_.only[int64_t(y) * width + x]) continue;
-                if (!side.camera.may_show({x + 0.5, y + 0.5}, options_.filter.radius())) continue;
+                if (!sub_camera.camera.may_show({x + 0.5, y + 0.5}, options_.filter.radius())) continue;
                 for (int done = 0; done < options_.spp;) {
                     const int n = std::min(options_.spp - done, RayBatch::size - rays_.count);
-                    side.pixel_rays.append(x, y, done, n, rays_);
+                    sub_camera.pixel_rays.append(x, y, done, n, rays_);
                     part_[parts_++] = {x, n};
                     done += n;
                     if (rays_.count == RayBatch::size) cast(to);
@@ -90,7 +90,7 @@ class HitRow {
     // Holds what pixels on one face share. Some faces are kept, because they recur in the next pixel.
     struct Kept {
         int32_t face = -1;
-        bool indirect = false;
+        bool edge_on = false;
         FaceMap map;
         DepthBound depth;
     };
@@ -101,15 +101,15 @@ class HitRow {
         int32_t first = std::numeric_limits<int32_t>::max(), last = -1;
     };
 
-    void look_through(const Side& side) {
-        side_ = &side, rays_.look_through(side.frame);
+    void look_through(const SubCameraRays& sub_camera) {
+        sub_camera_ = &sub_camera, rays_.look_through(sub_camera.frame);
         for (Kept& kept : kept_) kept.face = -1;
     }
 
     void cast(std::vector<PixelHit>& to) {
         team_.check();
         rays_.prepare();
-        side_->frame.cast(rays_);
+        sub_camera_->frame.cast(rays_);
         int i = 0;
         for (int p = 0; p < parts_; ++p) {
             if (part_[p].x != x_) begin(part_[p].x);
@@ -117,10 +117,10 @@ class HitRow {
             for (int k = i; k < end; ++k) {
                 if (rays_.face[k] < 0) continue;
                 // A face whose plane contains the eye shows nothing.
-                if (kept(rays_.face[k]).indirect) [[unlikely]] {
+                if (kept(rays_.face[k]).edge_on) [[unlikely]] {
                     rays_.prepare();
-                    side_->frame.cast_with_alpha_test(rays_, nullptr,
-                                                      [&](int32_t face) { return !kept(face).indirect; });
+                    sub_camera_->frame.cast_with_alpha_test(rays_, nullptr,
+                                                            [&](int32_t face) { return !kept(face).edge_on; });
                     if (rays_.face[k] < 0) continue;
                 }
                 add(rays_.face[k], samples_ + k - i, rays_.n(k));
@@ -134,7 +134,7 @@ class HitRow {
     void begin(int x) {
         const int stream = choice_.only ? 6 : 5;
         x_ = x, count_ = samples_ = 0;
-        key_ = Hash(options_.seed, hash(stream, uint64_t(y_) * side_->camera.width + x));
+        key_ = Hash(options_.seed, hash(stream, uint64_t(y_) * sub_camera_->camera.width + x));
     }
 
     // Adds a sample. The samples with the least random numbers represent all. They mostly stay the same if one sample
@@ -158,9 +158,9 @@ class HitRow {
         std::push_heap(drawn.begin(), drawn.end(), is_less);
     }
 
-    // Appends the hits of a pixel through this side.
+    // Appends the hits of a pixel through this sub-camera.
     void finish(std::vector<PixelHit>& to) {
-        const Camera& camera = side_->camera;
+        const Camera& camera = sub_camera_->camera;
         const Vec2 middle = normalised(camera, {x_ + 0.5, y_ + 0.5});
         Pixel& pixel = row_[x_];
         for (int i = 0; i < count_; ++i) {
@@ -174,7 +174,7 @@ class HitRow {
                 to.push_back({int32_t(int64_t(y_) * camera.width + x_), g.face, b, x, weight, spread});
             }
             pixel.hits += g.count;
-            pixel.farthest = std::max(pixel.farthest, face.depth.farthest(middle, side_->reach));
+            pixel.farthest = std::max(pixel.farthest, face.depth.farthest(middle, sub_camera_->reach));
             pixel.first = std::min(pixel.first, g.face), pixel.last = std::max(pixel.last, g.face);
         }
         x_ = -1;
@@ -186,12 +186,12 @@ class HitRow {
         return found;
     }
     void keep(Kept& kept, int32_t face) {
-        const Camera& camera = side_->camera;
+        const Camera& camera = sub_camera_->camera;
         const int32_t* v = scene_.faces + 3 * int64_t(face);
-        const Vec3 corner[3] = {side_->q[v[0]], side_->q[v[1]], side_->q[v[2]]};
+        const Vec3 corner[3] = {sub_camera_->q[v[0]], sub_camera_->q[v[1]], sub_camera_->q[v[2]]};
         kept.face = face;
-        kept.indirect = camera.passes_through_eye(corner);
-        if (kept.indirect) return;
+        kept.edge_on = camera.passes_through_eye(corner);
+        if (kept.edge_on) return;
         kept.map = face_map(camera, corner);
         kept.depth.set(camera, corner, kept.map);
         std::atomic_ref<uint8_t> seen(out_.seen[face]);
@@ -200,8 +200,8 @@ class HitRow {
     }
 
     const SceneView<T>& scene_;
-    const std::deque<Side>& sides_;
-    const Side* side_;  // The rays pass through this side.
+    const std::deque<SubCameraRays>& sub_cameras_;
+    const SubCameraRays* sub_camera_;  // The rays pass through this sub-camera.
     const ImageOptions& options_;
     const PixelChoice& choice_;
     const HitBuffers<T>& out_;
@@ -240,9 +240,10 @@ template <class T>
 void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                       const ImageOptions& options, const PixelChoice& choice, ThreadTeam& team,
                       const HitBuffers<T>& out, const MakeVisitor& make) {
-    const std::deque<Side> sides = make_sides(scene, camera, caster, options, team);
+    const std::deque<SubCameraRays> sub_cameras = make_sub_camera_rays(scene, camera, caster, options, team);
     const int width = camera.width, unit = pixels_of_batches(options.spp);
-    const ReachablePixels reachable(sides.front().camera, caster, sides.front().q, options.filter.radius() - 0.5, team);
+    const ReachablePixels reachable(sub_cameras.front().camera, caster, sub_cameras.front().q,
+                                    options.filter.radius() - 0.5, team);
     struct State {
         HitRow<T> row;
         std::unique_ptr<RowVisitor> visitor;
@@ -251,7 +252,8 @@ void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const Ray
     team.parallel_for_with_state(
         choice.end - choice.first,
         [&] {
-            return std::unique_ptr<State>(new State{HitRow<T>(scene, sides, options, choice, out, team), make(), {}});
+            return std::unique_ptr<State>(
+                new State{HitRow<T>(scene, sub_cameras, options, choice, out, team), make(), {}});
         },
         [&](State& state, int64_t k) {
             const int y = choice.first + int(k);

@@ -46,7 +46,7 @@ struct PixelChoice {
 };
 
 // Receives the hits of rows, one row after another. Hits of one pixel are consecutive, but may come in several parts
-// where a lens has several sides.
+// where a lens has several sub-cameras.
 class RowVisitor {
    public:
     virtual ~RowVisitor() = default;

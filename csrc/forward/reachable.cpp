@@ -14,7 +14,7 @@ ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, 
             if (!caster.uses(v)) continue;
             const Vec2 x = project(camera, q[v]);
             const double far = std::max(std::fabs(x.x), std::fabs(x.y));
-            if (!(camera.depth_weight(q[v]) > 0) || !std::isfinite(far) || has_sides(camera.lens)) {
+            if (!(camera.depth_weight(q[v]) > 0) || !std::isfinite(far) || has_cube_faces(camera.lens)) {
                 b = Bounds::everything();
                 break;
             }
@@ -27,7 +27,7 @@ ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, 
     });
     for (const Bounds& b : of_block)
         for (int k = 0; k < 4; ++k) bounds_.add(k, b.low[k]), bounds_.add(k, b.high[k]);
-    if (!camera.is_undistorted() && !has_sides(camera.lens)) distort_bounds(camera);
+    if (!camera.is_undistorted() && !has_cube_faces(camera.lens)) distort_bounds(camera);
 }
 
 std::vector<Vec2> ReachablePixels::polygon(const Bounds& bounds, Vec2 low, Vec2 high) {

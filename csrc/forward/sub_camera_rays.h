@@ -1,4 +1,4 @@
-// Holds the sides through which a camera's rays pass (sub_cameras.h).
+// Holds the sub-cameras through which a camera's rays pass (sub_cameras.h).
 #pragma once
 
 #include <deque>
@@ -11,13 +11,13 @@
 
 namespace edgegrad {
 
-// Holds a side's own vertices in its frame, and its rays.
-struct Side {
+// Holds a sub-camera's own vertices in its frame, and its rays.
+struct SubCameraRays {
     template <class T>
-    Side(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
-         ThreadTeam& team);
-    Side(const Side&) = delete;  // Its parts point to its camera.
-    ~Side();
+    SubCameraRays(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
+                  ThreadTeam& team);
+    SubCameraRays(const SubCameraRays&) = delete;  // Its parts point to its camera.
+    ~SubCameraRays();
 
     const Camera camera;
     const Array<Vec3> q;
@@ -32,7 +32,7 @@ struct Side {
 };
 
 template <class T>
-std::deque<Side> make_sides(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                            const ImageOptions& o, ThreadTeam& team);
+std::deque<SubCameraRays> make_sub_camera_rays(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
+                                               const ImageOptions& o, ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -92,12 +92,12 @@ class Coincidence {
         const Vec2 along = line.tangent();
         const bool opposite = along.x * curve.tangent().x + along.y * curve.tangent().y < 0;
         for (const HalfEdge& h : view_.geometry.topology().half_edges(curve.edge)) {
-            const int turn = lies_on(h, curve) ? 0 : finder_.turn_of(h);
-            if (turn == 0) {
+            const int facing = lies_on(h, curve) ? 0 : finder_.facing_of(h);
+            if (facing == 0) {
                 c.edge_on.push_back(h);
                 continue;
             }
-            HalfEdge& end = c.side[(turn > 0) == opposite];
+            HalfEdge& end = c.side[(facing > 0) == opposite];
             if (end.face < 0 || !in_front(view_, end, h, curve.a, curve.b)) end = h;
         }
         const HalfEdge& h = view_.geometry.topology().half_edges(curve.edge)[0];

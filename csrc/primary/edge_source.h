@@ -170,7 +170,7 @@ class EdgeSource {
         place.segment = coincident_.find(curve.edge);
         const auto halves = topology.half_edges(curve.edge);
         place.edge_on =
-            std::any_of(halves.begin(), halves.end(), [&](const HalfEdge& h) { return finder_.turn_of(h) == 0; });
+            std::any_of(halves.begin(), halves.end(), [&](const HalfEdge& h) { return finder_.facing_of(h) == 0; });
         place.with_faces = false;
         const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
         place.faces = {topology.faces(curve.edge), largest_coordinate(view_.scene, h),
@@ -182,9 +182,9 @@ class EdgeSource {
     bool show(const Curve& curve, double t, CoincidentShare& share) const {
         share.side[0].face = share.side[1].face = -1;
         for (const HalfEdge& h : view_.geometry.topology().half_edges(curve.edge)) {
-            const int turn = finder_.turn_of(h);
-            if (turn == 0 || !shows(view_.scene, h.face, next_to_edge(view_.scene, h, t))) continue;
-            HalfEdge& side = share.side[turn > 0 ? 0 : 1];
+            const int facing = finder_.facing_of(h);
+            if (facing == 0 || !shows(view_.scene, h.face, next_to_edge(view_.scene, h, t))) continue;
+            HalfEdge& side = share.side[facing > 0 ? 0 : 1];
             if (side.face < 0 || !in_front(view_, side, h, curve.a, curve.b)) side = h;
         }
         return share.side[0].face >= 0 || share.side[1].face >= 0;

@@ -188,8 +188,8 @@ NB_MODULE(_core_tests, p) {
     // Returns the sub-cameras, with the rotations into their frames.
     p.def("sub_cameras", [](const Camera& c, double reach) {
         std::vector<std::tuple<Camera, A33>> out;
-        for (const Camera& w : sub_cameras_of(c, reach))
-            out.emplace_back(w, A33{array(w.turn.row[0]), array(w.turn.row[1]), array(w.turn.row[2])});
+        for (const Camera& w : sub_cameras_for_points(c, reach))
+            out.emplace_back(w, A33{array(w.rotation.row[0]), array(w.rotation.row[1]), array(w.rotation.row[2])});
         return out;
     });
     // Returns the box of its undistorted image.

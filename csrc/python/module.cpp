@@ -18,6 +18,7 @@
 #include "forward/centers.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
+#include "texture/texture.h"
 
 using namespace nanobind::literals;
 
@@ -138,9 +139,9 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Chann
             {"curves", p.curves},
             {"edge rays", p.edge[0]},
             {"edge scatter", p.edge[1]},
-            {"step_lines", double(p.step_lines)},
-            {"step rays", p.step[0]},
-            {"step scatter", p.step[1]},
+            {"step_lines", double(p.discontinuity_lines)},
+            {"step rays", p.discontinuity[0]},
+            {"step scatter", p.discontinuity[1]},
             {"world", p.world}};
 }
 
@@ -244,7 +245,7 @@ NB_MODULE(_core, m) {
         // Returns the angle to the axis where the lens folds over or ends in the image, if it does.
         .def_prop_ro("end", [](const Camera& c) { return c.lens_view.end; })
         // Returns how many pinholes it sees through.
-        .def_prop_ro("sides", [](const Camera& c) { return sides_of(c).size(); });
+        .def_prop_ro("sides", [](const Camera& c) { return sub_cameras_for_rays(c).size(); });
     nb::class_<ChannelArrays>(m, "Channels")
         .def(nb::init<In<double, 2>, In<double, 2>, bool, bool, bool, int>(), "vertex_attributes"_a.noconvert(),
              "face_attributes"_a.noconvert(), "alpha"_a, "barycentrics"_a, "uv"_a, "unit"_a);

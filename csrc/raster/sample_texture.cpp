@@ -7,17 +7,11 @@
 #include "core/channels.h"
 #include "raster/sums.h"
 #include "raster/texture_level.h"
+#include "texture/pyramid_level.h"
 
 namespace edgegrad {
 
 namespace {
-
-// Holds which levels of a pyramid one pixel uses: two of them, the second one's weight, and whether that moves.
-struct Levels {
-    int below = 0, above = 0;
-    double share = 0;
-    bool moves = false;
-};
 
 template <class T>
 class PixelLookUp {
@@ -33,54 +27,42 @@ class PixelLookUp {
             level = LongAxis(texels_a_pixel(uv_, in.shape, place_)).level;
         }
         if (in.bias) level += double(in.bias[pixel]);
-        const double top = in.shape.levels - 1;
-        const bool inside = level > 0 && level < top;
-        level = level >= top ? top : level > 0 ? level : 0;  // −∞ and NaN select the texture itself.
-        if (in.look_up == LookUp::linear_nearest_level) {
-            levels_.below = levels_.above = int(std::floor(level + 0.5));
-            return;
-        }
-        levels_.below = int(std::floor(level)), levels_.above = std::min(levels_.below + 1, in.shape.levels - 1);
-        levels_.share = level - levels_.below, levels_.moves = inside;
+        level_ = {level, in.shape.levels};
+        if (in.look_up == LookUp::linear_nearest_level)
+            level_ = {std::floor(level_.fine + level_.share + 0.5), in.shape.levels}, level_.is_between = false;
     }
     bool valid() const { return valid_; }
 
-    // Calls visit(level, weight) for the levels that count; for both where the weight has a derivative.
-    template <class Visit>
-    void each_level(Visit visit) const {
-        visit(levels_.below, 1 - levels_.share);
-        if (levels_.share > 0 || levels_.moves) visit(levels_.above, levels_.share);
-    }
-    int64_t nearest(const TexelPlane& plane) const { return nearest_texel(plane, place_, in_.shape.border); }
-    Taps taps(const TexelPlane& plane) const { return linear_taps(plane, place_, in_.shape.border); }
+    int64_t nearest(const TexelGrid& grid) const { return nearest_texel(grid, place_, in_.shape.border); }
+    BorderedFootprint linear(const TexelGrid& grid) const { return footprint(grid, place_, in_.shape.border); }
 
     // Adds the cotangents, given those of s and t and of the level.
     void vjp(Vec2 place_bar, double level_bar, TextureCoordinates& uv_bar) const {
         place_vjp(uv_, in_.shape.border, place_, place_bar, uv_bar);
-        if (!levels_.moves || !in_.uv_da || level_bar == 0) return;
+        if (!level_.is_between || !in_.uv_da || level_bar == 0) return;
         const Mat2 jacobian = texels_a_pixel(uv_, in_.shape, place_);
         const Mat2 bar = long_axis_vjp(jacobian, LongAxis(jacobian), level_bar);
         texels_a_pixel_vjp(uv_, in_.shape, place_, bar, uv_bar);
     }
-    const Levels& levels() const { return levels_; }
+    const PyramidLevel<double>& level() const { return level_; }
 
    private:
     const TextureInput<T>& in_;
     TextureCoordinates uv_;
     TexturePlace place_;
     bool valid_;
-    Levels levels_;
+    PyramidLevel<double> level_;
 };
 
 // Returns the levels of one image's texture.
-std::vector<TexelPlane> planes_of(const TextureShape& shape, int64_t image) {
-    std::vector<TexelPlane> out;
-    for (int level = 0; level < shape.levels; ++level) out.emplace_back(shape, image, level);
+std::vector<TexelGrid> grids_of(const TextureShape& shape, int64_t image) {
+    std::vector<TexelGrid> out;
+    for (int level = 0; level < shape.levels; ++level) out.push_back(shape.grid(image, level));
     return out;
 }
 
 template <int N, class T>
-void sample_pixel(const TextureInput<T>& in, const std::vector<TexelPlane>& planes, int64_t pixel, T* to) {
+void sample_pixel(const TextureInput<T>& in, const std::vector<TexelGrid>& grids, int64_t pixel, T* to) {
     const int C = N > 0 ? N : in.shape.channels;
     const PixelLookUp<T> at(in, pixel);
     if (!at.valid()) {
@@ -88,19 +70,19 @@ void sample_pixel(const TextureInput<T>& in, const std::vector<TexelPlane>& plan
         return;
     }
     if (in.look_up == LookUp::nearest) {
-        const int64_t texel = at.nearest(planes[0]);
+        const int64_t texel = at.nearest(grids[0]);
         for (int c = 0; c < C; ++c) to[c] = texel < 0 ? T(0) : in.texels[texel * C + c];
         return;
     }
     double fixed[N > 0 ? N : 1] = {};
     std::vector<double> many(N > 0 ? 0 : C, 0.0);
     double* sum = N > 0 ? fixed : many.data();
-    at.each_level([&](int level, double weight) {
-        const Taps taps = at.taps(planes[level]);
+    at.level().each([&](int level, double weight) {
+        const BorderedFootprint f = at.linear(grids[level]);
         for (int k = 0; k < 4; ++k) {
-            if (taps.texel[k] < 0) continue;
-            const T* texel = in.texels + taps.texel[k] * C;
-            const double w = weight * taps.weight[k];
+            if (f.texel[k] < 0) continue;
+            const T* texel = in.texels + f.texel[k] * C;
+            const double w = weight * f.weight(k);
             for (int c = 0; c < C; ++c) sum[c] += w * double(texel[c]);
         }
     });
@@ -108,7 +90,7 @@ void sample_pixel(const TextureInput<T>& in, const std::vector<TexelPlane>& plan
 }
 
 template <class T, int N>
-void coordinates_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& planes, int64_t pixel, const T* bar,
+void coordinates_vjp(const TextureInput<T>& in, const std::vector<TexelGrid>& grids, int64_t pixel, const T* bar,
                      TextureWanted wanted, TextureGrad<T>& out) {
     const int C = N > 0 ? N : in.shape.channels, n = in.coordinates();
     TextureCoordinates uv_bar;
@@ -118,21 +100,22 @@ void coordinates_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& p
         Vec2 place_bar;
         double value[2] = {};  // They are bar · what each level shows.
         int index = 0;
-        at.each_level([&](int level, double weight) {
-            const TexelPlane& plane = planes[level];
-            const Taps taps = at.taps(plane);
-            double by_x = 0, by_y = 0;
+        at.level().each([&](int level, double weight) {
+            const TexelGrid& grid = grids[level];
+            const BorderedFootprint f = at.linear(grid);
+            double s[4] = {};  // It is bar · texel.
             for (int k = 0; k < 4; ++k) {
-                if (taps.texel[k] < 0) continue;
-                const T* texel = in.texels + taps.texel[k] * C;
-                double s = 0;
-                for (int c = 0; c < C; ++c) s += double(bar[c]) * double(texel[c]);
-                by_x += taps.by_x[k] * s, by_y += taps.by_y[k] * s, value[index] += taps.weight[k] * s;
+                if (f.texel[k] < 0) continue;
+                const T* texel = in.texels + f.texel[k] * C;
+                for (int c = 0; c < C; ++c) s[k] += double(bar[c]) * double(texel[c]);
             }
-            place_bar += Vec2{weight * by_x * double(plane.width), weight * by_y * double(plane.height)};
-            ++index;
+            f.fill_corner(s);
+            const Vec2 slopes = f.slopes(s);
+            place_bar += Vec2{weight * f.moves.x * slopes.x * double(grid.width),
+                              weight * f.moves.y * slopes.y * double(grid.height)};
+            value[index++] = f.interpolate(s);
         });
-        if (at.levels().moves) level_bar = value[1] - value[0];
+        if (at.level().is_between) level_bar = value[1] - value[0];
         at.vjp(place_bar, level_bar, uv_bar);
     }
     if (wanted.uv)
@@ -144,7 +127,7 @@ void coordinates_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& p
 
 // Adds to `sums`, which covers all levels of one image's texture.
 template <class T, int N>
-void texels_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& planes, int64_t pixel, const T* bar,
+void texels_vjp(const TextureInput<T>& in, const std::vector<TexelGrid>& grids, int64_t pixel, const T* bar,
                 double* sums) {
     const int C = N > 0 ? N : in.shape.channels;
     const PixelLookUp<T> at(in, pixel);
@@ -153,13 +136,13 @@ void texels_vjp(const TextureInput<T>& in, const std::vector<TexelPlane>& planes
         for (int c = 0; c < C; ++c) sums[texel * C + c] += weight * double(bar[c]);
     };
     if (in.look_up == LookUp::nearest) {
-        if (const int64_t texel = at.nearest(planes[0]); texel >= 0) add(texel, 1);
+        if (const int64_t texel = at.nearest(grids[0]); texel >= 0) add(texel, 1);
         return;
     }
-    at.each_level([&](int level, double weight) {
-        const Taps taps = at.taps(planes[level]);
+    at.level().each([&](int level, double weight) {
+        const BorderedFootprint f = at.linear(grids[level]);
         for (int k = 0; k < 4; ++k)
-            if (taps.texel[k] >= 0) add(taps.texel[k], weight * taps.weight[k]);
+            if (f.texel[k] >= 0) add(f.texel[k], weight * f.weight(k));
     });
 }
 
@@ -172,7 +155,7 @@ Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, ThreadTeam& tea
     const Targets to{one.all_texels(), C, in.shape.images == 1};
     TextureInput<T> of_one = in;
     of_one.shape = one;
-    const std::vector<TexelPlane> planes = planes_of(one, 0);
+    const std::vector<TexelGrid> grids = grids_of(one, 0);
     Array<T> sums = sums_over<T>(shares_of(in.frames, to), in.frames, to, team, [&](const Share& share, double* found) {
         dispatch_channels(C, false, [&]<int N>() {
             share.each_row([&](int64_t item, int64_t y) {
@@ -180,7 +163,7 @@ Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, ThreadTeam& tea
                 for (int64_t p = first; p < first + in.frames.width; ++p) {
                     const T* own = bar + p * C;
                     if (std::all_of(own, own + C, [](T x) { return x == 0; })) continue;
-                    texels_vjp<T, N>(of_one, planes, p, own, found);
+                    texels_vjp<T, N>(of_one, grids, p, own, found);
                 }
             });
         });
@@ -190,7 +173,7 @@ Array<T> all_texels_vjp(const TextureInput<T>& in, const T* bar, ThreadTeam& tea
     team.parallel_for(in.shape.images, [&](int64_t image) {
         for (int level = 0; level < one.levels; ++level)
             std::copy_n(sums.data() + (image * one.all_texels() + one.first(level)) * C, one.texels(level) * C,
-                        out.data() + TexelPlane(in.shape, image, level).first * C);
+                        out.data() + in.shape.grid(image, level).first * C);
     });
     return out;
 }
@@ -206,11 +189,11 @@ Array<T> sample_texture(const TextureInput<T>& in, ThreadTeam& team) {
     const int64_t bands = (frames.height + rows - 1) / rows;
     team.parallel_for(frames.count * bands, [&](int64_t k) {
         const int64_t image = k / bands, row = k % bands * rows;
-        const std::vector<TexelPlane> planes = planes_of(in.shape, image);
+        const std::vector<TexelGrid> grids = grids_of(in.shape, image);
         const int64_t first = (image * frames.height + row) * frames.width,
                       end = first + (std::min(row + rows, frames.height) - row) * frames.width;
         dispatch_channels(C, false, [&]<int N>() {
-            for (int64_t p = first; p < end; ++p) sample_pixel<N>(in, planes, p, out.data() + p * C);
+            for (int64_t p = first; p < end; ++p) sample_pixel<N>(in, grids, p, out.data() + p * C);
         });
     });
     return out;
@@ -227,10 +210,10 @@ TextureGrad<T> sample_texture_vjp(const TextureInput<T>& in, const T* bar, Textu
     if (wanted.bias) out.bias.emplace(frames.pixels());
     if (!wanted.coordinates()) return out;
     team.parallel_for(frames.count * frames.height, [&](int64_t row) {
-        const std::vector<TexelPlane> planes = planes_of(in.shape, row / frames.height);
+        const std::vector<TexelGrid> grids = grids_of(in.shape, row / frames.height);
         dispatch_channels(C, false, [&]<int N>() {
             for (int64_t p = row * frames.width; p < (row + 1) * frames.width; ++p)
-                coordinates_vjp<T, N>(in, planes, p, bar + p * C, wanted, out);
+                coordinates_vjp<T, N>(in, grids, p, bar + p * C, wanted, out);
         });
     });
     return out;

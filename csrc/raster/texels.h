@@ -1,5 +1,5 @@
-// Finds the texels and weights of a lookup in a texture or a cube map. Texel (0, 0) is at the origin of texture
-// coordinates, and texel centres are at +0.5. The sides of a cube and their axes are OpenGL's.
+// Finds the texels of a lookup in a texture or a cube map; texture/texture.h has their weights. Unlike there, texel (0,
+// 0) is at the origin of texture coordinates, as in nvdiffrast. The sides of a cube and their axes are OpenGL's.
 #pragma once
 
 #include <algorithm>
@@ -7,9 +7,12 @@
 #include <cstdint>
 
 #include "core/math.h"
+#include "texture/texture.h"
 
 namespace edgegrad {
 
+// Says how coordinates continue beyond a border, as nvdiffrast does. Unlike Wrap, `wrap` subtracts whole periods before
+// coordinates are scaled to texels, and `clamp` clamps coordinates rather than texels.
 enum class Border { wrap, clamp, zero, cube };
 
 // Describes levels of halves, one after the other. Each has all images' textures with their sides, row by row.
@@ -20,8 +23,8 @@ struct TextureShape {
     Border border;
 
     int sides() const { return border == Border::cube ? 6 : 1; }
-    int64_t rows(int level) const { return std::max<int64_t>(1, height >> level); }
-    int64_t columns(int level) const { return std::max<int64_t>(1, width >> level); }
+    int64_t rows(int level) const { return level_size(height, level); }
+    int64_t columns(int level) const { return level_size(width, level); }
     int64_t texels(int level) const { return images * sides() * rows(level) * columns(level); }
     int64_t first(int level) const {
         int64_t n = 0;
@@ -29,18 +32,16 @@ struct TextureShape {
         return n;
     }
     int64_t all_texels() const { return first(levels); }
-};
 
-// Locates one image's texture in one level.
-struct TexelPlane {
-    int64_t first, height, width;
-
-    TexelPlane(const TextureShape& t, int64_t image, int level)
-        : first(t.first(level) + (t.images > 1 ? image : 0) * t.sides() * t.rows(level) * t.columns(level)),
-          height(t.rows(level)),
-          width(t.columns(level)) {}
-    int64_t at(int side, int64_t x, int64_t y) const { return first + (side * height + y) * width + x; }
+    // Locates one image's texture in one level; the sides of a cube lie below one another.
+    TexelGrid grid(int64_t image, int level) const {
+        const int64_t own = sides() * rows(level) * columns(level);
+        return {first(level) + (images > 1 ? image : 0) * own, rows(level), columns(level)};
+    }
 };
+inline int64_t texel_of_side(const TexelGrid& grid, int side, int64_t x, int64_t y) {
+    return grid.at(x, side * grid.height + y);
+}
 
 // Locates a point in a texture, or on a side of a cube; s and t are fractions of its width and height.
 struct TexturePlace {
@@ -48,22 +49,33 @@ struct TexturePlace {
     double s, t;
 };
 
-// Holds up to four texels, −1 where there is none, with weights and their changes per texel to the right and up.
-struct Taps {
-    int64_t texel[4];
-    double weight[4], by_x[4], by_y[4];
+// Holds up to four texels, −1 where there is none. Where three sides of a cube meet, the missing texel is the mean of
+// the other three, seen from any side.
+struct BorderedFootprint : Footprint {
+    Vec2 moves;       // They are 0 along axes where the coordinate is clamped, otherwise 1.
+    int corner = -1;  // It is the missing texel of the four.
+
+    // Returns the weight of a texel that is there.
+    double weight(int i) const {
+        const double own = Footprint::weight(i);
+        return corner < 0 ? own : own + Footprint::weight(corner) / 3;
+    }
+    // Sets the missing number of four at the texels.
+    void fill_corner(double (&s)[4]) const {
+        if (corner >= 0) s[corner] = 0, s[corner] = (s[0] + s[1] + s[2] + s[3]) / 3;
+    }
 };
 
 // Holds the axes of a cube's sides: the major one with its sign, and those along which s and t run.
-struct CubeFace {
+struct SideAxes {
     int major, s, t;
     double sign, s_sign, t_sign;
 };
-inline constexpr CubeFace cube_faces[6] = {{0, 2, 1, 1, -1, -1}, {0, 2, 1, -1, 1, -1}, {1, 0, 2, 1, 1, 1},
-                                           {1, 0, 2, -1, 1, -1}, {2, 0, 1, 1, 1, -1},  {2, 0, 1, -1, -1, -1}};
+inline constexpr SideAxes side_axes[6] = {{0, 2, 1, 1, -1, -1}, {0, 2, 1, -1, 1, -1}, {1, 0, 2, 1, 1, 1},
+                                          {1, 0, 2, -1, 1, -1}, {2, 0, 1, 1, 1, -1},  {2, 0, 1, -1, -1, -1}};
 
 // Returns the side of a direction, or −1 for directions that are zero or not finite.
-inline int cube_face_of(const double (&d)[3]) {
+inline int side_of(const double (&d)[3]) {
     int axis = 0;
     for (int k = 0; k < 3; ++k) {
         if (!std::isfinite(d[k])) return -1;
@@ -76,23 +88,23 @@ inline int cube_face_of(const double (&d)[3]) {
 // Returns the texel (x, y) of a side of n by n, or beyond an edge, the adjacent texel on the next side. Centres are at
 // odd numbers in a cube from −n to n. A coordinate that leaves the cube becomes that of the next side, and the side's
 // own coordinate that of its outermost texels. Returns −1 beyond a corner, where three sides meet.
-inline int64_t cube_texel(const TexelPlane& plane, int side, int64_t x, int64_t y) {
-    const int64_t n = plane.width;
+inline int64_t cube_texel(const TexelGrid& grid, int side, int64_t x, int64_t y) {
+    const int64_t n = grid.width;
     const bool over_x = x < 0 || x >= n, over_y = y < 0 || y >= n;
-    if (!over_x && !over_y) return plane.at(side, x, y);
+    if (!over_x && !over_y) return texel_of_side(grid, side, x, y);
     if (over_x && over_y) return -1;
-    const CubeFace& from = cube_faces[side];
+    const SideAxes& from = side_axes[side];
     int64_t place[3];
     place[from.s] = int64_t(from.s_sign) * (2 * x + 1 - n), place[from.t] = int64_t(from.t_sign) * (2 * y + 1 - n);
     const int over = over_x ? from.s : from.t;
     place[from.major] = int64_t(from.sign) * (n - 1);
     const int next = 2 * over + (place[over] < 0);
-    const CubeFace& to = cube_faces[next];
-    return plane.at(next, (int64_t(to.s_sign) * place[to.s] + n - 1) / 2,
-                    (int64_t(to.t_sign) * place[to.t] + n - 1) / 2);
+    const SideAxes& to = side_axes[next];
+    return texel_of_side(grid, next, (int64_t(to.s_sign) * place[to.s] + n - 1) / 2,
+                         (int64_t(to.t_sign) * place[to.t] + n - 1) / 2);
 }
 
-// Holds one coordinate as two texels, the weight of the second, and its derivative by the coordinate.
+// Holds one coordinate as two texels, the weight of the second, and its derivative by the position in texels.
 struct Steps {
     int64_t i0, i1;  // −1 means outside.
     double share, slope;
@@ -116,46 +128,31 @@ inline Steps steps(double s, int64_t n, Border border) {
     return out;
 }
 
-inline Taps linear_taps(const TexelPlane& plane, const TexturePlace& at, Border border) {
-    const Steps x = steps(at.s, plane.width, border), y = steps(at.t, plane.height, border);
-    const double a = x.share, b = y.share;
-    Taps out{{},
-             {(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b},
-             {-(1 - b) * x.slope, (1 - b) * x.slope, -b * x.slope, b * x.slope},
-             {-(1 - a) * y.slope, -a * y.slope, (1 - a) * y.slope, a * y.slope}};
-    if (border != Border::cube) {
-        const int64_t column[2] = {x.i0, x.i1}, row[2] = {y.i0, y.i1};
-        for (int k = 0; k < 4; ++k) {
-            const int64_t i = column[k & 1], j = row[k >> 1];
-            out.texel[k] = i < 0 || j < 0 ? -1 : plane.at(0, i, j);
+inline BorderedFootprint footprint(const TexelGrid& grid, const TexturePlace& at, Border border) {
+    const Steps x = steps(at.s, grid.width, border), y = steps(at.t, grid.height, border);
+    BorderedFootprint out{{{}, x.share, y.share}, {x.slope, y.slope}};
+    for (int k = 0; k < 4; ++k) {
+        const int64_t i = k & 1 ? x.i1 : x.i0, j = k & 2 ? y.i1 : y.i0;
+        if (border != Border::cube) {
+            out.texel[k] = i < 0 || j < 0 ? -1 : grid.at(i, j);
+        } else {
+            out.texel[k] = cube_texel(grid, at.side, i, j);
+            if (out.texel[k] < 0) out.corner = k;
         }
-        return out;
-    }
-    int corner = -1;
-    for (int k = 0; k < 4; ++k) {
-        out.texel[k] = cube_texel(plane, at.side, k & 1 ? x.i1 : x.i0, k & 2 ? y.i1 : y.i0);
-        if (out.texel[k] < 0) corner = k;
-    }
-    if (corner < 0) return out;
-    // The missing texel is the mean of the three that meet there, seen from any side.
-    for (int k = 0; k < 4; ++k) {
-        if (k == corner) continue;
-        out.weight[k] += out.weight[corner] / 3;
-        out.by_x[k] += out.by_x[corner] / 3, out.by_y[k] += out.by_y[corner] / 3;
     }
     return out;
 }
 
 // Returns the texel that contains a point, or −1.
-inline int64_t nearest_texel(const TexelPlane& plane, const TexturePlace& at, Border border) {
+inline int64_t nearest_texel(const TexelGrid& grid, const TexturePlace& at, Border border) {
     const auto cell = [&](double s, int64_t n) {
         if (border == Border::wrap) s -= std::floor(s);
         const double x = std::floor(s * double(n));
         if (border == Border::zero && !(x >= 0 && x < double(n))) return int64_t(-1);
         return int64_t(std::clamp(x, 0.0, double(n - 1)));
     };
-    const int64_t x = cell(at.s, plane.width), y = cell(at.t, plane.height);
-    return x < 0 || y < 0 ? -1 : plane.at(at.side, x, y);
+    const int64_t x = cell(at.s, grid.width), y = cell(at.t, grid.height);
+    return x < 0 || y < 0 ? -1 : texel_of_side(grid, at.side, x, y);
 }
 
 }  // namespace edgegrad

@@ -21,9 +21,9 @@ inline bool place_of(const TextureCoordinates& uv, Border border, TexturePlace& 
         out = {0, uv.at[0], uv.at[1]};
         return true;
     }
-    const int side = cube_face_of(uv.at);
+    const int side = side_of(uv.at);
     if (side < 0) return false;
-    const CubeFace& axes = cube_faces[side];
+    const SideAxes& axes = side_axes[side];
     const double m = std::fabs(uv.at[axes.major]);
     out = {side, 0.5 * (axes.s_sign * uv.at[axes.s] / m + 1), 0.5 * (axes.t_sign * uv.at[axes.t] / m + 1)};
     return true;
@@ -34,7 +34,7 @@ inline void place_vjp(const TextureCoordinates& uv, Border border, const Texture
         uv_bar.at[0] += bar.x, uv_bar.at[1] += bar.y;
         return;
     }
-    const CubeFace& axes = cube_faces[place.side];
+    const SideAxes& axes = side_axes[place.side];
     const double m = std::fabs(uv.at[axes.major]), s = 2 * place.s - 1, t = 2 * place.t - 1;
     uv_bar.at[axes.s] += 0.5 * bar.x * axes.s_sign / m, uv_bar.at[axes.t] += 0.5 * bar.y * axes.t_sign / m;
     uv_bar.at[axes.major] -= 0.5 * axes.sign * (bar.x * s + bar.y * t) / m;
@@ -45,7 +45,7 @@ inline Mat2 texels_a_pixel(const TextureCoordinates& uv, const TextureShape& t, 
     const double w = double(t.width), h = double(t.height), *d = uv.by_pixel;
     if (t.border != Border::cube) return {w * d[0], w * d[1], h * d[2], h * d[3]};
     // s = (±x_s / m + 1) / 2 gives ∂s = (±∂x_s − (2 s − 1) ∂m) / (2 m).
-    const CubeFace& axes = cube_faces[place.side];
+    const SideAxes& axes = side_axes[place.side];
     const double scale = 0.5 * w / std::fabs(uv.at[axes.major]), s = 2 * place.s - 1, r = 2 * place.t - 1;
     const auto of = [&](int axis, int k) { return d[2 * axis + k]; };
     const auto m = [&](int k) { return axes.sign * of(axes.major, k); };
@@ -60,7 +60,7 @@ inline void texels_a_pixel_vjp(const TextureCoordinates& uv, const TextureShape&
         d[0] += w * bar.xx, d[1] += w * bar.xy, d[2] += h * bar.yx, d[3] += h * bar.yy;
         return;
     }
-    const CubeFace& axes = cube_faces[place.side];
+    const SideAxes& axes = side_axes[place.side];
     const double size = std::fabs(uv.at[axes.major]), scale = 0.5 * w / size, s = 2 * place.s - 1, r = 2 * place.t - 1;
     const double s_bar[2] = {scale * bar.xx, scale * bar.xy}, t_bar[2] = {scale * bar.yx, scale * bar.yy};
     double by_s = 0, by_t = 0;  // They are cotangents of 2 s − 1 and 2 t − 1.

@@ -41,21 +41,6 @@ struct Attributes {
     int channels() const { return alpha + vertex_width + face_width + 3 * barycentrics + 2 * uv; }
 };
 
-// Says how an image is sampled. Beyond its border it repeats, clamps to its outermost texels, or is mirrored.
-enum class Wrap { repeat, clamp, mirror };
-enum class TextureFilter { linear, nearest };
-constexpr const char* wrap_names[] = {"repeat", "clamp", "mirror"};
-constexpr const char* texture_filter_names[] = {"linear", "nearest"};
-struct Sampler {
-    Wrap u = Wrap::repeat, v = Wrap::repeat;
-    TextureFilter filter = TextureFilter::linear;
-
-    bool operator==(const Sampler&) const = default;
-};
-
-// A row of a table of textures has the first texel, height, width, and the sampler's three numbers.
-constexpr int texture_columns = 6;
-
 // Describes alpha-tested faces, which are transparent where an alpha texture is below a cutoff (rays/alpha_mask.h).
 template <class T>
 struct AlphaMaskArrays {

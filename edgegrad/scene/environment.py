@@ -14,6 +14,7 @@ from ..check import check_shape
 from .affine import Affine, check_rotation
 from .lights import Light, LightPoints
 from .material import numbers
+from .textures import adjacent
 
 EVEN = 0.1  # the share of points of a light that is drawn evenly, so that what is dark has a gradient too
 
@@ -177,12 +178,11 @@ class Environment(Light):
         h, w = self._size
         c0, r0 = column.detach().floor(), row.detach().floor()
         fc, fr = (column - c0).to(texels)[:, None], (row - r0).to(texels)[:, None]
-
-        def texel(down: int, right: int) -> Tensor:
-            return texels[(r0 + down).clamp(0, h - 1).long() * w + (c0 + right).long() % w]
-
-        top = torch.lerp(texel(0, 0), texel(0, 1), fc)
-        return torch.lerp(top, torch.lerp(texel(1, 0), texel(1, 1), fc), fr)
+        left, right = adjacent(c0, w, "repeat")
+        above, below = (
+            torch.lerp(texels[row * w + left], texels[row * w + right], fc) for row in adjacent(r0, h, "clamp")
+        )
+        return torch.lerp(above, below, fr)
 
     def towards(self, direction: Tensor) -> Tensor:
         """Return the radiance (N, C) from where directions (N, 3) in the world, of any length, point to; differentiable."""

@@ -16,6 +16,7 @@ from .affine import Affine, check_rotation
 from .material import Material, numbers
 from .mesh import Mesh
 from .rows import unit
+from .spherical_harmonics import harmonics
 
 
 class LightPoints(NamedTuple):
@@ -299,19 +300,7 @@ class SphericalHarmonics(Light):
     def irradiance(self, normal: Tensor) -> Tensor:
         """Return the irradiance (N, C) of surfaces with unit normals (N, 3)."""
         n = normal if self.rotation is None else normal @ self.rotation.to(normal)
-        return harmonics(n) @ self.coefficients.to(normal)
-
-
-def harmonics(n: Tensor) -> Tensor:
-    """Return the real spherical harmonics (N, 9) up to the second order, of unit vectors (N, 3)."""
-    x, y, z = n.unbind(-1)
-    one, c1, c2 = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi)), math.sqrt(15 / (4 * math.pi))
-    return torch.stack(
-        [
-            one * torch.ones_like(x), c1 * y, c1 * z, c1 * x, c2 * x * y, c2 * y * z,
-            math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1), c2 * x * z, c2 / 2 * (x * x - y * y),
-        ], -1,
-    )  # fmt: skip
+        return torch.stack(harmonics(n), -1) @ self.coefficients.to(normal)
 
 
 class AreaLight:

@@ -19,6 +19,11 @@ def wrapped(cell: Tensor, count: int | Tensor, wrap: str) -> Tensor:
     return torch.minimum(i, 2 * count - 1 - i)
 
 
+def adjacent(cell: Tensor, count: int | Tensor, wrap: str) -> list[Tensor]:
+    """Return the texels, as wrapped() does, of cells and of those after them."""
+    return [wrapped(cell + k, count, wrap) for k in (0, 1)]
+
+
 def bilinear(texture: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
     h, w = texture.shape[:2]
     return bilinear_of_rows(texture.reshape(h * w, -1), 0, h, w, uv, wraps)
@@ -31,9 +36,7 @@ def bilinear_of_rows(
     x, y = uv[:, 0].double() * w - 0.5, (1 - uv[:, 1].double()) * h - 0.5
     x0, y0 = x.detach().floor(), y.detach().floor()
     fx, fy = (x - x0).to(texels.dtype)[:, None], (y - y0).to(texels.dtype)[:, None]
-    columns, rows = (
-        [wrapped(at + k, n, wrap) for k in (0, 1)] for at, n, wrap in ((x0, w, wraps[0]), (y0, h, wraps[1]))
-    )
+    columns, rows = adjacent(x0, w, wraps[0]), adjacent(y0, h, wraps[1])
 
     def across(row: Tensor) -> Tensor:
         left, right = (rows_of(texels, first + row * w + column) for column in columns)

@@ -6,6 +6,7 @@
 #include <cmath>
 
 #include "shading/lit/light.h"
+#include "texture/texture.h"
 
 namespace edgegrad {
 
@@ -44,12 +45,10 @@ inline LightPoint above(const std::vector<Table>& tables, const Light& light, co
 template <class Visit>
 void each_texel(const Light& light, double column, double row, Visit visit) {
     column -= 0.5, row -= 0.5;
-    const double c0 = std::floor(column), r0 = std::floor(row), a = column - c0, b = row - r0;
-    for (int i = 0; i < 4; ++i) {
-        const int64_t r = std::clamp<int64_t>(int64_t(r0) + i / 2, 0, light.height - 1),
-                      c = (int64_t(c0) + i % 2 + light.width) % light.width;
-        visit(r * light.width + c, (i % 2 ? a : 1 - a) * (i / 2 ? b : 1 - b));
-    }
+    const double c0 = std::floor(column), r0 = std::floor(row);
+    const TexelGrid grid{0, light.height, light.width, {Wrap::repeat, Wrap::clamp}};
+    const Footprint f = footprint_at(grid, c0, r0, column - c0, row - r0);
+    for (int i = 0; i < 4; ++i) visit(f.texel[i], f.weight(i));
 }
 
 // Calls visit(texel, its weight) for the texels around a point.

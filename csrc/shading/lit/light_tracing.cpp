@@ -24,49 +24,49 @@ class LightPaths {
         filtered_ = lit.is_filtered();
     }
 
-    void follow(const Arrivals& arrivals, int64_t first_arrival, StepRange steps, Connections& out) {
-        ends_.clear();
+    void trace(const Arrivals& arrivals, int64_t first_arrival, StepRange steps, Connections& out) {
+        vertices_.clear();
         for (int64_t i = 0; i < arrivals.size; ++i) {
             const double *in = arrivals.from + 3 * i, *carried = arrivals.carried + C_ * i;
             if (std::all_of(carried, carried + C_, [](double x) { return x == 0; })) continue;
-            End end;
-            end.arrival = first_arrival + i, end.seed = arrivals.seed[i], end.through = 1;
-            end.in = {in[0], in[1], in[2]};
-            std::copy(carried, carried + C_, end.carried);
-            if (place(arrivals.face[i], arrivals.b + 3 * i, end)) ends_.push_back(end);
+            PathVertex vertex;
+            vertex.arrival = first_arrival + i, vertex.seed = arrivals.seed[i], vertex.throughput = 1;
+            vertex.in = {in[0], in[1], in[2]};
+            std::copy(carried, carried + C_, vertex.carried);
+            if (place(arrivals.face[i], arrivals.b + 3 * i, vertex)) vertices_.push_back(vertex);
         }
-        for (int k = 0; k <= steps.last && !ends_.empty(); ++k) {
+        for (int k = 0; k <= steps.last && !vertices_.empty(); ++k) {
             if (k >= steps.first) connect(out);
-            if (k < steps.last) go_on(k);
+            if (k < steps.last) extend(k);
         }
     }
 
    private:
-    // Holds the current end of a path.
-    struct End {
+    // Holds the current vertex of a path.
+    struct PathVertex {
         int64_t arrival, seed;
-        double through;  // It is the throughput up to this end, in its largest channel.
+        double throughput;  // It is the throughput up to this vertex, in its largest channel.
         Vec3 in;
-        double carried[most_lit_channels];  // It is B t (n · in) / |g · in| once the end is placed.
+        double carried[most_lit_channels];  // It is B t (n · in) / |g · in| once the vertex is placed.
         Surface<double> o;
         int64_t face;
     };
 
     // Returns false where the side that faces the light scatters none.
-    bool place(int64_t face, const double* b, End& end) const {
-        Surface<double>& o = end.o;
-        end.face = face;
+    bool place(int64_t face, const double* b, PathVertex& vertex) const {
+        Surface<double>& o = vertex.o;
+        vertex.face = face;
         set_place<double>(lit_, face, b, nullptr, o);
-        set_view(lit_, end.in, o);
+        set_view(lit_, vertex.in, o);
         if (!o.mesh->has_material || o.is_black()) return false;
-        const double cosine = dot(o.n, end.in), of_face = dot(o.g, end.in);
+        const double cosine = dot(o.n, vertex.in), of_face = dot(o.g, vertex.in);
         if (!(cosine > 0 && of_face > 0)) return false;
         look_up_material(lit_, o);
         double factor = cosine / of_face;
-        if (!o.mesh->normal.is_flat()) factor *= terminator<double>(o.g, o.n, end.in);
+        if (!o.mesh->normal.is_flat()) factor *= terminator<double>(o.g, o.n, vertex.in);
         else factor = 1;
-        for (int c = 0; c < C_; ++c) end.carried[c] *= factor;
-        end.through *= factor;
+        for (int c = 0; c < C_; ++c) vertex.carried[c] *= factor;
+        vertex.throughput *= factor;
         return true;
     }
 
@@ -80,27 +80,27 @@ class LightPaths {
     void connect(Connections& out) {
         lines_.clear();
         const Vec3 eye = lit_.tables[lit_.eye].vector_at<double>(0);
-        for (size_t e = 0; e < ends_.size(); ++e) {
-            const End& end = ends_[e];
-            const Surface<double>& o = end.o;
+        for (size_t e = 0; e < vertices_.size(); ++e) {
+            const PathVertex& vertex = vertices_[e];
+            const Surface<double>& o = vertex.o;
             const Vec3 v = lit_.perspective ? unit(eye - o.y) : eye;
             double f[most_lit_channels];
-            if (!scatters(end.o, v, end.in, f)) continue;
+            if (!scatters(vertex.o, v, vertex.in, f)) continue;
             const Vec3* corner = o.frame.corner;
             camera_.each(o.y, corner[1] - corner[0], corner[2] - corner[0], [&](CameraConnection there) {
                 const Vec3 to = lit_.perspective ? eye : o.y + (length(o.y - lit_.center) + 1.01 * lit_.radius) * v;
-                lines_.face.push_back(int32_t(end.face));
+                lines_.face.push_back(int32_t(vertex.face));
                 lines_.b.insert(lines_.b.end(), {o.at.b[1], o.at.b[2]});
                 lines_.to.insert(lines_.to.end(), {to.x, to.y, to.z});
                 lines_.contact.push_back(16 * eps_ * std::max(size_of(o.y), size_of(to)));
-                lines_.arrival.push_back(end.arrival), lines_.x.push_back(there.x);
+                lines_.arrival.push_back(vertex.arrival), lines_.x.push_back(there.x);
                 if (filtered_) {
                     Surface<double> seen = o;
                     seen.at.spread = there.spread;
                     look_up_material(lit_, seen);
-                    scatters(seen, v, end.in, f);
+                    scatters(seen, v, vertex.in, f);
                 }
-                for (int c = 0; c < C_; ++c) lines_.radiance.push_back(f[c] * end.carried[c] * there.area_scale);
+                for (int c = 0; c < C_; ++c) lines_.radiance.push_back(f[c] * vertex.carried[c] * there.area_scale);
             });
         }
         const size_t n = lines_.face.size();
@@ -117,42 +117,42 @@ class LightPaths {
     }
 
     // Extends all paths by step k, and plays Russian roulette.
-    void go_on(int k) {
-        leaving_.clear(), rays_.clear();
-        for (const End& end : ends_) {
-            const uint64_t seed = uint64_t(end.seed);
+    void extend(int k) {
+        extended_.clear(), rays_.clear();
+        for (const PathVertex& vertex : vertices_) {
+            const uint64_t seed = uint64_t(vertex.seed);
             const PathRandomNumbers numbers(seed, k);
             const Vec2 choice = numbers.of_choice(seed);
-            double survival = 1;
-            if (k >= steps_without_roulette) {
-                survival = std::clamp(end.through, least_survival, 1.0);
-                if (choice.y >= survival) continue;
+            double russian_roulette_probability = 1;
+            if (k >= steps_without_russian_roulette) {
+                russian_roulette_probability = std::clamp(vertex.throughput, least_russian_roulette_probability, 1.0);
+                if (choice.y >= russian_roulette_probability) continue;
             }
-            const Surface<double>& o = end.o;
+            const Surface<double>& o = vertex.o;
             const PathSample draw(o, C_);
             const Vec3 w = draw.draw(choice.x, numbers.of_direction(seed));
             double f[most_lit_channels];
-            if (!scatters(o, w, end.in, f)) continue;
-            const double weight = dot(o.g, w) / (draw.pdf(w) * survival);
+            if (!scatters(o, w, vertex.in, f)) continue;
+            const double weight = dot(o.g, w) / (draw.pdf(w) * russian_roulette_probability);
             if (!std::isfinite(weight)) continue;
-            End& next = leaving_.emplace_back(end);
+            PathVertex& next = extended_.emplace_back(vertex);
             for (int c = 0; c < C_; ++c) f[c] *= weight, next.carried[c] *= f[c], f[c] = std::fabs(f[c]);
-            next.through *= *std::max_element(f, f + C_), next.in = -w;
-            rays_.face.push_back(int32_t(end.face)), rays_.b.insert(rays_.b.end(), {o.at.b[1], o.at.b[2]});
+            next.throughput *= *std::max_element(f, f + C_), next.in = -w;
+            rays_.face.push_back(int32_t(vertex.face)), rays_.b.insert(rays_.b.end(), {o.at.b[1], o.at.b[2]});
             rays_.direction.insert(rays_.direction.end(), {w.x, w.y, w.z});
             rays_.contact.push_back(16 * eps_ * size_of(o.y));
         }
-        const size_t n = leaving_.size();
+        const size_t n = extended_.size();
         rays_.hit.resize(n), rays_.hit_b.resize(2 * n);
         depart(scene_, caster_,
                {rays_.face.data(), rays_.b.data(), rays_.direction.data(), rays_.contact.data(), int64_t(n)},
                rays_.hit.data(), rays_.hit_b.data());
-        ends_.clear();
+        vertices_.clear();
         for (size_t r = 0; r < n; ++r) {
             if (rays_.hit[r] < 0) continue;
             const double u = rays_.hit_b[2 * r], v = rays_.hit_b[2 * r + 1], b[3] = {1 - (u + v), u, v};
-            End& end = leaving_[r];
-            if (place(rays_.hit[r], b, end)) ends_.push_back(end);
+            PathVertex& vertex = extended_[r];
+            if (place(rays_.hit[r], b, vertex)) vertices_.push_back(vertex);
         }
     }
 
@@ -163,7 +163,7 @@ class LightPaths {
     const int C_;
     double eps_ = 0;  // It is the relative spacing of positions.
     bool filtered_ = false;
-    std::vector<End> ends_, leaving_;
+    std::vector<PathVertex> vertices_, extended_;
     struct {
         std::vector<int32_t> face, hit;
         std::vector<double> b, direction, contact, hit_b;
@@ -194,7 +194,7 @@ std::vector<Connections> towards_camera(const LitScene& lit, const SceneView<T>&
         [&](LightPaths<T>& paths, int64_t block) {
             team.check();
             const int64_t first = block * shaded_at_once;
-            paths.follow(arrivals.part(first, shaded_at_once, lit.channels), first, steps, out[block]);
+            paths.trace(arrivals.part(first, shaded_at_once, lit.channels), first, steps, out[block]);
         });
     return out;
 }

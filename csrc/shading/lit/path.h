@@ -23,8 +23,8 @@
 
 namespace edgegrad {
 
-constexpr int steps_without_roulette = 2;
-constexpr double least_survival = 0.05;
+constexpr int steps_without_russian_roulette = 2;
+constexpr double least_russian_roulette_probability = 0.05;
 
 // Returns the solid angle of a face per unit of its last two barycentrics, seen from the displacement d: |M · d| /
 // |d|³. M is the cross product of two sides of the face.
@@ -53,15 +53,15 @@ struct Path {
     const LightPoint* drawn;
     const int8_t* seen;
     size_t stride, lights;
-    const EmitterHit* met;  // Null means that hits of emitters do not count.
+    const EmitterHit* emitter_hits;  // Null means that hits of emitters do not count.
 
     int64_t face_at(int k) const { return face[k * stride]; }
     const double* b_at(int k) const { return b + 3 * k * stride; }
     double pdf_at(int k) const { return pdf[k * stride]; }
     const LightPoint* drawn_at(int k) const { return drawn + k * stride * lights; }
     const int8_t* seen_at(int k) const { return seen + k * stride * lights; }
-    bool has_met(int k) const { return met && met[k * stride].light >= 0; }
-    const EmitterHit& met_at(int k) const { return met[k * stride]; }
+    bool has_emitter_hit(int k) const { return emitter_hits && emitter_hits[k * stride].light >= 0; }
+    const EmitterHit& emitter_hit_at(int k) const { return emitter_hits[k * stride]; }
 };
 
 // Holds the paths of about shaded_at_once points, ordered by step and then by path. Calls reuse its memory.
@@ -90,15 +90,15 @@ class Paths {
             set_surface<double>(lit_, from.face[i], from.b + 3 * i, from.spread_at(i), o);
             return true;
         });
-        go_on(scene, caster, from);
+        extend(scene, caster, from);
     }
     // Traces paths for an image: lights are also sampled for the first points, and emitters that paths hit count. Each
     // point i starts paths_of_point paths, path(paths_of_point · i) and those after it. The first of them has the light
     // samples of the point.
     template <class T>
     void find_whole(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
-        meets_ = options_.shadows, each_ = paths_of_point;
-        by_paths_ = meets_ && sky_ >= 0 && !lit_.lights[sky_].is_image ? sky_ : -1;
+        counts_emitter_hits_ = options_.shadows, paths_of_point_ = paths_of_point;
+        by_paths_ = counts_emitter_hits_ && sky_ >= 0 && !lit_.lights[sky_].is_image ? sky_ : -1;
         find_lit(scene, caster, from, [&](int64_t i, Surface<double>& o) {
             set_surface<double>(lit_, from.face[i], from.b + 3 * i, from.spread_at(i), o);
             return true;
@@ -109,7 +109,7 @@ class Paths {
     void find_lit(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Place place) {
         begin(from, place);
         sample_lights(scene, caster, from, 0);
-        go_on(scene, caster, from);
+        extend(scene, caster, from);
     }
 
     static bool scatters(const Surface<double>& o) { return o.mesh->has_material && !o.is_black(); }
@@ -123,7 +123,7 @@ class Paths {
                 seen_.data() + i * K(),
                 size_t(n_),
                 size_t(K()),
-                meets_ ? &met_[i] : nullptr};
+                counts_emitter_hits_ ? &emitter_hits_[i] : nullptr};
     }
     // Returns the surface point with which the path was traced.
     const Surface<double>& surface(int64_t i, int k) const { return surfaces_[k * n_ + i]; }
@@ -133,28 +133,29 @@ class Paths {
     struct Rays {
         std::vector<int64_t> index;
         std::vector<int32_t> face, hit;
-        std::vector<double> b, direction, contact, survival, pdf, hit_b;
+        std::vector<double> b, direction, contact, russian_roulette_probability, pdf, hit_b;
 
         void clear() {
-            index.clear(), face.clear(), b.clear(), direction.clear(), contact.clear(), survival.clear();
+            index.clear(), face.clear(), b.clear(), direction.clear(), contact.clear(),
+                russian_roulette_probability.clear();
             pdf.clear();
         }
     };
 
     template <class Place>
     void begin(const LitPoints& from, Place place) {
-        n_ = from.size * each_;
+        n_ = from.size * paths_of_point_;
         const int64_t all = n_ * options_.bounces;
         surfaces_.resize(all), pdf_.resize(all), face_.resize(all), b_.resize(3 * all), seed_.resize(all);
         drawn_.resize(all * lights_.size()), seen_.resize(all * lights_.size());
         length_.assign(n_, 0), throughput_.assign(n_ * C_, 1.0);
-        if (meets_) met_.assign(all, {});
+        if (counts_emitter_hits_) emitter_hits_.assign(all, {});
         for (int64_t i = 0; i < from.size; ++i) {
-            const int64_t first = i * each_;
+            const int64_t first = i * paths_of_point_;
             Surface<double>& o = surfaces_[first];
             if (!place(i, o)) continue;
             if (scatters(o)) look_up_material(lit_, o);
-            for (int64_t at = first; at < first + each_; ++at) {
+            for (int64_t at = first; at < first + paths_of_point_; ++at) {
                 if (at > first) surfaces_[at] = o;
                 face_[at] = from.face[i], std::copy(from.b + 3 * i, from.b + 3 * i + 3, &b_[3 * at]);
                 length_[at] = scatters(o) ? 1 : 0;
@@ -163,15 +164,15 @@ class Paths {
     }
     // Paths from one point have consecutive indices in its sequence.
     uint64_t seed_of(const LitPoints& from, int64_t i) const {
-        const uint64_t seed = uint64_t(from.seed[i / each_]), sequence = seed >> 32 << 32;
-        return sequence | uint32_t(uint32_t(seed) * uint32_t(each_) + uint32_t(i % each_));
+        const uint64_t seed = uint64_t(from.seed[i / paths_of_point_]), sequence = seed >> 32 << 32;
+        return sequence | uint32_t(uint32_t(seed) * uint32_t(paths_of_point_) + uint32_t(i % paths_of_point_));
     }
     template <class T>
-    void go_on(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
+    void extend(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
         for (int k = 0; k + 1 < options_.bounces; ++k) {
-            leave(from, k);
+            sample_bsdf(from, k);
             if (rays_.index.empty()) break;
-            arrive(scene, caster, k);
+            trace(scene, caster, k);
             sample_lights(scene, caster, from, k + 1);
         }
     }
@@ -179,7 +180,7 @@ class Paths {
     int64_t K() const { return int64_t(lights_.size()); }
 
     // Samples the directions in which paths continue after k steps, and plays Russian roulette.
-    void leave(const LitPoints& from, int k) {
+    void sample_bsdf(const LitPoints& from, int k) {
         rays_.clear();
         std::optional<PathRandomNumbers> numbers;
         for (int64_t i = 0; i < n_; ++i) {
@@ -189,13 +190,15 @@ class Paths {
             const uint64_t seed = seed_of(from, i);
             if (!numbers || !numbers->are_of(seed)) numbers.emplace(seed, k);
             const Vec2 choice = numbers->of_choice(seed);
-            double survival = 1;
-            if (k >= steps_without_roulette) {
+            double russian_roulette_probability = 1;
+            if (k >= steps_without_russian_roulette) {
                 const double* throughput = &throughput_[i * C_];
-                survival = std::clamp(*std::max_element(throughput, throughput + C_), least_survival, 1.0);
+                russian_roulette_probability =
+                    std::clamp(*std::max_element(throughput, throughput + C_), least_russian_roulette_probability, 1.0);
             }
-            if (meets_ && o.scattering.lambertian && (k > 0 || i % each_ == 0)) apply_mis(at, paths_at(k) * survival);
-            if (choice.y >= survival) continue;
+            if (counts_emitter_hits_ && o.scattering.lambertian && (k > 0 || i % paths_of_point_ == 0))
+                apply_mis(at, paths_at(k) * russian_roulette_probability);
+            if (choice.y >= russian_roulette_probability) continue;
             const PathSample draw(o, C_);
             const Vec3 l = draw.draw(choice.x, numbers->of_direction(seed));
             if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
@@ -203,14 +206,15 @@ class Paths {
             rays_.index.push_back(i), rays_.face.push_back(int32_t(face_[at]));
             rays_.b.insert(rays_.b.end(), {o.at.b[1], o.at.b[2]});
             rays_.direction.insert(rays_.direction.end(), {l.x, l.y, l.z});
-            rays_.contact.push_back(16 * eps_ * size), rays_.survival.push_back(survival);
+            rays_.contact.push_back(16 * eps_ * size),
+                rays_.russian_roulette_probability.push_back(russian_roulette_probability);
             rays_.pdf.push_back(draw.pdf(l));
         }
     }
 
     // Traces these rays, and extends the paths by what they hit.
     template <class T>
-    void arrive(const SceneView<T>& scene, const RayCaster& caster, int k) {
+    void trace(const SceneView<T>& scene, const RayCaster& caster, int k) {
         rays_.hit.resize(rays_.index.size()), rays_.hit_b.resize(2 * rays_.index.size());
         depart(scene, caster,
                {rays_.face.data(), rays_.b.data(), rays_.direction.data(), rays_.contact.data(),
@@ -219,7 +223,7 @@ class Paths {
         for (size_t r = 0; r < rays_.index.size(); ++r) {
             const int64_t i = rays_.index[r], at = (k + 1) * n_ + i;
             if (rays_.hit[r] < 0) {
-                if (meets_ && sky_ >= 0) meet_sky(r, k);
+                if (counts_emitter_hits_ && sky_ >= 0) add_environment_hit(r, k);
                 continue;
             }
             const double u = rays_.hit_b[2 * r], v = rays_.hit_b[2 * r + 1];
@@ -231,22 +235,23 @@ class Paths {
             const double measure = solid_angle(next, d);
             set_view(lit_, -l, next);
             if (const int light = light_of_[next.mesh - lit_.meshes.data()];
-                meets_ && light >= 0 && o.scattering.lambertian) {
+                counts_emitter_hits_ && light >= 0 && o.scattering.lambertian) {
                 const double by_light = lit_.lights[light].pdf[next.at.face];
-                met_[k * n_ + i] = {light, {next.at.face, u, v, by_light + paths_at(k) * by_area(rays_, r, next, d)}};
+                emitter_hits_[k * n_ + i] = {light,
+                                             {next.at.face, u, v, by_light + paths_at(k) * by_area(rays_, r, next, d)}};
             }
             if (!scatters(next) || !(measure > 0) || !(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
-            pdf_[at] = rays_.pdf[r] * rays_.survival[r] * measure;
+            pdf_[at] = rays_.pdf[r] * rays_.russian_roulette_probability[r] * measure;
             length_[i] = k + 2;
             double f[most_lit_channels];
             scatter(o.scattering, o.v, o.n, l, C_, f);
-            const double weight = dot(o.n, l) / (rays_.pdf[r] * rays_.survival[r]);
+            const double weight = dot(o.n, l) / (rays_.pdf[r] * rays_.russian_roulette_probability[r]);
             for (int c = 0; c < C_; ++c) throughput_[i * C_ + c] *= std::fabs(f[c]) * weight;
         }
     }
 
     // Returns the number of paths whose directions share a point's light samples after k steps.
-    int paths_at(int k) const { return k == 0 ? each_ : 1; }
+    int paths_at(int k) const { return k == 0 ? paths_of_point_ : 1; }
 
     // -- MIS of sampled lights and emitters that paths hit ----------------------------------------------------------
 
@@ -256,9 +261,9 @@ class Paths {
         return pdf * std::fabs(dot(normal, d)) / (squared * std::sqrt(squared));
     }
     static double by_area(const Rays& rays, size_t r, const Surface<double>& light, Vec3 d) {
-        return by_area(rays.pdf[r] * rays.survival[r], light.frame.g, d);
+        return by_area(rays.pdf[r] * rays.russian_roulette_probability[r], light.frame.g, d);
     }
-    void meet_sky(size_t r, int k) {
+    void add_environment_hit(size_t r, int k) {
         const int64_t i = rays_.index[r];
         const Surface<double>& o = surfaces_[k * n_ + i];
         if (!o.scattering.lambertian) return;
@@ -267,8 +272,8 @@ class Paths {
         LightPoint p = point_towards(lit_.tables, light, {l[0], l[1], l[2]});
         if (light.is_image) p = above(lit_.tables, light, p, o.g);
         else p.pdf = k == 0 && by_paths_ >= 0 ? 0 : rays_.pdf[r];  // draw_even_sky() also samples by the cosine.
-        p.pdf += paths_at(k) * rays_.pdf[r] * rays_.survival[r];
-        met_[k * n_ + i] = {sky_, p};
+        p.pdf += paths_at(k) * rays_.pdf[r] * rays_.russian_roulette_probability[r];
+        emitter_hits_[k * n_ + i] = {sky_, p};
     }
     // Adds the BSDF's pdf to the pdfs of light samples that a point of a path sees (balance heuristic).
     void apply_mis(int64_t at, double paths) {
@@ -298,26 +303,27 @@ class Paths {
         const int64_t first = k * n_;
         for (int64_t i = 0; i < n_; ++i)
             seed_[first + i] =
-                PathRandomNumbers::of_lights(k == 0 ? uint64_t(from.seed[i / each_]) : seed_of(from, i), k);
+                PathRandomNumbers::of_lights(k == 0 ? uint64_t(from.seed[i / paths_of_point_]) : seed_of(from, i), k);
         LitOptions options = options_;
         if (k == 0) options.by_paths = by_paths_;
         const LitPoints here{n_, &face_[first], &b_[3 * first], &seed_[first], {}, nullptr};
-        const auto came = [&](int64_t i) { return length_[i] == k + 1 && (k > 0 || i % each_ == 0); };
+        const auto reached = [&](int64_t i) { return length_[i] == k + 1 && (k > 0 || i % paths_of_point_ == 0); };
         query_lights(lit_, scene, caster, here, options, lights_,
-                     {&surfaces_[first], drawn_.data() + first * K(), seen_.data() + first * K()}, shadow_rays_, came);
+                     {&surfaces_[first], drawn_.data() + first * K(), seen_.data() + first * K()}, shadow_rays_,
+                     reached);
         for (int64_t i = 0; i < n_; ++i)
-            if (came(i) && surfaces_[first + i].scattering.lambertian) look_up_material(lit_, surfaces_[first + i]);
+            if (reached(i) && surfaces_[first + i].scattering.lambertian) look_up_material(lit_, surfaces_[first + i]);
     }
 
     const LitScene& lit_;
     LitOptions options_;
     const int C_;
-    double eps_ = 0;             // It is the relative spacing of positions.
-    std::vector<int> light_of_;  // Maps meshes to their lights, −1: none.
-    int sky_ = -1;               // Escaping rays hit this environment.
-    bool meets_ = false;         // Says whether emitters that paths hit count.
-    int each_ = 1;               // This many paths start at one point.
-    int by_paths_ = -1;          // These paths sample this light well enough alone.
+    double eps_ = 0;                    // It is the relative spacing of positions.
+    std::vector<int> light_of_;         // Maps meshes to their lights, −1: none.
+    int sky_ = -1;                      // Escaping rays hit this environment.
+    bool counts_emitter_hits_ = false;  // Says whether emitters that paths hit count.
+    int paths_of_point_ = 1;            // This many paths start at one point.
+    int by_paths_ = -1;                 // These paths sample this light well enough alone.
     std::vector<LightSample> lights_;
     int64_t n_ = 0;  // It counts paths.
     // Rows hold the points of all paths after no step, one step, …, and the light samples of each.
@@ -326,7 +332,7 @@ class Paths {
     std::vector<int64_t> face_, seed_;
     std::vector<LightPoint> drawn_;
     std::vector<int8_t> seen_;
-    std::vector<EmitterHit> met_;
+    std::vector<EmitterHit> emitter_hits_;
     // For each path: the number of its points, and the throughput from its end to its beginning.
     std::vector<int> length_;
     std::vector<double> throughput_;

@@ -66,7 +66,8 @@ void add_drawn(const LitScene& lit, const std::vector<LightSample>& lights, cons
 }
 template <class S>
 void add_met(const LitScene& lit, const Path& path, int k, const Surface<S>& o, S* total) {
-    if (path.has_met(k)) add_light(lit, lit.lights[path.met_at(k).light], path.met_at(k).point, 1.0, o, total);
+    if (path.has_emitter_hit(k))
+        add_light(lit, lit.lights[path.emitter_hit_at(k).light], path.emitter_hit_at(k).point, 1.0, o, total);
 }
 template <class S>
 void add_direct(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,

@@ -7,6 +7,7 @@
 #include <cstdint>
 
 #include "shading/lit/tables.h"
+#include "texture/pyramid_level.h"
 #include "texture/texture.h"
 
 namespace edgegrad {
@@ -76,35 +77,12 @@ Uv<S> interpolated_uv(const std::vector<Table>& tables, const Source& source, co
 }
 inline Footprint footprint(const Source& source, Vec2 uv) { return footprint(source.grid(), uv); }
 
-// Returns a fraction between texels. Its derivative is the coordinate's derivative times the number of texels.
-inline double fraction(double value, double, double) { return value; }
-inline Dual fraction(double value, Dual coordinate, double texels) { return {value, texels * coordinate.dot}; }
-
-template <class S, class Visit>
-void each_texel(const Footprint& f, S a, S b, Visit visit) {
-    visit(f.texel[0], (S(1) - a) * (S(1) - b)), visit(f.texel[1], a * (S(1) - b));
-    visit(f.texel[2], (S(1) - a) * b), visit(f.texel[3], a * b);
-}
-template <class S, class Visit>
-void each_texel(const TexelGrid& grid, Uv<S> uv, Visit visit) {
-    const Footprint f = footprint(grid, {plain(uv.u), plain(uv.v)});
-    const bool moves = grid.sampler.filter == TextureFilter::linear;
-    const S a = fraction(f.a, uv.u, moves ? double(grid.width) : 0),
-            b = fraction(f.b, uv.v, moves ? -double(grid.height) : 0);
-    each_texel(f, a, b, visit);
-}
-
 // Selects the level of a pyramid (Williams 1983): log2 of the distance between neighbouring pixels in texels. The
-// larger distance of both directions counts; two levels are interpolated. edgegrad/points/footprints.py does the same.
+// larger distance of both directions counts. edgegrad/points/footprints.py does the same.
 template <class S>
-struct Level {
-    int fine = 0;
-    S share = 0;             // It is the weight of the coarser level.
-    int axis = -1;           // It is the direction with the larger distance.
+struct Level : PyramidLevel<S> {
+    int axis = 0;            // It is the direction with the larger distance.
     S across = 0, down = 0;  // They are that distance in texels.
-
-    // Returns whether it lies between two levels. Otherwise it is the finest or the coarsest one, without a derivative.
-    bool is_between() const { return axis >= 0; }
 };
 template <class S>
 Level<S> level_of(const std::vector<Table>& tables, const Source& source, const FacePoint<S>& at) {
@@ -121,14 +99,7 @@ Level<S> level_of(const std::vector<Table>& tables, const Source& source, const 
     const int axis = plain(squared[1]) > plain(squared[0]) || std::isnan(plain(squared[1])) ? 1 : 0;
     Level<S> o;
     if (!(plain(squared[axis]) > 1)) return o;
-    const S level = S(0.5) * log2(squared[axis]);
-    if (!(plain(level) < source.levels - 1)) {
-        o.fine = source.levels - 1;
-        return o;
-    }
-    o.fine = int(plain(level)), o.share = level - S(double(o.fine));
-    o.axis = axis, o.across = across[axis], o.down = down[axis];
-    return o;
+    return {{S(0.5) * log2(squared[axis]), source.levels}, axis, across[axis], down[axis]};
 }
 // Adds the cotangents of `share`.
 inline void level_vjp(const std::vector<Table>& tables, const Source& source, const FacePoint<double>& at,
@@ -163,13 +134,10 @@ void each_row(const std::vector<Table>& tables, const Source& source, const Face
             return;
         case Source::Kind::texture: {
             const Uv<S> uv = interpolated_uv(tables, source, at);
-            if (!source.is_filtered(at)) return each_texel(source.grid(), uv, visit);
-            const Level<S> level = level_of(tables, source, at);
-            each_texel(source.grid(level.fine), uv,
-                       [&](int64_t row, S weight) { visit(row, (S(1) - level.share) * weight); });
-            if (level.is_between())
-                each_texel(source.grid(level.fine + 1), uv,
-                           [&](int64_t row, S weight) { visit(row, level.share * weight); });
+            if (!source.is_filtered(at)) return each_texel(source.grid(), uv.u, uv.v, visit);
+            level_of(tables, source, at).each([&](int level, S share) {
+                each_texel(source.grid(level), uv.u, uv.v, [&](int64_t row, S weight) { visit(row, share * weight); });
+            });
         }
     }
 }
@@ -228,15 +196,15 @@ inline void value_vjp(const std::vector<Table>& tables, const Source& source, co
     const auto look_up_vjp = [&](const TexelGrid& grid, double share) {
         const Footprint f = footprint(grid, {uv.u, uv.v});
         k = 0;
-        each_texel<double>(f, f.a, f.b, [&](int64_t row, double weight) { add(row, share * weight); });
-        u_bar += share * (grid.width * ((1 - f.b) * (s[1] - s[0]) + f.b * (s[3] - s[2])));
-        v_bar += share * (-double(grid.height) * ((1 - f.a) * (s[2] - s[0]) + f.a * (s[3] - s[1])));
-        return (1 - f.b) * ((1 - f.a) * s[0] + f.a * s[1]) + f.b * ((1 - f.a) * s[2] + f.a * s[3]);
+        for (int i = 0; i < 4; ++i) add(f.texel[i], share * f.weight(i));
+        const Vec2 slopes = f.slopes(s);
+        u_bar += share * (grid.width * slopes.x), v_bar += share * (-double(grid.height) * slopes.y);
+        return f.interpolate(s);
     };
     if (source.is_filtered(at)) {
         const Level<double> level = level_of(tables, source, at);
         const double fine = look_up_vjp(source.grid(level.fine), 1 - level.share);
-        if (level.is_between()) {
+        if (level.is_between) {
             const double coarse = look_up_vjp(source.grid(level.fine + 1), level.share);
             level_vjp(tables, source, at, level, coarse - fine, at_bar, to);
         }

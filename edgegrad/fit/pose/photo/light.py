@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ....scene.spherical_harmonics import UNSCALED, harmonics, harmonics_jvp
 from ...region import smoothed
 from ..gauss_newton import NormalEquations
 from .picture import Picture
@@ -122,7 +123,7 @@ class FittedLight:
         inside, D = surface.inside, len(surface.motion)
         (x, y), n = surface.flow().unbind(-1), surface.normals[inside]
         turned = surface.motion.of_directions(n.double()).float()
-        slopes_of_light = harmonic_slopes(n, turned)[..., : self.coefficients.shape[1]]
+        slopes_of_light = _x_first(harmonics_jvp(n, turned))[..., : self.coefficients.shape[1]]
         colour = surface.channels["image"].float()[inside].T
         curvature, gradient = torch.zeros(D, D), torch.zeros(D)
         for c, light in enumerate(self.coefficients):
@@ -140,15 +141,13 @@ class FittedLight:
 
 def harmonics_of(n: Tensor) -> Tensor:
     """Return the harmonics (…, 9) of directions (…, 3), up to factors."""
-    x, y, z = n.unbind(-1)
-    return torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y], -1)
+    return _x_first(harmonics(n, UNSCALED))
 
 
-def harmonic_slopes(n: Tensor, tangents: Tensor) -> Tensor:
-    """Return the derivatives (D, …, 9) of harmonics_of(n) along tangents (D, …, 3)."""
-    (x, y, z), (a, b, c) = n.unbind(-1), tangents.unbind(-1)
-    parts = [a * 0.0, a, b, c, a * y + x * b, b * z + y * c, 6.0 * z * c, a * z + x * c, 2.0 * (x * a - y * b)]
-    return torch.stack(parts, -1)
+def _x_first(terms: list[Tensor]) -> Tensor:
+    """Stack harmonics with those of the first degree in the order x, y, z."""
+    one, y, z, x, *second = terms
+    return torch.stack([one, x, y, z, *second], -1)
 
 
 def _weighted_median(values: Tensor, weights: Tensor) -> float:
