@@ -284,7 +284,7 @@ def _moving_alpha_edges(scene: Scene, request: Request) -> bool:
 
 def _most_bounce_samples(request: Request) -> int:
     each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
-    return each if each >= 0 else core.most_secondary_edge_samples(*size, request.image.spp)
+    return each if each >= 0 else core.default_secondary_samples(*size, request.image.spp)
 
 
 def _has_alpha(scene: Scene) -> bool:
@@ -292,7 +292,7 @@ def _has_alpha(scene: Scene) -> bool:
 
 
 def _most_shadow_samples(request: Request) -> int:
-    return core.most_shadow_samples(request.camera.width, request.camera.height, request.image.spp)
+    return core.default_secondary_samples(request.camera.width, request.camera.height, request.image.spp)
 
 
 def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str, Term]:

@@ -1,19 +1,16 @@
 // This file declares the gradient of a loss of the image, and the recorders of its samples.
 #pragma once
 
-#include <cstdint>
+#include <functional>
+#include <type_traits>
 #include <vector>
 
 #include "accumulate/gradients.h"
 #include "accumulate/records.h"
 #include "estimator/gradient_input.h"
-#include "scene/light_parts.h"
+#include "estimator/view.h"
 
 namespace edgegrad {
-
-struct LitPaths;  // secondary/secondary_edges.h
-struct SecondaryEdgeSamples;
-struct MovingEdges;
 
 // Adds the gradient to the arrays of `grad`.
 template <class T>
@@ -34,32 +31,12 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions optio
 template <class T>
 RecordList record_samples(const BackwardInput<T>& input, GradientOptions options, ThreadTeam& team);
 
-// Returns samples on shadow boundaries. `casters` is the scene as light meets it. `samples` = −1 is the default.
+// Returns the samples that record(view, sink) adds, such as those on shadow boundaries (secondary/shadows.h): for each
+// sub-camera, or for any one, unless the camera must see the samples.
 template <class T>
-std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                         const GradientOptions& options, const LightParts& light, int64_t samples,
-                                         ThreadTeam& team);
-// Returns `samples` samples on indirect shadow boundaries (secondary/indirect_shadows.h).
+using RecordBody = std::function<void(const BackwardView<T>&, GradientSink&)>;
 template <class T>
-std::vector<CurveRecords> record_indirect_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                                  const GradientOptions& options, const LightParts& light,
-                                                  int64_t samples, ThreadTeam& team);
-
-// Returns the samples on secondary edges (secondary/secondary_edges.h).
-template <class T>
-std::vector<CurveRecords> record_secondary_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                                 const GradientOptions& options, const LitPaths& paths, int64_t samples,
-                                                 ThreadTeam& team, SecondaryEdgeSamples& out);
-// Returns the samples on curves at which the light that surfaces send jumps (secondary/surface_edges.h).
-template <class T>
-std::vector<CurveRecords> record_surface_edges(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                               const GradientOptions& options, const LitPaths& paths,
-                                               MovingEdges moving, int64_t samples, ThreadTeam& team,
-                                               SecondaryEdgeSamples& out);
-
-// Adds the adjoint of q = T (R p + t), with the rotation T of a sub-camera: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ
-// q̄, for q_bar (V, 3).
-void add_world(const Camera& sub_camera, const double* verts, const Array<double>& q_bar, ThreadTeam& team,
-               const Gradients& grad);
+std::vector<CurveRecords> record_curves(const BackwardInput<T>& input, const GradientOptions& options, bool seen,
+                                        ThreadTeam& team, const std::type_identity_t<RecordBody<T>>& record);
 
 }  // namespace edgegrad

@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "accumulate/scatter.h"
-#include "backward/backward.h"
+#include "accumulate/world.h"
 #include "camera/vertices.h"
 #include "shading/shade.h"
 

@@ -31,9 +31,8 @@ struct BackwardProfile {
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // number of curves in view
     double lens_boundary = 0;                                 // px of the lens boundary in view
     int64_t discontinuity_lines = 0;                          // number of lines that find discontinuities within faces
-    int64_t shadow_samples = 0;
-    double view = 0;                 // time for vertices in camera coordinates
-    double measure = 0, curves = 0;  // time to lay triangles and curves end to end
+    double view = 0;                                          // time for vertices in camera coordinates
+    double measure = 0, curves = 0;                           // time to lay triangles and curves end to end
     double surface[2] = {0, 0}, edge[2] = {0, 0},
            discontinuity[2] = {0, 0};  // time for samples with their rays; time to add the results
     double world = 0;                  // time from camera coordinates to the user's arrays

@@ -15,6 +15,7 @@
 #include "python/shaped.h"
 #include "python/unlocked.h"
 #include "rays/trace.h"
+#include "secondary/indirect_shadows.h"
 #include "secondary/shadows.h"
 #include "texture/pyramid.h"
 
@@ -119,8 +120,10 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
         const BackwardInput<T> input{scene,   camera,      *geometry, image,
                                      nullptr, hits.view(), nullptr,   marked_faces("transparent", arrays, transparent)};
-        found = seen ? record_shadows(input, casting, options, light.view(), samples, team)
-                     : record_indirect_shadows(input, casting, options, light.view(), samples, team);
+        found = record_curves(input, options, seen, team, [&](const BackwardView<T>& view, GradientSink& to) {
+            if (seen) add_shadows(view, casting, light.view(), samples, Record{options.intrinsics}, to);
+            else add_indirect_shadows(view, casting, light.view(), samples, to);
+        });
     });
     return curve_arrays(found, least, one, threads);
 }
@@ -307,7 +310,6 @@ void bind_for_shaders(nb::module_& m) {
               "threads"_a, "weight"_a.noconvert() = nb::none());
     };
     bind_vjp(&splat_vjp<float>), bind_vjp(&splat_vjp<double>);
-    m.def("most_shadow_samples", &most_shadow_samples, "width"_a, "height"_a, "spp"_a);
     m.def("rays_at", &rays_of, "camera"_a, "x"_a.noconvert(), "intrinsics"_a, "threads"_a);
     bind_pyramid<float>(m), bind_pyramid<double>(m);
 }

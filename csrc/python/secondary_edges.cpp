@@ -13,6 +13,7 @@
 #include "python/lit_arrays.h"
 #include "python/shaped.h"
 #include "python/unlocked.h"
+#include "secondary/estimator.h"
 #include "secondary/surface_edges.h"
 
 using namespace nanobind::literals;
@@ -29,7 +30,7 @@ nb::object joined_rows(const std::vector<std::vector<double>>& parts, size_t wid
 
 // Holds the input of both kinds of samples. `casters` are the same faces as light sees them.
 template <class T>
-struct Asked {
+struct EdgeSampleInput {
     const SceneArrays<T>&arrays, &casters;
     const LitArrays& lit;
     const Camera& camera;
@@ -39,23 +40,27 @@ struct Asked {
     double least;
     int threads;
 
-    // Returns records of arrays with their first point alone. Where the camera does not see the points,
-    // SecondaryEdgeSamples adds the jumps (S, channels) and origins (S, 3). It calls record(input, casters, team,
-    // samples).
-    template <class Record>
-    nb::tuple samples(const LitOptions& options, int further, GeometryWanted wanted, Record record) const {
+    // Returns the records that add(view, casters, sink, samples) adds, with their first point alone. `seen` tells
+    // whether the camera must see that point. If not, SecondaryEdgeSamples has the jumps (S, channels) and origins (S,
+    // 3).
+    template <class Add>
+    nb::tuple samples(const LitPaths& paths, const GradientOptions& options, GeometryWanted wanted, Add add) const {
         hits.check(arrays, camera), check_faces(arrays, lit);
         if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
-        if (further < 0 || options.bounces < 2 + further) refuse("bounces: expected at least 2 + further");
+        if (paths.further < 0 || paths.options.bounces < 2 + paths.further)
+            refuse("bounces: expected at least 2 + further");
         const SceneView<T> scene = arrays.view(), casting = casters.view();
         std::vector<CurveRecords> found;
         SecondaryEdgeSamples of_chunks;
         unlocked(threads, [&](ThreadTeam& team) {
             GeometryWork done;
             const auto geometry = arrays.geometry(wanted, team, done);
-            found = record(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view(), nullptr,
-                                            marked_faces("transparent", arrays, transparent)},
-                           casting, team, of_chunks);
+            const BackwardInput<T> input{
+                scene,   camera,      *geometry, image,
+                nullptr, hits.view(), nullptr,   marked_faces("transparent", arrays, transparent)};
+            found = record_curves(input, options, paths.seen, team, [&](const BackwardView<T>& view, GradientSink& to) {
+                add(view, casting, to, of_chunks);
+            });
         });
         return nb::make_tuple(curve_arrays(found, least, true, threads),
                               joined_rows(of_chunks.jump, size_t(lit.scene.channels)),
@@ -69,11 +74,11 @@ nb::tuple secondary_edge_samples(const SceneArrays<T>& arrays, const SceneArrays
                                  const ImageOptions& image, const GradientOptions& options, int64_t samples,
                                  double least, int threads, const HitArrays<T>& hits,
                                  const std::optional<In<uint8_t, 1>>& transparent) {
-    return Asked<T>{arrays, casters, lit, camera, image, hits, transparent, least, threads}.samples(
-        lit_options, further, {.topology = true, .parts = true},
-        [&](const BackwardInput<T>& input, const SceneView<T>& casting, ThreadTeam& team, SecondaryEdgeSamples& out) {
-            return record_secondary_edges(input, casting, options, {lit.scene, lit_options, further, seen}, samples,
-                                          team, out);
+    const LitPaths paths{lit.scene, lit_options, further, seen};
+    return EdgeSampleInput<T>{arrays, casters, lit, camera, image, hits, transparent, least, threads}.samples(
+        paths, options, {.topology = true, .parts = true},
+        [&](const BackwardView<T>& view, const SceneView<T>& casting, GradientSink& to, SecondaryEdgeSamples& out) {
+            add_secondary_edges(view, casting, paths, samples, Record{options.intrinsics}, to, out);
         });
 }
 
@@ -83,11 +88,11 @@ nb::tuple surface_edge_samples(const SceneArrays<T>& arrays, const SceneArrays<T
                                const Camera& camera, const ImageOptions& image, const GradientOptions& options,
                                int64_t samples, double least, int threads, const HitArrays<T>& hits,
                                const std::optional<In<uint8_t, 1>>& transparent) {
-    return Asked<T>{arrays, casters, lit, camera, image, hits, transparent, least, threads}.samples(
-        lit_options, further, {.topology = true, .intersections = true},
-        [&](const BackwardInput<T>& input, const SceneView<T>& casting, ThreadTeam& team, SecondaryEdgeSamples& out) {
-            return record_surface_edges(input, casting, options, {lit.scene, lit_options, further, false},
-                                        {crossings, alpha_edges}, samples, team, out);
+    const LitPaths paths{lit.scene, lit_options, further, false};
+    return EdgeSampleInput<T>{arrays, casters, lit, camera, image, hits, transparent, least, threads}.samples(
+        paths, options, {.topology = true, .intersections = true},
+        [&](const BackwardView<T>& view, const SceneView<T>& casting, GradientSink& to, SecondaryEdgeSamples& out) {
+            add_surface_edges(view, casting, paths, {crossings, alpha_edges}, samples, to, out);
         });
 }
 
@@ -106,7 +111,10 @@ template void bind_scene_secondary_edges(nb::class_<SceneArrays<float>>&);
 template void bind_scene_secondary_edges(nb::class_<SceneArrays<double>>&);
 
 void bind_secondary_edges(nb::module_& m) {
-    m.def("most_secondary_edge_samples", &most_secondary_edge_samples, "width"_a, "height"_a, "spp"_a);
+    m.def(
+        "default_secondary_samples",
+        [](int64_t width, int64_t height, int spp) { return default_secondary_samples(width, height, spp); }, "width"_a,
+        "height"_a, "spp"_a);
 }
 
 }  // namespace edgegrad

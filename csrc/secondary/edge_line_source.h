@@ -53,7 +53,7 @@ class EdgeLineSource {
     using Curve = EdgeLine;
 
     struct Sample : CurveSample {
-        EdgeLine line;
+        EdgeLine curve;
         int32_t own;  // the receiver, which the primary ray ignores
         CurveFaces faces;
         Vec3 N, m;             // ∂F/∂y₂ / (1 − λ), and ∂F/∂v_i / β_i of the receiver
@@ -81,7 +81,7 @@ class EdgeLineSource {
         // A face that the viewer sees from behind is dark on both sides of the edge.
         if (!(line.facing * dot(m, camera.to_viewer(y)) > 0)) return false;
 
-        sample.line = line, sample.own = line.receiver;
+        sample.curve = line, sample.own = line.receiver;
         sample.point = y, sample.behind = {};
         const Vec3 w = camera.R * line.w;
         const auto at = [&](int32_t i) { return q[i]; };
@@ -104,7 +104,7 @@ class EdgeLineSource {
 
     // Returns the receiver and the reflector. The reflector's radiance is not wanted.
     SampleSurfaces surfaces(const Sample& sample) const {
-        const EdgeLine& line = sample.line;
+        const EdgeLine& line = sample.curve;
         return {{{line.receiver, line.at, sample.point.z}, {line.reflector, line.asked, sample.point.z}}};
     }
 
@@ -117,7 +117,7 @@ class EdgeLineSource {
 
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
         if (!direction.moves()) return {};
-        const EdgeLine& line = sample.line;
+        const EdgeLine& line = sample.curve;
         const auto moved = [&](int32_t face, Barycentrics b) {
             const int32_t* vertex = view_.scene.faces + 3 * int64_t(face);
             return b[0] * direction.q[vertex[0]] + b[1] * direction.q[vertex[1]] + b[2] * direction.q[vertex[2]];
@@ -132,7 +132,7 @@ class EdgeLineSource {
     }
 
     void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) const {
-        const EdgeLine& line = sample.line;
+        const EdgeLine& line = sample.curve;
         const double F_bar = sample.scale * sample.area_scale * jumps.first;
         const auto add = [&](int32_t vertex, Vec3 bar) { grad.q.add<3>(vertex, &bar.x); };
         for (int i = 0; i < 3; ++i) {

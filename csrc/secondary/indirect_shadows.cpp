@@ -15,8 +15,8 @@
 #include "secondary/indirect_shadows.h"
 
 #include <cmath>
-#include <vector>
 
+#include "secondary/estimator.h"
 #include "secondary/shadow_samples.h"
 #include "secondary/shadow_source.h"
 
@@ -74,38 +74,18 @@ struct BorderOnFace {
 template <class T>
 void add_indirect_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
                           int64_t samples, GradientSink& to) {
-    const ShadowCasters<T> edges(view, casters, light, samples);
-    if (edges.empty() || samples == 0) return;
-    std::vector<ShadowStatistics> of_interval(edges.intervals());
-    const uint64_t pilot_seed = hash(view.options.seed, 15, gradient_stream);
-    edges.draw_pilots(pilot_seed, [&](auto ask) {
-        ShadowChunk chunk(edges.scene(), mix(pilot_seed), [&](const ShadowPoint& point, double weight) {
-            const BorderOnFace<T> on(view.scene, light, point);
-            const double cosine = std::fabs(dot(on.g, on.border.d)) / length(on.border.d);
-            const double value = on.border.swept(weight * on.scale(), point.caster) * cosine *
-                                 light.towards(point.part, point.light, on.y);
-            if (std::isfinite(value)) of_interval[point.segment].squares += value * value;
-        });
-        ask(chunk);
-    });
-    Array<double> density = density_of(of_interval);
-    const int64_t samples_of_place = light.extended ? mirrored : 1,
-                  places = (samples + samples_of_place - 1) / samples_of_place;
-    const Places drawn(edges.scene().pieces, density, places, light.extended,
-                       hash(view.options.seed, 16, gradient_stream), view.team);
-    double seconds[2] = {};
-    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
-        ShadowChunk chunk(edges.scene(), hash(view.options.seed, 14, gradient_stream),
-                          [&](const ShadowPoint& point, double weight) {
-                              BorderOnFace<T>(view.scene, light, point).append_to(grad.records.curves, weight);
-                          });
-        Places place(drawn);
-        for (int64_t i = first; i < last; ++i) {
-            const auto [position, interval, weight] = place(i);
-            chunk.add(i, position, interval, weight, samples_of_place);
-        }
-        chunk.cast();
-    });
+    if (samples == 0) return;
+    ShadowSampler<T> sampler(view, casters, light, {.pilots = 15, .places = 16, .rays = 14}, samples);
+    const auto pilot = [&](const ShadowPoint& point, double weight) {
+        const BorderOnFace<T> on(view.scene, light, point);
+        const double cosine = std::fabs(dot(on.g, on.border.d)) / length(on.border.d);
+        return ShadowPilot{on.border.swept(weight * on.scale(), point.caster) * cosine *
+                           light.towards(point.part, point.light, on.y)};
+    };
+    const auto append_sample = [&](const ShadowPoint& point, double weight, CurveRecords& records) {
+        BorderOnFace<T>(view.scene, light, point).append_to(records, weight);
+    };
+    record_secondary(view, sampler, CurvesOnSurfaces(append_sample, pilot), [&] { return samples; }, to);
 }
 
 template void add_indirect_shadows(const BackwardView<float>&, const SceneView<float>&, const LightParts&, int64_t,

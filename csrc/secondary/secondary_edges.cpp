@@ -8,13 +8,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <memory>
+#include <optional>
 
-#include "boundary/accumulation.h"
-#include "boundary/curve_samples.h"
 #include "core/sampler.h"
-#include "core/systematic.h"
 #include "secondary/edge_line_source.h"
+#include "secondary/estimator.h"
 #include "secondary/line_ends.h"
 #include "secondary/line_pdf.h"
 #include "secondary/traced_edge_lines.h"
@@ -25,116 +23,120 @@ namespace edgegrad {
 
 namespace {
 
-constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 constexpr int64_t fewest_pilots = 1 << 10, most_pilots = 1 << 14, samples_of_pilot = 4, pilots_of_block = 1 << 8;
 
-// LineScene holds what chunks of lines share.
+// EdgeLineSampler draws lines past edges and alpha edges, with a receiver at each end (estimator.h).
 template <class T>
-struct LineScene : LineLight<T> {
-    PooledLines& pooled;
-    Mirrors mirrors;
-    const std::vector<AlphaEdge> alpha_edges;
-    std::vector<double> means = {};  // means of the cells of `pooled`; empty until pilots are cast
+class EdgeLineSampler {
+   public:
+    EdgeLineSampler(const LineLight<T>& light, int64_t n)
+        : light_(light),
+          pilots_(std::clamp(n / samples_of_pilot, fewest_pilots, most_pilots)),
+          pooled_(light.view.geometry.parts()),
+          mirrors_(light.lit.lit, light.is_seen()),
+          alpha_edges_(AlphaEdgeFinder<T>(light.casters).find(seed_of(13), light.view.team)) {}
 
-    LineScene(const LineLight<T>& light, PooledLines& pooled_)
-        : LineLight<T>(light),
-          pooled(pooled_),
-          mirrors(this->lit.lit, this->is_seen()),
-          alpha_edges(AlphaEdgeFinder<T>(this->casters)
-                          .find(hash(this->view.options.seed, 13, gradient_stream), this->view.team)) {}
-    EdgeLines<T> lines() const {
-        return {this->casters, this->view.geometry.topology(), alpha_edges, pooled, means, mirrors};
+    bool is_empty() const { return pieces() == 0; }
+
+    // Fills pooled_ and sets its means.
+    template <class Receiver>
+    void cast_pilots(const Receiver& receiver) {
+        const SystematicPlaces places(measure(), pilots_, to_unit(seed_of(17)), light_.view.team);
+        std::vector<PilotStatistics> found((places.size() + pilots_of_block - 1) / pilots_of_block);
+        const int C = light_.lit.lit.channels;
+        light_.view.team.parallel_for_with_state(
+            int64_t(found.size()), [&] { return path_buffers(light_.lit.lit, light_.at_reflector); },
+            [&](Paths& paths, int64_t block) {
+                light_.view.team.check();
+                PilotStatistics& own = found[block];
+                Ends ends;
+                const int64_t first = block * pilots_of_block, last = std::min(first + pilots_of_block, places.size());
+                receiver.cast_pilots(
+                    [&](auto body) {
+                        trace(places, 18, first, last, body, [&](int64_t cell) { own.lines.push_back(cell); });
+                    },
+                    [&](const EdgeLine& line, double size) {
+                        if (!(size > 0)) return;
+                        own.cell.push_back(line.segment), own.value.push_back(size);
+                        ends.add(0, line.receiver, line.at.u, line.at.v);
+                        ends.add(1, line.reflector, line.asked.u, line.asked.v);
+                    });
+                const std::vector<double> sent = ends.sent(light_, 19, 2 * first, paths);
+                for (size_t i = 0; i < own.value.size(); ++i) {
+                    double most = 0;
+                    for (int c = 0; c < C; ++c) most = std::max(most, std::fabs(sent[i * C + c]));
+                    own.value[i] *= most;
+                }
+            });
+        for (const PilotStatistics& own : found) {
+            for (const int64_t cell : own.lines) pooled_.add_line(cell);
+            for (size_t i = 0; i < own.cell.size(); ++i) pooled_.add(own.cell[i], own.value[i]);
+        }
+        means_ = pooled_.means();
     }
+
+    int64_t lay_out(int64_t n) {
+        places_.emplace(measure(), n, to_unit(seed_of(14)), light_.view.team);
+        return places_->size();
+    }
+
+    // Calls body(line, weight) for both ways along the lines.
+    template <class Body>
+    void trace(int64_t first, int64_t last, Body body) const {
+        trace(*places_, 16, first, last, body, [](int64_t) {});
+    }
+
+   private:
+    struct PilotStatistics {
+        std::vector<int64_t> lines, cell;  // cells of all lines, and of those that contribute
+        std::vector<double> value;
+    };
+
+    uint64_t seed_of(uint64_t stream) const { return hash(light_.view.options.seed, stream, gradient_stream); }
+    const Topology& topology() const { return light_.view.geometry.topology(); }
+    int64_t pieces() const { return topology().n_edges() + int64_t(alpha_edges_.size()); }
+    EdgeLines<T> lines() const { return {light_.casters, topology(), alpha_edges_, pooled_, means_, mirrors_}; }
 
     // Returns the relative number of lines of each edge and alpha edge.
     Array<double> measure() const {
-        const int64_t n = this->view.geometry.topology().n_edges() + int64_t(alpha_edges.size());
-        Array<double> out(n);
-        this->view.team.parallel_for_blocks(n, [&](int64_t, int64_t first, int64_t last) {
+        Array<double> out(pieces());
+        light_.view.team.parallel_for_blocks(pieces(), [&](int64_t, int64_t first, int64_t last) {
             EdgeLines<T> edge = lines();
             for (int64_t k = first; k < last; ++k) out[k] = edge.set(k);
         });
         return out;
     }
-};
 
-// Pilots holds the lines and contributions of pilots.
-struct Pilots {
-    std::vector<int64_t> cell;  // cells of PooledLines
-    std::vector<double> value;
-    Ends ends;
-
-    void add(const EdgeLine& line, double size) {
-        if (!(size > 0)) return;
-        cell.push_back(line.segment), value.push_back(size);
-        ends.add(0, line.receiver, line.at.u, line.at.v), ends.add(1, line.reflector, line.asked.u, line.asked.v);
-    }
-};
-
-// SeenPilots accumulates pilots that the camera sees, by the motion of each edge's image with the edge or the receiver.
-template <class T>
-class SeenPilots {
-   public:
-    SeenPilots(const BackwardView<T>& view, Pilots& found) : view_(view), found_(found) {}
-
-    bool wants(int, Vec2) const { return true; }
-    void add(int, EdgeLineSource<T>&, typename EdgeLineSource<T>::Sample& sample) {
-        const double moved = length(sample.N) + length(sample.m), look = view_.importance.mean(sample.x, sample.x);
-        found_.add(sample.line, sample.weight * sample.scale * sample.area_scale * moved * look);
+    // Calls body(line, weight) for both ways along the lines of places, and drawn(cell) with the cell of PooledLines of
+    // each.
+    template <class Body, class Drawn>
+    void trace(const SystematicPlaces& places, uint64_t stream, int64_t first, int64_t last, Body body,
+               Drawn drawn) const {
+        const uint64_t seed = seed_of(stream);
+        const ShiftedSequence sequence(seed);
+        EdgeLines<T> edge = lines();
+        TracedEdgeLines<T> traced(light_.view, light_.casters, alpha_edges_);
+        int64_t current = -1;
+        places.each(first, last, [&](int64_t i, int64_t piece, double along, double weight) {
+            if (piece != current) edge.set(current = piece);
+            const auto [t, w, area] = edge.at(along, sequence(uint64_t(i)), to_unit(hash(seed, 1, uint64_t(i))));
+            const int64_t cell = edge.cell(w);
+            drawn(cell);
+            if (area == 0) return;
+            traced.add(piece, t, w, cell, weight * area);
+            if (traced.is_full()) traced.cast(body);
+        });
+        traced.cast(body);
     }
 
-   private:
-    const BackwardView<T>& view_;
-    Pilots& found_;
+    const LineLight<T>& light_;
+    const int64_t pilots_;
+    PooledLines pooled_;
+    const Mirrors mirrors_;
+    const std::vector<AlphaEdge> alpha_edges_;
+    std::vector<double> means_;  // means of the cells of pooled_; empty until pilots are cast
+    std::optional<SystematicPlaces> places_;
 };
-
-// LineChunk calls body(line, weight) for both ways along the lines of a chunk.
-template <class T, class Body>
-class LineChunk {
-   public:
-    LineChunk(const LineScene<T>& scene, const Systematic& edges, uint64_t seed, Body body)
-        : edges_(edges),
-          seed_(seed),
-          sequence_(seed),
-          body_(body),
-          edge_lines_(scene.lines()),
-          lines_(scene.view, scene.casters, scene.alpha_edges) {}
-
-    // Adds the i-th line, at an ascending position along the edges. Returns the cell in which it is pooled.
-    int64_t add(int64_t i, double position) {
-        const int64_t k = edge_ < 0 ? edges_.primitive(position) : edges_.primitive(position, edge_);
-        if (k != edge_) edge_ = k, edge_lines_.set(k);
-        const double along = std::clamp((position - edges_.begin_of(k)) / edges_.measure_of(k), 0.0, 1.0);
-        const auto [t, w, area] = edge_lines_.at(along, sequence_(uint64_t(i)), to_unit(hash(seed_, 1, uint64_t(i))));
-        const int64_t cell = edge_lines_.cell(w);
-        if (area == 0) return cell;
-        lines_.add(k, t, w, cell, edges_.weight(k) * area);
-        if (lines_.is_full()) cast();
-        return cell;
-    }
-    void cast() { lines_.cast(body_); }
-
-   private:
-    const Systematic& edges_;
-    const uint64_t seed_;
-    const ShiftedSequence sequence_;
-    const Body body_;
-    int64_t edge_ = -1;
-    EdgeLines<T> edge_lines_;
-    TracedEdgeLines<T> lines_;
-};
-
-// Calls lines(body). Its body passes on to the accumulation the lines with an end in view of the camera.
-template <class T, class Accumulation, class Lines>
-void each_seen(const BackwardView<T>& view, double near, Accumulation& accumulation, LocalGradients& grad,
-               Lines lines) {
-    EdgeLineSource<T> source(view, near);
-    CurveSamples samples(view, source, accumulation);
-    lines([&](const EdgeLine& line, double weight) {
-        if (is_in_view(view, source.place_of(line))) samples.add(line, 0, weight);
-    });
-    samples.finish(grad);
-}
 
 template <class T>
 auto places_of(const BackwardView<T>& view) {
@@ -170,91 +172,34 @@ void append_indirect(const BackwardView<T>& view, const EdgeLine& line, double w
     if (occluder.is_alpha_edge()) occluder.append_alpha_edge(occluder.turned(line.w, places_of(view)), sample, records);
 }
 
-// Fills scene.pooled from n pilots and sets its means.
-template <class T>
-void cast_pilots(LineScene<T>& scene, int64_t n) {
-    const BackwardView<T>& view = scene.view;
-    Array<double> measure = scene.measure();
-    Systematic edges(measure, view.team);
-    if (!(edges.total() > 0)) return;
-    edges.draw(n, to_unit(hash(view.options.seed, 17, gradient_stream)));
-    struct PilotStatistics {
-        std::vector<int64_t> lines, cell;  // cells of all lines, and of those that contribute
-        std::vector<double> value;
-    };
-    std::vector<PilotStatistics> found((n + pilots_of_block - 1) / pilots_of_block);
-    const int C = scene.lit.lit.channels;
-    view.team.parallel_for_with_state(
-        int64_t(found.size()), [&] { return path_buffers(scene.lit.lit, scene.at_reflector); },
-        [&](Paths& paths, int64_t block) {
-            view.team.check();
-            Pilots pilots;
-            PilotStatistics& own = found[block];
-            const int64_t first = block * pilots_of_block, last = std::min(first + pilots_of_block, n);
-            const auto lines = [&](auto body) {
-                LineChunk chunk(scene, edges, hash(view.options.seed, 18, gradient_stream), body);
-                for (int64_t i = first; i < last; ++i) own.lines.push_back(chunk.add(i, edges.position(i)));
-                chunk.cast();
-            };
-            if (scene.is_seen()) {
-                LocalGradients unused;
-                SeenPilots seen(view, pilots);
-                each_seen(view, scene.lit.options.near, seen, unused, lines);
-            } else {
-                lines([&](const EdgeLine& line, double weight) {
-                    pilots.add(line, weight * length(normal_of(view, line)));
-                });
-            }
-            const std::vector<double> sent = pilots.ends.sent(scene, 19, 2 * first, paths);
-            own.cell = std::move(pilots.cell), own.value = std::move(pilots.value);
-            for (size_t i = 0; i < own.value.size(); ++i) {
-                double most = 0;
-                for (int c = 0; c < C; ++c) most = std::max(most, std::fabs(sent[i * C + c]));
-                own.value[i] *= most;
-            }
-        });
-    for (const PilotStatistics& own : found) {
-        for (const int64_t cell : own.lines) scene.pooled.add_line(cell);
-        for (size_t i = 0; i < own.cell.size(); ++i) scene.pooled.add(own.cell[i], own.value[i]);
-    }
-    scene.means = scene.pooled.means();
-}
-
 }  // namespace
-
-int64_t most_secondary_edge_samples(int64_t width, int64_t height, int spp) {
-    return std::clamp(width * height * spp / 8, fewest_samples, most_samples);
-}
 
 template <class T>
 void add_secondary_edges(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& lit, int64_t samples,
                          const Record& record, GradientSink& to, SecondaryEdgeSamples& out) {
-    const int64_t n =
-        samples >= 0 ? samples : most_secondary_edge_samples(view.camera.width, view.camera.height, view.image.spp);
+    const int64_t n = samples >= 0 ? samples : default_secondary_samples(view);
     if (n == 0) return;
-    PooledLines pooled(view.geometry.parts());
-    LineScene<T> scene({view, casters, lit}, pooled);
-    cast_pilots(scene, std::clamp(n / samples_of_pilot, fewest_pilots, most_pilots));
-    Array<double> measure = scene.measure();
-    Systematic edges(measure, view.team);
-    if (!(edges.total() > 0)) return;
-    edges.draw(n, to_unit(hash(view.options.seed, 14, gradient_stream)));
-    double seconds[2] = {};
+    const LineLight<T> light(view, casters, lit);
+    EdgeLineSampler<T> sampler(light, n);
     const size_t before = to.records->curves.size();
-    view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
-        const auto lines = [&](auto body) {
-            LineChunk chunk(scene, edges, hash(view.options.seed, 16, gradient_stream), body);
-            for (int64_t i = first; i < last; ++i) chunk.add(i, edges.position(i));
-            chunk.cast();
+    const auto estimate = [&](const auto& receiver) {
+        record_secondary(view, sampler, receiver, [&] { return n; }, to);
+    };
+    if (lit.seen) {
+        // Pilots count by the motion of each edge's image with the edge or the receiver.
+        const auto pilot = [&](const auto&, const auto& sample) {
+            const double moved = length(sample.N) + length(sample.m), look = view.importance.mean(sample.x, sample.x);
+            return sample.weight * sample.scale * sample.area_scale * moved * look;
         };
-        if (scene.is_seen()) {
-            each_seen(view, lit.options.near, *accumulate_curves(view, record, grad), grad, lines);
-        } else {
-            lines(
-                [&](const EdgeLine& line, double weight) { append_indirect(view, line, weight, grad.records.curves); });
-        }
-    });
-    light_reflectors(scene, to.records->curves, before, 15, out);
+        estimate(CurvesInView(view, EdgeLineSource<T>(view, lit.options.near), record, pilot));
+    } else {
+        estimate(CurvesOnSurfaces(
+            [&](const EdgeLine& line, double weight, CurveRecords& records) {
+                append_indirect(view, line, weight, records);
+            },
+            [&](const EdgeLine& line, double weight) { return weight * length(normal_of(view, line)); }));
+    }
+    light_reflectors(light, to.records->curves, before, 15, out);
 }
 
 template void add_secondary_edges(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, int64_t,

@@ -8,9 +8,6 @@
 
 namespace edgegrad {
 
-// Returns the default number of samples for an image of this size and samples per pixel.
-int64_t most_secondary_edge_samples(int64_t width, int64_t height, int spp);
-
 // LitPaths holds what scatters light, and how often. After a line's end, light is scattered up to `further` more times.
 // `seen` tells whether the camera must see that end.
 struct LitPaths {

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <vector>
 
 #include "core/sampler.h"
@@ -22,7 +23,6 @@ constexpr double own_share = 0.3;        // fraction of the mean square that com
 constexpr double uniform_share = 0.1;    // fraction of the density that is independent of pilots
 constexpr int64_t pair_tests = 1 << 22;  // number of tested pairs of edges and light parts
 constexpr int64_t fewest_intervals = 1 << 10, most_intervals = 1 << 15, samples_of_interval = 16;
-constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 
 // Cuts edges with much of the measure, because samples run along the light's wedges, at drawn places of the edge.
 inline std::vector<ShadowPiece> cut(const std::vector<ShadowPiece>& pieces, double intervals) {
@@ -38,10 +38,10 @@ inline std::vector<ShadowPiece> cut(const std::vector<ShadowPiece>& pieces, doub
     return out;
 }
 
-// Pieces maps positions in [0, 1) to pieces laid end to end by their measure.
-class Pieces {
+// ShadowPieces maps positions in [0, 1) to pieces laid end to end by their measure.
+class ShadowPieces {
    public:
-    Pieces(std::vector<ShadowPiece> pieces, ThreadTeam& team)
+    ShadowPieces(std::vector<ShadowPiece> pieces, ThreadTeam& team)
         : pieces_(std::move(pieces)), measure_(int64_t(pieces_.size())), systematic_(fill(), team) {}
 
     bool empty() const { return !(systematic_.total() > 0); }
@@ -77,20 +77,32 @@ class Pieces {
     Systematic systematic_;
 };
 
-// ShadowStatistics holds sums over the pilots of an interval.
-struct ShadowStatistics {
-    double squares = 0;  // (swept area · light)²
+// ShadowPilot is what a pilot finds.
+struct ShadowPilot {
+    double swept_light;  // swept area · light
     double length = 0;   // px
 };
 
-// Places draws n places from a density that is constant in equal intervals of the pieces' positions. Places are equally
-// spaced, except in a piece whose expected number is at least one. There they are spread evenly from end to end, each
-// jittered in its stratum. Otherwise rounding the number of places per piece would cause most of the variance between
-// vertices. The estimate is unbiased given any number of places.
-class Places {
+// ShadowStatistics holds sums over the pilots of an interval.
+struct ShadowStatistics {
+    double squares = 0;  // of ShadowPilot::swept_light
+    double length = 0;   // px
+
+    void add(ShadowPilot pilot) {
+        if (!std::isfinite(pilot.swept_light)) return;
+        squares += pilot.swept_light * pilot.swept_light, length += pilot.length;
+    }
+};
+
+// ShadowPlaces draws n places from a density that is constant in equal intervals of the pieces' positions. Places are
+// equally spaced, except in a piece whose expected number is at least one. There they are spread evenly from end to
+// end, each jittered in its stratum. Otherwise rounding the number of places per piece would cause most of the variance
+// between vertices. The estimate is unbiased given any number of places.
+class ShadowPlaces {
    public:
     // `density` has one number per interval and becomes its running sum. `whole` gives pieces whole numbers of places.
-    Places(const Pieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed, ThreadTeam& team)
+    ShadowPlaces(const ShadowPieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed,
+                 ThreadTeam& team)
         : pieces_(pieces), intervals_(density.size()), whole_(whole), seed_(seed), systematic_(density, team) {
         systematic_.draw(n, to_unit(seed));
         spacing_ = systematic_.total() / double(n);
@@ -137,7 +149,7 @@ class Places {
     int64_t number_from(double sum) const { return int64_t(std::ceil((sum - systematic_.position(0)) / spacing_)); }
     double weight_of(int64_t interval) const { return systematic_.weight(interval) / double(intervals_); }
 
-    const Pieces& pieces_;
+    const ShadowPieces& pieces_;
     const int64_t intervals_;
     const bool whole_;
     const uint64_t seed_;
@@ -154,7 +166,7 @@ struct ShadowScene {
     const LightParts& light;
     const FacesBeforeLight<T>& faces;
     const std::vector<AlphaEdge>& alpha_edges;
-    const Pieces& pieces;
+    const ShadowPieces& pieces;
 };
 
 // ShadowChunk traces light rays past edges, and calls body(ShadowPoint, weight) for each shadow boundary behind.
@@ -197,53 +209,6 @@ class ShadowChunk {
     Body body_;
 };
 
-// ShadowCasters holds the edges and alpha edges that cast shadows of a light.
-template <class T>
-class ShadowCasters {
-   public:
-    // `expected` is the approximate number of samples.
-    ShadowCasters(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t expected)
-        : intervals_(std::clamp(expected / samples_of_interval, fewest_intervals, most_intervals)),
-          faces_(view.scene, light, view.team),
-          alpha_edges_(AlphaEdgeFinder<T>(casters).find(hash(view.options.seed, 13, gradient_stream), view.team)),
-          pieces_(find(view, casters, light), view.team),
-          scene_{view, casters, light, faces_, alpha_edges_, pieces_} {}
-
-    bool empty() const { return pieces_.empty(); }
-    const ShadowScene<T>& scene() const { return scene_; }
-    int64_t intervals() const { return intervals_; }
-
-    // Draws pilots in each interval. Calls body(ask) per block, which must call ask(chunk) with a ShadowChunk.
-    template <class Body>
-    void draw_pilots(uint64_t seed, Body body) const {
-        scene_.view.team.parallel_for((intervals_ + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
-            const int64_t first = block * intervals_of_block, last = std::min(first + intervals_of_block, intervals_);
-            body([&](auto& chunk) {
-                for (int64_t i = first; i < last; ++i) {
-                    const double shift = to_unit(hash(seed, i));
-                    for (int k = 0; k < pilots; ++k)
-                        chunk.add(i * pilots + k, (double(i) + (k + shift) / pilots) / double(intervals_), i, 1, 1);
-                }
-                chunk.cast();
-            });
-        });
-    }
-
-   private:
-    std::vector<ShadowPiece> find(const BackwardView<T>& view, const SceneView<T>& casters,
-                                  const LightParts& light) const {
-        std::vector<ShadowPiece> found =
-            ShadowEdgeFinder<T>(view, casters, light, faces_, alpha_edges_).find(pair_tests);
-        return light.extended ? cut(found, double(intervals_)) : found;
-    }
-
-    const int64_t intervals_;
-    const FacesBeforeLight<T> faces_;
-    const std::vector<AlphaEdge> alpha_edges_;
-    const Pieces pieces_;
-    const ShadowScene<T> scene_;
-};
-
 // Returns the density of samples in each interval. Neighbouring pilots may have found what an interval's own missed, so
 // most of the mean square is theirs.
 inline Array<double> density_of(const std::vector<ShadowStatistics>& of_interval) {
@@ -260,5 +225,95 @@ inline Array<double> density_of(const std::vector<ShadowStatistics>& of_interval
     for (int64_t i = 0; i < count; ++i) measure[i] += uniform_share * (known > 0 ? known : 1);
     return measure;
 }
+
+// ShadowSampler draws points of a light's shadow boundaries (estimator.h).
+template <class T>
+class ShadowSampler {
+   public:
+    // Streams are numbers of independent random sequences.
+    struct Streams {
+        uint64_t pilots, places, rays;
+    };
+    // `expected` is the approximate number of samples.
+    ShadowSampler(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, Streams streams,
+                  int64_t expected)
+        : streams_(streams),
+          intervals_(std::clamp(expected / samples_of_interval, fewest_intervals, most_intervals)),
+          faces_(view.scene, light, view.team),
+          alpha_edges_(AlphaEdgeFinder<T>(casters).find(hash(view.options.seed, 13, gradient_stream), view.team)),
+          pieces_(find(view, casters, light), view.team),
+          scene_{view, casters, light, faces_, alpha_edges_, pieces_},
+          of_interval_(intervals_) {}
+
+    bool is_empty() const { return pieces_.empty(); }
+
+    // Returns the length of the boundary that pilots found, px, averaged over the light.
+    double length() const {
+        double sum = 0;
+        for (const ShadowStatistics& found : of_interval_) sum += found.length / double(pilots * intervals_);
+        return sum;
+    }
+
+    // Casts pilots in each interval.
+    template <class Receiver>
+    void cast_pilots(const Receiver& receiver) {
+        const uint64_t seed = seed_of(streams_.pilots);
+        scene_.view.team.parallel_for((intervals_ + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
+            const int64_t first = block * intervals_of_block, last = std::min(first + intervals_of_block, intervals_);
+            const auto trace = [&](auto body) {
+                ShadowChunk chunk(scene_, mix(seed), body);
+                for (int64_t i = first; i < last; ++i) {
+                    const double shift = to_unit(hash(seed, i));
+                    for (int k = 0; k < pilots; ++k)
+                        chunk.add(i * pilots + k, (double(i) + (k + shift) / pilots) / double(intervals_), i, 1, 1);
+                }
+                chunk.cast();
+            };
+            receiver.cast_pilots(
+                trace, [&](const ShadowPoint& point, ShadowPilot pilot) { of_interval_[point.segment].add(pilot); });
+        });
+    }
+
+    // Returns the number of places for n samples.
+    int64_t lay_out(int64_t n) {
+        const bool extended = scene_.light.extended;
+        samples_of_place_ = extended ? mirrored : 1;
+        const int64_t places = (n + samples_of_place_ - 1) / samples_of_place_;
+        density_ = density_of(of_interval_);
+        places_.emplace(pieces_, density_, places, extended, seed_of(streams_.places), scene_.view.team);
+        return places;
+    }
+
+    template <class Body>
+    void trace(int64_t first, int64_t last, Body body) const {
+        ShadowChunk chunk(scene_, seed_of(streams_.rays), body);
+        ShadowPlaces place(*places_);
+        for (int64_t i = first; i < last; ++i) {
+            const auto [position, interval, weight] = place(i);
+            chunk.add(i, position, interval, weight, samples_of_place_);
+        }
+        chunk.cast();
+    }
+
+   private:
+    uint64_t seed_of(uint64_t stream) const { return hash(scene_.view.options.seed, stream, gradient_stream); }
+    std::vector<ShadowPiece> find(const BackwardView<T>& view, const SceneView<T>& casters,
+                                  const LightParts& light) const {
+        std::vector<ShadowPiece> found =
+            ShadowEdgeFinder<T>(view, casters, light, faces_, alpha_edges_).find(pair_tests);
+        return light.extended ? cut(found, double(intervals_)) : found;
+    }
+
+    const Streams streams_;
+    const int64_t intervals_;
+    const FacesBeforeLight<T> faces_;
+    const std::vector<AlphaEdge> alpha_edges_;
+    const ShadowPieces pieces_;
+    const ShadowScene<T> scene_;
+    std::vector<ShadowStatistics> of_interval_;
+    int64_t samples_of_place_ = 1;
+    Array<double> density_{0};
+    std::optional<ShadowPlaces> places_;
+};
 
 }  // namespace edgegrad

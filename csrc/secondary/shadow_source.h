@@ -73,7 +73,7 @@ class ShadowSource {
     using Curve = ShadowPoint;
 
     struct Sample : CurveSample {
-        ShadowPoint shadow;
+        ShadowPoint curve;
         int32_t receiver;  // face that the primary ray ignores
         CurveFaces faces;
         ShadowBorder border;
@@ -106,7 +106,7 @@ class ShadowSource {
         // A face that is lit from behind is dark on both sides of the boundary.
         if (!(dot(m, d) * dot(m, camera.view_direction(y)) > 0)) return false;
 
-        sample.shadow = curve, sample.receiver = curve.face;
+        sample.curve = curve, sample.receiver = curve.face;
         sample.point = y, sample.behind = {};
         sample.border = border, sample.m = (camera.along_ray(N, sample.n) / camera.along_ray(m, sample.n)) * m;
         const Vec3 slope = camera.unit_at_depth(y.z) * (N - sample.m);
@@ -133,7 +133,7 @@ class ShadowSource {
 
     // Returns the receiver twice: lit, and in shadow.
     SampleSurfaces surfaces(const Sample& sample) const {
-        const SurfacePoint there{sample.receiver, sample.shadow.on, sample.point.z};
+        const SurfacePoint there{sample.receiver, sample.curve.on, sample.point.z};
         return {{there, there}};
     }
 
@@ -150,8 +150,8 @@ class ShadowSource {
         if (!direction.moves()) return {};
         const int32_t* vertex = view_.scene.faces + 3 * int64_t(sample.receiver);
         Vec3 receiver;
-        for (int i = 0; i < 3; ++i) receiver += sample.shadow.on[i] * direction.q[vertex[i]];
-        const Occluder& edge = sample.shadow.caster;
+        for (int i = 0; i < 3; ++i) receiver += sample.curve.on[i] * direction.q[vertex[i]];
+        const Occluder& edge = sample.curve.caster;
         const Vec3 caster = edge.sum(sample.border.by_caster, [&](int32_t i) { return direction.q[i]; });
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
         double F_dot =
@@ -164,16 +164,16 @@ class ShadowSource {
         const double F_bar = sample.scale * sample.area_scale * jumps.first;
         const int32_t* vertex = view_.scene.faces + 3 * int64_t(sample.receiver);
         for (int i = 0; i < 3; ++i) {
-            const Vec3 bar = (F_bar * sample.shadow.on[i]) * sample.m;
+            const Vec3 bar = (F_bar * sample.curve.on[i]) * sample.m;
             grad.q.add<3>(vertex[i], &bar.x);
         }
-        const Occluder& caster = sample.shadow.caster;
+        const Occluder& caster = sample.curve.caster;
         for (int i = 0; i < caster.count; ++i) {
             const Vec3 bar = (-F_bar * sample.border.by_caster[i]) * sample.border.N;
             grad.q.add<3>(caster.vertex[i], &bar.x);
         }
         caster.alpha_edge_vjp(F_bar * sample.border.by_alpha_edge, grad);
-        grad.light = {sample.shadow.part, sample.shadow.uv, (-F_bar * sample.border.by_light) * sample.border.N};
+        grad.light = {sample.curve.part, sample.curve.uv, (-F_bar * sample.border.by_light) * sample.border.N};
         normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
     }
 

@@ -6,13 +6,10 @@
 
 namespace edgegrad {
 
-// Returns the default maximum number of samples for an image of this size and samples per pixel.
-int64_t most_shadow_samples(int64_t width, int64_t height, int spp);
-
 // Records `samples` samples on a light's shadow boundaries; −1 selects a default number per pixel of boundary.
 // `casters` is the scene as light meets it, which may lack faces that the camera sees.
 template <class T>
 void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t samples,
-                 const Record& record, GradientSink& to, BackwardProfile& profile);
+                 const Record& record, GradientSink& to);
 
 }  // namespace edgegrad

@@ -19,11 +19,12 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <vector>
 
-#include "core/systematic.h"
 #include "rays/trace.h"
 #include "scene/intersections.h"
+#include "secondary/estimator.h"
 #include "secondary/line_ends.h"
 #include "secondary/occluder.h"
 #include "shading/lit/bsdf_sampling.h"
@@ -82,11 +83,12 @@ class BorderPieces {
             alpha_edges_ = AlphaEdgeFinder<T>(casters).find(hash(seed, 13, gradient_stream), view.team);
     }
 
+    int64_t size() const { return int64_t(crossings_->size() + alpha_edges_.size()); }
+
     // Returns the relative number of samples of each piece.
     Array<double> measure() const {
-        const auto n = int64_t(crossings_->size() + alpha_edges_.size());
-        Array<double> out(n);
-        for (int64_t k = 0; k < n; ++k) {
+        Array<double> out(size());
+        for (int64_t k = 0; k < size(); ++k) {
             const auto [a, b, stands_for] = piece(k);
             out[k] = stands_for * length(b - a);
         }
@@ -192,6 +194,24 @@ class BorderPieces {
     std::vector<AlphaEdge> alpha_edges_;
 };
 
+// A LitPoint is a point that a ray from a part of a face meets.
+struct LitPoint {
+    const Place& place;
+    const Part& part;
+    Barycentrics from;
+    int32_t face;
+    Barycentrics at;
+
+    void append_to(CurveRecords& records, double weight) const {
+        const int64_t sample = records.size();
+        append(records.x, {0.0, 0.0});
+        append(records.face, {face, part.face, -2});
+        append(records.b, {at.u, at.v, from.u, from.v, 0.0, 0.0});
+        append(records.factor, {M_PI * weight * part.factor, 0.0, 0.0});  // the cosine over its pdf
+        place.append_motion(part, sample, records);
+    }
+};
+
 // LeavingRays traces rays from both sides of all parts of faces next to a place, to the points that they light.
 template <class T>
 class LeavingRays {
@@ -200,7 +220,9 @@ class LeavingRays {
         for (const Light& light : light.lit.lit.lights) eps_ = std::max(eps_, light.eps);
     }
 
-    void add(int64_t piece, double t, Vec2 u, double weight, CurveRecords& records) {
+    // Calls body(LitPoint, weight) for those of the place t of a piece.
+    template <class Body>
+    void trace(int64_t piece, double t, Vec2 u, double weight, Body body) {
         if (!pieces_.set(piece, t, place_)) return;
         part_.clear(), face_.clear(), b_.clear(), directions_.clear(), contact_.clear();
         for (const Part& part : place_.parts) {
@@ -221,20 +243,14 @@ class LeavingRays {
         depart(light_.casters, light_.view.geometry.caster(),
                {face_.data(), b_.data(), directions_.data(), contact_.data(), n}, hit_.data(), hit_b_.data());
         for (int64_t i = 0; i < n; ++i)
-            if (hit_[i] >= 0) append_to(records, i, weight);
+            if (hit_[i] >= 0)
+                body(
+                    LitPoint{
+                        place_, *part_[i], {b_[2 * i], b_[2 * i + 1]}, hit_[i], {hit_b_[2 * i], hit_b_[2 * i + 1]}},
+                    weight);
     }
 
    private:
-    void append_to(CurveRecords& records, int64_t i, double weight) const {
-        const Part& part = *part_[i];
-        const int64_t sample = records.size();
-        append(records.x, {0.0, 0.0});
-        append(records.face, {hit_[i], face_[i], -2});
-        append(records.b, {hit_b_[2 * i], hit_b_[2 * i + 1], b_[2 * i], b_[2 * i + 1], 0.0, 0.0});
-        append(records.factor, {M_PI * weight * part.factor, 0.0, 0.0});  // the cosine over its pdf
-        place_.append_motion(part, sample, records);
-    }
-
     const LineLight<T>& light_;
     const BorderPieces<T>& pieces_;
     double eps_ = 0;
@@ -244,34 +260,52 @@ class LeavingRays {
     std::vector<double> b_, directions_, contact_, hit_b_;
 };
 
+// SurfaceEdgeSampler draws points that the parts of faces next to these curves light (estimator.h). It needs no pilots.
+template <class T>
+class SurfaceEdgeSampler {
+   public:
+    SurfaceEdgeSampler(const LineLight<T>& light, MovingEdges moving)
+        : light_(light), pieces_(light.view, light.casters, moving) {}
+
+    bool is_empty() const { return pieces_.size() == 0; }
+    template <class Receiver>
+    void cast_pilots(const Receiver&) {}
+    int64_t lay_out(int64_t n) {
+        places_.emplace(pieces_.measure(), std::max(n / places_of_samples, fewest_places), to_unit(seed_of(21)),
+                        light_.view.team);
+        return places_->size();
+    }
+
+    template <class Body>
+    void trace(int64_t first, int64_t last, Body body) const {
+        const ShiftedSequence sequence(seed_of(22));
+        LeavingRays rays(light_, pieces_);
+        places_->each(first, last, [&](int64_t i, int64_t piece, double t, double weight) {
+            rays.trace(piece, t, sequence(uint64_t(i)), weight, body);
+        });
+    }
+
+   private:
+    uint64_t seed_of(uint64_t stream) const { return hash(light_.view.options.seed, stream, gradient_stream); }
+
+    const LineLight<T>& light_;
+    const BorderPieces<T> pieces_;
+    std::optional<SystematicPlaces> places_;
+};
+
 }  // namespace
 
 template <class T>
 void add_surface_edges(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& lit,
                        MovingEdges moving, int64_t samples, GradientSink& to, SecondaryEdgeSamples& out) {
-    const int64_t all =
-        samples >= 0 ? samples : most_secondary_edge_samples(view.camera.width, view.camera.height, view.image.spp);
-    if (all == 0) return;
-    const int64_t places = std::max(all / places_of_samples, fewest_places);
+    const int64_t n = samples >= 0 ? samples : default_secondary_samples(view);
+    if (n == 0) return;
     const LineLight<T> light(view, casters, lit);
-    const BorderPieces<T> pieces(view, casters, moving);
-    Array<double> measure = pieces.measure();
-    Systematic drawn(measure, view.team);
-    if (!(drawn.total() > 0)) return;
-    drawn.draw(places, to_unit(hash(view.options.seed, 21, gradient_stream)));
-    double seconds[2] = {};
+    SurfaceEdgeSampler<T> sampler(light, moving);
+    const CurvesOnSurfaces receiver(
+        [](const LitPoint& point, double weight, CurveRecords& records) { point.append_to(records, weight); });
     const size_t before = to.records->curves.size();
-    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
-        const ShiftedSequence sequence(hash(view.options.seed, 22, gradient_stream));
-        LeavingRays rays(light, pieces);
-        int64_t k = -1;
-        for (int64_t i = first; i < last; ++i) {
-            const double position = drawn.position(i);
-            k = k < 0 ? drawn.primitive(position) : drawn.primitive(position, k);
-            const double t = std::clamp((position - drawn.begin_of(k)) / drawn.measure_of(k), 0.0, 1.0);
-            rays.add(k, t, sequence(uint64_t(i)), drawn.weight(k), grad.records.curves);
-        }
-    });
+    record_secondary(view, sampler, receiver, [&] { return n; }, to);
     light_reflectors(light, to.records->curves, before, 23, out);
 }
 

@@ -33,7 +33,7 @@ def indirect_shadows(frame: Frame, bounces: int, watch: Watch) -> list[Term]:
     request, surfaces, sampler = frame.request, frame.surfaces, frame.sampler
     count = request.gradient.edge_samples
     if count < 0:
-        count = core.most_shadow_samples(frame.width, frame.height, request.image.spp)
+        count = core.default_secondary_samples(frame.width, frame.height, request.image.spp)
     flat = surfaces.casters
     # As the camera moves these borders stay.
     moving = moves(surfaces.verts) or (bool(len(flat.alpha_masks)) and moves(flat.alphas, flat.uvs))
