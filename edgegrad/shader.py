@@ -31,7 +31,8 @@ from .points.blend import Blended, let_through, transparent
 from .points.borders import Borders
 from .points.frame import Frame
 from .points.hits import Hits
-from .points.records import PixelRecords, shaded_memory, without_colors
+from .points.records import PixelRecords, without_colors
+from .points.sampler import shaded_memory
 from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
 from .points.splat import Term, boundary
@@ -53,12 +54,12 @@ CREASES = ("auto", True, False)
 
 
 def shaded_points(spp: int) -> int:
-    """Of a face in a pixel with so many samples."""
+    """Return how many points of a face are shaded in a pixel with so many samples."""
     return max(1, spp // SAMPLES_A_POINT)
 
 
 class Effort(NamedTuple):
-    """What shading an image takes, and what the renderer may rely on."""
+    """Properties of a way of shading: how many points it takes, and what the renderer may rely on."""
 
     points: int = 1  # of a face in a pixel that are shaded
     blended: bool = False  # whether one may see through surfaces
@@ -263,7 +264,7 @@ class _Image:
 
     @cached_property
     def _background(self) -> Tensor | None:
-        """The same, of as many channels as the shader gives."""
+        """Return the background, of as many channels as the shader gives."""
         background = self._behind_all
         if background is not None and background.shape[-1] != self._channels:
             raise ValueError(
@@ -274,7 +275,7 @@ class _Image:
     # -- what its derivatives are those of ----------------------------------------------------------------------------
 
     def _interior(self, samples: SurfaceSamples) -> list[Term]:
-        """Σ k(x − c) L px² over samples inside faces."""
+        """Return the terms Σ k(x − c) L px² over samples inside faces."""
         terms: list[Term] = []
         at_once = self._effort.at_once
         # Once at least, so that an image with nothing in view has a graph too, of zeros.
@@ -298,7 +299,7 @@ class _Image:
         return terms
 
     def _shadows(self) -> list[Term]:
-        """The same over samples on the borders of the shadows that the shader asked for."""
+        """Return the terms of samples on the boundaries of the shadows that the shader asked for."""
         frame = self._frame
         terms: list[Term] = []
         count, flat = frame.request.gradient.edge_samples, frame.surfaces.casters
@@ -308,7 +309,7 @@ class _Image:
             _warn_of_lights(frame)
         for index in sorted(frame.surfaces.shadowing):
             seed = derived_seed(frame.sampler.grad_seed, index + 2)
-            light = ShadowLight.of(frame.surfaces, index, seed)
+            light = ShadowLight.from_surfaces(frame.surfaces, index, seed)
             if moving or ShadowLight.moves(light.light):
                 one = self._effort.additive
                 casters = frame.fixed.casters if frame.surfaces.scene.blends else None
@@ -403,7 +404,7 @@ class _Image:
 
 
 def _warn_of_lights(frame: Frame) -> None:
-    """Of which alpha cuts out some, not all or nothing."""
+    """Warn of emissive meshes of which alpha cuts out some faces or parts, not all or nothing."""
     lights = (light.mesh for light in frame.surfaces.scene.casting if isinstance(light, MeshLight))
     for mesh in lights:
         if mesh.alpha is None or mesh.uvs is None or not moves(mesh.alpha, mesh.uvs) or not values_visible(mesh.alpha):

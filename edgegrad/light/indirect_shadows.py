@@ -29,19 +29,19 @@ AT_ONCE = 1 << 17  # samples whose light is followed together
 
 
 def indirect_shadows(frame: Frame, bounces: int, watch: Watch) -> list[Term]:
-    """What samples on these borders give to the image, by light that is scattered `bounces` times at most."""
+    """Return the terms of samples on these boundaries, by light that is scattered `bounces` times at most."""
     request, surfaces, sampler = frame.request, frame.surfaces, frame.sampler
     count = request.gradient.edge_samples
     if count < 0:
         count = core.most_shadow_samples(frame.width, frame.height, request.image.spp)
     flat = surfaces.casters
-    # As the camera moves these borders stay.
+    # As the camera moves these boundaries stay.
     moving = moves(surfaces.verts) or (bool(len(flat.alpha_masks)) and moves(flat.alphas, flat.uvs))
     terms: list[Term] = []
     for index, casting in enumerate(surfaces.scene.casting):
         if moving or ShadowLight.moves(casting):
             seed = derived_seed(sampler.grad_seed, index + 2)
-            light = ShadowLight.of(surfaces, index, seed)
+            light = ShadowLight.from_surfaces(surfaces, index, seed)
             records = sampler.shadow_samples(light.parts, seed, count, False, one=True, seen=False)
             watch.count("indirect_shadow_samples", len(records.x))
             terms += _of_light(frame, light, records, bounces)

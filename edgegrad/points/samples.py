@@ -29,7 +29,8 @@ from ..scene.scene import Scene, as_scene
 from .frame import Frame
 from .hits import Hits
 from .moving import Form, velocity
-from .records import CurveRecords, SurfaceRecords, shaded_memory, without_colors
+from .records import CurveRecords, SurfaceRecords, without_colors
+from .sampler import shaded_memory
 from .shadow_rays import Forced
 from .shadows import ShadowLight
 from .splat import Term, boundary, splat
@@ -39,7 +40,7 @@ ALL_AT_ONCE = 1 << 40
 
 
 class PrimaryHits:
-    """What the rays of an image hit: all samples of a pixel on one face are one hit, at one of them drawn at random.
+    """Hits of the rays of an image. All samples of a pixel on one face are one hit, at one of them drawn at random.
 
     hits      Hits, N points, differentiable functions of vertices and camera at fixed places in the image
     index     (N,) int64, the pixel of each, row by row
@@ -107,7 +108,7 @@ class SurfaceSamples:
         return self.frame.composed(splat(self._records.x, weighted, self.frame.request), None)
 
     def _term(self, radiance: Tensor) -> Term:
-        """The same, for attached()."""
+        """Return the radiance of the samples as a term of attached()."""
         return Term(self._records.x, radiance, self._records.weight)
 
 
@@ -192,8 +193,8 @@ def primary_hits(
     filter: str = "box",
     grad_seed: int | None = None,
 ) -> PrimaryHits:
-    """What the rays of an image hit: render()'s samples, for a pipeline of your own. The arguments are render()'s, with one
-    camera. Raises what render() raises."""
+    """Return the hits of the rays of an image: render()'s samples, for a pipeline of your own. The arguments are render()'s,
+    with one camera. Raises what render() raises."""
     request = make_request(scene, camera, spp, seed, filter=filter, grad_seed=grad_seed)
     if camera.batch is not None:
         raise ValueError(f"camera: expected one camera, got a batch of {camera.batch}; take camera[i] one by one")
@@ -201,7 +202,7 @@ def primary_hits(
 
 
 def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSamples:
-    """Samples for the gradient inside faces, fewer than those of the image: by default half a sample a pixel of surface.
+    """Return samples for the gradient inside faces, fewer than those of the image: by default half a sample a pixel of surface.
 
     primary   of primary_hits()
     count     of samples; see surface_samples of render()
