@@ -1,6 +1,6 @@
-"""How light from nearby, scattered on its way to what is seen, changes as that slides on its face.
+"""The near-field term: how light that nearby surfaces scatter changes as the shading point moves on its face.
 
-At a fixed place x of the image, vertices and camera move the barycentrics b of what is seen: it slides by δξ = (∂b/∂x)⁻¹ δb, px.
+At a fixed place x of the image, vertices and camera move the barycentrics b of the shading point by δξ = (∂b/∂x)⁻¹ δb, px.
 With the further points of its path held on their faces, the derivative of light by δξ grows as one over the distance to them, and
 near corners of a room its variance is infinite. But along an axis of the image the mean of a derivative is a difference,
 
@@ -37,7 +37,7 @@ LEAST_WIDTH = 2.0**-10  # px, below which a difference is rounding
 
 
 def radius(frame: Frame) -> float:
-    """How near light is compared at two places, world units: some pixels where most of what is seen lies; 0: nothing is seen."""
+    """Return the radius of the near field in world units: some pixels where most of what is seen lies. 0: nothing is seen."""
     height, width = frame.height, frame.width
     y, x = (((torch.arange(PLACES) + 0.5) / PLACES * size).double() for size in (height, width))
     places = torch.cartesian_prod(x, y)
@@ -57,7 +57,7 @@ def radius(frame: Frame) -> float:
 
 
 class NearField(NamedTuple):
-    """Light from nearby that comes to hits inside faces."""
+    """Light from within the radius that comes to hits inside faces."""
 
     frame: Frame
     hits: Hits

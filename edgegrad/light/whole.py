@@ -54,7 +54,7 @@ def lit_image(
 
 
 def _dtype(scene: Scene) -> torch.dtype:
-    """Of the image."""
+    """Return the dtype of the image."""
     if not scene.is_lit:
         return image_dtype(scene)
     return torch.float64 if any(mesh.verts.dtype == torch.float64 for mesh in scene.meshes) else torch.float32

@@ -365,7 +365,7 @@ class Hits:
 
         by   None: drawn in proportion to what the light emits. eg.lights.points_by_material: as render() draws them, by what the
              material of the point's mesh makes of them where nothing lies between; on glossy ones the density is then that of
-             the choice among some candidates, infinite where none gives anything
+             the choice among some candidates, infinite where none gives anything. For hits of trace() it is as None
 
         A mean of any function of the point over the density is right with either, but points_by_material draws nothing of what
         the material scatters not at all. There are no derivatives by where points are drawn. Raises TypeError or ValueError.

@@ -22,7 +22,7 @@ class Pyramid(NamedTuple):
     width: Tensor  # (L,) int64
 
     @classmethod
-    def of(cls, texture: Tensor) -> Pyramid:
+    def from_texture(cls, texture: Tensor) -> Pyramid:
         sizes = [texture.shape[:2]]
         while max(sizes[-1]) > 1:
             sizes.append(torch.Size(max(1, n // 2) for n in sizes[-1]))

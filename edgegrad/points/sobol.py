@@ -21,15 +21,8 @@ def sobol(seed: Tensor, key: int, part: int = 0, parts: int = 1) -> Tensor:
     return torch.stack([_unit(_scrambled(i, random)), _unit(_scrambled(_pascal(i), _mixed(random)))], 1)
 
 
-def sobol_parts(seed: Tensor, key: int, parts: int) -> Tensor:
-    """(N · parts, 2): all parts of each."""
-    every = torch.arange(parts, device=seed.device)
-    own = (seed[:, None] * parts + every & _32) | (seed[:, None] >> 32 << 32)
-    return sobol(own.reshape(-1), key)
-
-
 def key_of(light: int, kind: int) -> int:
-    """Of the light with this number: of what the light draws (0), of what lobes draw (1), of the choice (2)."""
+    """Return the key of the numbers of a light: for what the light draws (0), what BSDF lobes draw (1), and the choice (2)."""
     return signed(mixed_bits(light * 0x10001 + kind))
 
 
