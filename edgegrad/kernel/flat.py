@@ -72,7 +72,7 @@ def _vertex_spacing(scene: Scene) -> list[float]:
 
 
 def image_dtype(scene: Scene) -> torch.dtype:
-    """That of the colours, or, if there are none, of the vertices; float32 or float64."""
+    """Return the dtype of the colours, or of the vertices if there are none: float32 or float64."""
     floats = [t for m in scene.meshes for t in (m.colors, m.face_colors, m.corner_colors, m.texture) if t is not None]
     floats += [scene.background] if scene.background is not None else []
     floats = floats or [scene.meshes[0].verts]

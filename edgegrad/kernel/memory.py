@@ -90,7 +90,7 @@ def room(what: str, needs: Mapping[str, int], lower: Callable[[], str]) -> Itera
 
 
 def size(count: int) -> str:
-    """Of bytes, with two or three digits, in powers of 1000; "" for none."""
+    """Return a number of bytes as text, with two or three digits, in powers of 1000; "" for none."""
     if count == 0:
         return ""
     for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):

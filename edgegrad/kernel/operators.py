@@ -24,7 +24,7 @@ Profile = dict[str, float]
 
 
 class Hits(NamedTuple):
-    """What the image pass hit, for the backward pass; for B cameras."""
+    """Hits of the image pass of B cameras, for the backward pass."""
 
     coverage: Tensor  # (B, H, W): the filtered share of a pixel where something is hit
     depth: Tensor  # (B, H, W) float32: nothing that samples hit lies farther away; infinite if one hit nothing
@@ -238,7 +238,7 @@ def faces_with_textures(lit: Scene | None) -> np.ndarray | None:
 
 
 def camera_seed(seed: int, camera: int) -> int:
-    """Cameras of a batch get samples of their own."""
+    """Return the seed of a camera of a batch: each has samples of its own."""
     return seed if camera == 0 else derived_seed(seed, camera + 1)
 
 
@@ -246,14 +246,14 @@ def camera_seed(seed: int, camera: int) -> int:
 
 
 def _sides(camera: PackedCamera) -> int:
-    """Of how many pinholes the widest of the cameras is made."""
+    """Return the largest number of pinholes that one of the cameras is made of."""
     if camera.lens not in ("fisheye", "panorama"):
         return 1
     return max(kernel_camera(camera, b).sides for b in range(len(camera.K)))
 
 
 def pass_size(request: Request) -> Any:
-    """What the kernel's needs depend on, of tensors with values."""
+    """Return the sizes of tensors with values on which the memory of the kernel depends."""
     flat, camera, auxiliary = request.scene, request.camera, request.auxiliary
     by_vertex = flat.corners is flat.faces or flat.corners.data_ptr() == flat.faces.data_ptr()
     jumps = not by_vertex or auxiliary.barycentrics or auxiliary.face_attributes.shape[-1] > 0
@@ -384,7 +384,7 @@ def _faces_at_centers_fake(*args: Any) -> Tensor:
 
 
 def _arguments(args: Sequence[Any]) -> tuple[Tensor, Hits, Request, list[bool]]:
-    """Those of edgegrad::render_backward."""
+    """Return the arguments of edgegrad::render_backward: adjoint, hits, request, and which gradients are wanted."""
     adjoint, coverage, depth, hit, seen, *packed, wanted = args
     return adjoint, Hits(coverage, depth, hit, seen), Request.unpack(packed), wanted
 
@@ -422,5 +422,5 @@ def _render_jvp_fake(*args: Any) -> Tensor:
 
 
 def _nothing(adjoint: Tensor) -> Tensor:
-    """What an operator returns for a gradient that is not wanted."""
+    """Return an empty tensor: the gradient of an operator that is not wanted."""
     return adjoint.new_empty(0, dtype=torch.float32)

@@ -1,5 +1,5 @@
-"""What a render is asked, as records of tensors and numbers. Operators of torch take flat arguments of a few types: each
-record is packed into them and unpacked again here, by the names of its fields, and nobody else counts positions.
+"""Requests for a render: records of tensors and numbers. Operators of torch take flat arguments of a few types. Here alone
+records are packed into them and unpacked again, by the names of their fields.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ STEPPING = (*MOVING, "uvs", "alphas")  # slots that move what is cut out, and th
 
 
 def label(slot: str) -> str:
-    """What the user calls it."""
+    """Return the user's name of a slot."""
     return _LABELS.get(slot, slot)
 
 

@@ -1,4 +1,4 @@
-"""What samples on the steps that a shader declares give to the image:
+"""Terms of samples on the discontinuities that a shader declares:
 
     δI = Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight
 
@@ -28,7 +28,7 @@ MARGIN = {"box": 0.0, "tent": 0.5, "gaussian": 1.0}
 
 
 class StepTerms(NamedTuple):
-    """The steps of one image, and who declares them."""
+    """The discontinuities of one image, and who declares them."""
 
     frame: Frame
     kinds: list[str]

@@ -47,7 +47,7 @@ class Surfaces:
         self.has_derivatives = True
 
     def detach(self) -> Surfaces:
-        """The same without derivatives; both share their notes."""
+        """Return the surfaces without derivatives. Both share their notes."""
         other = Surfaces.__new__(Surfaces)
         other.__dict__.update(self.__dict__)
         for name in ("bare", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
@@ -71,7 +71,7 @@ class Surfaces:
 
     @cached_property
     def casters(self) -> Flat:
-        """The same for shadow rays: surfaces that blend are cut out where their alpha is below ½."""
+        """Return the surfaces that shadow rays meet: alpha-blended faces count where their alpha is at least ½."""
         return bare(self.scene, blended=False) if self.scene.blends else self.bare
 
     @cached_property
@@ -199,7 +199,7 @@ class View:
         return barycentrics(bare.verts, bare.faces, face, self.world_to_camera, along, self.perspective)
 
     def barycentrics_by(self, surfaces: Surfaces, face: Tensor, along: Tensor, by: Tensor) -> tuple[Tensor, Tensor]:
-        """The same, and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K)."""
+        """Return barycentrics() and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K)."""
         bare = surfaces.bare
         return barycentrics_by(bare.verts, bare.faces, face, self.world_to_camera, along, by, self.perspective)
 
