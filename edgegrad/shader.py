@@ -74,7 +74,7 @@ class Effort(NamedTuple):
 
     @property
     def at_once(self) -> int:
-        """Points of the image that are shaded together."""
+        """Return points of the image that are shaded together."""
         return 2 * AT_ONCE if self.keeps_little else AT_ONCE
 
 
@@ -123,7 +123,8 @@ def render_shaded(
     effort: Effort | None = None,
     watch: Watch = Watch(),  # noqa: B008  it keeps nothing
 ) -> Tensor:
-    """The image (H, W, C), or (B, H, W, C) for a batch of cameras; see Effort and Radiance. `watch` is told what it takes."""
+    """Return the image (H, W, C), or (B, H, W, C) for a batch of cameras; see Effort and Radiance. `watch` is told what it
+    takes."""
     if not callable(shader):
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
@@ -139,8 +140,8 @@ def render_shaded(
 
 
 def _where_bright(image: Tensor) -> Tensor | None:
-    """(H, W), above zero: how bright the pixels of an image (H, W, C) are over the mean, how much that changes from one to the
-    next, for there highlights move, and a little the same for all; None if all are black."""
+    """Return (H, W), above zero: how bright the pixels of an image (H, W, C) are over the mean, how much that changes from one
+    to the next, for there highlights move, and a little the same for all; None if all are black."""
     size = image.detach().double().abs().mean(2)
     mean = size.mean()
     if not mean > 0:
@@ -224,7 +225,7 @@ class _Image:
     # -- the image -----------------------------------------------------------------------------------------------------
 
     def _values(self) -> Tensor:
-        """The image, without a graph of its surfaces."""
+        """Return the image, without a graph of its surfaces."""
         frame = self._frame
         with torch.no_grad():
             image = self._radiance.image(frame)
@@ -234,7 +235,7 @@ class _Image:
         return frame.composed(image, self._background)
 
     def _point_by_point(self) -> Tensor:
-        """(H · W, C) what surfaces add to the image."""
+        """Return (H · W, C) what surfaces add to the image."""
         frame = self._frame
         points = self._effort.points
         borders = Borders((frame.height, frame.width), points)
@@ -255,7 +256,7 @@ class _Image:
         return torch.where(frame.here(again).reshape(-1, 1), torch.cat(parts), image)
 
     def _shaded(self, found: PixelRecords, pixels: range, seeds: Tensor) -> tuple[Tensor, Hits]:
-        """(pixels, C) what hits add to the image, and the hits."""
+        """Return (pixels, C) what hits add to the image, and the hits."""
         frame = self._frame
         hits = frame.fixed_hits(found.face, found.b, found.x, seeds)
         radiance = self._shade(hits).detach()
@@ -340,7 +341,7 @@ class _Image:
         return max(self._frame.request.gradient.step_spacing / self._effort.closer, LEAST_SPACING)
 
     def _with_creases(self) -> Request:
-        """The request for samples on curves, with colours that jump where the shader may."""
+        """Return the request for samples on curves, with colours that jump where the shader may."""
         frame = self._frame
         with torch.no_grad():
             if self._creases is True:
@@ -353,7 +354,7 @@ class _Image:
     # -- the shader ----------------------------------------------------------------------------------------------------
 
     def _shade(self, hits: Hits) -> Tensor:
-        """(N, C), checked."""
+        """Return (N, C), checked."""
         radiance = self._checked(self._shader(hits), hits)
         if not self._radiance.declares_steps and not hits._only_light:  # for one light less may be looked up
             kinds = list(hits._steps.kinds)

@@ -124,8 +124,8 @@ def backward_kernel(
     dry: bool = False,
     lit: Scene | None = None,
 ) -> tuple[dict[str, Tensor], list[Profile]]:
-    """The gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts samples,
-    as for a scene that is `lit`, whose textures the request does not hold.
+    """Return the gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts
+    samples, as for a scene that is `lit`, whose textures the request does not hold.
 
     `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
@@ -185,7 +185,7 @@ def jvp_kernel(hits: Hits, request: Request, tangents: Mapping[str, Tensor], dir
 
 
 def _channel_weights(request: Request) -> Tensor:
-    """(C,) how much each channel matters for where samples of a derivative of all of them go: as much as any other,
+    """Return how much each channel matters (C,) for where samples of a derivative of all of them go: as much as any other,
     whatever its unit."""
     weights = request.scene.colors.new_ones(request.channels)
     values = request.auxiliary.vertex_attributes.detach()
@@ -196,7 +196,7 @@ def _channel_weights(request: Request) -> Tensor:
 
 
 def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Tensor:
-    """How the loss changes as what is seen in a pixel moves right and down: (B, H, W, 2). Raises MemoryError."""
+    """Return how the loss changes as what is seen in a pixel moves right and down: (B, H, W, 2). Raises MemoryError."""
     with derivatives_memory(request, ["verts"], 1):
         scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
         out = np.zeros((*adjoint.shape[:3], 2))
@@ -232,7 +232,7 @@ def _gradient_options(
 
 
 def faces_with_textures(lit: Scene | None) -> np.ndarray | None:
-    """(F,) uint8, if there are some in a scene that is lit."""
+    """Return which faces have a texture (F,) uint8, or None if none has one or the scene is not lit."""
     textured = None if lit is None else lit.textured_faces
     return None if textured is None else textured.numpy()
 

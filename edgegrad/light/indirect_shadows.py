@@ -61,7 +61,7 @@ def _of_light(frame: Frame, light: ShadowLight, records: CurveRecords, bounces: 
 def _towards_camera(
     frame: Frame, light: ShadowLight, records: CurveRecords, some: slice, bounces: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which samples send light to the camera (M,), to which places of the image (M, 2), and how much (M, C)."""
+    """Return which samples send light to the camera (M,), to which places of the image (M, 2), and how much (M, C)."""
     face, b = frame.here(records.hit_face[some]), frame.here(records.hit_b[some])
     seed = frame.seeds("unseen shadows", len(records.x))[some]
     hits = frame.fixed_hits(face, b, frame.here(records.hit_x[some]), seed)
@@ -80,7 +80,7 @@ def _towards_camera(
 
 
 def _velocity(frame: Frame, light: ShadowLight, records: CurveRecords) -> Tensor:
-    """(S,): zeros with the derivatives of F."""
+    """Return zeros (S,) with the derivatives of F."""
     count, forms = len(records.x), world_velocity(frame, records)
     if light.moves(light.light):
         points, _ = light.points(frame.here(records.light), frame.here(records.light_uv))

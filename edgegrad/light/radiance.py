@@ -74,7 +74,7 @@ class Lighting(NamedTuple):
 
     @property
     def options(self) -> dict[str, Any]:
-        """The arguments of render() that it is made of."""
+        """Return the arguments of render() that it is made of."""
         return dict(zip(LIGHTING, self, strict=True))
 
     def image(
@@ -85,7 +85,7 @@ class Lighting(NamedTuple):
         creases: bool | str = "auto",
         watch: Watch = Watch(),  # noqa: B008  it keeps nothing
     ) -> Tensor:
-        """(H, W, C), or (B, H, W, C) for a batch of cameras, of tensors with values; see lit_image()."""
+        """Return the image (H, W, C), or (B, H, W, C) for a batch of cameras, of tensors with values; see lit_image()."""
         if scene.is_lit and not (scene.lights or scene.casting):
             warn(
                 "no light",
@@ -134,19 +134,21 @@ class Lighting(NamedTuple):
 
     @staticmethod
     def resamples(scene: Scene) -> bool:
-        """Whether points of lights are drawn by how surfaces scatter as well."""
+        """Return whether points of lights are drawn by how surfaces scatter as well."""
         return scene.is_glossy and any(not light.punctual for light in scene.casting)
 
     def in_gradient(self, scene: Scene, light: Light) -> int:
-        """Points of a light for each sample of the gradient inside a glossy face."""
+        """Return how many points of a light are drawn for each sample of the gradient inside a glossy face."""
         if light.punctual:
             return 1
         sets = scene.is_glossy and isinstance(light, Environment)
         return self.samples * (SETS * SET_SIZE if sets else 1)
 
     def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
-        """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces
-        more points with fewer light samples each: what is mirrored changes within a pixel as well."""
+        """Return how an image is lit without derivatives, and how many points of a face in a pixel are shaded.
+
+        Glossy surfaces get more points with fewer light samples each: what is mirrored changes within a pixel as well.
+        """
         if not self.resamples(scene):
             return self, points
         more = max(points, min(spp, points * self.samples))
@@ -208,8 +210,8 @@ class _LitRadiance(Radiance):
 
 
 def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
-    """(H · W, C) the surfaces before black, with `points` of each face in a pixel shaded. None where it is not finite: then
-    points are shaded in PyTorch, which names the first that is not."""
+    """Return the image of surfaces before black (H · W, C), with `points` of each face in a pixel shaded, or None if it is not
+    finite. Then points are shaded one by one, and an error names the first that is not."""
     note_jumps(frame.no_hits, lighting.bounces > 1)
     options = Options(lighting.shadows, lighting.samples, bounces=lighting.bounces)
     found = in_kernel.image(frame, options, points)
@@ -229,7 +231,7 @@ def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1, bounces: 
 
 
 def _has_moving_steps(scene: Scene, camera: Camera) -> bool:
-    """Whether borders of texels may move in the image."""
+    """Return whether texel edges may move in the image."""
     found = [(mesh, texture) for mesh in scene.meshes for texture in nearest_textures(mesh)]
     uvs = [coordinates(mesh, texture)[0] for mesh, texture in found]
     return bool(found) and moves(*tensors_in(camera), *uvs, *(mesh.verts for mesh, _ in found))

@@ -32,7 +32,7 @@ _PARTS = (
 def lit_image(
     lighting: Lighting, scene: Scene, camera: Camera, request: Request, creases: bool | str = "auto"
 ) -> Tensor:
-    """(H, W, C), or (B, H, W, C) for a batch of cameras, also of tensors without values."""
+    """Return the image (H, W, C), or (B, H, W, C) for a batch of cameras, also of tensors without values."""
     if values_visible(*tensors_in((scene, camera))):
         return lighting.image(scene, camera, request, creases)
     tensors: list[Tensor] = []

@@ -33,7 +33,7 @@ class Pyramid(NamedTuple):
         return cls(texels.to(texture), count.cumsum(0) - count, height, width)
 
     def look_up(self, level: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
-        """(N, K) at uv (N, 2), linear between the two levels around `level` (N,)."""
+        """Return values (N, K) at uv (N, 2), linear between the two levels around `level` (N,)."""
         level = level.clamp(0, len(self.first) - 1)
         below = level.detach().floor().long()
         share = (level - below).to(self.texels.dtype)[:, None]

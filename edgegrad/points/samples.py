@@ -60,7 +60,7 @@ class PrimaryHits:
         return f"PrimaryHits({len(self.hits)} points in {self.frame.height} x {self.frame.width} pixels)"
 
     def image(self, radiance: Tensor, background: Tensor | None = None) -> Tensor:
-        """(H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
+        """Return the image (H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
 
         Its gradient by the radiance, and so inside faces, is right; that of what moves at edges is not in it. Raises TypeError
         or ValueError that names the argument.
@@ -90,7 +90,7 @@ class SurfaceSamples:
         return f"SurfaceSamples({len(self)} points)"
 
     def part(self, first: int, end: int) -> SurfaceSamples:
-        """Some of them."""
+        """Return the samples from `first` to `end`."""
         return SurfaceSamples(self.frame, SurfaceRecords(*(part[first:end] for part in self._records)), first)
 
     @property
@@ -101,8 +101,8 @@ class SurfaceSamples:
         return self._hits
 
     def image(self, radiance: Tensor) -> Tensor:
-        """(H, W, C) from the radiance (S, C) of the samples: an estimate of the image before black. Its weights are areas, so
-        its gradient is the interior term. Raises TypeError or ValueError that names the argument."""
+        """Return an estimate of the image (H, W, C) before black from the radiance (S, C) of the samples. Its weights are
+        areas, so its gradient is the interior term. Raises TypeError or ValueError that names the argument."""
         radiance = _rows("radiance", radiance, len(self))
         weighted = self.weight.to(radiance.dtype)[:, None] * radiance
         return self.frame.composed(splat(self._records.x, weighted, self.frame.request), None)
@@ -169,12 +169,12 @@ class EdgeSamples:
         return f"EdgeSamples({len(self)} samples, {len(self.hits)} points)"
 
     def jump(self, radiance: Tensor) -> Tensor:
-        """(S, C) how the image jumps at each sample, from the radiance (N, C) of the hits; a background comes in by
+        """Return the jump (S, C) of the image at each sample, from the radiance (N, C) of the hits; a background comes in by
         attach_boundary(). Raises TypeError or ValueError that names the argument."""
         return self.sum(_rows("radiance", radiance, len(self.hits)))
 
     def sum(self, radiance: Tensor) -> Tensor:
-        """(S, C) from the radiance (N, C)."""
+        """Return the sum (S, C) over the points of each sample, from the radiance (N, C)."""
         weighted = self._factor.to(radiance.dtype)[:, None] * radiance
         if self._in_order:
             return weighted
@@ -248,7 +248,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
 
 
 def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, background: Tensor | None = None) -> Tensor:
-    """The image, with the gradient of what moves at edges: its value is the same.
+    """Return the image, with the gradient of what moves at edges: its value is the same.
 
     image       (H, W, C)
     samples     of edge_samples()

@@ -108,7 +108,7 @@ def triangles_of(directions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def z_order(place: Tensor) -> Tensor:
-    """(K,) int64: places (K, 3) in the order of a Z-curve through the cube around them (Morton 1966)."""
+    """Return the order (K,) int64 of places (K, 3) along a Z-curve through the cube around them (Morton 1966)."""
     low, high = place.amin(0), place.amax(0)
     size = (high - low).amax()
     cell = ((place - low) / torch.where(size > 0, size, 1.0) * 1023.99).long()
@@ -120,8 +120,8 @@ def z_order(place: Tensor) -> Tensor:
 
 
 def _even(count: int, seed: int) -> Tensor:
-    """(count, 3) float64 in [0, 1), with a random shift: the first column ascends in equal steps, the others fill the unit square
-    evenly (Roberts 2018)."""
+    """Return numbers (count, 3) float64 in [0, 1), with a random shift: the first column ascends in equal steps, the others
+    fill the unit square evenly (Roberts 2018)."""
     shift = [(mixed_bits(mixed_bits(seed) + k) >> 11) * 2.0**-53 for k in range(3)]
     rows = torch.arange(count)
     columns = [(rows.double() + shift[0]) / count]

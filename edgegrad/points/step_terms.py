@@ -72,7 +72,7 @@ class StepTerms(NamedTuple):
             return find_crossings(at, self.kinds, size, margin, self.spacing, frame.sampler.grad_seed)
 
     def _jumps(self, found: Crossings, rays: RayRecords) -> tuple[Tensor, Tensor]:
-        """(M, C) L₊ − L₋ and (M,) the weight over |∇ₓs|, of constants."""
+        """Return L₊ − L₋ (M, C) and the weight over |∇ₓs| (M,), without derivatives."""
         frame = self.frame
         seed = frame.seeds("steps", len(found.x))
         gradient = torch.cat([self._by_place(found, rays, part) for part in self._parts(found)])
@@ -94,7 +94,7 @@ class StepTerms(NamedTuple):
         return jump, torch.nan_to_num(weight, nan=0.0, posinf=0.0)
 
     def _aside(self, found: Crossings, rays: RayRecords, part: slice, gradient: Tensor) -> Tensor:
-        """(M, 2) by how much barycentrics change from a step to its side after it, where its gradient is ∇ₓs."""
+        """Return the change of barycentrics (M, 2) from a discontinuity to the side after it, where its gradient is ∇ₓs."""
         frame = self.frame
         face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
         _, b_by_x = frame.fixed_view.barycentrics_by(frame.fixed, face, along, by_x)
@@ -104,7 +104,7 @@ class StepTerms(NamedTuple):
         return (b_by_x * x[:, None]).sum(-1)[:, 1:].to(found.b)
 
     def _values_of_scene(self, found: Crossings, rays: RayRecords) -> Tensor:
-        """(M,) the function of each crossing's step, with a graph of vertices and camera."""
+        """Return the function (M,) of each crossing's discontinuity, with a graph of vertices and camera."""
         frame = self.frame
         step = frame.here(found.step)[:, None]
         values = []
@@ -122,7 +122,7 @@ class StepTerms(NamedTuple):
         return torch.cat(values)
 
     def _by_place(self, found: Crossings, rays: RayRecords, part: slice) -> Tensor:
-        """(M, 2): ∇ₓs of each crossing's step, without derivatives of its own."""
+        """Return ∇ₓs (M, 2) of each crossing's discontinuity, without derivatives of its own."""
         frame = self.frame
         step = frame.here(found.step[part])[:, None]
         face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
@@ -142,7 +142,7 @@ class StepTerms(NamedTuple):
             return torch.autograd.grad(sum_of_steps(zero), zero, materialize_grads=True)[0].detach()
 
     def _values(self, hits: Hits) -> Tensor:
-        """(N, K) the functions of all steps."""
+        """Return the functions (N, K) of all discontinuities."""
         self.declare(hits)
         return torch.stack([values.double() for values in hits._steps.values], 1)
 
