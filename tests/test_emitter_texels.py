@@ -255,8 +255,8 @@ def test_steps_are_declared_as_shading_looks_them_up() -> None:
     whole, alone = (eg.trace(lit, place, vector(0, 0, -1)) for _ in range(2))
     reference(whole)
     declare_texel_edges(alone)
-    assert whole._steps.kinds == alone._steps.kinds == ["floor"] * 14
-    for a, b in zip(whole._steps.values, alone._steps.values, strict=True):
+    assert whole._discontinuities.kinds == alone._discontinuities.kinds == ["floor"] * 14
+    for a, b in zip(whole._discontinuities.values, alone._discontinuities.values, strict=True):
         assert torch.equal(a.isnan(), b.isnan())
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
 

@@ -525,8 +525,8 @@ def test_nearest_texels_that_one_sees_through_are_shaded_as_in_pytorch() -> None
     assert not in_kernel.is_fused(scene)
     kernel, twin = (hits_of(scene, CAMERAS["perspective"]) for _ in range(2))
     assert torch.allclose(radiance.radiance(kernel), shading.reference(twin), rtol=1e-12, atol=1e-12)
-    assert kernel._steps.kinds == twin._steps.kinds != []
-    for a, b in zip(kernel._steps.values, twin._steps.values, strict=True):
+    assert kernel._discontinuities.kinds == twin._discontinuities.kinds != []
+    for a, b in zip(kernel._discontinuities.values, twin._discontinuities.values, strict=True):
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
 
 

@@ -63,7 +63,7 @@ def _towards_camera(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return which samples send light to the camera (M,), to which places of the image (M, 2), and how much (M, C)."""
     face, b = frame.here(records.hit_face[some]), frame.here(records.hit_b[some])
-    seed = frame.seeds("unseen shadows", len(records.x))[some]
+    seed = frame.seeds("indirect shadows", len(records.x))[some]
     hits = frame.fixed_hits(face, b, frame.here(records.hit_x[some]), seed)
     points, share = light.points(frame.here(records.light[some]), frame.here(records.light_uv[some]))
     drawn = light.light.shows(points) & points.density.isfinite()

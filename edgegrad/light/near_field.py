@@ -62,9 +62,10 @@ class NearField(NamedTuple):
     frame: Frame
     hits: Hits
     light: Callable[[Hits], Tensor]  # (N, C)
-    declare: Callable[[Hits], object] | None  # where light jumps within faces (points/steps.py); None: nowhere
+    # Declares where light jumps within faces (points/discontinuities.py); None: nowhere.
+    declare: Callable[[Hits], object] | None
 
-    def slid(self) -> Tensor:
+    def term(self) -> Tensor:
         """Return zeros (N, C) with its derivatives by where the hits lie on their faces."""
         frame, surfaces, face = self.frame, self.frame.surfaces, self.hits._face
         none = frame.fixed.verts.new_zeros((len(face), surfaces.scene.channels))
@@ -95,7 +96,7 @@ class NearField(NamedTuple):
         return self.hits._pixel.detach()
 
     def _slope(self, axis: int, along: Tensor, along_by: Tensor, b_by: Tensor) -> Tensor:
-        """Return the differences (N, C) along an axis of the image, by which rays and barycentrics change by these (N, 3) a px."""
+        """Return differences (N, C) along an axis of the image, by which rays and barycentrics change by these (N, 3) a px."""
         frame, place = self.frame, self._x[:, axis]
         width = WIDTH.get(frame.request.image.filter, OF_WIDER_FILTERS)
         cell = (place / width).floor() * width
@@ -142,7 +143,7 @@ class NearField(NamedTuple):
         """Return between which discontinuities hits lie (N, K)."""
         assert self.declare is not None
         self.declare(hits)
-        return torch.stack([values.floor().nan_to_num() for values in hits._steps.values], 1)
+        return torch.stack([values.floor().nan_to_num() for values in hits._discontinuities.values], 1)
 
     def _there(self, axis: int, t: Tensor) -> Hits:
         """Return the hits t px further along an axis of the image, on the same faces and with the same random numbers."""

@@ -27,7 +27,7 @@ from ..scene.environment import Environment
 from ..scene.lights import Light
 from ..scene.scene import Scene
 from ..scene.tree import tensors_in
-from ..shader import Effort, Radiance, render_shaded, shaded_points
+from ..shader import Radiance, ShadingTraits, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
 from .at_points import Options
@@ -106,7 +106,7 @@ class Lighting(NamedTuple):
         in_image = self._in_image(scene, max(FEWEST_IN_PENUMBRA, points // 2) if several else points, spp)
         fused = is_fused(scene)
         additive = not scene.blends
-        effort = Effort(
+        traits = ShadingTraits(
             points=points,
             blended=scene.blends,
             lit=True,
@@ -115,16 +115,16 @@ class Lighting(NamedTuple):
             gives_derivatives=additive,
             additive=additive,
             closer=CLOSER_STEPS if self.bounces > 1 else 1.0,
-            step_margin=NEXT_TO_TEXELS,
+            discontinuity_margin=NEXT_TO_TEXELS,
         )
         lit = _LitRadiance(
             self,
             in_image if fused and additive else None,
-            declares_steps=additive and _has_moving_steps(scene, camera),
+            declares_discontinuities=additive and _has_moving_texel_edges(scene, camera),
             # Comparisons see borders, which visibility=False leaves out; and layers behind others have none.
             near_field=self.bounces > 1 and additive and request.gradient.visibility,
         )
-        image = render_shaded(scene, camera, lit, request, creases, False, effort, watch)
+        image = render_shaded(scene, camera, lit, request, creases, False, traits, watch)
         if not scene.is_lit:  # as the kernel has it where there are no mipmaps
             image = image.to(image_dtype(scene))
         # A graph from all tensors, whatever is in view and whatever is lit.
@@ -163,13 +163,17 @@ class _LitRadiance(Radiance):
     """The radiance of a lit scene."""
 
     def __init__(
-        self, lighting: Lighting, in_image: tuple[Lighting, int] | None, declares_steps: bool, near_field: bool
+        self,
+        lighting: Lighting,
+        in_image: tuple[Lighting, int] | None,
+        declares_discontinuities: bool,
+        near_field: bool,
     ) -> None:
         """`in_image`: the lighting, and the points of a face in a pixel, of an image that the kernel shades at once."""
-        self._lighting, self._in_image, self.declares_steps, self._near_field = (
+        self._lighting, self._in_image, self.declares_discontinuities, self._near_field = (
             lighting,
             in_image,
-            declares_steps,
+            declares_discontinuities,
             near_field,
         )
 
@@ -179,7 +183,7 @@ class _LitRadiance(Radiance):
     def image(self, frame: Frame) -> Tensor | None:
         return None if self._in_image is None else _kernel_image(frame, *self._in_image)
 
-    def steps(self, hits: Hits) -> None:
+    def declare(self, hits: Hits) -> None:
         declare_texel_edges(hits)
 
     def near_field(self, frame: Frame, hits: Hits) -> tuple[float, Tensor] | None:
@@ -193,7 +197,7 @@ class _LitRadiance(Radiance):
         )
         declare = declare_texel_edges if any(nearest_textures(mesh) for mesh in scene.meshes) else None
         nearby = NearField(frame, hits, lambda there: in_kernel.indirect(there, shadows, bounces, near), declare)
-        return near, nearby.slid() if near > 0 else hits._exact.new_zeros((len(hits), 1)).to(frame.dtype)
+        return near, nearby.term() if near > 0 else hits._exact.new_zeros((len(hits), 1)).to(frame.dtype)
 
     def indirect(self, frame: Frame, watch: Watch) -> list[Term]:
         shadows, bounces = self._lighting.shadows, self._lighting.bounces
@@ -230,7 +234,7 @@ def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1, bounces: 
     return L + by_texel_edges(hits, lights, shadows, light_samples) if lights else L
 
 
-def _has_moving_steps(scene: Scene, camera: Camera) -> bool:
+def _has_moving_texel_edges(scene: Scene, camera: Camera) -> bool:
     """Return whether texel edges may move in the image."""
     found = [(mesh, texture) for mesh in scene.meshes for texture in nearest_textures(mesh)]
     uvs = [coordinates(mesh, texture)[0] for mesh, texture in found]

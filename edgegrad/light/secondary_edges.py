@@ -40,13 +40,13 @@ def secondary_edges(frame: Frame, options: Options) -> list[Term]:
     if on_surfaces:
         for further in range(1, options.bounces - 1):
             terms += _passed_on(
-                frame, in_kernel.secondary_edge_samples(frame, options, further), "bounce edges", further
+                frame, in_kernel.secondary_edge_samples(frame, options, further), "secondary edges", further
             )
     crossings = moves(surfaces.verts) and has_intersections(frame.request.scene)
     if crossings or alpha_edges:
         for further in range(options.bounces - 1):
             found = in_kernel.surface_edge_samples(frame, options, further, crossings, alpha_edges)
-            terms += _passed_on(frame, found, "surface borders", further)
+            terms += _passed_on(frame, found, "surface edges", further)
     return terms
 
 

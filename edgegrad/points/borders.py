@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ..check import values_visible
+from .discontinuities import FLOOR
 from .hits import Hits
-from .steps import FLOOR
 
 MOST = 8  # at most so many times the first pass's points of a face in a pixel
 SHARE = 4  # and so many times all of its points
@@ -30,7 +30,7 @@ class Borders:
 
     def add(self, pixel: Tensor, hits: Hits) -> None:
         """Add points of the pixels (N,), after they were shaded."""
-        steps = list(zip(hits._steps.kinds, hits._steps.values, strict=True))
+        steps = list(zip(hits._discontinuities.kinds, hits._discontinuities.values, strict=True))
         self._known = self._known and values_visible(*(values for _, values in steps if values is not None))
         # Each point sees another part of a light with an extent, so its neighbours say nothing about the shadow's border.
         lights = [k for k, light in enumerate(hits.lights) if light.punctual]

@@ -12,6 +12,7 @@ from ..kernel.derivatives import moves
 from ..kernel.operators import camera_seed
 from ..kernel.request import Request
 from ..scene.scene import Scene
+from .discontinuities import Discontinuities
 from .hits import Hits
 from .records import RayRecords, SurfaceRecords, barycentrics, without_colors
 from .sampler import Sampler
@@ -19,13 +20,12 @@ from .seeds import sample_seeds
 from .shadow_rays import Forced
 from .sobol import z_order
 from .splat import Term, attached
-from .steps import Steps
 from .surfaces import Surfaces, View
 
 _Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
 # Each kind has its own random numbers.
 SAMPLES = (
-    "image", "inside", "edges", "steps", "shadows", "image again", "unseen shadows", "bounce edges", "surface borders",
+    "image", "inside", "edges", "steps", "shadows", "image again", "indirect shadows", "secondary edges", "surface edges",
 )  # fmt: skip
 
 
@@ -73,7 +73,7 @@ class Frame:
         b: Tensor,
         x: Tensor,
         seed: Tensor | None = None,
-        steps: Steps | None = None,
+        steps: Discontinuities | None = None,
         forced: Forced | None = None,
     ) -> Hits:
         """Return hits without derivatives; b are (N, 3), or the last two barycentrics."""

@@ -16,12 +16,12 @@ from ..scene.material import WRAPS
 from ..scene.mesh import FILTERS
 from ..scene.rows import interpolated, rows_of
 from ..scene.textures import bilinear, in_texels, nearest
+from .discontinuities import Discontinuities, DiscontinuitiesOfSubset
 from .footprints import Footprints, level, pyramid_of
 from .records import RayRecords, visible
 from .seeds import uniform
 from .shadow_rays import Forced, seen_from
 from .sobol import key_of, sobol
-from .steps import Steps, StepsOfSubset
 from .surfaces import Rays, Surfaces, View, every_face
 
 LightSampler = Callable[["Hits", Light, int], list[LightPoints]]  # so many points of a light for each of the hits
@@ -47,7 +47,7 @@ class Hits:
         barycentrics: Tensor,  # (N, 3) float64
         pixel: Tensor | None = None,  # (N, 2)
         rays_at: Callable[[Tensor], RayRecords] | None = None,  # those of the camera
-        steps: Steps | None = None,
+        steps: Discontinuities | None = None,
         seed: Tensor | None = None,  # (N,) int64, of random()
         forced: Forced | None = None,
     ) -> None:
@@ -59,7 +59,7 @@ class Hits:
         self._forced = forced
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
-        self._pixel, self._steps = pixel, steps or Steps()
+        self._pixel, self._discontinuities = pixel, steps or Discontinuities()
         self._all: tuple[Hits, Tensor] | None = None  # the hits that these are a subset of, and their rows there
         self._drawn: dict[
             tuple[LightSampler, int, int], list[LightPoints]
@@ -89,9 +89,9 @@ class Hits:
         wrong = (index < -count) | (index >= count)
         if values_visible(index) and bool(wrong.any()):
             raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
-        return self._subset(index, StepsOfSubset(self._steps, index % max(count, 1), count))
+        return self._subset(index, DiscontinuitiesOfSubset(self._discontinuities, index % max(count, 1), count))
 
-    def _subset(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
+    def _subset(self, index: Tensor | slice, steps: Discontinuities | None = None) -> Hits:
         """Return some of the points, with steps of their own, while select() passes them on to the whole."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
@@ -300,7 +300,7 @@ class Hits:
         """
         s = _function("s", s)
         check_shape("s", s, (len(self),), (len(self), 1))
-        up = self._steps.above_zero(s.reshape(-1))[:, None]
+        up = self._discontinuities.above_zero(s.reshape(-1))[:, None]
         sides = []
         for name, side in (("a", a), ("b", b)):
             value = as_tensor(name, side, like=s, floating=True)
@@ -323,8 +323,8 @@ class Hits:
         t = _function("t", t)
         check_shape("t", t, (len(self),), (len(self), "K"))
         if t.dim() == 1:
-            return self._steps.floor(t)
-        return torch.stack([self._steps.floor(column) for column in t.unbind(1)], 1)
+            return self._discontinuities.floor(t)
+        return torch.stack([self._discontinuities.floor(column) for column in t.unbind(1)], 1)
 
     # -- shadows -------------------------------------------------------------------------------------------------------
 

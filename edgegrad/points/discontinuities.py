@@ -24,7 +24,7 @@ BISECTIONS = 12  # to 1/4096 of the spacing
 MOST_LEVELS = 4  # of a floor() between two neighbours; if there are more, so many are drawn
 
 
-class Steps:
+class Discontinuities:
     """The values of the step functions that a shader declares at some points, in its order.
 
     `states` (N, K), if given, are the sides that the steps are forced to, whatever the values say.
@@ -57,10 +57,10 @@ class Steps:
         return self._states[:, len(self.kinds) - 1].to(values.device)
 
 
-class StepsOfSubset(Steps):
+class DiscontinuitiesOfSubset(Discontinuities):
     """Steps that are declared of some of the points, and noted as steps of all."""
 
-    def __init__(self, steps: Steps, index: Tensor, count: int) -> None:
+    def __init__(self, steps: Discontinuities, index: Tensor, count: int) -> None:
         super().__init__()
         self._all, self._index, self._count = steps, index, count
 

@@ -2,7 +2,8 @@
 
     δI = Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight
 
-over where lines cross the steps s = 0 (steps.py). L₊ and L₋ are the shader's values with the step forced to either side.
+over where lines cross the steps s = 0 (discontinuities.py). L₊ and L₋ are the shader's values
+with the discontinuity forced to either side.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from torch.utils.checkpoint import checkpoint
 from ..check import values_visible
 from ..kernel.counts import Watch
 from ..kernel.derivatives import transformed
+from .discontinuities import Crossings, Discontinuities, Points, find_crossings
 from .frame import Frame
 from .hits import Hits
 from .records import RayRecords
 from .splat import Term, boundary
-from .steps import Crossings, Points, Steps, find_crossings
 
 # By which a pixel's filter reaches out of the image, in px.
 MARGIN = {"box": 0.0, "tent": 0.5, "gaussian": 1.0}
 
 
-class StepTerms(NamedTuple):
+class DiscontinuityTerms(NamedTuple):
     """The discontinuities of one image, and who declares them."""
 
     frame: Frame
@@ -82,7 +83,7 @@ class StepTerms(NamedTuple):
                 face, b, x = found.face[part], found.b[part], found.x[part]
                 aside = self._aside(found, rays, part, gradient[part]) if self.margin else torch.zeros_like(b)
                 before, after = (
-                    self.shade(frame.fixed_hits(face, b + shift, x, seed[part], Steps(states[part])))
+                    self.shade(frame.fixed_hits(face, b + shift, x, seed[part], Discontinuities(states[part])))
                     for states, shift in ((found.before, -aside), (found.after, aside))
                 )
                 jumps.append((after - before).detach())
@@ -144,7 +145,7 @@ class StepTerms(NamedTuple):
     def _values(self, hits: Hits) -> Tensor:
         """Return the functions (N, K) of all discontinuities."""
         self.declare(hits)
-        return torch.stack([values.double() for values in hits._steps.values], 1)
+        return torch.stack([values.double() for values in hits._discontinuities.values], 1)
 
     def _parts(self, found: Crossings) -> list[slice]:
         return [slice(first, first + self.at_once) for first in range(0, max(len(found.x), 1), self.at_once)]
