@@ -105,6 +105,7 @@ report: $(VENV)/.ready
 lint: $(VENV)/.ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[dev,demo,test]"
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright --pythonpath $(BIN)/python && $(BIN)/lint-imports
+	$(BIN)/python tests/check_includes.py && $(BIN)/python tests/check_words.py
 	$(BIN)/clang-format --dry-run --Werror $(filter-out %.txt %.toml,$(SOURCES))
 
 # Warnings are errors; build/docs/index.html is the site.

@@ -86,7 +86,7 @@ def vertex_fit(steps: int = STEPS, preconditioned: bool = False, say: Say = lamb
         target = render(Scene([mesh.replace(verts=goal)], back), cameras, spp=256)
     solve = LaplacianSolver(mesh.faces, len(mesh.verts), SMOOTHNESS) if preconditioned else None
     v = mesh.verts.clone()
-    u = v if solve is None else solve.times(v)
+    u = v if solve is None else solve.to_differential(v)
     mean, square = torch.zeros_like(u), torch.zeros_like(u)
     losses = []
     samples: dict[str, Any] = {"surface_samples": 10_000, "edge_samples": 5_000}  # of each camera
