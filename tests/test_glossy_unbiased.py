@@ -20,8 +20,8 @@ from torch import Tensor
 import edgegrad as eg
 from benchmarks.stability.cases.case import Parts, Problem
 from benchmarks.stability.cases.glossy import GLOSSY, LIGHTS
-from benchmarks.stability.cases.measure import Running, differences
 from benchmarks.stability.cases.measure import Effort as Seeds
+from benchmarks.stability.cases.measure import Running, differences
 from benchmarks.stability.statistics import holm
 from edgegrad.kernel.request import make_request
 from edgegrad.shader import ShadingTraits, render_shaded
