@@ -277,9 +277,6 @@ def pass_size(request: Request) -> Any:
     )
 
 
-KEPT = ("ray structure", "topology")  # what may be there already, from an earlier call
-
-
 def image_memory(request: Request) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the image does not fit."""
     needs = core.image_bytes(pass_size(request), request.cameras)
