@@ -78,7 +78,7 @@ def render_aovs(
     """
     names = check_aovs(aovs)
     scene = as_scene(scene)
-    lighting = Lighting.of(shadows, light_samples, bounces)
+    lighting = Lighting.from_options(shadows, light_samples, bounces)
     if "image" in names:
         warn_of_unused(scene, False, lighting.options)
     if "uv" in names:

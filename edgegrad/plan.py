@@ -18,10 +18,9 @@ from .kernel.flat import Flat
 from .kernel.operators import Hits, backward_kernel, image_memory, pass_size
 from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
 from .library import core
-from .light.antithetic import MOST_SETS, SETS
 from .light.bounces import check_bounces
 from .light.radiance import LIGHTING, Lighting
-from .light.resampled import how_drawn
+from .light.sampling import MOST_SETS, SETS, how_drawn
 from .light.unused_options import warn_of_unused
 from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, without_colors
 from .points.shadows import ShadowLight
@@ -101,7 +100,7 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     warn_of_unused(scene, shading.get("shader") is not None, shading)
     if shading.get("shader") is not None:
         return Plan(_shaded_terms(scene, request, shading.get("creases", "auto")))
-    lighting = Lighting.of(**{name: shading[name] for name in LIGHTING if name in shading})
+    lighting = Lighting.from_options(**{name: shading[name] for name in LIGHTING if name in shading})
     if scene.is_shaded:
         if lighting.bounces > 1:
             check_bounces(scene, camera, request)

@@ -156,7 +156,7 @@ def _of_shaded(
     options: Mapping[str, Any],
 ) -> Profile:
     """Return the profile of a scene of which points are shaded."""
-    lighting = Lighting.of(**{name: options[name] for name in LIGHTING if name in options})
+    lighting = Lighting.from_options(**{name: options[name] for name in LIGHTING if name in options})
     creases, own = options.get("creases", "auto"), {n: v for n, v in options.items() if n not in SHADING}
     scene, camera, leaves = _leaves(scene, camera)
     request = make_request(scene, camera, *spp_and_seed, **own)

@@ -116,7 +116,7 @@ def render(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
-    lighting = Lighting.of(shadows, light_samples, bounces)
+    lighting = Lighting.from_options(shadows, light_samples, bounces)
     shading = {"creases": creases, "check_shader": check_shader, **lighting.options}
     warn_of_unused(scene, shader is not None, shading)
     if shader is None and scene.is_shaded:
@@ -312,7 +312,7 @@ def screen_gradient(
 
 
 def check_options(function: str, options: Mapping[str, Any]) -> None:
-    """What a `function` that takes the options of render() was given are such. Raises TypeError."""
+    """Raise TypeError if a `function` that takes the options of render() was given others."""
     known = [name for name, p in inspect.signature(render).parameters.items() if p.kind is p.KEYWORD_ONLY]
     if unknown := [name for name in options if name not in known]:
         raise TypeError(f"{function}: expected only the options {', '.join(known)}, got {unknown[0]!r}")

@@ -29,14 +29,15 @@ from .kernel.request import LEAST_SPACING, Request, derived_seed
 from .points.background import environments
 from .points.blend import Blended, let_through, transparent
 from .points.borders import Borders
+from .points.discontinuities import UNEQUAL
+from .points.discontinuity_terms import DiscontinuityTerms
 from .points.frame import Frame
 from .points.hits import Hits
-from .points.records import PixelRecords, shaded_memory, without_colors
+from .points.records import PixelRecords, without_colors
+from .points.sampler import shaded_memory
 from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
 from .points.splat import Term, boundary
-from .points.step_terms import StepTerms
-from .points.steps import UNEQUAL
 from .points.surfaces import every_face
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene
@@ -53,12 +54,12 @@ CREASES = ("auto", True, False)
 
 
 def shaded_points(spp: int) -> int:
-    """Of a face in a pixel with so many samples."""
+    """Return how many points of a face are shaded in a pixel with so many samples."""
     return max(1, spp // SAMPLES_A_POINT)
 
 
-class Effort(NamedTuple):
-    """What shading an image takes, and what the renderer may rely on."""
+class ShadingTraits(NamedTuple):
+    """Properties of a way of shading: how many points it takes, and what the renderer may rely on."""
 
     points: int = 1  # of a face in a pixel that are shaded
     blended: bool = False  # whether one may see through surfaces
@@ -69,18 +70,18 @@ class Effort(NamedTuple):
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     closer: float = 1.0  # by which lines that look for steps lie closer, for what is shaded next to them is noisy
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
-    step_margin: float = 0.0  # how far from a step its sides are shaded
+    discontinuity_margin: float = 0.0  # how far from a discontinuity its sides are shaded
 
     @property
     def at_once(self) -> int:
-        """Points of the image that are shaded together."""
+        """Return points of the image that are shaded together."""
         return 2 * AT_ONCE if self.keeps_little else AT_ONCE
 
 
 class Radiance:
     """The radiance at hits, and what else an image may ask of it. A user's shader gives the radiance alone: see UserShader."""
 
-    declares_steps = False  # whether steps() declares its steps; else it does so while it shades
+    declares_discontinuities = False  # whether declare() declares its discontinuities; else shading does
 
     def __call__(self, hits: Hits) -> Tensor:
         """Return the radiance (N, C)."""
@@ -90,8 +91,8 @@ class Radiance:
         """Return the image (H · W, C) before black by one call of the kernel, or None: then points are shaded one by one."""
         return None
 
-    def steps(self, hits: Hits) -> None:
-        """Declare the steps without shading."""
+    def declare(self, hits: Hits) -> None:
+        """Declare the discontinuities without shading."""
 
     def near_field(self, frame: Frame, hits: Hits) -> tuple[float, Tensor] | None:
         """Return how near light changes as samples slide on faces, and that change (N, C); see light/near_field.py."""
@@ -119,27 +120,28 @@ def render_shaded(
     request: Request,
     creases: bool | str,
     check: bool,
-    effort: Effort | None = None,
+    traits: ShadingTraits | None = None,
     watch: Watch = Watch(),  # noqa: B008  it keeps nothing
 ) -> Tensor:
-    """The image (H, W, C), or (B, H, W, C) for a batch of cameras; see Effort and Radiance. `watch` is told what it takes."""
+    """Return the image (H, W, C), or (B, H, W, C) for a batch of cameras; see ShadingTraits and Radiance. `watch` is told what it
+    takes."""
     if not callable(shader):
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
     radiance = shader if isinstance(shader, Radiance) else UserShader(shader)
-    effort = effort or Effort(shaded_points(request.image.spp), blended=scene.blends)
-    with shaded_memory(request, textured=effort.lit and scene.textured_faces is not None):
+    traits = traits or ShadingTraits(shaded_points(request.image.spp), blended=scene.blends)
+    with shaded_memory(request, textured=traits.lit and scene.textured_faces is not None):
         images = [
-            _Image(Frame(scene, request, k), radiance, creases, check, effort, watch).render()
+            _Image(Frame(scene, request, k), radiance, creases, check, traits, watch).render()
             for k in range(request.cameras)
         ]
     return images[0] if camera.batch is None else torch.stack(images)
 
 
 def _where_bright(image: Tensor) -> Tensor | None:
-    """(H, W), above zero: how bright the pixels of an image (H, W, C) are over the mean, how much that changes from one to the
-    next, for there highlights move, and a little the same for all; None if all are black."""
+    """Return (H, W), above zero: how bright the pixels of an image (H, W, C) are over the mean, how much that changes from one
+    to the next, for there highlights move, and a little the same for all; None if all are black."""
     size = image.detach().double().abs().mean(2)
     mean = size.mean()
     if not mean > 0:
@@ -159,22 +161,22 @@ class _Image:
         radiance: Radiance,
         creases: bool | str,
         check: bool,
-        effort: Effort,
+        traits: ShadingTraits,
         watch: Watch = Watch(),  # noqa: B008  it keeps nothing
     ) -> None:
-        self._frame, self._creases, self._check, self._effort, self._watch = frame, creases, check, effort, watch
+        self._frame, self._creases, self._check, self._traits, self._watch = frame, creases, check, traits, watch
         self._radiance = radiance
         # (C,) or (H, W, C): the scene's background, or the environments that it shows. Found here, where derivatives are
         # enabled if they are asked for; the values of an image are found without.
         background = frame.surfaces.scene.background
         self._behind_all = environments(frame) if background is None else background
         self._shader: Shader = radiance
-        if effort.blended:
+        if traits.blended:
             self._shader = Blended(frame, radiance, self._behind_all)
             frame.sampler.transparent = transparent(frame.surfaces)
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
-        self.steps_move = radiance.declares_steps  # whether one of their functions has a derivative
+        self.discontinuities_move = radiance.declares_discontinuities  # whether one of their functions has a derivative
 
     def render(self) -> Tensor:
         watch = self._watch
@@ -182,10 +184,10 @@ class _Image:
             image = self._values()
         if not differentiates():
             return image
-        if self._radiance.declares_steps:
+        if self._radiance.declares_discontinuities:
             none = self._frame.no_hits
-            self._radiance.steps(none)
-            self._kinds = list(none._steps.kinds)
+            self._radiance.declare(none)
+            self._kinds = list(none._discontinuities.kinds)
         frame = self._frame
         visibility = frame.request.gradient.visibility
         moving = visibility and moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
@@ -198,8 +200,8 @@ class _Image:
                 boundary=moving,
                 intrinsics=moves(frame.intrinsics),
                 steps=cut,
-                lit=frame.surfaces.scene if self._effort.lit else None,
-                importance=_where_bright(image) if self._effort.glossy else None,
+                lit=frame.surfaces.scene if self._traits.lit else None,
+                importance=_where_bright(image) if self._traits.glossy else None,
             )
         watch.count("surface_samples", len(surface.x))
         with watch.part("surface shading"):
@@ -208,11 +210,13 @@ class _Image:
             watch.count("edge_samples", len(curves.x))
             with watch.part("edge shading"):
                 terms += self._boundary(EdgeSamples(frame, curves))
-        if visibility and self._kinds and self.steps_move:
+        if visibility and self._kinds and self.discontinuities_move:
             with watch.part("steps"):
-                declare = self._radiance.steps if self._radiance.declares_steps else self._shade
-                margin = self._effort.step_margin
-                found = StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE, self._step_spacing, margin)
+                declare = self._radiance.declare if self._radiance.declares_discontinuities else self._shade
+                margin = self._traits.discontinuity_margin
+                found = DiscontinuityTerms(
+                    frame, self._kinds, self._shade, declare, AT_ONCE, self._step_spacing, margin
+                )
                 terms += found.found(watch)
         if visibility:
             with watch.part("shadows"):
@@ -223,7 +227,7 @@ class _Image:
     # -- the image -----------------------------------------------------------------------------------------------------
 
     def _values(self) -> Tensor:
-        """The image, without a graph of its surfaces."""
+        """Return the image, without a graph of its surfaces."""
         frame = self._frame
         with torch.no_grad():
             image = self._radiance.image(frame)
@@ -233,12 +237,12 @@ class _Image:
         return frame.composed(image, self._background)
 
     def _point_by_point(self) -> Tensor:
-        """(H · W, C) what surfaces add to the image."""
+        """Return (H · W, C) what surfaces add to the image."""
         frame = self._frame
-        points = self._effort.points
+        points = self._traits.points
         borders = Borders((frame.height, frame.width), points)
         parts: list[Tensor] = []
-        for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, points):
+        for pixels, found in frame.sampler.pixel_hits(self._traits.at_once, points):
             seeds = frame.seeds_of_pixels("image", found.pixel, points)
             sums, hits = self._shaded(found, pixels, seeds)
             parts.append(sums)
@@ -248,13 +252,13 @@ class _Image:
         if again is None or not bool(again.any()):
             return image
         parts = []
-        for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, most, again):
+        for pixels, found in frame.sampler.pixel_hits(self._traits.at_once, most, again):
             seeds = frame.seeds_of_pixels("image again", found.pixel, most)
             parts.append(self._shaded(found, pixels, seeds)[0])
         return torch.where(frame.here(again).reshape(-1, 1), torch.cat(parts), image)
 
     def _shaded(self, found: PixelRecords, pixels: range, seeds: Tensor) -> tuple[Tensor, Hits]:
-        """(pixels, C) what hits add to the image, and the hits."""
+        """Return (pixels, C) what hits add to the image, and the hits."""
         frame = self._frame
         hits = frame.fixed_hits(found.face, found.b, found.x, seeds)
         radiance = self._shade(hits).detach()
@@ -263,7 +267,7 @@ class _Image:
 
     @cached_property
     def _background(self) -> Tensor | None:
-        """The same, of as many channels as the shader gives."""
+        """Return the background, of as many channels as the shader gives."""
         background = self._behind_all
         if background is not None and background.shape[-1] != self._channels:
             raise ValueError(
@@ -274,9 +278,9 @@ class _Image:
     # -- what its derivatives are those of ----------------------------------------------------------------------------
 
     def _interior(self, samples: SurfaceSamples) -> list[Term]:
-        """Σ k(x − c) L px² over samples inside faces."""
+        """Return the terms Σ k(x − c) L px² over samples inside faces."""
         terms: list[Term] = []
-        at_once = self._effort.at_once
+        at_once = self._traits.at_once
         # Once at least, so that an image with nothing in view has a graph too, of zeros.
         for first in range(0, max(len(samples), 1), at_once):
             some = samples.part(first, first + at_once)
@@ -284,21 +288,21 @@ class _Image:
             def radiance(first: int = first) -> Tensor:
                 # Hits of its own each time, for these keep what was computed from them.
                 hits = samples.part(first, first + at_once).hits
-                hits._needs_values = not self._effort.gives_derivatives
+                hits._needs_values = not self._traits.gives_derivatives
                 if (change := self._radiance.near_field(self._frame, hits)) is None:
                     return self._shade(hits)
-                hits._near, slid = change
-                return self._shade(hits) + slid
+                hits._near, term = change
+                return self._shade(hits) + term
 
             # So that memory is that of some points, not of all.
-            many = len(samples) > at_once and not transformed() and not self._effort.keeps_little
+            many = len(samples) > at_once and not transformed() and not self._traits.keeps_little
             L = checkpoint(radiance, use_reentrant=False) if many else radiance()
             assert isinstance(L, Tensor)
             terms.append(some._term(L))
         return terms
 
     def _shadows(self) -> list[Term]:
-        """The same over samples on the borders of the shadows that the shader asked for."""
+        """Return the terms of samples on the boundaries of the shadows that the shader asked for."""
         frame = self._frame
         terms: list[Term] = []
         count, flat = frame.request.gradient.edge_samples, frame.surfaces.casters
@@ -308,9 +312,9 @@ class _Image:
             _warn_of_lights(frame)
         for index in sorted(frame.surfaces.shadowing):
             seed = derived_seed(frame.sampler.grad_seed, index + 2)
-            light = ShadowLight.of(frame.surfaces, index, seed)
+            light = ShadowLight.from_surfaces(frame.surfaces, index, seed)
             if moving or ShadowLight.moves(light.light):
-                one = self._effort.additive
+                one = self._traits.additive
                 casters = frame.fixed.casters if frame.surfaces.scene.blends else None
                 records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one, casters)
                 self._watch.count("shadow_samples", len(records.x))
@@ -320,7 +324,7 @@ class _Image:
 
     def _boundary(self, samples: EdgeSamples) -> list[Term]:
         """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
-        at_once = self._effort.at_once
+        at_once = self._traits.at_once
         parts = [self._frame.fixed.verts.new_zeros((0, self._channels or 1))]
         with torch.no_grad():
             for first in range(0, len(samples.hits), at_once):
@@ -329,17 +333,17 @@ class _Image:
                     points = points._subset(slice(first, first + at_once))
                 parts.append(self._shade(points).detach())
             jump, to_background = samples.sum(torch.cat(parts[1:] or parts)), samples.to_background
-            if self._effort.blended:
+            if self._traits.blended:
                 through = let_through(self._frame, samples._records)
                 jump, to_background = through[:, None].to(jump) * jump, through * to_background
         return boundary(samples.x, samples.velocity, jump, to_background, self._background)
 
     @property
     def _step_spacing(self) -> float:
-        return max(self._frame.request.gradient.step_spacing / self._effort.closer, LEAST_SPACING)
+        return max(self._frame.request.gradient.step_spacing / self._traits.closer, LEAST_SPACING)
 
     def _with_creases(self) -> Request:
-        """The request for samples on curves, with colours that jump where the shader may."""
+        """Return the request for samples on curves, with colours that jump where the shader may."""
         frame = self._frame
         with torch.no_grad():
             if self._creases is True:
@@ -352,15 +356,15 @@ class _Image:
     # -- the shader ----------------------------------------------------------------------------------------------------
 
     def _shade(self, hits: Hits) -> Tensor:
-        """(N, C), checked."""
+        """Return (N, C), checked."""
         radiance = self._checked(self._shader(hits), hits)
-        if not self._radiance.declares_steps and not hits._only_light:  # for one light less may be looked up
-            kinds = list(hits._steps.kinds)
+        if not self._radiance.declares_discontinuities and not hits._only_light:  # for one light less may be looked up
+            kinds = list(hits._discontinuities.kinds)
             if self._kinds not in (None, kinds):
                 raise ValueError(UNEQUAL)
             self._kinds = kinds
-            self.steps_move = self.steps_move or moves(*hits._steps.values)
-        if self._check and len(hits) > 1 and not hits._steps.forced:
+            self.discontinuities_move = self.discontinuities_move or moves(*hits._discontinuities.values)
+        if self._check and len(hits) > 1 and not hits._discontinuities.forced:
             order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
             order = order[: (len(hits) + 1) // 2]
             with torch.no_grad():
@@ -391,7 +395,7 @@ class _Image:
         if hits._needs_values and values_visible(radiance) and not all_finite(radiance.detach()):
             row = int((~torch.isfinite(radiance.detach())).any(1).nonzero()[0])
             name, hint = "shader", "divisions by zero and powers of negative numbers"
-            if self._effort.lit:
+            if self._traits.lit:
                 name, hint = (
                     "radiance",
                     "numbers of textures, colours, materials or lights that are too large for its dtype",
@@ -403,7 +407,7 @@ class _Image:
 
 
 def _warn_of_lights(frame: Frame) -> None:
-    """Of which alpha cuts out some, not all or nothing."""
+    """Warn of emissive meshes of which alpha cuts out some faces or parts, not all or nothing."""
     lights = (light.mesh for light in frame.surfaces.scene.casting if isinstance(light, MeshLight))
     for mesh in lights:
         if mesh.alpha is None or mesh.uvs is None or not moves(mesh.alpha, mesh.uvs) or not values_visible(mesh.alpha):

@@ -49,7 +49,7 @@ EXCEPTIONS = {
         edgegrad/files/formats/off.py edgegrad/files/formats/ply_elements.py edgegrad/fit/plots.py
         edgegrad/fit/pose/photo/level.py edgegrad/fit/pose/photo/match.py edgegrad/light/near_field.py
         edgegrad/points/blend.py edgegrad/points/borders.py edgegrad/points/hits.py edgegrad/points/pyramid.py
-        edgegrad/points/step_terms.py edgegrad/points/steps.py edgegrad/raster/exact.py edgegrad/render.py
+        edgegrad/points/discontinuity_terms.py edgegrad/points/discontinuities.py edgegrad/raster/exact.py edgegrad/render.py
         edgegrad/scene/environment.py edgegrad/scene/texel_borders.py edgegrad/scene/textures.py
         """,
     "looks": """

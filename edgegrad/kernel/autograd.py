@@ -19,7 +19,7 @@ FIRST_ORDER = (
 
 
 def render_image(request: Request, batched: bool) -> Tensor:
-    """The image (B, H, W, C), or (H, W, C) unless `batched`, as a function of the request's tensors."""
+    """Return the image (B, H, W, C), or (H, W, C) unless `batched`, as a function of the request's tensors."""
     packed = request.pack()
     if not torch.compiler.is_compiling():
         image, *_ = _RenderEager.apply(batched, *packed)
@@ -131,7 +131,7 @@ class _RenderJvp(torch.autograd.Function):
 
 
 def faces_at_centers(request: Request, batched: bool) -> Tensor:
-    """The face seen through the centre of each pixel, as the flat scene counts them: (B, H, W) int32, −1: none."""
+    """Return the face seen through the centre of each pixel, as the flat scene counts them: (B, H, W) int32, −1: none."""
     return _FacesAtCenters.apply(batched, *request.pack())  # pyright: ignore[reportReturnType]
 
 
@@ -158,7 +158,7 @@ class _FacesAtCenters(torch.autograd.Function):
 
 
 def _with_tangents(args: Sequence[Any]) -> list[Any]:
-    """The last arguments, a tangent for each slot, as one list."""
+    """Return the last arguments, a tangent for each slot, as one list."""
     return [*args[: -len(SLOTS)], list(args[-len(SLOTS) :])]
 
 

@@ -17,8 +17,8 @@ WIDTH = len(IS_TENSOR)  # arguments of a packed request
 
 
 def render_images(requests: Iterable[Request], count: int) -> list[Tensor]:
-    """The image (H, W, C) of each of `count` requests, as functions of their tensors: those that are there are rendered while
-    others are made. The bits, also of gradients, are those of one image after another."""
+    """Return the image (H, W, C) of each of `count` requests, as functions of their tensors. Requests are rendered while others
+    are made. The bits, also of gradients, are those of one image after another."""
     made: list[Request] = []
 
     def remembered() -> Iterator[Request]:
@@ -33,7 +33,7 @@ def render_images(requests: Iterable[Request], count: int) -> list[Tensor]:
 
 
 class _RenderBatch(torch.autograd.Function):
-    """What forward_kernel() found of requests, as functions of these, packed one after the other."""
+    """Images of forward_kernel() as functions of requests, which are packed one after the other."""
 
     @staticmethod
     def forward(ctx: Any, found: list[Any], *packed: Any) -> tuple[Tensor, ...]:

@@ -1,4 +1,4 @@
-"""What the kernel counts in a backward pass, and how counts are shown."""
+"""Counts of the kernel in a backward pass, and tables that show them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ COUNTS = (
 
 
 class Watch:
-    """Is told what an image and its gradient take, where points are shaded. This one does not listen."""
+    """Receives what an image and its gradient take, where points are shaded. This one keeps nothing."""
 
     def part(self, name: str) -> AbstractContextManager[None]:
-        """Around a part of the work; parts of one name add up."""
+        """Return a context around a part of the work. Parts of one name add up."""
         return nullcontext()
 
     def count(self, name: str, number: int) -> None:
-        """Of samples; those of one name add up."""
+        """Receive a number of samples. Those of one name add up."""
 
 
 def table(rows: Sequence[Sequence[str]], align: str) -> str:
-    """Rows of text in columns, each aligned to the left (<) or to the right (>)."""
+    """Return rows of text in columns, each aligned to the left (<) or to the right (>)."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     cells = [[f"{cell:{side}{w}s}" for cell, side, w in zip(row, align, widths, strict=True)] for row in rows]
     return "\n".join("  ".join(row).rstrip() for row in cells)

@@ -9,13 +9,14 @@ from torch import Tensor
 
 
 def transformed() -> bool:
-    """Whether a transform of torch.func is under way."""
+    """Return whether a transform of torch.func is under way."""
     functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
     return functorch.peek_interpreter_stack() is not None
 
 
 def plain() -> bool:
-    """Whether tensors are what they seem: neither a transform of torch.func, nor forward mode, nor torch.compile is under way."""
+    """Return whether tensors are what they seem: neither a transform of torch.func, nor forward mode, nor torch.compile is
+    under way."""
     return not (transformed() or torch.autograd.forward_ad._current_level >= 0 or torch.compiler.is_compiling())
 
 
@@ -24,7 +25,7 @@ def differentiates() -> bool:
 
 
 def moves(*tensors: Tensor) -> bool:
-    """Whether a derivative by one of them may be asked for."""
+    """Return whether a derivative by one of them may be asked for."""
     if transformed():
         return True
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):

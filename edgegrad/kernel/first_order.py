@@ -17,33 +17,33 @@ Tensors = Sequence[Tensor | None]
 
 
 class Operation(Protocol):
-    """A function of tensors, with the three things that are asked of it."""
+    """A function of tensors, with its value, its cotangents and its tangent."""
 
     @property
     def moving(self) -> Sequence[int]:
-        """Which of the tensors have derivatives."""
+        """Return which of the tensors have derivatives."""
         ...
 
     def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
-        """The result, and more that the derivatives need, which has none."""
+        """Return the result, and further tensors that the derivatives need and that have none."""
         ...
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
-        """The cotangents of the moving tensors from that of the result; of those that are not wanted, anything."""
+        """Return the cotangents of the moving tensors from that of the result. Those that are not wanted may be anything."""
         ...
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
-        """The tangent of the result from those of the moving tensors."""
+        """Return the tangent of the result from those of the moving tensors."""
         ...
 
 
 def apply(operation: Operation, tensors: Tensors) -> tuple[Tensor, ...]:
-    """What value() returns, differentiable."""
+    """Return what value() returns, with derivatives."""
     return _Value.apply(operation, *tensors)  # pyright: ignore[reportReturnType]
 
 
 def without_derivatives(compute: Callable[..., Sequence[Tensor]], *tensors: Tensor) -> tuple[Tensor, ...]:
-    """What `compute` makes of the values of tensors, whatever transforms of torch.func are under way."""
+    """Return compute() of the values of tensors, whatever transforms of torch.func are under way."""
     if plain():
         with torch.no_grad():
             return tuple(compute(*(tensor.detach() for tensor in tensors)))
@@ -51,7 +51,7 @@ def without_derivatives(compute: Callable[..., Sequence[Tensor]], *tensors: Tens
 
 
 def unreached(result: Tensor, tensors: Iterable[Tensor]) -> list[Tensor]:
-    """Those that require a gradient and get none from the result, not even of zeros."""
+    """Return the tensors that require a gradient and get none from the result, not even of zeros."""
     wanting = [tensor for tensor in tensors if tensor.requires_grad]
     if transformed() or not result.requires_grad:
         return wanting
@@ -68,8 +68,6 @@ def unreached(result: Tensor, tensors: Iterable[Tensor]) -> list[Tensor]:
 
 
 class _Values(torch.autograd.Function):
-    """What `compute` makes of the values of tensors, whatever transforms of torch.func are under way."""
-
     @staticmethod
     def forward(compute: Callable[..., Sequence[Tensor]], *tensors: Tensor) -> tuple[Tensor, ...]:
         return tuple(compute(*tensors))
@@ -177,10 +175,10 @@ class _Jvp(_First):
 
 
 def array(tensor: Tensor) -> Any:
-    """A contiguous array of a tensor's values on the CPU."""
+    """Return a contiguous array of a tensor's values on the CPU."""
     return tensor.detach().cpu().contiguous().numpy()
 
 
 def doubles(tensor: Tensor | None) -> Any:
-    """The same in double, None as it is."""
+    """Return a contiguous array of a tensor's values in double, or None for None."""
     return None if tensor is None else array(tensor.double())

@@ -38,15 +38,15 @@ class Flat(NamedTuple):
 
     @property
     def has_steps(self) -> bool:
-        """Whether something jumps within a face: it is cut out, or its texels are."""
+        """Return whether something jumps within a face: it is cut out, or its texels are."""
         if len(self.alpha_masks) > 0 or len(self.textures) == 0:
             return len(self.alpha_masks) > 0
         return bool((self.textures[:, 5] == FILTERS.index("nearest")).any())
 
 
 def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
-    """Indices into `count` rows as indices into all rows, int32. What is out of range stays so, for the kernel to refuse: it
-    must not wrap around, nor reach into the rows of another mesh, so unless the mesh is alone it becomes −1."""
+    """Return indices into `count` rows as indices into all rows, int32. What is out of range stays so, for the kernel to
+    refuse: it must not wrap around, nor reach into the rows of another mesh, so unless the mesh is alone it becomes −1."""
     index = index.cpu()
     if alone:
         # Comparing the extremes costs less than a copy of a million indices.
@@ -59,8 +59,8 @@ def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
 
 
 def _vertex_spacing(scene: Scene) -> list[float]:
-    """The relative spacing of the numbers in which the vertices were given, by which copies of a point may differ: pairs of
-    the number of a vertex in the flat arrays and the spacing from there on."""
+    """Return the relative spacing of the numbers in which the vertices were given, by which copies of a point may differ: pairs
+    of the number of a vertex in the flat arrays and the spacing from there on."""
     pairs: list[float] = []
     n_verts = 0
     for mesh in scene.meshes:
@@ -72,7 +72,7 @@ def _vertex_spacing(scene: Scene) -> list[float]:
 
 
 def image_dtype(scene: Scene) -> torch.dtype:
-    """That of the colours, or, if there are none, of the vertices; float32 or float64."""
+    """Return the dtype of the colours, or of the vertices if there are none: float32 or float64."""
     floats = [t for m in scene.meshes for t in (m.colors, m.face_colors, m.corner_colors, m.texture) if t is not None]
     floats += [scene.background] if scene.background is not None else []
     floats = floats or [scene.meshes[0].verts]
@@ -80,15 +80,15 @@ def image_dtype(scene: Scene) -> torch.dtype:
 
 
 def _sampler(mesh: Mesh) -> list[int]:
-    """How the images of a mesh are looked up: the wrap of u and of v, and the filter, as the kernel counts them. It knows no
-    mipmaps: their levels are of the texture, which it is not given where there are some."""
+    """Return how the images of a mesh are looked up: the wrap of u and of v, and the filter, as the kernel counts them. It
+    knows no mipmaps: their levels are of the texture, which it is not given where there are some."""
     u, v = mesh.wraps
     filter = "linear" if mesh.filter == "mipmap" else mesh.filter
     return [WRAPS.index(u), WRAPS.index(v), FILTERS.index(filter)]
 
 
 def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
-    """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back.
+    """Return the arrays of a scene; every step is a differentiable torch operation, so gradients find their way back.
 
     all_uvs   also texture coordinates that neither a texture nor a alpha-tested face needs
     blended   whether meshes that blend are there as a whole; else they are cut out where their alpha is below ½

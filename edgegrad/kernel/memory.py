@@ -21,14 +21,14 @@ LOOK_FROM = 256 << 20
 
 
 def available() -> int:
-    """Bytes that this process can still have: of the machine, and of the control groups (containers) that it is in."""
+    """Return the bytes that this process can still have: of the machine, and of the control groups (containers) that it is in."""
     import psutil  # here, since few processes ever ask
 
     return min([psutil.virtual_memory().available, *_left_in_groups()])
 
 
 def _left_in_groups(proc: Path = Path("/proc/self/cgroup"), mount: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:
-    """Bytes that each control group, from this process's to the root, leaves; nothing where there are none."""
+    """Return the bytes that each control group, from this process's to the root, leaves; nothing where there are none."""
     try:
         lines = proc.read_text().splitlines()
     except OSError:
@@ -90,7 +90,7 @@ def room(what: str, needs: Mapping[str, int], lower: Callable[[], str]) -> Itera
 
 
 def size(count: int) -> str:
-    """Of bytes, with two or three digits, in powers of 1000; "" for none."""
+    """Return a number of bytes as text, with two or three digits, in powers of 1000; "" for none."""
     if count == 0:
         return ""
     for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):

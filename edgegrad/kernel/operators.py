@@ -24,7 +24,7 @@ Profile = dict[str, float]
 
 
 class Hits(NamedTuple):
-    """What the image pass hit, for the backward pass; for B cameras."""
+    """Hits of the image pass of B cameras, for the backward pass."""
 
     coverage: Tensor  # (B, H, W): the filtered share of a pixel where something is hit
     depth: Tensor  # (B, H, W) float32: nothing that samples hit lies farther away; infinite if one hit nothing
@@ -124,8 +124,8 @@ def backward_kernel(
     dry: bool = False,
     lit: Scene | None = None,
 ) -> tuple[dict[str, Tensor], list[Profile]]:
-    """The gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts samples,
-    as for a scene that is `lit`, whose textures the request does not hold.
+    """Return the gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts
+    samples, as for a scene that is `lit`, whose textures the request does not hold.
 
     `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
@@ -185,7 +185,7 @@ def jvp_kernel(hits: Hits, request: Request, tangents: Mapping[str, Tensor], dir
 
 
 def _channel_weights(request: Request) -> Tensor:
-    """(C,) how much each channel matters for where samples of a derivative of all of them go: as much as any other,
+    """Return how much each channel matters (C,) for where samples of a derivative of all of them go: as much as any other,
     whatever its unit."""
     weights = request.scene.colors.new_ones(request.channels)
     values = request.auxiliary.vertex_attributes.detach()
@@ -196,7 +196,7 @@ def _channel_weights(request: Request) -> Tensor:
 
 
 def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Tensor:
-    """How the loss changes as what is seen in a pixel moves right and down: (B, H, W, 2). Raises MemoryError."""
+    """Return how the loss changes as what is seen in a pixel moves right and down: (B, H, W, 2). Raises MemoryError."""
     with derivatives_memory(request, ["verts"], 1):
         scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
         out = np.zeros((*adjoint.shape[:3], 2))
@@ -232,13 +232,13 @@ def _gradient_options(
 
 
 def faces_with_textures(lit: Scene | None) -> np.ndarray | None:
-    """(F,) uint8, if there are some in a scene that is lit."""
+    """Return which faces have a texture (F,) uint8, or None if none has one or the scene is not lit."""
     textured = None if lit is None else lit.textured_faces
     return None if textured is None else textured.numpy()
 
 
 def camera_seed(seed: int, camera: int) -> int:
-    """Cameras of a batch get samples of their own."""
+    """Return the seed of a camera of a batch: each has samples of its own."""
     return seed if camera == 0 else derived_seed(seed, camera + 1)
 
 
@@ -246,14 +246,14 @@ def camera_seed(seed: int, camera: int) -> int:
 
 
 def _sides(camera: PackedCamera) -> int:
-    """Of how many pinholes the widest of the cameras is made."""
+    """Return the largest number of pinholes that one of the cameras is made of."""
     if camera.lens not in ("fisheye", "panorama"):
         return 1
     return max(kernel_camera(camera, b).sides for b in range(len(camera.K)))
 
 
 def pass_size(request: Request) -> Any:
-    """What the kernel's needs depend on, of tensors with values."""
+    """Return the sizes of tensors with values on which the memory of the kernel depends."""
     flat, camera, auxiliary = request.scene, request.camera, request.auxiliary
     by_vertex = flat.corners is flat.faces or flat.corners.data_ptr() == flat.faces.data_ptr()
     jumps = not by_vertex or auxiliary.barycentrics or auxiliary.face_attributes.shape[-1] > 0
@@ -275,9 +275,6 @@ def pass_size(request: Request) -> Any:
         threads=threads(),
         sides=_sides(camera),
     )
-
-
-KEPT = ("ray structure", "topology")  # what may be there already, from an earlier call
 
 
 def image_memory(request: Request) -> AbstractContextManager[None]:
@@ -384,7 +381,7 @@ def _faces_at_centers_fake(*args: Any) -> Tensor:
 
 
 def _arguments(args: Sequence[Any]) -> tuple[Tensor, Hits, Request, list[bool]]:
-    """Those of edgegrad::render_backward."""
+    """Return the arguments of edgegrad::render_backward: adjoint, hits, request, and which gradients are wanted."""
     adjoint, coverage, depth, hit, seen, *packed, wanted = args
     return adjoint, Hits(coverage, depth, hit, seen), Request.unpack(packed), wanted
 
@@ -422,5 +419,5 @@ def _render_jvp_fake(*args: Any) -> Tensor:
 
 
 def _nothing(adjoint: Tensor) -> Tensor:
-    """What an operator returns for a gradient that is not wanted."""
+    """Return an empty tensor: the gradient of an operator that is not wanted."""
     return adjoint.new_empty(0, dtype=torch.float32)

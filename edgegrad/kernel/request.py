@@ -1,5 +1,5 @@
-"""What a render is asked, as records of tensors and numbers. Operators of torch take flat arguments of a few types: each
-record is packed into them and unpacked again here, by the names of its fields, and nobody else counts positions.
+"""Requests for a render: records of tensors and numbers. Operators of torch take flat arguments of a few types. Here alone
+records are packed into them and unpacked again, by the names of their fields.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Request(NamedTuple):
         return self.scene.background.shape[-1]
 
     def slot(self, name: str) -> Tensor:
-        """The tensor of a gradient slot."""
+        """Return the tensor of a gradient slot."""
         return getattr(self[_RECORD_OF[name]], name)
 
 
@@ -117,7 +117,7 @@ STEPPING = (*MOVING, "uvs", "alphas")  # slots that move what is cut out, and th
 
 
 def label(slot: str) -> str:
-    """What the user calls it."""
+    """Return the user's name of a slot."""
     return _LABELS.get(slot, slot)
 
 
@@ -130,7 +130,7 @@ def others_of(packed: Sequence[Any]) -> list[Any]:
 
 
 def join(tensors: Sequence[Tensor], others: Sequence[Any]) -> list[Any]:
-    """The packed values of tensors_of() and others_of()."""
+    """Return the packed values of tensors_of() and others_of()."""
     packed, t, o = [], 0, 0
     for is_tensor in IS_TENSOR:
         packed.append(tensors[t] if is_tensor else others[o])
@@ -139,7 +139,7 @@ def join(tensors: Sequence[Tensor], others: Sequence[Any]) -> list[Any]:
 
 
 def required(request: Request) -> tuple[str, ...]:
-    """The slots that a backward pass will be asked for: none under torch.no_grad()."""
+    """Return the slots that a backward pass will be asked for: none under torch.no_grad()."""
     return tuple(name for name in SLOTS if torch.is_grad_enabled() and request.slot(name).requires_grad)
 
 
@@ -179,8 +179,8 @@ def make_request(
     step_spacing: float = 1.0,
     all_uvs: bool = False,
 ) -> Request:
-    """The arguments of render(), checked; and whether texture coordinates that nothing needs are taken along. Raises TypeError
-    or ValueError."""
+    """Return the arguments of render(), checked; and whether texture coordinates that nothing needs are taken along. Raises
+    TypeError or ValueError."""
     scene = as_scene(scene)
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
@@ -261,5 +261,5 @@ def _check_seed(name: str, seed: object) -> int:
 
 
 def derived_seed(seed: int, stream: int = 1) -> int:
-    """Another seed for each stream: multiplication by an odd number is a bijection, so no two seeds meet."""
+    """Return a seed of its own for each stream: multiplication by an odd number is a bijection, so no two seeds meet."""
     return (seed * 0x5851F42D4C957F2D + stream * 0x14057B7EF767814F) & (2**63 - 1)

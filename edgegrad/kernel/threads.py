@@ -1,4 +1,4 @@
-"""How many threads a pass of the kernel takes, and passes that run in parallel."""
+"""Number of threads of a pass of the kernel, and passes that run in parallel."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ Result = TypeVar("Result")
 
 
 def threads() -> int:
-    """As many as torch takes; one where passes run in parallel."""
+    """Return the number of threads of a pass: as many as torch takes, or one where passes run in parallel."""
     return 1 if getattr(_own, "parallel", False) else torch.get_num_threads()
 
 
 def parallel_map(work: Callable[[Item], Result], items: Iterable[Item], count: int) -> list[Result]:
-    """work(item) of all `count` items, on as many threads as torch takes, each pass on one of them. Work on an item begins once
-    it is there, while the calling thread makes the next. Nothing of the work is recorded by autograd."""
+    """Return work(item) of all `count` items, on as many threads as torch takes, each pass on one of them.
+
+    Work on an item begins once it is there, while the calling thread makes the next. Autograd records nothing of the work.
+    """
     threads = min(torch.get_num_threads(), count)
 
     def run(item: Item) -> Result:

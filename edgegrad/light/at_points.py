@@ -1,5 +1,4 @@
-"""What the kernel computes at points of lit surfaces (csrc/shading/lit), as operations with first derivatives
-(kernel/first_order.py)."""
+"""Operations of the kernel at points of lit surfaces (csrc/shading/lit), with first derivatives (kernel/first_order.py)."""
 
 from __future__ import annotations
 
@@ -13,11 +12,11 @@ from ..kernel.first_order import Tensors, array, doubles
 from ..kernel.flat import Flat
 from ..kernel.operators import kernel_scene
 from ..library import core
-from .resampled import DARK
+from .sampling import DARK
 
 
 class Points(NamedTuple):
-    """Tensors of points, but for their barycentrics and what these differ by from pixel to pixel."""
+    """Tensors of points, but for their barycentrics and the differences of these from pixel to pixel."""
 
     face: Tensor  # (N,) int64
     seed: Tensor  # (N,) int64
@@ -56,7 +55,7 @@ class AtPoints(NamedTuple):
 
     @property
     def _first(self) -> int:
-        """Of the tables."""
+        """Return the place of the first table among the tensors."""
         return 2 + len(Points._fields)
 
     @property
@@ -68,7 +67,7 @@ class AtPoints(NamedTuple):
         return Flat(*arrays, cutoffs=self.cutoffs, spacing=self.spacing)  # pyright: ignore[reportArgumentType]
 
     def kernel(self, tensors: Tensors) -> Any:
-        """The scene whose methods the kernel has."""
+        """Return the kernel's scene."""
         return kernel_scene(self._flat(tensors))
 
     def arguments(self, tensors: Tensors, options: Options) -> dict[str, Any]:
@@ -86,7 +85,7 @@ class AtPoints(NamedTuple):
         }
 
     def zeros(self, tensors: Tensors) -> Tensor:
-        """(N, C): radiance that is asked for its derivatives alone."""
+        """Return zeros (N, C) for radiance that is asked for its derivatives alone."""
         b = tensors[0]
         assert b is not None
         return torch.zeros((len(b), self.layout.channels), dtype=self.dtype)
@@ -157,7 +156,7 @@ class Indirect(NamedTuple):
 
 
 def _cotangents(found: Sequence[Any], bar: Tensor) -> list[Tensor]:
-    """Of b, its spread and the tables, in the order of the tensors."""
+    """Return the cotangents of b, its spread and the tables, in the order of the tensors."""
     tables, *places = found
     none = bar.new_zeros(0)
     return [none if g is None else torch.from_numpy(g) for g in (*places, *tables)]

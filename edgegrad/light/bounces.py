@@ -1,9 +1,9 @@
-"""What render() can differentiate where light is scattered more than once.
+"""Checks of what render() can differentiate where light is scattered more than once.
 
 Every tensor of a scene has its derivative inside surfaces (csrc/shading/lit/path_radiance.h). The borders of lights' shadows
-have theirs (indirect_shadows.py). So have edges on the way of light from one surface to another, and the lines along which
-surfaces pass through each other (secondary_edges.py). Some borders have no samples. Without them a gradient would be wrong
-without notice, so it is refused.
+have theirs (indirect_shadows.py). So have secondary edges, and the lines along which surfaces pass through each other
+(secondary_edges.py). Some discontinuities have no samples. Without them a gradient would be wrong without notice, so it is
+refused.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .in_kernel import is_fused, nearest_textures
 
 
 def check_bounces(scene: Scene, camera: Camera, request: Request) -> None:
-    """Raises ValueError for scenes whose surfaces do not light each other, and for derivatives that are not whole."""
+    """Raise ValueError for scenes whose surfaces cannot light each other, and for derivatives that are not complete."""
     if not is_fused(scene):
         raise ValueError(
             'bounces: expected at most 16 channels, and no texture of the filter "nearest" where meshes blend, for light that '
@@ -45,7 +45,7 @@ def _refused(name: str, where: str) -> ValueError:
 
 
 def _without_samples(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor, str]]:
-    """Tensors that move borders of which there are no samples: their names, and where these borders are."""
+    """Yield tensors that move discontinuities without samples: their names, and where these discontinuities are."""
     if scene.blends:
         for name, tensor in (*_moving(scene, camera), *_lights(scene)):
             yield name, tensor, "where one sees through surfaces"
@@ -59,7 +59,7 @@ def _without_samples(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor
 
 
 def _moving(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor]]:
-    """The tensors of the camera and of meshes, by name, that move borders of what one sees through."""
+    """Yield the tensors of camera and meshes, by name, that move discontinuities seen through alpha-blended faces."""
     yield from named_tensors(camera, "camera")
     for number, mesh in enumerate(scene.meshes):
         yield f"meshes[{number}].verts", mesh.verts
@@ -70,7 +70,7 @@ def _moving(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor]]:
 
 
 def _lights(scene: Scene) -> Iterator[tuple[str, Tensor]]:
-    """The same of lights. They move the borders of their shadows alone."""
+    """Yield the tensors of lights, by name, that move the boundaries of their shadows."""
     for number, light in enumerate(scene.lights):
         name = f"lights[{number}]"
         if isinstance(light, DirectionalLight):
@@ -82,7 +82,7 @@ def _lights(scene: Scene) -> Iterator[tuple[str, Tensor]]:
 
 
 def _has_derivative(tensor: Tensor) -> bool:
-    """Of the tensor itself, while moves() says yes to all under torch.func."""
+    """Return whether the tensor itself has a derivative, while moves() says yes to all under torch.func."""
     if torch.is_grad_enabled() and tensor.requires_grad:
         return True
     dual = torch.autograd.forward_ad

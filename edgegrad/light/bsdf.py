@@ -29,11 +29,12 @@ class Scattering(NamedTuple):
 
     @property
     def diffuse(self) -> Tensor:
-        """The share that is scattered evenly."""
+        """Return the share that is scattered evenly."""
         return self.base if self.metallic is None else self.base * (1 - self.metallic)
 
     def evaluate(self, v: Tensor, n: Tensor, l: Tensor) -> Tensor:
-        """(N, C): f(v, l), 1/sr, of unit directions (N, 3) to the viewer, of the normal and to the light, which is above."""
+        """Return f(v, l) (N, C), 1/sr, of unit directions (N, 3) to the viewer, of the normal and to the light, which is
+        above."""
         if self.metallic is None or self.roughness is None:
             return self.base / math.pi
         h = normalize(v + l, dim=-1)
@@ -46,28 +47,28 @@ class Scattering(NamedTuple):
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """(N, 1)."""
+    """Return a · b (N, 1)."""
     return (a * b).sum(-1, keepdim=True)
 
 
 def ggx(n: Tensor, h: Tensor, a2: Tensor) -> Tensor:
-    """(N, 1): the density of microfacets with the normal h, α² = a2 (Walter et al. 2007). The sine is that of a cross product:
-    1 − cos² would round away what decides where α is small."""
+    """Return the density (N, 1) of microfacets with the normal h, α² = a2 (Walter et al. 2007). The sine is that of a cross
+    product: 1 − cos² would round away what decides where α is small."""
     sine = torch.linalg.cross(n, h)
     d = dot(sine, sine) + a2 * dot(n, h) ** 2
     return a2 / (math.pi * d * d)
 
 
 def masking(nv: Tensor, nl: Tensor, a2: Tensor) -> Tensor:
-    """(N, 1): Smith's joint masking and shadowing with correlated heights over 4 (n·v)(n·l) (Heitz 2014, eq. 99)."""
+    """Return Smith's joint masking and shadowing with correlated heights over 4 (n·v)(n·l): (N, 1) (Heitz 2014, eq. 99)."""
     towards = nl * (a2 + (1 - a2) * nv * nv).sqrt()
     back = nv * (a2 + (1 - a2) * nl * nl).sqrt()
     return 0.5 / (towards + back)
 
 
 def terminator(g: Tensor, n: Tensor, l: Tensor) -> Tensor:
-    """(N, 1): a factor that takes the light on an interpolated normal n smoothly to zero where the light sets behind the face,
-    whose normal is g (Chiang, Li and Burley 2019, "Taming the Shadow Terminator"). Both normals are on the light's side."""
+    """Return a factor (N, 1) that takes the light on an interpolated normal n smoothly to zero where the light sets behind the
+    face, whose normal is g (Chiang, Li and Burley 2019, "Taming the Shadow Terminator"). Both normals are on the light's side."""
     ratio = dot(g, l) / (dot(g, n).clamp(min=1e-6) * dot(n, l).clamp(min=1e-12))
     G = ratio.clamp(0, 1)
     return G + G * G - G * G * G

@@ -19,7 +19,7 @@ ABOVE = 0.01  # the horizon, by which a lobe reaches there
 
 
 def note_jumps(hits: Hits, indirect: bool = False) -> None:
-    """Notes what of the radiance of materials may jump. `indirect`: light also comes by way of other surfaces."""
+    """Note what of the radiance of materials may jump. `indirect`: light also comes by way of other surfaces."""
     surfaces = hits._surfaces
     scene = surfaces.scene
     if len(scene.meshes) > 1:
@@ -47,7 +47,7 @@ def note_jumps(hits: Hits, indirect: bool = False) -> None:
 
 
 def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> Callable[[], Tensor]:
-    """(F, 3, K) of all faces from that of one mesh's; zero elsewhere."""
+    """Return values (F, 3, K) of all faces from those of one mesh, zero elsewhere."""
 
     def corners() -> Tensor:
         own = of_mesh().detach()
@@ -75,7 +75,7 @@ def _face_normals(surfaces: Surfaces, index: int) -> Tensor:
 
 
 def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays, indirect: bool) -> Tensor:
-    """(F, 3, K) of a mesh without shading normals: what may jump at its edges, besides colours.
+    """Return what may jump at edges of a mesh without shading normals, besides colours (F, 3, K).
 
     That is the face's normal on the viewer's side; if all light is that of punctual lights, only of faces that one of them
     lights. Of Lambertian faces it is then E max(0, n·l) of each light: if both faces agree at the ends of an edge, they agree
@@ -102,7 +102,7 @@ def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays, indirect: 
 
 
 def _shadow_terminators(surfaces: Surfaces, index: int, view: View | Rays, indirect: bool) -> Tensor:
-    """(F, 3, K): n·l times the shadow terminator at corners, with interpolated normals n, for each light.
+    """Return n·l times the shadow terminator at corners, with interpolated normals n, for each light (F, 3, K).
 
     The face's normal g enters through the terminator alone, which is 1 where g·l ≥ (g·n)(n·l). So of a fine mesh only edges near
     the terminator are creases. An extended light, or another surface, has a terminator for each of its points: then g itself is

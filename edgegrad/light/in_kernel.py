@@ -1,5 +1,5 @@
 """Radiance of lit surfaces by the kernel (csrc/shading/lit), with derivatives by all tensors of the scene, in reverse and in
-forward mode; radiance.py computes the same in PyTorch."""
+forward mode. Scenes of more channels than the kernel takes are shaded some channels after the other."""
 
 from __future__ import annotations
 
@@ -24,30 +24,29 @@ from ..scene.lights import Light, LightPoints
 from ..scene.material import Texture
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
-from .antithetic import MOST_SETS, SET_SIZE
 from .at_points import AtPoints, Indirect, Options, Points, Shading
-from .layout import layout_of
-from .resampled import DARK
+from .layout import channel_groups, layout_of
+from .sampling import DARK, MOST_SETS, SET_SIZE
 
 _64_BITS = 2**64 - 1
 
 
 def is_fused(scene: Scene) -> bool:
-    """Whether the kernel can shade a scene: no texture is nearest where one sees through surfaces, for the kernel declares no
-    steps."""
+    """Return whether the kernel can shade a whole image of a scene by itself. Where one sees through surfaces, texels that are
+    nearest must be declared as discontinuities at each of them."""
     if scene.channels > core.MOST_LIT_CHANNELS:
         return False
     return not scene.blends or "nearest" not in _filters(scene)
 
 
 def _filters(scene: Scene) -> set[str]:
-    """Those of all textures."""
+    """Return the filters of all textures."""
     textures = [t for m in scene.meshes if m.material is not None for t in m.material.textures.values()]
     return {*(mesh.filter for mesh in scene.meshes if mesh.texture is not None), *(t.filter for t in textures)}
 
 
 def nearest_textures(mesh: Mesh) -> list[Texture]:
-    """Those of a mesh that give the nearest texel, in the order in which shading reads them."""
+    """Return the textures of a mesh that give the nearest texel, in the order in which shading reads them."""
     found = [] if mesh.texture is None else [Texture(mesh.texture, wrap=mesh.wrap, filter=mesh.filter)]
     if mesh.material is not None:
         m = mesh.material
@@ -57,10 +56,16 @@ def nearest_textures(mesh: Mesh) -> list[Texture]:
 
 
 def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
-    """(N, C) the radiance of meshes by their materials and the scene's lights; of meshes without a material their colours. Zeros
-    with the same derivatives, if the hits need no values. Which lights are seen is noted in the hits."""
+    """Return the radiance (N, C) of meshes by their materials and the scene's lights; of meshes without a material their colours.
+    If the hits need no values, these are zeros with the same derivatives. Which lights are seen is noted in the hits."""
+    groups = channel_groups(hits._surfaces.scene)
+    found = [_radiance(hits, shadows, samples, channels) for channels in groups]
+    return found[0] if len(found) == 1 else torch.cat(found, 1)
+
+
+def _radiance(hits: Hits, shadows: bool, samples: int, channels: slice) -> Tensor:
     surfaces = hits._surfaces
-    at, tensors = _at(hits)
+    at, tensors = _at(hits, channels)
     only = at.forced if hits._only_light else -1
     samples = samples if only < 0 else 1
     # Without values nothing is computed now; but once it must be, to note the lights whose shadows are asked for.
@@ -86,8 +91,12 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
 
 
 def indirect(hits: Hits, shadows: bool, bounces: int, only_near_field: float = 0.0) -> Tensor:
-    """(N, C) what is to be added of light that is scattered more than once, `bounces` times at most; or, of light that comes from
-    so near, world units. Zeros with the same derivatives, if the hits need no values."""
+    """Return the radiance (N, C) that light adds which is scattered more than once, `bounces` times at most.
+
+    only_near_field : if above 0, only that of light which comes from so near, in world units
+
+    If the hits need no values, these are zeros with the same derivatives.
+    """
     at, tensors = _at(hits)
     options = Options(
         shadows, 1, bounces=bounces, near=only_near_field or hits._near, only_near_field=only_near_field > 0
@@ -95,10 +104,10 @@ def indirect(hits: Hits, shadows: bool, bounces: int, only_near_field: float = 0
     return apply(Indirect(at, options, hits._needs_values), tensors)[0].to(hits._surfaces.verts)
 
 
-def _at(hits: Hits) -> tuple[AtPoints, list[Tensor | None]]:
+def _at(hits: Hits, channels: slice = slice(None)) -> tuple[AtPoints, list[Tensor | None]]:
     surfaces, view = hits._surfaces, hits._view
     assert isinstance(view, View)
-    layout, tables = layout_of(surfaces, view)
+    layout, tables = layout_of(surfaces, view, channels)
     forced, casters = hits._forced, surfaces.casters
     known = (None,) * 4 if forced is None else _forced(forced.points, forced.lit)
     points = Points(hits._face.cpu(), hits._seed.cpu(), *known)
@@ -110,7 +119,7 @@ def _at(hits: Hits) -> tuple[AtPoints, list[Tensor | None]]:
 
 
 def image(frame: Frame, options: Options, points: int) -> Tensor:
-    """(H · W, C) the scene's surfaces before black, without derivatives, with `points` of each face in a pixel shaded."""
+    """Return the image (H · W, C) of surfaces before black, without derivatives; `points` of each face in a pixel are shaded."""
     layout, tables = layout_of(frame.fixed, frame.fixed_view)
     seed, again = (int(frame.seeds(kind, 1)) & _64_BITS for kind in ("image", "image again"))
 
@@ -133,9 +142,11 @@ def image(frame: Frame, options: Options, points: int) -> Tensor:
 
 
 def secondary_edge_samples(frame: Frame, options: Options, further: int) -> tuple[CurveRecords, Tensor, Tensor]:
-    """Samples on the borders of what surfaces of paths see of one another, and (S, C) float64 by how much the image jumps there,
-    times what a sample stands for. Where light goes `further` steps after that: what has come to the first point of each, and
-    (S, 3) from which unit directions (csrc/secondary/secondary_edges.h)."""
+    """Return samples on secondary edges, and (S, C) float64 the jump of the image there times what a sample stands for.
+
+    Where light goes `further` steps after that, it is the light that has come to the first point of each sample instead, and
+    (S, 3) the unit directions it came from (csrc/secondary/secondary_edges.h).
+    """
     own = {"further": further, "seen": further == 0}
     return _samples_of_lines(
         frame, options, "secondary_edge_samples", derived_seed(frame.sampler.grad_seed, -further), own
@@ -145,7 +156,7 @@ def secondary_edge_samples(frame: Frame, options: Options, further: int) -> tupl
 def surface_edge_samples(
     frame: Frame, options: Options, further: int, crossings: bool, alpha_edges: bool
 ) -> tuple[CurveRecords, Tensor, Tensor]:
-    """Samples on the curves at which surfaces begin to send light: where faces pass through each other, and on alpha edges.
+    """Return samples on the curves at which emitters or reflectors end: where faces pass through each other, and alpha edges.
     The first point of each gets light from there, that may go `further` steps after that; see secondary_edge_samples()."""
     own = {"further": further, "crossings": crossings, "alpha_edges": alpha_edges}
     seed = derived_seed(frame.sampler.grad_seed, -core.MOST_BOUNCES - further)
@@ -168,8 +179,8 @@ def _samples_of_lines(
 
 
 def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, int]) -> list[Tensor]:
-    """What comes to the image of light that has come to points, without derivatives: which point it is of (M,) int64, the places
-    in the image (M, 2), and the radiance times px² (M, C). See csrc/shading/lit/light_tracing.h.
+    """Return what reaches the image of light that has come to points, without derivatives: the point it comes from (M,) int64,
+    places in the image (M, 2), and radiance times px² (M, C). See csrc/shading/lit/light_tracing.h.
 
     arrivals  faces (N,), barycentrics (N, 3), seeds (N,), unit directions (N, 3) where the light came from, and how much (N, C)
     steps     the first and the last after which it goes to the camera
@@ -192,11 +203,11 @@ def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, i
 
 
 def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
-    """`samples` points of a light for each of the hits, as radiance() draws them; where nothing arrives their density is
-    infinite."""
+    """Return `samples` points of a light for each of the hits, as radiance() draws them for the first channels that it takes.
+    Where nothing arrives their density is infinite."""
     surfaces, view = hits._surfaces, hits._view
     assert isinstance(view, View)
-    layout, tables = layout_of(surfaces, view)
+    layout, tables = layout_of(surfaces, view, channel_groups(surfaces.scene)[0])
     filtered = "mipmap" in _filters(surfaces.scene)
 
     def compute(b: Tensor, face: Tensor, seed: Tensor, faces: Tensor, *others: Tensor) -> Sequence[Tensor]:
@@ -217,7 +228,7 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
 def light_on_faces(
     verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, power: Tensor
 ) -> Tensor:
-    """(F, 3, L) float64: E max(0, n·l) at the corners of flat faces, divided by its maximum (csrc/shading/lit/flat_light.h).
+    """Return E max(0, n·l) at the corners of flat faces (F, 3, L) float64, over its maximum (csrc/shading/lit/flat_light.h).
 
     place   (L, 3) positions of point lights, or directions to infinite ones
     power   (L,) in W/sr, or in W/m² of infinite ones

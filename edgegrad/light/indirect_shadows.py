@@ -29,19 +29,19 @@ AT_ONCE = 1 << 17  # samples whose light is followed together
 
 
 def indirect_shadows(frame: Frame, bounces: int, watch: Watch) -> list[Term]:
-    """What samples on these borders give to the image, by light that is scattered `bounces` times at most."""
+    """Return the terms of samples on these boundaries, by light that is scattered `bounces` times at most."""
     request, surfaces, sampler = frame.request, frame.surfaces, frame.sampler
     count = request.gradient.edge_samples
     if count < 0:
         count = core.default_secondary_samples(frame.width, frame.height, request.image.spp)
     flat = surfaces.casters
-    # As the camera moves these borders stay.
+    # As the camera moves these boundaries stay.
     moving = moves(surfaces.verts) or (bool(len(flat.alpha_masks)) and moves(flat.alphas, flat.uvs))
     terms: list[Term] = []
     for index, casting in enumerate(surfaces.scene.casting):
         if moving or ShadowLight.moves(casting):
             seed = derived_seed(sampler.grad_seed, index + 2)
-            light = ShadowLight.of(surfaces, index, seed)
+            light = ShadowLight.from_surfaces(surfaces, index, seed)
             records = sampler.shadow_samples(light.parts, seed, count, False, one=True, seen=False)
             watch.count("indirect_shadow_samples", len(records.x))
             terms += _of_light(frame, light, records, bounces)
@@ -61,9 +61,9 @@ def _of_light(frame: Frame, light: ShadowLight, records: CurveRecords, bounces: 
 def _towards_camera(
     frame: Frame, light: ShadowLight, records: CurveRecords, some: slice, bounces: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which samples send light to the camera (M,), to which places of the image (M, 2), and how much (M, C)."""
+    """Return which samples send light to the camera (M,), to which places of the image (M, 2), and how much (M, C)."""
     face, b = frame.here(records.hit_face[some]), frame.here(records.hit_b[some])
-    seed = frame.seeds("unseen shadows", len(records.x))[some]
+    seed = frame.seeds("indirect shadows", len(records.x))[some]
     hits = frame.fixed_hits(face, b, frame.here(records.hit_x[some]), seed)
     points, share = light.points(frame.here(records.light[some]), frame.here(records.light_uv[some]))
     drawn = light.light.shows(points) & points.density.isfinite()
@@ -80,7 +80,7 @@ def _towards_camera(
 
 
 def _velocity(frame: Frame, light: ShadowLight, records: CurveRecords) -> Tensor:
-    """(S,): zeros with the derivatives of F."""
+    """Return zeros (S,) with the derivatives of F."""
     count, forms = len(records.x), world_velocity(frame, records)
     if light.moves(light.light):
         points, _ = light.points(frame.here(records.light), frame.here(records.light_uv))

@@ -22,32 +22,34 @@ from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
-from .mesh_light_sampling import hides, least_brightness, tree_of
+from .sampling import hides, least_brightness, tree_of
 
 
 class _Tables:
-    """Tensors of a scene as tables on the CPU."""
+    """Tensors of a scene as tables on the CPU, of colours with more channels than the kernel takes some channels alone."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: slice) -> None:
         self.tensors: list[Tensor] = []
+        self.channels = channels
 
     def add(self, tensor: Tensor | float | None, width: int) -> int:
-        """The number of the table with rows of this width; −1 where there is no tensor."""
+        """Return the number of a new table with rows of this width, or −1 where there is no tensor."""
         if tensor is None:
             return -1
         tensor = torch.as_tensor(tensor).cpu()
         if tensor.dtype not in (torch.float32, torch.float64):
             tensor = tensor.double()
-        self.tensors.append(tensor.reshape(-1, width))
+        tensor = tensor.reshape(-1, width)
+        self.tensors.append(tensor[:, self.channels] if width > core.MOST_LIT_CHANNELS else tensor)
         return len(self.tensors) - 1
 
     def add_numbers(self, tensor: Tensor | float | None) -> int:
-        """A table of one row."""
+        """Return the number of a new table of one row, or −1."""
         return -1 if tensor is None else self.add(tensor, torch.as_tensor(tensor).numel())
 
 
 class Layout(NamedTuple):
-    """How a scene is made of tables: which table holds what."""
+    """The tables of a scene: which holds what."""
 
     meshes: list[Any]
     lights: list[Any]
@@ -58,7 +60,7 @@ class Layout(NamedTuple):
     ball: list[float]
 
     @classmethod
-    def of(cls, surfaces: Surfaces, view: View, tables: _Tables) -> Layout:
+    def from_surfaces(cls, surfaces: Surfaces, view: View, tables: _Tables) -> Layout:
         scene = surfaces.scene
         verts, seen_from = tables.add(surfaces.bare.verts, 3), tables.add(view.eye, 3)
         firsts = np.cumsum([0, *(len(mesh.verts) for mesh in scene.meshes)])
@@ -68,22 +70,30 @@ class Layout(NamedTuple):
         lights = [_kernel_light(scene, light, k, eps, tables) for k, light in enumerate((*scene.casting, *still))]
         center, radius = surfaces.ball
         ball = [*map(float, values_of(center)[0]), radius]
-        return cls(meshes, lights, verts, seen_from, view.perspective, scene.channels, ball)
+        channels = len(range(scene.channels)[tables.channels])
+        return cls(meshes, lights, verts, seen_from, view.perspective, channels, ball)
 
     def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
         parts = self._asdict()
         return core.Lit(tables=[array(t) for t in tables], faces=array(faces), **parts)
 
 
-def layout_of(surfaces: Surfaces, view: View) -> tuple[Layout, list[Tensor]]:
-    """The layout of surfaces and a view, and its tables; kept for points that have no derivatives."""
-    if surfaces.layout is None or surfaces.layout[0] is not view:
-        tables = _Tables()
-        found = view, Layout.of(surfaces, view, tables), tables.tensors
+def channel_groups(scene: Scene) -> list[slice]:
+    """Return the channels of a scene in groups that the kernel shades at once, of about equal sizes."""
+    C = scene.channels
+    count = -(-C // core.MOST_LIT_CHANNELS)
+    return [slice(None)] if count == 1 else [slice(C * k // count, C * (k + 1) // count) for k in range(count)]
+
+
+def layout_of(surfaces: Surfaces, view: View, channels: slice = slice(None)) -> tuple[Layout, list[Tensor]]:
+    """Return the layout of surfaces and a view, and its tables; they are kept for points that have no derivatives."""
+    if surfaces.layout is None or surfaces.layout[0] is not view or surfaces.layout[1] != channels:
+        tables = _Tables(channels)
+        found = view, channels, Layout.from_surfaces(surfaces, view, tables), tables.tensors
         if surfaces.has_derivatives:
-            return found[1:]
+            return found[2:]
         surfaces.layout = found
-    return surfaces.layout[1:]
+    return surfaces.layout[2:]
 
 
 def _mesh(surfaces: Surfaces, index: int, first_vertex: int, tables: _Tables) -> Any:

@@ -1,6 +1,6 @@
-"""How light from nearby, scattered on its way to what is seen, changes as that slides on its face.
+"""The near-field term: how light that nearby surfaces scatter changes as the shading point moves on its face.
 
-At a fixed place x of the image, vertices and camera move the barycentrics b of what is seen: it slides by δξ = (∂b/∂x)⁻¹ δb, px.
+At a fixed place x of the image, vertices and camera move the barycentrics b of the shading point by δξ = (∂b/∂x)⁻¹ δb, px.
 With the further points of its path held on their faces, the derivative of light by δξ grows as one over the distance to them, and
 near corners of a room its variance is infinite. But along an axis of the image the mean of a derivative is a difference,
 
@@ -37,7 +37,7 @@ LEAST_WIDTH = 2.0**-10  # px, below which a difference is rounding
 
 
 def radius(frame: Frame) -> float:
-    """How near light is compared at two places, world units: some pixels where most of what is seen lies; 0: nothing is seen."""
+    """Return the radius of the near field in world units: some pixels where most of what is seen lies. 0: nothing is seen."""
     height, width = frame.height, frame.width
     y, x = (((torch.arange(PLACES) + 0.5) / PLACES * size).double() for size in (height, width))
     places = torch.cartesian_prod(x, y)
@@ -57,15 +57,16 @@ def radius(frame: Frame) -> float:
 
 
 class NearField(NamedTuple):
-    """Light from nearby that comes to hits inside faces."""
+    """Light from within the radius that comes to hits inside faces."""
 
     frame: Frame
     hits: Hits
     light: Callable[[Hits], Tensor]  # (N, C)
-    declare: Callable[[Hits], object] | None  # where light jumps within faces (points/steps.py); None: nowhere
+    # Declares where light jumps within faces (points/discontinuities.py); None: nowhere.
+    declare: Callable[[Hits], object] | None
 
-    def slid(self) -> Tensor:
-        """(N, C) zeros with its derivatives by where the hits lie on their faces."""
+    def term(self) -> Tensor:
+        """Return zeros (N, C) with its derivatives by where the hits lie on their faces."""
         frame, surfaces, face = self.frame, self.frame.surfaces, self.hits._face
         none = frame.fixed.verts.new_zeros((len(face), surfaces.scene.channels))
         if moves(frame.view.world_to_camera, frame.intrinsics):
@@ -95,7 +96,7 @@ class NearField(NamedTuple):
         return self.hits._pixel.detach()
 
     def _slope(self, axis: int, along: Tensor, along_by: Tensor, b_by: Tensor) -> Tensor:
-        """(N, C) the differences along an axis of the image, by which rays and barycentrics change by these (N, 3) each px."""
+        """Return differences (N, C) along an axis of the image, by which rays and barycentrics change by these (N, 3) a px."""
         frame, place = self.frame, self._x[:, axis]
         width = WIDTH.get(frame.request.image.filter, OF_WIDER_FILTERS)
         cell = (place / width).floor() * width
@@ -116,7 +117,7 @@ class NearField(NamedTuple):
         return (L[1] - L[0]) / (ends[1] - ends[0]).clamp(min=LEAST_WIDTH)[:, None].to(L[0].dtype)
 
     def _visible(self, axis: int, end: Tensor) -> Tensor:
-        """(N,) how far one may go towards an end, px along an axis, before something hides the face, or light jumps there."""
+        """Return how far one may go towards an end, px along an axis, before something hides the face or light jumps (N,)."""
         rows = (~self._sees(axis, end)).nonzero()[:, 0]
         if not len(rows):
             return end
@@ -129,7 +130,7 @@ class NearField(NamedTuple):
         return end.index_copy(0, rows, near)
 
     def _sees(self, axis: int, t: Tensor) -> Tensor:
-        """(N,) bool: whether one sees the same face t px further along an axis, and between the same steps."""
+        """Return whether one sees the same face t px further along an axis, between the same discontinuities: (N,) bool."""
         there = self._there(axis, t)
         assert there._pixel is not None
         seen = self.frame.here(self.frame.sampler.hits_at(there._pixel).face) == self.hits._face
@@ -139,13 +140,13 @@ class NearField(NamedTuple):
         return seen & (here == there).all(1)
 
     def _steps_at(self, hits: Hits) -> Tensor:
-        """(N, K) between which steps hits lie."""
+        """Return between which discontinuities hits lie (N, K)."""
         assert self.declare is not None
         self.declare(hits)
-        return torch.stack([values.floor().nan_to_num() for values in hits._steps.values], 1)
+        return torch.stack([values.floor().nan_to_num() for values in hits._discontinuities.values], 1)
 
     def _there(self, axis: int, t: Tensor) -> Hits:
-        """The hits t px further along an axis of the image, on the same faces and with the same random numbers."""
+        """Return the hits t px further along an axis of the image, on the same faces and with the same random numbers."""
         frame, x = self.frame, self._x.clone()
         x[:, axis] += t
         along = frame.here(frame.sampler.rays_at(x, intrinsics=False).along)

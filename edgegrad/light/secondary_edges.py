@@ -29,7 +29,7 @@ AT_ONCE = 1 << 17  # samples whose light is followed together
 
 
 def secondary_edges(frame: Frame, options: Options) -> list[Term]:
-    """What samples on these borders give to the image."""
+    """Return the terms of samples on secondary edges."""
     surfaces = frame.surfaces
     flat = surfaces.casters
     alpha_edges = bool(len(flat.alpha_masks)) and moves(flat.alphas, flat.uvs)
@@ -40,18 +40,18 @@ def secondary_edges(frame: Frame, options: Options) -> list[Term]:
     if on_surfaces:
         for further in range(1, options.bounces - 1):
             terms += _passed_on(
-                frame, in_kernel.secondary_edge_samples(frame, options, further), "bounce edges", further
+                frame, in_kernel.secondary_edge_samples(frame, options, further), "secondary edges", further
             )
     crossings = moves(surfaces.verts) and has_intersections(frame.request.scene)
     if crossings or alpha_edges:
         for further in range(options.bounces - 1):
             found = in_kernel.surface_edge_samples(frame, options, further, crossings, alpha_edges)
-            terms += _passed_on(frame, found, "surface borders", further)
+            terms += _passed_on(frame, found, "surface edges", further)
     return terms
 
 
 def world_velocity(frame: Frame, records: CurveRecords) -> list[tuple[Form, Tensor]]:
-    """How F of samples that have no place in the image moves, by vertices in the world and by the textures of alpha."""
+    """Return how F of samples without a place in the image moves, by vertices in the world and by the textures of alpha."""
     flat = frame.surfaces.casters
     return [
         (Form(records.row_of, records.vertex, records.by_q), frame.surfaces.verts),
@@ -73,7 +73,7 @@ def _seen(frame: Frame, options: Options) -> list[Term]:
 
 
 def _passed_on(frame: Frame, found: tuple[CurveRecords, Tensor, Tensor], kind: str, further: int) -> list[Term]:
-    """By light that is scattered so many times more after the point that receives it."""
+    """Return the terms by light that is scattered `further` times more after the shading point."""
     records, carried, origin = found
     count = len(records.x)
     if not count:

@@ -32,7 +32,7 @@ _PARTS = (
 def lit_image(
     lighting: Lighting, scene: Scene, camera: Camera, request: Request, creases: bool | str = "auto"
 ) -> Tensor:
-    """(H, W, C), or (B, H, W, C) for a batch of cameras, also of tensors without values."""
+    """Return the image (H, W, C), or (B, H, W, C) for a batch of cameras, also of tensors without values."""
     if values_visible(*tensors_in((scene, camera))):
         return lighting.image(scene, camera, request, creases)
     tensors: list[Tensor] = []
@@ -54,7 +54,7 @@ def lit_image(
 
 
 def _dtype(scene: Scene) -> torch.dtype:
-    """Of the image."""
+    """Return the dtype of the image."""
     if not scene.is_lit:
         return image_dtype(scene)
     return torch.float64 if any(mesh.verts.dtype == torch.float64 for mesh in scene.meshes) else torch.float32

@@ -1,4 +1,4 @@
-"""What lies behind all surfaces: environments that a scene shows."""
+"""Environments that a scene shows behind all surfaces."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ AT_ONCE = 1 << 16  # pixels whose rays are in memory at a time
 
 
 def environments(frame: Frame) -> Tensor | None:
-    """(H, W, C): the visible environments, each pixel the mean of four rays; None if there are none, or a background."""
+    """Return the image (H, W, C) of the visible environments, each pixel the mean of four rays; None if there are none, or a
+    background."""
     scene = frame.surfaces.scene
     shown = [light for light in scene.lights if isinstance(light, Environment) and light.visible]
     if scene.background is not None or not shown:

@@ -37,7 +37,7 @@ class Blended:
         return (alpha * radiance).index_add(0, through, (1 - alpha[through]) * behind)
 
     def _behind(self, hits: Hits, channels: int, left: int) -> Tensor:
-        """(N, C) what rays meet behind hits."""
+        """Return the radiance (N, C) of what rays meet behind hits."""
         frame = self._frame
         with torch.no_grad():
             found = trace(hits._surfaces.bare, hits.position.double(), -hits.view.double(), hits._face)
@@ -56,7 +56,7 @@ class Blended:
         return total.to(radiance.dtype).index_copy(0, meets, radiance)
 
     def _behind_all(self, x: Tensor, channels: int) -> Tensor:
-        """(N, C) the background at places (N, 2)."""
+        """Return the background (N, C) at places (N, 2)."""
         frame, background = self._frame, self._background
         if background is None:
             return frame.fixed.verts.new_zeros((len(x), channels))
@@ -67,13 +67,13 @@ class Blended:
 
 
 def transparent(surfaces: Surfaces) -> Tensor:
-    """(F,) bool: the faces of meshes that blend."""
+    """Return which faces are alpha-blended (F,) bool."""
     blends = torch.tensor([mesh.blends for mesh in surfaces.scene.meshes], device=surfaces.mesh_of_face.device)
     return blends[surfaces.mesh_of_face]
 
 
 def let_through(frame: Frame, records: CurveRecords) -> Tensor:
-    """(S,) float64: what the surfaces before samples on curves let through, Π (1 − α), without derivatives."""
+    """Return the share Π (1 − α) that surfaces before samples on curves let through (S,) float64, without derivatives."""
     sample = frame.here(records.transparent_row_of)
     passed = frame.fixed_hits(records.transparent, records.transparent_b, records.x[records.transparent_row_of])
     total = torch.ones(len(records.x), dtype=torch.float64, device=frame.device)
@@ -81,7 +81,7 @@ def let_through(frame: Frame, records: CurveRecords) -> Tensor:
 
 
 def opacity(hits: Hits) -> Tensor:
-    """(N, 1): the alpha of meshes that blend, at most 1; 1 elsewhere."""
+    """Return the alpha (N, 1) of meshes that blend, at most 1; 1 elsewhere."""
     surfaces = hits._surfaces
     alpha = surfaces.verts.new_ones((len(hits), 1))
     for index, mesh in enumerate(surfaces.scene.meshes):

@@ -1,8 +1,7 @@
-"""Pixels that borders of a shader's steps, or of shadows, run through: there one point of a face is a poor estimate of the
-pixel.
+"""Pixels that a shader's discontinuities, or shadow boundaries, run through: one point of a face is a poor estimate there.
 
-A pixel counts as such if the eight pixels around it lie on different sides of a step. Its own points do not count: if they
-decided whether they are replaced by others, the mean over seeds would be biased.
+A pixel counts as such if the eight pixels around it lie on different sides of a discontinuity. Its own points do not count: if
+they decided whether they are replaced by others, the mean over seeds would be biased.
 """
 
 from __future__ import annotations
@@ -11,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ..check import values_visible
+from .discontinuities import FLOOR
 from .hits import Hits
-from .steps import FLOOR
 
 MOST = 8  # at most so many times the first pass's points of a face in a pixel
 SHARE = 4  # and so many times all of its points
@@ -20,7 +19,7 @@ LEVELS = 1 << 14  # levels of a floor() are compared modulo this, so that int16 
 
 
 class Borders:
-    """Of an image of `size` (height, width), from a first pass with `points` of each face in a pixel."""
+    """Finds such pixels of an image of `size` (height, width), from a first pass with `points` of each face in a pixel."""
 
     def __init__(self, size: tuple[int, int], points: int) -> None:
         self._size, self._each = size, points
@@ -30,8 +29,8 @@ class Borders:
         self._known = True
 
     def add(self, pixel: Tensor, hits: Hits) -> None:
-        """Points of the pixels (N,), after they were shaded."""
-        steps = list(zip(hits._steps.kinds, hits._steps.values, strict=True))
+        """Add points of the pixels (N,), after they were shaded."""
+        steps = list(zip(hits._discontinuities.kinds, hits._discontinuities.values, strict=True))
         self._known = self._known and values_visible(*(values for _, values in steps if values is not None))
         # Each point sees another part of a light with an extent, so its neighbours say nothing about the shadow's border.
         lights = [k for k, light in enumerate(hits.lights) if light.punctual]
@@ -51,7 +50,7 @@ class Borders:
             self._greatest[k].scatter_reduce_(0, pixel, side, "amax")
 
     def found(self) -> tuple[Tensor, int]:
-        """The pixels (H, W) bool, and how many points of each face to shade in them."""
+        """Return the pixels (H, W) bool, and how many points of each face to shade in them."""
         differ = torch.zeros(self._size, dtype=torch.bool)
         if not self._known:
             return differ, 1
@@ -63,14 +62,14 @@ class Borders:
 
 
 def _sides(kind: str, values: Tensor) -> Tensor:
-    """(N,) int16: on which side of a step points lie; −1 where the shader did not ask."""
+    """Return on which side of a discontinuity points lie (N,) int16; −1 where the shader did not ask."""
     values = values.detach()
     side = values.double().nan_to_num().floor() % LEVELS if kind == FLOOR else values > 0
     return side.to(torch.int16).masked_fill(~torch.isfinite(values), -1)
 
 
 def _around(values: Tensor, outside: int) -> Tensor:
-    """(H, W): the greatest of the eight neighbours of each pixel, with this value beyond the border."""
+    """Return the greatest of the eight neighbours of each pixel (H, W), with this value beyond the border."""
     padded = torch.nn.functional.pad(values, (1, 1, 1, 1), value=outside)
     horizontal = torch.maximum(padded[:, :-2], padded[:, 2:])
     three = torch.maximum(horizontal, padded[:, 1:-1])

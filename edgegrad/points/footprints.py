@@ -1,4 +1,4 @@
-"""How far apart pixels see a surface, and so which level of a texture's pyramid they see (Williams 1983)."""
+"""Distances on surfaces from pixel to pixel, and the levels of a texture's pyramid that these ask for (Williams 1983)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .surfaces import Surfaces, View
 
 
 class Footprints(NamedTuple):
-    """Of N points of surfaces that a camera sees."""
+    """The footprints of pixels at N points of surfaces."""
 
     surfaces: Surfaces
     view: View
@@ -24,7 +24,7 @@ class Footprints(NamedTuple):
     rays_at: Callable[[Tensor], RayRecords]
 
     def spread(self) -> Tensor:
-        """(N, 2, 2) float64: how far the last two barycentrics are apart one pixel to the right, and one down."""
+        """Return the change of the last two barycentrics one pixel to the right, and one down: (N, 2, 2) float64."""
         rays_at, pixel = self.rays_at, self.pixel
         aside = 1 / 64  # px, so small that texture coordinates are nearly affine in the image
         rays = rays_at(pixel)
@@ -41,8 +41,8 @@ class Footprints(NamedTuple):
 
 
 def level(texture: Tensor, corner_uvs: Tensor, spread: Tensor) -> Tensor:
-    """(N,) log2 of the distance in texels of neighbouring pixels, the larger of both directions. `corner_uvs` (N, 3, 2) are the
-    texture coordinates of the faces' corners. csrc/shading/lit/source.h has the same."""
+    """Return (N,) log2 of the distance in texels of neighbouring pixels, the larger of both directions. `corner_uvs` (N, 3, 2)
+    are the texture coordinates of the faces' corners. csrc/shading/lit/source.h has the same."""
     corners = corner_uvs.double()
     edges = (corners[:, 1:] - corners[:, :1]) * corners.new_tensor([texture.shape[1], texture.shape[0]])
     texels = spread[:, :, :1] * edges[:, None, 0] + spread[:, :, 1:] * edges[:, None, 1]
@@ -52,9 +52,9 @@ def level(texture: Tensor, corner_uvs: Tensor, spread: Tensor) -> Tensor:
 
 
 def pyramid_of(surfaces: Surfaces, texture: Tensor) -> Pyramid:
-    """That of a texture, kept with the surfaces where they have no graph."""
+    """Return the pyramid of a texture, kept with the surfaces where they have no graph."""
     if torch.is_grad_enabled():
-        return Pyramid.of(texture)
+        return Pyramid.from_texture(texture)
     if id(texture) not in surfaces.pyramids:
-        surfaces.pyramids[id(texture)] = texture, Pyramid.of(texture)
+        surfaces.pyramids[id(texture)] = texture, Pyramid.from_texture(texture)
     return surfaces.pyramids[id(texture)][1]

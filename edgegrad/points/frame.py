@@ -1,4 +1,4 @@
-"""What all samples of one image share: surfaces, view, seeds, and how they are summed in pixels."""
+"""One image of a scene: the surfaces, view and seeds that its samples share, and their sums in pixels."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from ..kernel.derivatives import moves
 from ..kernel.operators import camera_seed
 from ..kernel.request import Request
 from ..scene.scene import Scene
+from .discontinuities import Discontinuities
 from .hits import Hits
-from .records import RayRecords, Sampler, SurfaceRecords, barycentrics, without_colors
+from .records import RayRecords, SurfaceRecords, barycentrics, without_colors
+from .sampler import Sampler
 from .seeds import sample_seeds
 from .shadow_rays import Forced
 from .sobol import z_order
 from .splat import Term, attached
-from .steps import Steps
 from .surfaces import Surfaces, View
 
 _Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
 # Each kind has its own random numbers.
 SAMPLES = (
-    "image", "inside", "edges", "steps", "shadows", "image again", "unseen shadows", "bounce edges", "surface borders",
+    "image", "inside", "edges", "steps", "shadows", "image again", "indirect shadows", "secondary edges", "surface edges",
 )  # fmt: skip
 
 
 class Frame:
-    """One image of a scene: what all its samples share."""
+    """One image of a scene."""
 
     def __init__(self, scene: Scene, request: Request, index: int = 0) -> None:
         packed = request.camera
@@ -47,18 +48,18 @@ class Frame:
         return self.height * self.width
 
     def here(self, tensor: Tensor) -> Tensor:
-        """On the device of the scene."""
+        """Return a tensor on the device of the scene."""
         return tensor.to(self.device)
 
     def seeds(self, kind: str, count: int, first: int = 0) -> Tensor:
-        """(count,) int64: of the samples of a kind from `first` on."""
+        """Return the seeds (count,) int64 of the samples of a kind from `first` on."""
         request = self.request
         seed = camera_seed(request.image.seed, self._index) if kind.startswith("image") else self.sampler.grad_seed
         return self.here(sample_seeds(seed, SAMPLES.index(kind), first, count))
 
     def seeds_of_pixels(self, kind: str, pixel: Tensor, each: int) -> Tensor:
-        """(N,) int64: of hits in the pixels (N,) in ascending order, about `each` in one. The seeds of a pixel do not depend on
-        what other pixels see, so a small motion changes the image by little."""
+        """Return the seeds (N,) int64 of hits in the pixels (N,) in ascending order, about `each` in one. Those of a pixel do
+        not depend on what other pixels see, so a small motion changes the image by little."""
         row = torch.arange(len(pixel))
         begins = torch.ones(len(pixel), dtype=torch.bool)
         begins[1:] = pixel[1:] != pixel[:-1]
@@ -72,16 +73,16 @@ class Frame:
         b: Tensor,
         x: Tensor,
         seed: Tensor | None = None,
-        steps: Steps | None = None,
+        steps: Discontinuities | None = None,
         forced: Forced | None = None,
     ) -> Hits:
-        """Without derivatives; b (N, 3), or the last two barycentrics."""
+        """Return hits without derivatives; b are (N, 3), or the last two barycentrics."""
         place = self.here(face), self.here(b if b.shape[1] == 3 else barycentrics(b)), self.here(x)
         return Hits(self.fixed, self.fixed_view, *place, self._fixed_rays_at, steps, seed, forced)
 
     @property
     def no_hits(self) -> Hits:
-        """Hits without points, from which a shader still notes where it may jump."""
+        """Return hits without points, for which a shader still notes where it may jump."""
         none = torch.zeros(0, dtype=torch.int64)
         return self.fixed_hits(
             none, torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64), none
@@ -90,36 +91,36 @@ class Frame:
     def moving_hits(
         self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor, seed: Tensor | None = None
     ) -> Hits:
-        """As differentiable functions of vertices and camera, at fixed places in the image."""
+        """Return hits as differentiable functions of vertices and camera, at fixed places in the image."""
         face = self.here(face)
         b = self.view.barycentrics(self.surfaces, face, self.here(self._moving(rays).along))
         return Hits(self.surfaces, self.view, face, b, self.here(x), lambda x: self._moving(self.rays_at(x)), seed=seed)
 
     def rays_at(self, x: Tensor) -> RayRecords:
-        """The rays to places (N, 2), for moving_hits()."""
+        """Return the rays to places (N, 2), for moving_hits()."""
         return self.sampler.rays_at(x, moves(self.intrinsics))
 
     def _fixed_rays_at(self, x: Tensor) -> RayRecords:
         return self.sampler.rays_at(x, intrinsics=False)
 
     def _moving(self, rays: _Rays) -> _Rays:
-        """The rays as functions of the intrinsics, at fixed places in the image."""
+        """Return the rays as functions of the intrinsics, at fixed places in the image."""
         if not moves(self.intrinsics):
             return rays
         moved = rays.along_by_k @ (self.intrinsics - self.intrinsics.detach()).to(rays.along_by_k.device)
         return rays._replace(along=rays.along + moved)
 
     def image(self, pixel: Tensor, values: Tensor, pixels: range | None = None) -> Tensor:
-        """(H · W, C), or of a range of pixels: the sum of the values (N, C) in each."""
+        """Return the sum of the values (N, C) in each pixel, or in each of a range: (H · W, C)."""
         pixels = pixels or range(self.pixels)
         return values.new_zeros((len(pixels), values.shape[1])).index_add(0, self.here(pixel) - pixels.start, values)
 
     def attached(self, image: Tensor, terms: Sequence[Term]) -> Tensor:
-        """The image, with the derivatives of the terms: see attached()."""
+        """Return the image with the derivatives of the terms: see attached()."""
         return attached(image.reshape(self.pixels, -1), terms, self.request).reshape(image.shape)
 
     def composed(self, image: Tensor, background: Tensor | None) -> Tensor:
-        """(H, W, C), before a background (C,) or (H, W, C)."""
+        """Return the image (H, W, C) before a background (C,) or (H, W, C)."""
         image = image.reshape(self.height, self.width, -1)
         if background is None:
             return image

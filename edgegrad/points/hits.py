@@ -16,12 +16,12 @@ from ..scene.material import WRAPS
 from ..scene.mesh import FILTERS
 from ..scene.rows import interpolated, rows_of
 from ..scene.textures import bilinear, in_texels, nearest
+from .discontinuities import Discontinuities, DiscontinuitiesOfSubset
 from .footprints import Footprints, level, pyramid_of
 from .records import RayRecords, visible
 from .seeds import uniform
 from .shadow_rays import Forced, seen_from
 from .sobol import key_of, sobol
-from .steps import Steps, StepsOfSubset
 from .surfaces import Rays, Surfaces, View, every_face
 
 LightSampler = Callable[["Hits", Light, int], list[LightPoints]]  # so many points of a light for each of the hits
@@ -47,7 +47,7 @@ class Hits:
         barycentrics: Tensor,  # (N, 3) float64
         pixel: Tensor | None = None,  # (N, 2)
         rays_at: Callable[[Tensor], RayRecords] | None = None,  # those of the camera
-        steps: Steps | None = None,
+        steps: Discontinuities | None = None,
         seed: Tensor | None = None,  # (N,) int64, of random()
         forced: Forced | None = None,
     ) -> None:
@@ -59,7 +59,7 @@ class Hits:
         self._forced = forced
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
-        self._pixel, self._steps = pixel, steps or Steps()
+        self._pixel, self._discontinuities = pixel, steps or Discontinuities()
         self._all: tuple[Hits, Tensor] | None = None  # the hits that these are a subset of, and their rows there
         self._drawn: dict[
             tuple[LightSampler, int, int], list[LightPoints]
@@ -74,8 +74,9 @@ class Hits:
         return f"Hits({len(self)} points)"
 
     def select(self, index: Tensor) -> Hits:
-        """Some of the points, or all in another order: `index` (M,) of integers, each once, or a mask (N,). Steps that where()
-        and floor() declare of them are steps of the whole. Raises TypeError or ValueError that names the argument."""
+        """Return some of the points, or all in another order: `index` (M,) of integers, each once, or a mask (N,).
+        Discontinuities that where() and floor() declare of them are those of the whole. Raises TypeError or ValueError that
+        names the argument."""
         index = as_tensor("index", index).to(self._face.device)
         count = len(self)
         if index.dtype == torch.bool:
@@ -88,10 +89,10 @@ class Hits:
         wrong = (index < -count) | (index >= count)
         if values_visible(index) and bool(wrong.any()):
             raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
-        return self._subset(index, StepsOfSubset(self._steps, index % max(count, 1), count))
+        return self._subset(index, DiscontinuitiesOfSubset(self._discontinuities, index % max(count, 1), count))
 
-    def _subset(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
-        """Some of the points, with steps of their own, while select() passes them on to the whole."""
+    def _subset(self, index: Tensor | slice, steps: Discontinuities | None = None) -> Hits:
+        """Return some of the points, with steps of their own, while select() passes them on to the whole."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
         forced = None if self._forced is None else self._forced.select(index)
@@ -188,7 +189,7 @@ class Hits:
         return self._view.to_viewer(self.position).to(self.position.dtype)
 
     def interpolate(self, attribute: Tensor, per: str | None = None) -> Tensor:
-        """(N, K): an attribute of the scene's vertices (V, K), faces (F, K) or corners of faces (F, 3, K).
+        """Return an attribute (N, K) of the scene's vertices (V, K), faces (F, K) or corners of faces (F, 3, K).
 
         per   "vertex", "face" or "corner", where the shape does not say
 
@@ -232,8 +233,8 @@ class Hits:
         mipmap: bool = False,
         filter: str = "linear",
     ) -> Tensor:
-        """(N, K): a texture (h, w, K), row 0 on top, at texture coordinates uv (N, 2), v running up; those of the surface when
-        None.
+        """Return values (N, K) of a texture (h, w, K), row 0 on top, at texture coordinates uv (N, 2), v running up; those of the
+        surface when None.
 
         wrap     beyond the border: "repeat", "clamp" or "mirror", or two of these, for u and for v
         filter   "linear" between the centres of texels; "nearest", the texel itself, whose borders are steps: see where()
@@ -268,8 +269,8 @@ class Hits:
     def _look_up(
         self, texture: Tensor, uv: Tensor, wraps: tuple[str, ...], filter: str, corners: Tensor | None
     ) -> Tensor:
-        """(N, K), with "linear", "nearest" or "mipmap", for which `corners` (N, 3, 2) are the texture coordinates of the faces'
-        corners."""
+        """Return values (N, K) of a texture, with "linear", "nearest" or "mipmap", for which `corners` (N, 3, 2) are the
+        texture coordinates of the faces' corners."""
         if filter == "nearest":
             return nearest(texture, self.floor(in_texels(texture, uv)), wraps)
         if filter == "linear":
@@ -279,7 +280,7 @@ class Hits:
 
     @cached_property
     def _spread(self) -> Tensor:
-        """(N, 2, 2) float64: see Footprints."""
+        """Return Footprints.spread() (N, 2, 2) float64."""
         if self._rays_at is None or self._pixel is None or isinstance(self._view, Rays):
             raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
         return Footprints(self._surfaces, self._view, self._face, self._pixel, self._rays_at).spread()
@@ -287,7 +288,7 @@ class Hits:
     # -- steps ---------------------------------------------------------------------------------------------------------
 
     def where(self, s: Tensor, a: Tensor | float, b: Tensor | float) -> Tensor:
-        """(N, C): `a` where s > 0 and `b` elsewhere, a declared step: where it lies in the image has a gradient.
+        """Return `a` where s > 0 and `b` elsewhere (N, C). The discontinuity is declared: where it lies has a gradient.
 
         s      (N,) or (N, 1), any differentiable function of the point: s = 0 is the border
         a, b   rows (N, C), a colour (C,), or a number
@@ -299,7 +300,7 @@ class Hits:
         """
         s = _function("s", s)
         check_shape("s", s, (len(self),), (len(self), 1))
-        up = self._steps.above_zero(s.reshape(-1))[:, None]
+        up = self._discontinuities.above_zero(s.reshape(-1))[:, None]
         sides = []
         for name, side in (("a", a), ("b", b)):
             value = as_tensor(name, side, like=s, floating=True)
@@ -317,18 +318,18 @@ class Hits:
         return torch.where(up, *sides)
 
     def floor(self, t: Tensor) -> Tensor:
-        """The largest integers not above t (N,) or (N, K), whose jumps are declared steps: see where(). For checkerboards,
-        stripes, tables. Raises TypeError or ValueError that names the argument."""
+        """Return the largest integers not above t (N,) or (N, K), whose jumps are declared discontinuities: see where(). For
+        checkerboards, stripes, tables. Raises TypeError or ValueError that names the argument."""
         t = _function("t", t)
         check_shape("t", t, (len(self),), (len(self), "K"))
         if t.dim() == 1:
-            return self._steps.floor(t)
-        return torch.stack([self._steps.floor(column) for column in t.unbind(1)], 1)
+            return self._discontinuities.floor(t)
+        return torch.stack([self._discontinuities.floor(column) for column in t.unbind(1)], 1)
 
     # -- shadows -------------------------------------------------------------------------------------------------------
 
     def visible(self, points: Tensor) -> Tensor:
-        """(N,) bool: whether nothing lies between each point and another, `points` (N, 3) or (3,) in world coordinates.
+        """Return (N,) bool, whether nothing lies between each point and another, `points` (N, 3) or (3,) in world coordinates.
 
         A shadow ray ignores the face of its point, and what touches either end up to the rounding of the coordinates. There is
         no derivative, and what moves the border of such a shadow has no gradient: see visible_from(). Raises TypeError or
@@ -352,20 +353,21 @@ class Hits:
         return self._surfaces.scene.casting
 
     def random(self, n: int, stream: int = 0, part: int = 0, parts: int = 1) -> Tensor:
-        """(N, n) float64, uniform in [0, 1), without derivatives. All points of one sample, such as both sides of an edge, get
-        the same numbers. Those of successive points, and of the `parts` of one point, fill the unit cube evenly (a Kronecker
-        sequence with the powers of the generalised golden ratio of three dimensions). Each `stream` gives other numbers."""
+        """Return random numbers (N, n) float64, uniform in [0, 1), without derivatives. All points of one sample, such as both
+        sides of an edge, get the same numbers. Those of successive points, and of the `parts` of one point, fill the unit cube
+        evenly (a Kronecker sequence with the powers of the generalised golden ratio of three dimensions). Each `stream` gives
+        other numbers."""
         return uniform(self._seed * parts + part, n, stream)
 
     def light_points(
         self, light: Light, sample: int = 0, samples: int = 1, by: LightSampler | None = None
     ) -> LightPoints:
-        """A point of a light of `lights` for each of the N points. With several `samples` of a light, `sample` is the number of
-        this one. light.place() and light.arriving() take the result.
+        """Return a point of a light of `lights` for each of the N points. With several `samples` of a light, `sample` is the
+        number of this one. light.place() and light.arriving() take the result.
 
         by   None: drawn in proportion to what the light emits. eg.lights.points_by_material: as render() draws them, by what the
              material of the point's mesh makes of them where nothing lies between; on glossy ones the density is then that of
-             the choice among some candidates, infinite where none gives anything
+             the choice among some candidates, infinite where none gives anything. For hits of trace() it is as None
 
         A mean of any function of the point over the density is right with either, but points_by_material draws nothing of what
         the material scatters not at all. There are no derivatives by where points are drawn. Raises TypeError or ValueError.
@@ -384,8 +386,8 @@ class Hits:
         return points if forced is None or forced.light != index else forced.among(points)
 
     def visible_from(self, light: Light, points: LightPoints) -> Tensor:
-        """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). It has no derivative, but
-        the renderer samples the borders of the light's shadow, so what moves them has a gradient."""
+        """Return 1 (N,) where nothing lies between the points and those of a light, else 0: see visible(). It has no
+        derivative, but the renderer samples the borders of the light's shadow, so what moves them has a gradient."""
         index, s, forced = self._index(light), self._surfaces, self._forced
         s.shadowing.add(index)
         if forced is not None and forced.light == index and values_visible(forced.some) and bool(forced.some.all()):
@@ -412,11 +414,11 @@ class Hits:
 
     @property
     def _only_light(self) -> bool:
-        """Whether only the radiance that one light adds is wanted."""
+        """Return whether only the radiance that one light adds is wanted."""
         return self._forced is not None and self._forced.only
 
     def _knows_light(self, light: Light) -> bool:
-        """Whether the points of this light are given, for these hits lie on the border of its shadow."""
+        """Return whether the points of this light are given, for these hits lie on the boundary of its shadow."""
         return self._forced is not None and self._forced.light == self._index(light)
 
     def _index(self, light: Light) -> int:
@@ -427,7 +429,8 @@ class Hits:
 
 
 def _function(name: str, value: Tensor) -> Tensor:
-    """The function of a step: finite, and not in the half precision that autocast gives. Raises TypeError or ValueError."""
+    """Return the function of a discontinuity, finite, and not in the half precision that autocast gives. Raises TypeError or
+    ValueError."""
     value = as_tensor(name, value, floating=True)
     if value.dtype in (torch.float16, torch.bfloat16):
         value = value.float()

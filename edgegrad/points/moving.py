@@ -1,4 +1,4 @@
-"""How hits and curves move at fixed places in the image: barycentrics of hits, and the normal velocity of curves."""
+"""Motion at fixed places in the image: barycentrics of hits, and the normal velocity of curves."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from ..library import core
 def barycentrics(
     verts: Tensor, faces: Tensor, face: Tensor, world_to_camera: Tensor, along: Tensor, perspective: bool
 ) -> Tensor:
-    """(N, 3) float64 where rays meet the planes of faces (N,), rows of faces (F, 3) int32 of verts (V, 3). `along` (N, 3): the
-    directions of rays from the eye in camera coordinates, or, in an orthographic view, points that rays along the axis go
-    through. With several rays for each face, one after another, the same for each of them."""
+    """Return barycentrics (N, 3) float64 where rays meet the planes of faces (N,), rows of faces (F, 3) int32 of verts (V, 3).
+
+    `along` (N, 3) are the directions of rays from the eye in camera coordinates, or, in an orthographic view, points that rays
+    along the axis go through. With several rays for each face, one after another, the face is the same for each of them.
+    """
     tensors = [verts.cpu().double(), world_to_camera.cpu().double(), along.cpu().double(), faces.cpu(), face.cpu()]
     return apply(_Meeting(perspective), tensors)[0].to(verts.device)
 
@@ -25,7 +27,7 @@ def barycentrics(
 def barycentrics_by(
     verts: Tensor, faces: Tensor, face: Tensor, world_to_camera: Tensor, along: Tensor, by: Tensor, perspective: bool
 ) -> tuple[Tensor, Tensor]:
-    """The same, and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K). Neither has a graph."""
+    """Return barycentrics() and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K), without a graph."""
     meeting = _Meeting(perspective)
 
     def compute(*tensors: Tensor) -> Sequence[Tensor]:
@@ -79,7 +81,7 @@ class Form(NamedTuple):
 
 
 def velocity(samples: int, forms: Sequence[tuple[Form, Tensor]]) -> Tensor:
-    """(samples,) float64, zeros whose derivatives are those of the forms by their tables."""
+    """Return zeros (samples,) float64, whose derivatives are those of the forms by their tables."""
     # One at least, so that an image with nothing in view has a graph too, of zeros.
     forms = [(form, table) for form, table in forms if len(form.sample)] or list(forms[:1])
     tensors: list[Tensor] = [table for _, table in forms]

@@ -22,7 +22,7 @@ class Pyramid(NamedTuple):
     width: Tensor  # (L,) int64
 
     @classmethod
-    def of(cls, texture: Tensor) -> Pyramid:
+    def from_texture(cls, texture: Tensor) -> Pyramid:
         sizes = [texture.shape[:2]]
         while max(sizes[-1]) > 1:
             sizes.append(torch.Size(max(1, n // 2) for n in sizes[-1]))
@@ -33,7 +33,7 @@ class Pyramid(NamedTuple):
         return cls(texels.to(texture), count.cumsum(0) - count, height, width)
 
     def look_up(self, level: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
-        """(N, K) at uv (N, 2), linear between the two levels around `level` (N,)."""
+        """Return values (N, K) at uv (N, 2), linear between the two levels around `level` (N,)."""
         level = level.clamp(0, len(self.first) - 1)
         below = level.detach().floor().long()
         share = (level - below).to(self.texels.dtype)[:, None]

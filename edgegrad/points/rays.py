@@ -16,7 +16,7 @@ from .surfaces import Rays, Surfaces
 
 
 def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
-    """The nearest hits of any rays: Hits of those that hit something, with the row of each in `hits.ray`.
+    """Return the nearest hits of any rays: Hits of those that hit something, with the row of each in `hits.ray`.
 
     origins, directions  (N, 3) or (3,) world coordinates, directions of any length
 

@@ -29,7 +29,8 @@ from ..scene.scene import Scene, as_scene
 from .frame import Frame
 from .hits import Hits
 from .moving import Form, velocity
-from .records import CurveRecords, SurfaceRecords, shaded_memory, without_colors
+from .records import CurveRecords, SurfaceRecords, without_colors
+from .sampler import shaded_memory
 from .shadow_rays import Forced
 from .shadows import ShadowLight
 from .splat import Term, boundary, splat
@@ -39,7 +40,7 @@ ALL_AT_ONCE = 1 << 40
 
 
 class PrimaryHits:
-    """What the rays of an image hit: all samples of a pixel on one face are one hit, at one of them drawn at random.
+    """Hits of the rays of an image. All samples of a pixel on one face are one hit, at one of them drawn at random.
 
     hits      Hits, N points, differentiable functions of vertices and camera at fixed places in the image
     index     (N,) int64, the pixel of each, row by row
@@ -59,7 +60,7 @@ class PrimaryHits:
         return f"PrimaryHits({len(self.hits)} points in {self.frame.height} x {self.frame.width} pixels)"
 
     def image(self, radiance: Tensor, background: Tensor | None = None) -> Tensor:
-        """(H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
+        """Return the image (H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
 
         Its gradient by the radiance, and so inside faces, is right; that of what moves at edges is not in it. Raises TypeError
         or ValueError that names the argument.
@@ -89,7 +90,7 @@ class SurfaceSamples:
         return f"SurfaceSamples({len(self)} points)"
 
     def part(self, first: int, end: int) -> SurfaceSamples:
-        """Some of them."""
+        """Return the samples from `first` to `end`."""
         return SurfaceSamples(self.frame, SurfaceRecords(*(part[first:end] for part in self._records)), first)
 
     @property
@@ -100,14 +101,14 @@ class SurfaceSamples:
         return self._hits
 
     def image(self, radiance: Tensor) -> Tensor:
-        """(H, W, C) from the radiance (S, C) of the samples: an estimate of the image before black. Its weights are areas, so
-        its gradient is the interior term. Raises TypeError or ValueError that names the argument."""
+        """Return an estimate of the image (H, W, C) before black from the radiance (S, C) of the samples. Its weights are
+        areas, so its gradient is the interior term. Raises TypeError or ValueError that names the argument."""
         radiance = _rows("radiance", radiance, len(self))
         weighted = self.weight.to(radiance.dtype)[:, None] * radiance
         return self.frame.composed(splat(self._records.x, weighted, self.frame.request), None)
 
     def _term(self, radiance: Tensor) -> Term:
-        """The same, for attached()."""
+        """Return the radiance of the samples as a term of attached()."""
         return Term(self._records.x, radiance, self._records.weight)
 
 
@@ -168,12 +169,12 @@ class EdgeSamples:
         return f"EdgeSamples({len(self)} samples, {len(self.hits)} points)"
 
     def jump(self, radiance: Tensor) -> Tensor:
-        """(S, C) how the image jumps at each sample, from the radiance (N, C) of the hits; a background comes in by
+        """Return the jump (S, C) of the image at each sample, from the radiance (N, C) of the hits; a background comes in by
         attach_boundary(). Raises TypeError or ValueError that names the argument."""
         return self.sum(_rows("radiance", radiance, len(self.hits)))
 
     def sum(self, radiance: Tensor) -> Tensor:
-        """(S, C) from the radiance (N, C)."""
+        """Return the sum (S, C) over the points of each sample, from the radiance (N, C)."""
         weighted = self._factor.to(radiance.dtype)[:, None] * radiance
         if self._in_order:
             return weighted
@@ -192,8 +193,8 @@ def primary_hits(
     filter: str = "box",
     grad_seed: int | None = None,
 ) -> PrimaryHits:
-    """What the rays of an image hit: render()'s samples, for a pipeline of your own. The arguments are render()'s, with one
-    camera. Raises what render() raises."""
+    """Return the hits of the rays of an image: render()'s samples, for a pipeline of your own. The arguments are render()'s,
+    with one camera. Raises what render() raises."""
     request = make_request(scene, camera, spp, seed, filter=filter, grad_seed=grad_seed)
     if camera.batch is not None:
         raise ValueError(f"camera: expected one camera, got a batch of {camera.batch}; take camera[i] one by one")
@@ -201,7 +202,7 @@ def primary_hits(
 
 
 def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSamples:
-    """Samples for the gradient inside faces, fewer than those of the image: by default half a sample a pixel of surface.
+    """Return samples for the gradient inside faces, fewer than those of the image: by default half a sample a pixel of surface.
 
     primary   of primary_hits()
     count     of samples; see surface_samples of render()
@@ -247,7 +248,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
 
 
 def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, background: Tensor | None = None) -> Tensor:
-    """The image, with the gradient of what moves at edges: its value is the same.
+    """Return the image, with the gradient of what moves at edges: its value is the same.
 
     image       (H, W, C)
     samples     of edge_samples()

@@ -22,7 +22,7 @@ def signed(bits: int) -> int:
 
 
 def _golden(dimensions: int) -> float:
-    """The root above 1 of x ** (dimensions + 1) = x + 1 (Roberts 2018)."""
+    """Return the root above 1 of x ** (dimensions + 1) = x + 1 (Roberts 2018)."""
     x = 1.5
     for _ in range(64):
         x = (1 + x) ** (1 / (dimensions + 1))
@@ -34,14 +34,14 @@ STEPS = tuple(signed(int(_golden(3) ** -k * 2**64) | 1) for k in (1, 2, 3))
 
 
 def sample_seeds(seed: int, stream: int, first: int, count: int) -> Tensor:
-    """(count,) int64: the seeds of a stream's samples from `first` on. The upper half is the stream's, the lower counts."""
+    """Return the seeds (count,) int64 of a stream's samples from `first` on. The upper half is the stream's, the lower counts."""
     start = mixed_bits(mixed_bits(seed) ^ mixed_bits(-1 - stream)) & ~0xFFFFFFFF
     return torch.arange(first, first + count) + signed(start)
 
 
 def uniform(seed: Tensor, n: int, stream: int = 0) -> Tensor:
-    """(N, n) float64 in [0, 1) of seeds (N,). Successive seeds fill the unit cube evenly: a Kronecker sequence with the powers
-    of the generalised golden ratio of three dimensions. Each `stream` gives other numbers."""
+    """Return numbers (N, n) float64 in [0, 1) of seeds (N,). Successive seeds fill the unit cube evenly: a Kronecker sequence
+    with the powers of the generalised golden ratio of three dimensions. Each `stream` gives other numbers."""
     columns = []
     for k in range(n):
         mixed = seed * STEPS[k % 3] + signed(mixed_bits(stream * 0x10001 + k))

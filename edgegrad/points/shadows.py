@@ -1,4 +1,4 @@
-"""Lights as points or triangles, for the samples on the borders of their shadows."""
+"""Lights as points or triangles, for the samples on the boundaries of their shadows."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ShadowLight(NamedTuple):
     faces: Tensor  # (L,) int64 of an emissive mesh that the parts are
 
     @classmethod
-    def of(cls, surfaces: Surfaces, index: int, seed: int) -> ShadowLight:
+    def from_surfaces(cls, surfaces: Surfaces, index: int, seed: int) -> ShadowLight:
         light = surfaces.scene.casting[index]
         with torch.no_grad():
             if isinstance(light, MeshLight):
@@ -45,12 +45,12 @@ class ShadowLight(NamedTuple):
 
     @staticmethod
     def moves(light: Light) -> bool:
-        """Whether the place of one of its points may be differentiated."""
+        """Return whether the place of one of its points may be differentiated."""
         return moves(light.place(light.draw(torch.zeros((1, 2), dtype=torch.float64))))
 
     def points(self, part: Tensor, uv: Tensor) -> tuple[LightPoints, Tensor]:
-        """Those at the last two barycentrics uv (N, 2) of parts (N,), and (N,) the light's own density of points over that by
-        which the kernel draws them."""
+        """Return the points at the last two barycentrics uv (N, 2) of parts (N,), and (N,) the light's own pdf of points over
+        that by which the kernel draws them."""
         one = uv.new_ones(len(uv))
         if isinstance(self.light, MeshLight):
             face = self.faces.to(part.device)[part]
@@ -81,7 +81,7 @@ def _of_mesh(light: MeshLight, first_face: int, seed: int) -> tuple[LightParts, 
 
 
 def triangles_of(directions: Tensor) -> tuple[Tensor, Tensor]:
-    """(L, 3, 3), (L,): triangles around the origin, and about the share of the unit directions (N, 3) that goes through each.
+    """Return triangles around the origin (L, 3, 3), and (L,) about the share of the unit directions (N, 3) through each.
     They are the faces of an octahedron, divided until no share is large."""
     triangles, chances = [], []
     most = len(directions) / SHARES
@@ -108,7 +108,7 @@ def triangles_of(directions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def z_order(place: Tensor) -> Tensor:
-    """(K,) int64: places (K, 3) in the order of a Z-curve through the cube around them (Morton 1966)."""
+    """Return the order (K,) int64 of places (K, 3) along a Z-curve through the cube around them (Morton 1966)."""
     low, high = place.amin(0), place.amax(0)
     size = (high - low).amax()
     cell = ((place - low) / torch.where(size > 0, size, 1.0) * 1023.99).long()
@@ -120,8 +120,8 @@ def z_order(place: Tensor) -> Tensor:
 
 
 def _even(count: int, seed: int) -> Tensor:
-    """(count, 3) float64 in [0, 1), with a random shift: the first column ascends in equal steps, the others fill the unit square
-    evenly (Roberts 2018)."""
+    """Return numbers (count, 3) float64 in [0, 1), with a random shift: the first column ascends in equal steps, the others
+    fill the unit square evenly (Roberts 2018)."""
     shift = [(mixed_bits(mixed_bits(seed) + k) >> 11) * 2.0**-53 for k in range(3)]
     rows = torch.arange(count)
     columns = [(rows.double() + shift[0]) / count]

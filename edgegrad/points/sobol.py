@@ -12,29 +12,22 @@ _GOLDEN = signed(0x9E3779B97F4A7C15)
 
 
 def sobol(seed: Tensor, key: int, part: int = 0, parts: int = 1) -> Tensor:
-    """(N, 2) float64 in (0, 1) of seeds (N,), without derivatives: of each the `part` of so many points. The upper half of a seed
-    says which sequence, the lower which of its points; each takes `parts` in a row. These fill the unit square evenly, and so do
-    those of successive seeds and of blocks of pixels. Each `key` gives other numbers."""
+    """Return points (N, 2) float64 in (0, 1) of seeds (N,), without derivatives: of each seed the `part` of so many. The upper
+    half of a seed says which sequence, the lower which of its points; each takes `parts` in a row. These fill the unit square
+    evenly, and so do those of successive seeds and of blocks of pixels. Each `key` gives other numbers."""
     random = _mixed(_mixed(_mixed((seed >> 32 & _32) + _GOLDEN) + signed(key + _GOLDEN & 2**64 - 1)) + _GOLDEN)
     i = (seed * parts + part) & _32
     i = _reversed(_scrambled(_reversed(i), _mixed(random + 1)))
     return torch.stack([_unit(_scrambled(i, random)), _unit(_scrambled(_pascal(i), _mixed(random)))], 1)
 
 
-def sobol_parts(seed: Tensor, key: int, parts: int) -> Tensor:
-    """(N · parts, 2): all parts of each."""
-    every = torch.arange(parts, device=seed.device)
-    own = (seed[:, None] * parts + every & _32) | (seed[:, None] >> 32 << 32)
-    return sobol(own.reshape(-1), key)
-
-
 def key_of(light: int, kind: int) -> int:
-    """Of the light with this number: of what the light draws (0), of what lobes draw (1), of the choice (2)."""
+    """Return the key of the numbers of a light: for what the light draws (0), what BSDF lobes draw (1), and the choice (2)."""
     return signed(mixed_bits(light * 0x10001 + kind))
 
 
 def z_order(x: Tensor, y: Tensor) -> Tensor:
-    """(N,): the places of pixels on the Z-order curve (Morton 1966)."""
+    """Return the places (N,) of pixels on the Z-order curve (Morton 1966)."""
     return _spread(x) | _spread(y) << 1
 
 
@@ -48,14 +41,14 @@ def _spread(x: Tensor) -> Tensor:
 
 
 def _mixed(x: Tensor) -> Tensor:
-    """The finaliser of splitmix64 (Steele, Lea and Flood 2014)."""
+    """Return the bits of x mixed by the finaliser of splitmix64 (Steele, Lea and Flood 2014)."""
     x = (x ^ _shifted(x, 30)) * signed(0xBF58476D1CE4E5B9)
     x = (x ^ _shifted(x, 27)) * signed(0x94D049BB133111EB)
     return x ^ _shifted(x, 31)
 
 
 def _shifted(x: Tensor, by: int) -> Tensor:
-    """To the right, without the sign."""
+    """Return x shifted to the right, without the sign."""
     return x >> by & ((1 << (64 - by)) - 1)
 
 
@@ -80,5 +73,5 @@ def _reversed(x: Tensor) -> Tensor:
 
 
 def _unit(x: Tensor) -> Tensor:
-    """The middle of the cell of the 2³² that the digits say, the first of them in the lowest bit."""
+    """Return the middle of the cell of the 2³² that the digits say, the first of them in the lowest bit."""
     return (_reversed(x).double() + 0.5) * 2.0**-32

@@ -24,13 +24,13 @@ class Term(NamedTuple):
 
 
 def splat(x: Tensor, values: Tensor, request: Request) -> Tensor:
-    """(H · W, C): Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c."""
+    """Return Σ k(x − c) · value (H · W, C) over points x (S, 2) with values (S, C), for pixels with centres c."""
     return apply(_Splat(Film.of(request)), [values, x])[0]
 
 
 def attached(image: Tensor, terms: Sequence[Term], request: Request) -> Tensor:
-    """The image (H · W, C), with the derivatives of terms by their values. It has no second derivatives, for how the samples'
-    places and visibility change is not known."""
+    """Return the image (H · W, C), with the derivatives of terms by their values. It has no second derivatives, for how the
+    samples' places and visibility change is not known."""
     values = (term.values for term in terms)
     fixed = (part for term in terms for part in (term.x, term.weight, term.behind))
     return apply(_Attached(Film.of(request), len(terms)), [image, *values, *fixed])[0]
@@ -46,11 +46,11 @@ class Film(NamedTuple):
         return cls(request.image.filter, request.camera.width, request.camera.height)
 
     def sum(self, x: Tensor | None, values: Tensor) -> Tensor:
-        """(H · W, C)"""
+        """Return (H · W, C)"""
         return torch.from_numpy(core.splat(doubles(x), doubles(values), *self)).to(values)
 
     def adjoint(self, x: Tensor | None, bar: Tensor, weight: Tensor | None = None) -> Tensor:
-        """(S, C)"""
+        """Return (S, C)"""
         found = core.splat_vjp(doubles(x), array(bar), *self, torch.get_num_threads(), doubles(weight))
         return torch.from_numpy(found).to(bar.device)
 

@@ -47,7 +47,7 @@ class Surfaces:
         self.has_derivatives = True
 
     def detach(self) -> Surfaces:
-        """The same without derivatives; both share their notes."""
+        """Return the surfaces without derivatives. Both share their notes."""
         other = Surfaces.__new__(Surfaces)
         other.__dict__.update(self.__dict__)
         for name in ("bare", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
@@ -61,7 +61,7 @@ class Surfaces:
 
     @cached_property
     def first_faces(self) -> list[int]:
-        """The first face of each mesh."""
+        """Return the first face of each mesh."""
         return [sum(len(m.faces) for m in self.scene.meshes[:k]) for k in range(len(self.scene.meshes))]
 
     @cached_property
@@ -71,12 +71,12 @@ class Surfaces:
 
     @cached_property
     def casters(self) -> Flat:
-        """The same for shadow rays: surfaces that blend are cut out where their alpha is below ½."""
+        """Return the surfaces that shadow rays meet: alpha-blended faces count where their alpha is at least ½."""
         return bare(self.scene, blended=False) if self.scene.blends else self.bare
 
     @cached_property
     def ball(self) -> tuple[Tensor, float]:
-        """A centre (3,) and a radius of a ball around all vertices, float64."""
+        """Return a centre (3,) and a radius of a ball around all vertices, float64."""
         if self._moving is not None:
             return self._moving.ball
         # Contiguous columns make this four times as fast.
@@ -85,7 +85,7 @@ class Surfaces:
 
     @cached_property
     def corner_uvs(self) -> Tensor:
-        """(F, 3, 2) texture coordinates of corners."""
+        """Return (F, 3, 2) texture coordinates of corners."""
         parts = []
         for i, mesh in enumerate(self.scene.meshes):
             if mesh.uvs is None or mesh.uv_faces is None:
@@ -98,14 +98,14 @@ class Surfaces:
 
     @cached_property
     def vertex_normals(self) -> Tensor:
-        """(V, 3) unit normals: means of the normals of the faces at each index, weighted by area."""
+        """Return (V, 3) unit normals: means of the normals of the faces at each index, weighted by area."""
         corner = rows_of(self.verts, self.faces)
         area, index = areas(corner), self.faces.reshape(-1)
         total = torch.zeros_like(self.verts, dtype=area.dtype).index_add(0, index, area.repeat_interleave(3, 0))
         return unit(total).to(self.verts.dtype)
 
     def tangents(self, index: int) -> Tensor | None:
-        """(F, 3, 4) of a mesh whose normals are interpolated and bent by a map: see Fans."""
+        """Return (F, 3, 4) of a mesh whose normals are interpolated and bent by a map: see Fans."""
         mesh = self.scene.meshes[index]
         if mesh.normals is None or mesh.material is None or mesh.material.normal_map is None:
             return None
@@ -123,14 +123,14 @@ class Surfaces:
         return self._tangents[index]
 
     def corners(self, face: Tensor) -> Tensor:
-        """(N, 3, 3) world coordinates of the corners of faces (N,)."""
+        """Return (N, 3, 3) world coordinates of the corners of faces (N,)."""
         return rows_of(self.verts, rows_of(self.faces, face))
 
     def face_normals(self, face: Tensor) -> Tensor:
         return unit(areas(self.corners(face))).to(self.verts.dtype)
 
     def crease_attributes(self) -> Tensor:
-        """(F, 3, K): all properties that may jump and were asked for, each divided by its largest value."""
+        """Return (F, 3, K): all properties that may jump and were asked for, each divided by its largest value."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
         attributes = columns([scaled(p) for p in parts if p.shape[-1]], len(self.faces), self.verts)
         return _NextToSteps.apply(attributes) if transformed() else attributes
@@ -162,12 +162,13 @@ class _NextToSteps(torch.autograd.Function):
 
 
 def every_face(count: int) -> Tensor:
-    """(F, 3, 1): a number for each face, so that neighbours differ: the fractional parts of multiples of the golden ratio."""
+    """Return (F, 3, 1): a number for each face, so that neighbours differ: the fractional parts of multiples of the golden
+    ratio."""
     return (torch.arange(count).double() * 0.6180339887498949 % 1 + 0.5)[:, None, None].expand(-1, 3, 1)
 
 
 def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
-    """(N, 3) barycentrics where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
+    """Return (N, 3) barycentrics where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
     e1, e2, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
     p, q = torch.linalg.cross(direction, e2), torch.linalg.cross(s, e1)
     scale = 1 / dot(e1, p)
@@ -185,36 +186,36 @@ class View:
         return View(self.world_to_camera.detach(), self.perspective)
 
     def in_camera(self, points: Tensor) -> Tensor:
-        """World points (..., 3) in camera coordinates, float64."""
+        """Return world points (..., 3) in camera coordinates, float64."""
         return points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
 
     def turned(self, directions: Tensor) -> Tensor:
-        """World directions (..., 3) in camera coordinates, float64."""
+        """Return world directions (..., 3) in camera coordinates, float64."""
         return directions.double() @ self.world_to_camera[:3, :3].T
 
     def barycentrics(self, surfaces: Surfaces, face: Tensor, along: Tensor) -> Tensor:
-        """(N, 3) where rays meet the planes of faces. `along` (N, 3): the directions of rays from the eye in camera coordinates,
-        or, in an orthographic view, points that rays along the axis go through."""
+        """Return (N, 3) where rays meet the planes of faces. `along` (N, 3): the directions of rays from the eye in camera
+        coordinates, or, in an orthographic view, points that rays along the axis go through."""
         bare = surfaces.bare
         return barycentrics(bare.verts, bare.faces, face, self.world_to_camera, along, self.perspective)
 
     def barycentrics_by(self, surfaces: Surfaces, face: Tensor, along: Tensor, by: Tensor) -> tuple[Tensor, Tensor]:
-        """The same, and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K)."""
+        """Return barycentrics() and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K)."""
         bare = surfaces.bare
         return barycentrics_by(bare.verts, bare.faces, face, self.world_to_camera, along, by, self.perspective)
 
     def depth(self, points: Tensor) -> Tensor:
-        """(N,) along the axis."""
+        """Return (N,) along the axis."""
         return self.in_camera(points)[:, 2]
 
     @property
     def eye(self) -> Tensor:
-        """(3,) world coordinates; in an orthographic view, the unit direction towards it. float64."""
+        """Return (3,) world coordinates; in an orthographic view, the unit direction towards it. float64."""
         back = torch.linalg.inv(self.world_to_camera[:3, :3])
         return -back @ self.world_to_camera[:3, 3] if self.perspective else normalize(-back[:, 2], dim=0)
 
     def to_viewer(self, points: Tensor) -> Tensor:
-        """(N, 3) unit directions, float64."""
+        """Return (N, 3) unit directions, float64."""
         return unit(self.eye - points.double()) if self.perspective else self.eye.expand(len(points), 3)
 
 
@@ -229,12 +230,12 @@ class Rays(NamedTuple):
         return Rays(*(part[index] for part in self))
 
     def barycentrics(self, corners: Tensor, b: Tensor) -> Tensor:
-        """The barycentrics b (N, 3) of hits, as functions of the corners (N, 3, 3) and the rays."""
+        """Return the barycentrics b (N, 3) of hits, as functions of the corners (N, 3, 3) and the rays."""
         moved = meet(corners, self.origin, self.direction)
         return b + (moved - moved.detach())
 
     def depth(self, points: Tensor) -> Tensor:
-        """(N,) in lengths of the direction."""
+        """Return (N,) in lengths of the direction."""
         d = self.direction
         return dot(points.double() - self.origin, d) / dot(d, d)
 

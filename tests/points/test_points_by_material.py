@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 import torch
 from lit_scenes import F64, ball, plane, vector
+from oracles import shading
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
-from edgegrad.light import by_material, in_kernel
+from edgegrad.light import in_kernel
 from edgegrad.light.bsdf import Scattering
 from edgegrad.points.frame import Frame
 
@@ -45,7 +46,9 @@ def test_the_kernel_draws_what_pytorch_draws(light: int):
     hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
     assert set(hits.mesh.tolist()) == {0, 1, 2}
     of_light = hits.lights[light]
-    for a, b in zip(by_material.reference(hits, of_light, 3), in_kernel.light_points(hits, of_light, 3), strict=True):
+    for a, b in zip(
+        shading.points_by_material(hits, of_light, 3), in_kernel.light_points(hits, of_light, 3), strict=True
+    ):
         some = a.density.isfinite()
         assert torch.equal(some, b.density.isfinite()) and int(some.sum()) > 200
         assert torch.equal(a.index[some], b.index[some])

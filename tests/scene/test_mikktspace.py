@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 from lit_scenes import F64, vector
+from oracles.shading import radiance
 from scenes import icosphere
 from torch import Tensor
 from torch.autograd import gradcheck
 from torch.nn.functional import normalize
 
 import edgegrad as eg
-from edgegrad.light.radiance import radiance
 from edgegrad.points.surfaces import Surfaces
 from edgegrad.scene.appearance import jumps
 from edgegrad.scene.mikktspace import Fans

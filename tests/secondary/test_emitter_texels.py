@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 from lit_scenes import F64, grid, hits_of, plane, polygon_irradiance, vector
+from oracles.shading import radiance, reference
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.light.radiance import declare_steps, radiance, reference
+from edgegrad.light.radiance import declare_texel_edges
 from edgegrad.scene import texel_borders
 from edgegrad.scene.lights import LightPoints
 from edgegrad.scene.mesh_light import MeshLight
@@ -240,7 +241,7 @@ def test_texture_coordinates_in_single_precision() -> None:
 
 
 def test_steps_are_declared_as_shading_looks_them_up() -> None:
-    """By declare_steps() alone, in the same order."""
+    """By declare_texel_edges() alone, in the same order."""
     draw = torch.Generator().manual_seed(5)
 
     def nearest(channels: int) -> eg.Texture:
@@ -253,9 +254,9 @@ def test_steps_are_declared_as_shading_looks_them_up() -> None:
     place = torch.rand((60, 3), dtype=F64, generator=draw) * vector(4, 4, 0) - vector(2, 2, -1)
     whole, alone = (eg.trace(lit, place, vector(0, 0, -1)) for _ in range(2))
     reference(whole)
-    declare_steps(alone)
-    assert whole._steps.kinds == alone._steps.kinds == ["floor"] * 14
-    for a, b in zip(whole._steps.values, alone._steps.values, strict=True):
+    declare_texel_edges(alone)
+    assert whole._discontinuities.kinds == alone._discontinuities.kinds == ["floor"] * 14
+    for a, b in zip(whole._discontinuities.values, alone._discontinuities.values, strict=True):
         assert torch.equal(a.isnan(), b.isnan())
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
 

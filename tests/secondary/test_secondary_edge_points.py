@@ -107,7 +107,7 @@ def test_light_that_is_followed_to_the_camera(looks: tuple[str, str], monkeypatc
 
     def passed_on(frame: Frame, options: Options) -> list[Term]:
         found = in_kernel.secondary_edge_samples(frame, options._replace(bounces=3), 1)
-        return secondary_edges._passed_on(frame, found, "bounce edges", 1)
+        return secondary_edges._passed_on(frame, found, "secondary edges", 1)
 
     monkeypatch.setattr(secondary_edges, "_seen", passed_on)
     exact, weights = leaves_of(Strip.standard()), weights_of(Strip.standard())

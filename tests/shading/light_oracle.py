@@ -13,12 +13,13 @@ import math
 from typing import NamedTuple
 
 import torch
+from oracles.shading import emission_of
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
 from edgegrad.light.bsdf import dot, ggx, terminator
-from edgegrad.light.radiance import _emission, _of_each_mesh, _on_mesh, _Surface, _where_seen
+from edgegrad.light.shaded_points import ShadedPoints, of_each_mesh, on_mesh, where_seen
 
 F64 = torch.float64
 AWAY = 1e-6  # where rays begin, along themselves
@@ -45,14 +46,14 @@ class Oracle:
         self._generator = torch.Generator().manual_seed(seed)
 
     def __call__(self, hits: eg.Hits) -> Tensor:
-        return _of_each_mesh(hits, self._of_mesh)
+        return of_each_mesh(hits, self._of_mesh)
 
     def _of_mesh(self, hits: eg.Hits, index: int) -> Tensor:
-        scene, at = hits._surfaces.scene, _on_mesh(hits, index)
+        scene, at = hits._surfaces.scene, on_mesh(hits, index)
         material = at.mesh.material
         assert material is not None
-        surface = _Surface.of(hits, at, material)
-        emission = _emission(at, material)
+        surface = ShadedPoints.from_hits(hits, at, material)
+        emission = emission_of(at, material)
         total = surface.g.new_zeros((len(hits), 1)) if emission is None else emission
         casters = scene.replace(
             meshes=[m for m in scene.meshes if m.material is None or m.material.alpha_mode != "BLEND"]
@@ -67,10 +68,10 @@ class Oracle:
         for _ in range(self._draws):
             l, density = self._draw(surface)
             total = total + _scattered(surface, l) * _seen(scene, casters, surface.position, l) / density / self._draws
-        return _where_seen(hits, material, total)
+        return where_seen(hits, material, total)
 
     @torch.no_grad()
-    def _draw(self, surface: _Surface) -> tuple[Tensor, Tensor]:
+    def _draw(self, surface: ShadedPoints) -> tuple[Tensor, Tensor]:
         """Unit directions (N, 3) and their densities (N, 1)."""
         n, v, y = (t.detach().double() for t in (surface.n, surface.v, surface.position))
         roughness = (
@@ -116,7 +117,7 @@ def _around(axis: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return x * across + y * torch.linalg.cross(axis, across) + z * axis
 
 
-def _scattered(surface: _Surface, l: Tensor) -> Tensor:
+def _scattered(surface: ShadedPoints, l: Tensor) -> Tensor:
     """(N, C): f max(0, n·l), zero below the face."""
     above = (dot(surface.n, l) > 0) & (dot(surface.g, l) > 0)
     l = torch.where(above, l, surface.n.detach())
@@ -144,11 +145,11 @@ def _seen(scene: eg.Scene, casters: eg.Scene, place: Tensor, l: Tensor) -> Tenso
             found = found + torch.where(free[:, None], light.towards(l), 0.0)
 
     def emitted(own: eg.Hits, index: int) -> Tensor:
-        at = _on_mesh(own, index)
+        at = on_mesh(own, index)
         material = at.mesh.material
-        emission = None if material is None else _emission(at, material)
+        emission = None if material is None else emission_of(at, material)
         if material is None or emission is None:
             return torch.zeros((len(own), 1), dtype=F64)
-        return _where_seen(own, material, emission.expand(len(own), -1))
+        return where_seen(own, material, emission.expand(len(own), -1))
 
-    return found.index_add(0, hits.ray, _of_each_mesh(hits, emitted).to(found))
+    return found.index_add(0, hits.ray, of_each_mesh(hits, emitted).to(found))

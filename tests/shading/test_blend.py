@@ -12,7 +12,7 @@ from scenes import cube
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.points.step_terms import StepTerms
+from edgegrad.points.discontinuity_terms import DiscontinuityTerms
 
 F64 = torch.float64
 RADIANCES = (0.9, 0.5, 0.2, 0.7)
@@ -230,13 +230,13 @@ def test_borders_of_nearest_texels_are_searched_where_they_move(
     moving: str, searched: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of what requires a gradient, alpha and lights move none."""
-    searches: list[StepTerms] = []
+    searches: list[DiscontinuityTerms] = []
 
-    def found(terms: StepTerms, watch: object) -> list[object]:
+    def found(terms: DiscontinuityTerms, watch: object) -> list[object]:
         searches.append(terms)
         return []
 
-    monkeypatch.setattr(StepTerms, "found", found)
+    monkeypatch.setattr(DiscontinuityTerms, "found", found)
     start = plane()
     assert start.uvs is not None
     alpha, power = torch.full((2, 2), 0.5, dtype=F64), torch.tensor(3.0, dtype=F64)

@@ -17,7 +17,7 @@ from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel
 from edgegrad.light.at_points import Options
 from edgegrad.light.bsdf import dot, terminator
-from edgegrad.light.radiance import _on_mesh, _Surface
+from edgegrad.light.shaded_points import ShadedPoints, on_mesh
 from edgegrad.points.frame import Frame
 from edgegrad.points.hits import Hits
 from edgegrad.scene.lights import LightPoints, SphericalHarmonics
@@ -64,13 +64,13 @@ def hits_of(scene: eg.Scene, camera: eg.Camera) -> Hits:
 class Point(NamedTuple):
     """One of a path."""
 
-    surface: _Surface
+    surface: ShadedPoints
     doubled_area: Tensor  # (1, 1) of its face
 
 
 class Oracle:
     """What PyTorch makes of paths in float64, point by point: the recursion of csrc/shading/lit/path_radiance.h by the surfaces,
-    materials and lights of edgegrad/light/radiance.py. Textures of points that no pixel sees are those of `unfiltered`, hits of
+    materials and lights of edgegrad/light. Textures of points that no pixel sees are those of `unfiltered`, hits of
     the same scene."""
 
     def __init__(self, hits: Hits, unfiltered: Hits, bounces: int) -> None:
@@ -102,13 +102,13 @@ class Oracle:
             else:
                 hits = Hits(self._unfiltered._surfaces, self._hits._view, face, b)
                 hits.__dict__["view"] = normalize(found[-1].surface.position - hits.position, dim=1)
-            at = _on_mesh(hits, int(hits._surfaces.mesh_of_face[face]))
+            at = on_mesh(hits, int(hits._surfaces.mesh_of_face[face]))
             assert at.mesh.material is not None
             corner = hits._surfaces.corners(face)
             area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).norm(
                 dim=1, keepdim=True
             )
-            found.append(Point(_Surface.of(hits, at, at.mesh.material), area))
+            found.append(Point(ShadedPoints.from_hits(hits, at, at.mesh.material), area))
         return found
 
     @staticmethod
@@ -118,7 +118,7 @@ class Oracle:
         f = o.scattering.evaluate(o.v, o.n, l) * dot(o.n, l) * (1 if o.flat else terminator(o.g, o.n, l))
         return f * next.doubled_area * dot(next.surface.g, l).abs() / dot(d, d)
 
-    def _direct(self, o: _Surface, i: int, k: int) -> Tensor:
+    def _direct(self, o: ShadedPoints, i: int, k: int) -> Tensor:
         scene = self._hits._surfaces.scene
         total = torch.zeros(1, 3, dtype=F64)
         for light in scene.lights:

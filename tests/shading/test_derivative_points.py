@@ -8,16 +8,17 @@ import math
 import pytest
 import torch
 from lit_scenes import F64, ball, directions, plane, vector
+from oracles import shading
+from oracles.antithetic import antithetic_set
+from oracles.lobes import Lobes
+from oracles.resampled import Glossy, resampled
 from scipy.stats import chi2
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
-from edgegrad.light import in_kernel, radiance
-from edgegrad.light.antithetic import antithetic_set
+from edgegrad.light import in_kernel
 from edgegrad.light.bsdf import Scattering, dot
-from edgegrad.light.lobes import Lobes
-from edgegrad.light.resampled import Glossy, resampled
 from edgegrad.points.hits import Hits
 from edgegrad.scene.lights import LightPoints
 
@@ -199,7 +200,7 @@ def test_kernel_and_twin_draw_the_same_points():
         found = torch.autograd.grad((L * bar).sum(), list(of.values()))
         return dict(zip(of, found, strict=True))
 
-    wanted, got = gradients(radiance.reference), gradients(in_kernel.radiance)
+    wanted, got = gradients(shading.reference), gradients(in_kernel.radiance)
     for name, value in wanted.items():
         assert float(value.abs().max()) > 0, name
         assert float((value - got[name]).abs().max()) <= 1e-8 * float(value.abs().max()), name
@@ -210,4 +211,4 @@ def test_values_take_no_companions():
     scene = eg.Scene([ball(2, material=eg.Material(metallic=1.0, roughness=0.2))], lights=[sky(True)])
     camera = eg.Camera.look_at((0.0, -2.0, 2.5), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 50.0, (16, 16))
     hits: Hits = eg.primary_hits(scene, camera).hits
-    assert torch.allclose(radiance.reference(hits, True, 2), in_kernel.radiance(hits, True, 2), rtol=1e-10)
+    assert torch.allclose(shading.reference(hits, True, 2), in_kernel.radiance(hits, True, 2), rtol=1e-10)

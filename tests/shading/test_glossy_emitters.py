@@ -10,19 +10,20 @@ import pytest
 import torch
 from finite_differences import Case, check, gradient
 from lit_scenes import F64, ball, by_quadrature, from_above, plane, vector
+from oracles import shading
+from oracles.lobes import Lobes, sobol_parts
+from oracles.mesh_light_sampling import MeshTowards
+from oracles.resampled import Glossy, resampled
 from scenes import icosphere
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
-from edgegrad.light import by_material, in_kernel
+from edgegrad.light import in_kernel
 from edgegrad.light.bsdf import Scattering
-from edgegrad.light.lobes import Lobes
-from edgegrad.light.mesh_light_sampling import MeshTowards, tree_of
-from edgegrad.light.resampled import Glossy, resampled
+from edgegrad.light.sampling import tree_of
 from edgegrad.points.frame import Frame
-from edgegrad.points.sobol import sobol_parts
 from edgegrad.scene.mesh_light import MeshLight
 
 
@@ -181,7 +182,7 @@ def test_the_kernel_draws_what_pytorch_draws():
     lobes = Lobes.of(hits.view, hits.shading_normal, vector(0.3)[None])
     asked = MeshTowards.of(light, position, own).is_drawn_by(lobes)[hits.mesh == 0]
     assert bool(asked.any()) and not bool(asked.all())
-    for a, b in zip(by_material.reference(hits, light, 3), in_kernel.light_points(hits, light, 3), strict=True):
+    for a, b in zip(shading.points_by_material(hits, light, 3), in_kernel.light_points(hits, light, 3), strict=True):
         some = a.density.isfinite()
         assert torch.equal(some, b.density.isfinite()) and int(some.sum()) > 200
         assert torch.equal(a.index[some], b.index[some])

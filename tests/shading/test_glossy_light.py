@@ -8,14 +8,15 @@ import pytest
 import torch
 from finite_differences import Case, check_ratio
 from lit_scenes import F64, ball, directions, vector
+from oracles.lobes import Lobes
+from oracles.resampled import Glossy, resampled
 from scipy.stats import chi2
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
 from edgegrad.light.bsdf import Scattering
-from edgegrad.light.lobes import WIDEST_LOBE, Lobes
-from edgegrad.light.resampled import Glossy, resampled
+from edgegrad.light.sampling import WIDEST_LOBE
 
 pytestmark = pytest.mark.watched
 

@@ -24,7 +24,7 @@ from benchmarks.stability.cases.measure import Effort as Seeds
 from benchmarks.stability.cases.measure import Running, differences
 from benchmarks.stability.statistics import holm
 from edgegrad.kernel.request import make_request
-from edgegrad.shader import Effort, render_shaded
+from edgegrad.shader import ShadingTraits, render_shaded
 
 F64 = torch.float64
 ALPHA = 0.01 / len(GLOSSY)
@@ -57,8 +57,8 @@ def by_oracle(scene: eg.Scene, camera: eg.Camera, seed: int) -> Tensor:
     shining = [m for m in scene.meshes if m.material is not None and m.material.emission is not None]
     skies = any(isinstance(light, eg.Environment) for light in scene.lights)
     oracle = Oracle([around(mesh) for mesh in shining] + sky_lamps() * skies, seed)
-    effort = Effort(points=16, blended=scene.blends, glossy=True)
-    return render_shaded(scene, camera, oracle, make_request(scene, camera, seed=seed, **MANY), "auto", False, effort)
+    traits = ShadingTraits(points=16, blended=scene.blends, glossy=True)
+    return render_shaded(scene, camera, oracle, make_request(scene, camera, seed=seed, **MANY), "auto", False, traits)
 
 
 def sums_and_gradients(problem: Problem, parts: list[str], render: Render, seed: int) -> Tensor:

@@ -83,7 +83,7 @@ def from_light(scene: eg.Scene, seen_from: eg.Camera, count: int, seed: int, bou
     cosine = (frame.fixed.face_normals(face) * origin).sum(1).abs()
     lit = hits.visible(light.position).double()
     falls = float(light.intensity) / to_light.square().sum(1) * cosine * lit * area.sum() / count
-    arrivals = (face, b, frame.seeds("unseen shadows", count), origin, falls[:, None].expand(count, 3))
+    arrivals = (face, b, frame.seeds("indirect shadows", count), origin, falls[:, None].expand(count, 3))
     _, x, radiance = in_kernel.towards_camera(frame, arrivals, (1, bounces - 1))
     pixel = x.floor().long()
     inside = ((pixel >= 0) & (pixel < torch.tensor([frame.width, frame.height]))).all(1)

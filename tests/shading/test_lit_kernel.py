@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 from combinations import diagonal
+from oracles import shading
 from scenes import icosphere
 from torch import Tensor
 
@@ -157,7 +159,7 @@ def hits_of(scene: eg.Scene, camera: eg.Camera) -> Hits:
 
 def both(words: str, view: str, samples: int, leaves: Leaves, w2c: Tensor) -> tuple[Hits, Hits, Tensor, Tensor]:
     hits = [hits_of(scene_of(words, leaves), CAMERAS[view].replace(world_to_camera=w2c)) for _ in range(2)]
-    return hits[0], hits[1], radiance.reference(hits[0], True, samples), in_kernel.radiance(hits[1], True, samples)
+    return hits[0], hits[1], shading.reference(hits[0], True, samples), in_kernel.radiance(hits[1], True, samples)
 
 
 @pytest.mark.parametrize("view", CAMERAS)
@@ -198,7 +200,7 @@ def test_a_grey_normal_map_does_not_bend(grey: float, noise: float) -> None:
             name: value.clone().requires_grad_() for name, value in numbers.items() if mapped or "map" not in name
         }
         hits = [hits_of(scene_of(words, leaves), CAMERAS["perspective"]) for _ in range(2)]
-        for own, shade in zip(hits, (in_kernel.radiance, radiance.reference), strict=True):
+        for own, shade in zip(hits, (in_kernel.radiance, shading.reference), strict=True):
             L = shade(own, True, 1)
             grads = torch.autograd.grad(L.sum(), list(leaves.values()), materialize_grads=True)
             found.append({"": L, **dict(zip(leaves, grads, strict=True))})
@@ -241,7 +243,7 @@ def test_points_of_a_light_that_are_given() -> None:
         lit = (torch.arange(n) % 2).double()
         forced = Forced(light, LightPoints(*points), lit, torch.ones(n, dtype=torch.bool))
         found = []
-        for shade in (radiance.reference, in_kernel.radiance):
+        for shade in (shading.reference, in_kernel.radiance):
             given = Hits(
                 hits._surfaces, hits._view, hits._face, hits._exact, hits._pixel, seed=hits._seed, forced=forced
             )
@@ -264,7 +266,7 @@ def test_what_one_light_adds() -> None:
             place = hits._face, hits._exact, hits._pixel
             given = [Hits(hits._surfaces, hits._view, *place, seed=hits._seed, forced=forced) for _ in range(2)]
             L = in_kernel.radiance(given[0], True, 2)
-            assert torch.allclose(radiance.reference(given[1], True, 2), L, rtol=1e-12, atol=1e-12)
+            assert torch.allclose(shading.reference(given[1], True, 2), L, rtol=1e-12, atol=1e-12)
             of.append([L, *torch.autograd.grad(L.sum(), list(leaves.values()), materialize_grads=True)])
         for with_light, without, alone in zip(*of, strict=True):
             assert torch.allclose(
@@ -428,7 +430,7 @@ def test_without_shadows() -> None:
     scene = scene_of(words, numbers_of(words))
     dark, lit = (in_kernel.radiance(hits_of(scene, CAMERAS["perspective"]), shadows, 1) for shadows in (True, False))
     assert bool((lit >= dark - 1e-12).all()) and float((lit - dark).max()) > 0.01
-    expected = radiance.reference(hits_of(scene, CAMERAS["perspective"]), False, 1)
+    expected = shading.reference(hits_of(scene, CAMERAS["perspective"]), False, 1)
     assert torch.allclose(lit, expected, rtol=1e-12, atol=1e-12)
 
 
@@ -467,6 +469,67 @@ def test_the_same_bits_on_any_number_of_threads() -> None:
         torch.set_num_threads(before)
     assert len(found[0][0]) > 1024
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def many_channels(leaves: Leaves, **material: Any) -> eg.Scene:
+    mesh, C = icosphere(2), len(leaves["base"])
+    mesh = eg.Mesh(mesh.verts.double(), mesh.faces, material=eg.Material(leaves["base"], **material))
+    corner, across = torch.tensor([-0.5, 1.5, 1.0]).double(), torch.eye(3).double()
+    lamp = eg.AreaLight.rectangle(corner, across[0], across[2], torch.linspace(3.0, 1.0, C, dtype=F64))
+    lights = [
+        eg.PointLight(torch.tensor([1.0, 2.0, 3.0]).double(), 9.0, leaves["color"]),
+        eg.Environment(leaves["sky"]),
+    ]
+    return eg.Scene([mesh, lamp], lights=lights)
+
+
+def colors_of_many(channels: int) -> Leaves:
+    wave = torch.arange(channels, dtype=F64)
+    sky = 0.5 + 0.4 * torch.sin(wave + torch.arange(32, dtype=F64)[:, None]).reshape(4, 8, channels)
+    return {"base": 0.5 + 0.4 * torch.cos(wave), "color": 1.5 + torch.sin(wave), "sky": sky}
+
+
+def test_more_channels_than_the_kernel_takes_at_once() -> None:
+    found = []
+    for shade in (in_kernel.radiance, shading.reference):
+        leaves = {name: value.requires_grad_() for name, value in colors_of_many(37).items()}
+        L = shade(hits_of(many_channels(leaves), CAMERAS["perspective"]), True, 2)
+        assert L.shape[1] == 37 and float(L.detach().min(0).values.max()) > 0
+        found.append([L, *torch.autograd.grad(L.square().sum(), list(leaves.values()))])
+    assert all(torch.allclose(a, b, rtol=1e-10, atol=1e-12) for a, b in zip(*found, strict=True))
+
+
+def test_glossy_surfaces_of_many_channels_are_those_of_few() -> None:
+    """Images and gradients, within their noise."""
+    found = []
+    for few in (False, True):
+        leaves = {name: value[..., :3] if few else value for name, value in colors_of_many(20).items()}
+        leaves = {name: value.clone().requires_grad_() for name, value in leaves.items()}
+        scene = many_channels(leaves, metallic=0.8, roughness=0.15)
+        if few:  # the area light's colour is that of the first channels
+            lamp = eg.AreaLight.of(scene.meshes[1].replace(material=None), torch.linspace(3.0, 1.0, 20, dtype=F64)[:3])
+            scene = scene.replace(meshes=[scene.meshes[0], lamp])
+        image = eg.render(scene, CAMERAS["perspective"], spp=64, light_samples=4)[..., :3]
+        grads = torch.autograd.grad(image.mean(), list(leaves.values()))
+        found.append([image.mean((0, 1)), grads[0][:3], grads[1][:3], grads[2][..., :3].sum((0, 1))])
+    for a, b in zip(*found, strict=True):
+        assert float((a - b).norm()) < 0.02 * float(b.norm()), (a, b)
+
+
+def test_nearest_texels_that_one_sees_through_are_shaded_as_in_pytorch() -> None:
+    """So are their discontinuities, in the same order."""
+    leaves = numbers_of("nearest texture base point area")
+    scene = scene_of("nearest texture base point area", leaves)
+    mesh, *others = scene.meshes
+    assert mesh.material is not None
+    material, alpha = dataclasses.replace(mesh.material, alpha_mode="BLEND"), torch.full((2, 2), 0.5, dtype=F64)
+    scene = scene.replace(meshes=[mesh.replace(material=material, alpha=alpha), *others])
+    assert not in_kernel.is_fused(scene)
+    kernel, twin = (hits_of(scene, CAMERAS["perspective"]) for _ in range(2))
+    assert torch.allclose(radiance.radiance(kernel), shading.reference(twin), rtol=1e-12, atol=1e-12)
+    assert kernel._discontinuities.kinds == twin._discontinuities.kinds != []
+    for a, b in zip(kernel._discontinuities.values, twin._discontinuities.values, strict=True):
+        assert torch.equal(a.nan_to_num(), b.nan_to_num())
 
 
 def test_which_scenes_the_kernel_shades() -> None:

@@ -10,13 +10,13 @@ import pytest
 import torch
 from finite_differences import Case, check, gradient
 from lit_scenes import F64, ball, by_quadrature, directions, from_above, hits_of, plane, vector
+from oracles.shading import radiance
 from torch import Tensor
 from torch.autograd import gradcheck
 from torch.nn.functional import normalize
 
 import edgegrad as eg
 from edgegrad.light.bsdf import Scattering, ggx, masking, terminator
-from edgegrad.light.radiance import radiance
 from edgegrad.points.hits import Hits
 
 UP = vector(0, 0, 1)

@@ -74,7 +74,7 @@ def test_pyramids(wraps: tuple[str, str]) -> None:
         levels.append(pooled.movedim(0, -1))
     tents = [(1 - (level.clamp(0, 3) - k).abs()).clamp(min=0)[:, None] for k in range(4)]
     expected = sum(tent * bilinear(one, uv, wraps) for tent, one in zip(tents, levels, strict=True))
-    found = Pyramid.of(image).look_up(level, uv, wraps)
+    found = Pyramid.from_texture(image).look_up(level, uv, wraps)
     assert isinstance(expected, torch.Tensor)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-14)
     weights = torch.rand(found.shape, dtype=torch.float64, generator=draw)
@@ -94,13 +94,13 @@ def test_means_of_pyramids(size: tuple[int, int], channels: int) -> None:
         half = max(1, levels[-1].shape[0] // 2), max(1, levels[-1].shape[1] // 2)
         levels.append(torch.nn.functional.adaptive_avg_pool2d(levels[-1].movedim(-1, 0), half).movedim(0, -1))
     expected = torch.cat([level.reshape(-1, channels) for level in levels])
-    pyramid = Pyramid.of(image)
+    pyramid = Pyramid.from_texture(image)
     assert pyramid.first.tolist() == [sum(a.shape[0] * a.shape[1] for a in levels[:k]) for k in range(len(levels))]
     torch.testing.assert_close(pyramid.texels, expected, rtol=0, atol=1e-15)
-    torch.testing.assert_close(Pyramid.of(image.float()).texels, expected.float(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(Pyramid.from_texture(image.float()).texels, expected.float(), rtol=0, atol=1e-6)
     weights = torch.rand(expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     grads = [torch.autograd.grad((weights * texels).sum(), image)[0] for texels in (pyramid.texels, expected)]
     torch.testing.assert_close(*grads, rtol=0, atol=1e-14)
     along = torch.randn(image.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(6))
-    moved = torch.func.jvp(lambda x: Pyramid.of(x).texels, (image.detach(),), (along,))[1]
+    moved = torch.func.jvp(lambda x: Pyramid.from_texture(x).texels, (image.detach(),), (along,))[1]
     assert abs(float((moved * weights).sum() - (grads[0] * along).sum())) < 1e-12

@@ -7,11 +7,11 @@ from typing import Any
 
 import torch
 from finite_differences import Case
+from oracles.shading import radiance
 from scenes import icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.light.radiance import radiance
 
 F64 = torch.float64
 QUAD = torch.tensor([[-0.5, -0.4, 1.0], [0.6, -0.5, 1.2], [0.7, 0.5, 1.3], [-0.3, 0.6, 0.9]], dtype=F64)

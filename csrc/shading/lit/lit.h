@@ -3,8 +3,8 @@
 //
 //     L(y, v) = emission + Σ f(y, v, l) max(0, n·l) V(y, l) E(y) + irradiance without shadows · base / π
 //
-// The sum is over one or a few points of each light with an extent. edgegrad/light/radiance.py computes the same in
-// PyTorch, as reference, and where this file does not apply.
+// The sum is over one or a few points of each light with an extent. tests/oracles/shading.py computes the same in
+// PyTorch.
 #pragma once
 
 #include <cstdint>

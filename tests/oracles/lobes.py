@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from .bsdf import LEAST_ALPHA, dot, ggx
-
-WIDEST_LOBE = 0.65  # roughness
+from edgegrad.light.bsdf import LEAST_ALPHA, dot, ggx
+from edgegrad.light.sampling import WIDEST_LOBE
+from edgegrad.points.sobol import sobol
 
 
 class Lobes(NamedTuple):
@@ -85,3 +85,10 @@ def axes_around(n: Tensor) -> Tensor:
     b = x * y * a
     rows = [1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y, x, y, z]
     return torch.stack(rows, -1).reshape(-1, 3, 3)
+
+
+def sobol_parts(seed: Tensor, key: int, parts: int) -> Tensor:
+    """Return sobol() of all parts of each seed (N · parts, 2)."""
+    every = torch.arange(parts, device=seed.device)
+    own = (seed[:, None] * parts + every & 0xFFFFFFFF) | (seed[:, None] >> 32 << 32)
+    return sobol(own.reshape(-1), key)

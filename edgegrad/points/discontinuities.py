@@ -24,7 +24,7 @@ BISECTIONS = 12  # to 1/4096 of the spacing
 MOST_LEVELS = 4  # of a floor() between two neighbours; if there are more, so many are drawn
 
 
-class Steps:
+class Discontinuities:
     """The values of the step functions that a shader declares at some points, in its order.
 
     `states` (N, K), if given, are the sides that the steps are forced to, whatever the values say.
@@ -57,10 +57,10 @@ class Steps:
         return self._states[:, len(self.kinds) - 1].to(values.device)
 
 
-class StepsOfSubset(Steps):
+class DiscontinuitiesOfSubset(Discontinuities):
     """Steps that are declared of some of the points, and noted as steps of all."""
 
-    def __init__(self, steps: Steps, index: Tensor, count: int) -> None:
+    def __init__(self, steps: Discontinuities, index: Tensor, count: int) -> None:
         super().__init__()
         self._all, self._index, self._count = steps, index, count
 
@@ -90,7 +90,7 @@ class Points(NamedTuple):
 
     @staticmethod
     def choose(first: Tensor, a: Points, b: Points) -> Points:
-        """Those of `a` where `first` (N,), of `b` elsewhere."""
+        """Return the points of `a` where `first` (N,), of `b` elsewhere."""
         pairs = zip(a, b, strict=True)
         return Points(*(torch.where(first[:, None] if u.dim() == 2 else first, u, v) for u, v in pairs))
 
@@ -135,7 +135,7 @@ class _Candidates(NamedTuple):
 def find_crossings(
     at: At, kinds: list[str], size: tuple[int, int], margin: float, spacing: float, seed: int
 ) -> Crossings:
-    """Of an image of `size` (height, width), widened by `margin` px. at(x) gives the Points at places x (N, 2)."""
+    """Return the crossings in an image of `size` (height, width), widened by `margin` px. at(x) gives Points at places (N, 2)."""
     generator = np.random.default_rng(seed)  # torch's own draws nothing under torch.vmap
     lines = _at_jumps(at, _grid(at, size, margin, spacing, generator))
     found = []
@@ -158,7 +158,7 @@ def find_crossings(
 
 
 def _grid(at: At, size: tuple[int, int], margin: float, spacing: float, generator: np.random.Generator) -> _Lines:
-    """The pieces of all lines of the grid, up to the border of the image."""
+    """Return the pieces of all lines of the grid, up to the border of the image."""
     shift = torch.from_numpy(generator.random(2))
 
     def inner(length: int, shift: Tensor) -> Tensor:
@@ -184,7 +184,7 @@ def _grid(at: At, size: tuple[int, int], margin: float, spacing: float, generato
 
 
 def _at_jumps(at: At, lines: _Lines) -> _Lines:
-    """The pieces, divided where a surface ends before another or before the background."""
+    """Return the pieces, divided where a surface ends before another or before the background."""
     differ = lines.low.part != lines.high.part
     if int(differ.sum()) > len(differ) // 4:  # a triangle soup: only at the background
         differ = (lines.low.face < 0) != (lines.high.face < 0)
@@ -234,7 +234,7 @@ def _candidates(lines: _Lines, kinds: list[str], generator: np.random.Generator)
 
 
 def _refine(at: At, lines: _Lines, kinds: list[str], candidates: _Candidates) -> tuple[Points, Points, Tensor]:
-    """Short pieces around the crossings, by their ends, and whether the function is continuous in each."""
+    """Return short pieces around the crossings, by their ends, and whether the function is continuous in each."""
     where, step, level = candidates.line, candidates.step, candidates.level
     signs = torch.tensor([kind == SIGN for kind in kinds])[step]
 

@@ -1,8 +1,9 @@
-"""What samples on the steps that a shader declares give to the image:
+"""Terms of samples on the discontinuities that a shader declares:
 
     δI = Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight
 
-over where lines cross the steps s = 0 (steps.py). L₊ and L₋ are the shader's values with the step forced to either side.
+over where lines cross the steps s = 0 (discontinuities.py). L₊ and L₋ are the shader's values
+with the discontinuity forced to either side.
 """
 
 from __future__ import annotations
@@ -17,18 +18,18 @@ from torch.utils.checkpoint import checkpoint
 from ..check import values_visible
 from ..kernel.counts import Watch
 from ..kernel.derivatives import transformed
+from .discontinuities import Crossings, Discontinuities, Points, find_crossings
 from .frame import Frame
 from .hits import Hits
 from .records import RayRecords
 from .splat import Term, boundary
-from .steps import Crossings, Points, Steps, find_crossings
 
 # By which a pixel's filter reaches out of the image, in px.
 MARGIN = {"box": 0.0, "tent": 0.5, "gaussian": 1.0}
 
 
-class StepTerms(NamedTuple):
-    """The steps of one image, and who declares them."""
+class DiscontinuityTerms(NamedTuple):
+    """The discontinuities of one image, and who declares them."""
 
     frame: Frame
     kinds: list[str]
@@ -72,7 +73,7 @@ class StepTerms(NamedTuple):
             return find_crossings(at, self.kinds, size, margin, self.spacing, frame.sampler.grad_seed)
 
     def _jumps(self, found: Crossings, rays: RayRecords) -> tuple[Tensor, Tensor]:
-        """(M, C) L₊ − L₋ and (M,) the weight over |∇ₓs|, of constants."""
+        """Return L₊ − L₋ (M, C) and the weight over |∇ₓs| (M,), without derivatives."""
         frame = self.frame
         seed = frame.seeds("steps", len(found.x))
         gradient = torch.cat([self._by_place(found, rays, part) for part in self._parts(found)])
@@ -82,7 +83,7 @@ class StepTerms(NamedTuple):
                 face, b, x = found.face[part], found.b[part], found.x[part]
                 aside = self._aside(found, rays, part, gradient[part]) if self.margin else torch.zeros_like(b)
                 before, after = (
-                    self.shade(frame.fixed_hits(face, b + shift, x, seed[part], Steps(states[part])))
+                    self.shade(frame.fixed_hits(face, b + shift, x, seed[part], Discontinuities(states[part])))
                     for states, shift in ((found.before, -aside), (found.after, aside))
                 )
                 jumps.append((after - before).detach())
@@ -94,7 +95,7 @@ class StepTerms(NamedTuple):
         return jump, torch.nan_to_num(weight, nan=0.0, posinf=0.0)
 
     def _aside(self, found: Crossings, rays: RayRecords, part: slice, gradient: Tensor) -> Tensor:
-        """(M, 2) by how much barycentrics change from a step to its side after it, where its gradient is ∇ₓs."""
+        """Return the change of barycentrics (M, 2) from a discontinuity to the side after it, where its gradient is ∇ₓs."""
         frame = self.frame
         face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
         _, b_by_x = frame.fixed_view.barycentrics_by(frame.fixed, face, along, by_x)
@@ -104,7 +105,7 @@ class StepTerms(NamedTuple):
         return (b_by_x * x[:, None]).sum(-1)[:, 1:].to(found.b)
 
     def _values_of_scene(self, found: Crossings, rays: RayRecords) -> Tensor:
-        """(M,) the function of each crossing's step, with a graph of vertices and camera."""
+        """Return the function (M,) of each crossing's discontinuity, with a graph of vertices and camera."""
         frame = self.frame
         step = frame.here(found.step)[:, None]
         values = []
@@ -122,7 +123,7 @@ class StepTerms(NamedTuple):
         return torch.cat(values)
 
     def _by_place(self, found: Crossings, rays: RayRecords, part: slice) -> Tensor:
-        """(M, 2): ∇ₓs of each crossing's step, without derivatives of its own."""
+        """Return ∇ₓs (M, 2) of each crossing's discontinuity, without derivatives of its own."""
         frame = self.frame
         step = frame.here(found.step[part])[:, None]
         face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
@@ -142,9 +143,9 @@ class StepTerms(NamedTuple):
             return torch.autograd.grad(sum_of_steps(zero), zero, materialize_grads=True)[0].detach()
 
     def _values(self, hits: Hits) -> Tensor:
-        """(N, K) the functions of all steps."""
+        """Return the functions (N, K) of all discontinuities."""
         self.declare(hits)
-        return torch.stack([values.double() for values in hits._steps.values], 1)
+        return torch.stack([values.double() for values in hits._discontinuities.values], 1)
 
     def _parts(self, found: Crossings) -> list[slice]:
         return [slice(first, first + self.at_once) for first in range(0, max(len(found.x), 1), self.at_once)]

@@ -4,44 +4,26 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..library import core
-from ..points.records import values_of
-from ..points.shadow_rays import THIN
-from ..scene.environment import EVEN
-from ..scene.lights import LightPoints
-from ..scene.mesh_light import MeshLight
-from ..scene.rows import unit
-from .bsdf import dot
+from edgegrad.light.bsdf import dot
+from edgegrad.light.sampling import hides, least_brightness, tree_of
+from edgegrad.points.records import values_of
+from edgegrad.points.shadow_rays import THIN
+from edgegrad.scene.lights import LightPoints
+from edgegrad.scene.mesh_light import MeshLight
+from edgegrad.scene.rows import unit
+
 from .lobes import Lobes, axes_around
 
 LEAST_EMITTER = 0.25  # solid angle over that of a lobe, below which nothing is drawn by the lobe
 LEAST_ROUND = 1.0  # the same of round lights
 FARTHEST_LOBE = 4.0  # between them, in half angles of the lobe
 SMALLEST_EMITTER = 0.1  # solid angle over that of a lobe, below which points of a flat light are interchangeable
-
-_trees: WeakKeyDictionary[MeshLight, Any] = WeakKeyDictionary()
-
-
-def tree_of(light: MeshLight) -> Any:
-    """The kernel's tree of the faces; None where there are too many of them."""
-    if len(light.mesh.faces) > core.MOST_EMISSIVE_FACES:
-        return None
-    if light not in _trees:
-        verts, faces = values_of(light.mesh.verts.detach().double(), light.mesh.faces)
-        _trees[light] = core.EmissiveFaceTree(np.ascontiguousarray(verts), faces.astype(np.int32))
-    return _trees[light]
-
-
-def hides(light: MeshLight) -> bool:
-    """Whether near faces hide far ones, for none is cut out."""
-    return light.mesh.alpha is None
 
 
 class MeshTowards(NamedTuple):
@@ -170,9 +152,3 @@ class MeshTowards(NamedTuple):
 
 def _one_minus_cosine(sine: Tensor) -> Tensor:
     return sine * sine / (1 + (1 - sine * sine).sqrt())
-
-
-def least_brightness(light: MeshLight) -> float:
-    """What is added to how bright a light is, so that what is dark has a gradient too."""
-    mean = float(light.mean_emission)
-    return EVEN * mean if mean > 0 else 1.0

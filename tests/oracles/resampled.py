@@ -12,39 +12,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..points.sobol import key_of, sobol, sobol_parts
-from ..scene.environment import Environment
-from ..scene.lights import Light, LightPoints
-from ..scene.mesh_light import MeshLight
-from ..scene.scene import Scene
-from .antithetic import MOST_SETS, SET_SIZE, SETS, antithetic_set, seen_aside
-from .bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
-from .lobes import WIDEST_LOBE, Lobes
-from .mesh_light_sampling import MeshTowards, tree_of
+from edgegrad.light.bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
+from edgegrad.light.sampling import DARK, EACH, MOST_SETS, SET_SIZE, SETS
+from edgegrad.points.sobol import key_of, sobol
+from edgegrad.scene.environment import Environment
+from edgegrad.scene.lights import Light, LightPoints
 
-EACH = 8  # candidates for one point that is kept, half of them by the lobe if it is narrow
-# Where radiance has derivatives, points are drawn as if no surface were darker, for what is black has derivatives too.
-DARK = 0.05
+from .antithetic import antithetic_set, seen_aside
+from .lobes import Lobes, sobol_parts
+from .mesh_light_sampling import MeshTowards
+
 AT_ONCE = 1 << 19  # candidates
-
-
-def how_drawn(scene: Scene) -> str:
-    """What plan() says of points of lights: by what they are drawn, and why."""
-    skies = sum(isinstance(light, Environment) for light in scene.casting)
-    lights = [light for light in scene.casting if isinstance(light, MeshLight)]
-    if not (skies or lights):
-        return ""
-    materials = [mesh.material for mesh in scene.meshes if mesh.material is not None]
-    if not any(material.is_glossy for material in materials):
-        return ", drawn by the light, for no surface is glossy"
-    of = ["skies"] * (skies > 0) + ["meshes that emit"] * (len(lights) > 0)
-    said = f"; on glossy surfaces of {EACH} candidates for each, by light and, up to roughness {WIDEST_LOBE}, by lobe"
-    said += f", one is kept by what it gives ({', '.join(of)})"
-    if lights:
-        said += "; a light well within the lobe by the light alone, of a round one directions to a ball around it"
-    if any(tree_of(light) is None for light in lights):
-        said += "; lights of too many faces by the light alone"
-    return said
 
 
 class Glossy(NamedTuple):

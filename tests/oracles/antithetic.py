@@ -7,11 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from .bsdf import dot
+from edgegrad.light.bsdf import dot
 
-SET_SIZE = 4  # with the direction itself
-SETS = 2  # for one sample of a light
-MOST_SETS = 8  # the same where the face is seen from aside and its normal differs from the shading normal
 ASIDE, PART = 0.2, 0.1  # the cosine, and the share of it that the normals differ by
 LEAST_TANGENT2 = 1e-24  # below it a normal has no azimuth in doubles
 
