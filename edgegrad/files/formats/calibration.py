@@ -166,11 +166,7 @@ def _view(
     turn: np.ndarray, shift: np.ndarray, K: np.ndarray, distortion: np.ndarray | None, size: tuple[int, int], fisheye: bool,
 ) -> View:  # fmt: skip
     """Return the view of a camera whose rotation is a matrix or a rotation vector."""
-    if turn.size == 9:
-        turn = turn.reshape(3, 3)
-    else:
-        x, y, z = turn.reshape(3)
-        turn = torch.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)).numpy()
+    turn = turn.reshape((3, 3) if turn.size == 9 else 3)
     R, t, k = (torch.tensor(values, dtype=torch.float64) for values in (turn, shift.reshape(3), K))
     coefficients = None if distortion is None else torch.tensor(distortion.reshape(-1), dtype=torch.float64)
     make = Camera.fisheye if fisheye else Camera.from_opencv
