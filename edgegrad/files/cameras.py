@@ -149,7 +149,7 @@ def load_cameras(
 
     Cameras of one size can be joined by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the
     error names it. One warning names all keys that nothing reads, unless cameras do not depend on them. Raises
-    FileNotFoundError, TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML (edgegrad[cameras]).
+    FileNotFoundError, TypeError, ValueError that names the file, or ImportError without PyYAML (edgegrad[cameras]).
 
     Parameters
     ----------

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from ...camera.camera import Camera
-from ...optional import require
 from . import kalibr
 from .context import UnreadLog
 from .keys import image_size, matrix, note_unread, read_keys
@@ -73,7 +72,7 @@ class _Fields:
 
 def read(file: Path, size: tuple[int, int] | None, unread: UnreadLog) -> dict[str, View]:
     """Return views by name: that of a matrix of a pair, of a camera of ROS or Kalibr, else "camera", or "view 0" … for several
-    poses. Raises FormatError, or ImportError without OpenCV or PyYAML."""
+    poses. Raises FormatError, or ImportError without PyYAML."""
     values = read_keys(file)
     if kalibr.is_chain(values):
         return kalibr.read(values, unread)
@@ -167,13 +166,7 @@ def _view(
     turn: np.ndarray, shift: np.ndarray, K: np.ndarray, distortion: np.ndarray | None, size: tuple[int, int], fisheye: bool,
 ) -> View:  # fmt: skip
     """Return the view of a camera whose rotation is a matrix or a rotation vector."""
-    if turn.size == 9:
-        turn = turn.reshape(3, 3)
-    elif turn.any():
-        cv2: Any = require("cv2", "edgegrad[cameras]", "reading rotation vectors")
-        turn = cv2.Rodrigues(turn.reshape(3))[0]
-    else:
-        turn = np.eye(3)
+    turn = turn.reshape((3, 3) if turn.size == 9 else 3)
     R, t, k = (torch.tensor(values, dtype=torch.float64) for values in (turn, shift.reshape(3), K))
     coefficients = None if distortion is None else torch.tensor(distortion.reshape(-1), dtype=torch.float64)
     make = Camera.fisheye if fisheye else Camera.from_opencv

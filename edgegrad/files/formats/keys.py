@@ -1,13 +1,17 @@
-"""Files of keys and values: OpenCV's YAML and XML by OpenCV, other YAML by PyYAML; and a record of the keys that nobody
-read."""
+"""Files of keys and values: YAML by PyYAML, OpenCV's too, and OpenCV's XML; and a record of the keys that nobody read.
+
+OpenCV's own reader is not used, because it ends the process where a file is damaged.
+"""
 
 from __future__ import annotations
 
-import math
+import base64
+import operator
 import re
 from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -17,23 +21,25 @@ from .part import FormatError
 
 MOST_NUMBERS = 1 << 20  # of a matrix; YAML's references announce more than they hold
 MOST_PIXELS = 1 << 24  # on a side
-DEEP = 1000
-INDENT = re.compile(rb"(?<![ \t?-])[ \t?-]{1000}")
-ELEMENT = re.compile(r"([1-4]?)[ucwsifdh]")  # of OpenCV's matrices: how many channels, and their type
-OPENCV = ("%YAML:", "opencv-matrix", "opencv_storage")  # in files of cv2.FileStorage
+ELEMENT = re.compile(r"([1-4]?)([ucwsifdh])")  # of OpenCV's matrices: how many channels, and their type
+TYPES = {"u": "u1", "c": "i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8", "h": "<f2"}
+HEADER = 24  # bytes before the numbers of binary data, with the type in text
+VERSION = re.compile(r"(?m)^\ufeff?%YAML:.*$")  # OpenCV's first line, which is no directive of YAML
 
 
 def read_keys(file: Path) -> dict[str, Any]:
-    """Return numbers, text, lists, dicts and, from OpenCV, arrays. Raises FormatError or ImportError."""
-    text = file.read_text(encoding="utf-8", errors="replace")
-    if file.suffix.lower() == ".xml" or any(mark in text for mark in OPENCV):
-        if _is_deep(text.encode()):  # on which OpenCV ends the process
-            raise FormatError(f"expected a calibration, got lists or keys inside one another more than {DEEP} times")
-        return _of_opencv(file)
-    yaml = require("yaml", "edgegrad[cameras]", "reading YAML")
+    """Return numbers, text, lists and dicts, also of matrices. Raises FormatError or ImportError."""
+    if file.suffix.lower() == ".xml":
+        return _read_xml(file.read_bytes())
+    yaml: Any = require("yaml", "edgegrad[cameras]", "reading YAML")
+    loader = type("Loader", (yaml.SafeLoader,), {})
+    loader.add_multi_constructor(
+        "tag:yaml.org,2002:opencv-", lambda loader, _, node: loader.construct_mapping(node, deep=True)
+    )
+    text = VERSION.sub("", file.read_text(encoding="utf-8", errors="replace"), count=1)
     try:
         # The first of several documents counts: `ros2 topic echo` ends a message of ROS by ---.
-        found = next((document for document in yaml.safe_load_all(text) if document is not None), None)
+        found = next((document for document in yaml.load_all(text, loader) if document is not None), None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise FormatError(
             f"expected YAML, got a file that PyYAML does not read ({' '.join(str(error).split())})"
@@ -43,62 +49,43 @@ def read_keys(file: Path) -> dict[str, Any]:
     return {str(key): value for key, value in found.items() if value is not None}
 
 
-def _of_opencv(file: Path) -> dict[str, Any]:
-    cv2: Any = require("cv2", "edgegrad[cameras]", "reading OpenCV's calibrations")
+def _read_xml(data: bytes) -> dict[str, Any]:
     try:
-        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
-        root = storage.root()
-        return _value(root) if root.isMap() else {}
-    except (cv2.error, SystemError, RecursionError) as error:
-        raise FormatError("expected YAML or XML of cv2.FileStorage, got a file that OpenCV does not read") from error
+        root = ElementTree.fromstring(data)
+        found = _value(root) if root.tag == "opencv_storage" else None
+    except (ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:
+        raise FormatError(f"expected XML of cv2.FileStorage, got a file that cannot be read ({error})") from error
+    if not isinstance(found, dict):
+        raise FormatError(f"expected XML of cv2.FileStorage with keys and values, got {root.tag!r} without")
+    return found
 
 
-def _is_deep(text: bytes) -> bool:
-    """Return whether values nest too deeply, by brackets, by tags, or by the indentation of YAML."""
-    letters = np.frombuffer(text + b" ", np.uint8)
-    first, second = letters[:-1], letters[1:]
-    brackets = np.isin(first, list(b"[{")).astype(np.int64) - np.isin(first, list(b"]}"))
-    tag, slash = first == ord("<"), ord("/")
-    tags = (tag & ~np.isin(second, list(b"/!?"))).astype(np.int64) - (tag & (second == slash))
-    tags -= (first == slash) & (second == ord(">"))
-    return max(brackets.cumsum().max(), tags.cumsum().max()) > DEEP or INDENT.search(text) is not None
-
-
-def _value(node: Any) -> Any:
-    if node.isSeq():
-        return [_value(node.at(i)) for i in range(node.size())]
-    if node.isMap():
-        names = node.keys()
-        return _matrix(node) if {"dt", "data"} <= set(names) else {n: _value(node.getNode(n)) for n in names}
-    return node.string() if node.isString() else node.real() if node.isInt() or node.isReal() else None
-
-
-def _matrix(node: Any) -> np.ndarray:
-    """Return a matrix, whose size is checked first because OpenCV writes past its memory where numbers do not match."""
-    shape, data, dt = node.getNode("sizes"), node.getNode("data"), node.getNode("dt")
-    sides = [shape.at(i) for i in range(shape.size())] if shape.isSeq() else [node.getNode(n) for n in ("rows", "cols")]
-    known = ELEMENT.fullmatch(dt.string()) if dt.isString() else None
-    count = data.size() if data.isSeq() else int(data.isInt() or data.isReal())
-    sizes = [node.real() if node.isInt() else -1.0 for node in sides]
-    if known is None or min(sizes, default=-1.0) < 0 or math.prod(sizes) * int(known[1] or 1) != count:
-        shown = " × ".join(f"{size:g}" if size >= 0 else "?" for size in sizes)
-        raise FormatError(
-            f"{node.name()}: expected rows, cols and dt of a matrix of OpenCV and as many numbers, got {shown}, dt "
-            f"{dt.string() if dt.isString() else 'none'!r} and {count} numbers; save it again by cv2.FileStorage"
-        )
-    return node.mat() if count else np.zeros((0, 0))
+def _value(element: ElementTree.Element) -> Any:
+    if len(element):
+        if all(inner.tag == "_" for inner in element):
+            return [_value(inner) for inner in element]
+        return {inner.tag: _value(inner) for inner in element}
+    words = (element.text or "").split()
+    if element.get("type_id") == "binary":
+        return base64.b64decode("".join(words))
+    try:
+        values = [int(word) if word.lstrip("+-").isdecimal() else float(word) for word in words]
+    except ValueError:
+        return (element.text or "").strip().strip('"')
+    return values[0] if len(values) == 1 and element.tag not in ("data", "sizes") else values
 
 
 def matrix(name: str, value: object) -> np.ndarray:
     """Return (rows, columns) float64 of OpenCV's or ROS's matrices, or of lists; a single list is a row. Raises FormatError."""
     try:
-        if isinstance(value, np.ndarray):
-            return value.astype(np.float64)
         if isinstance(value, dict):
-            flat, shape = value["data"], (int(value["rows"]), int(value["cols"]))
-            if min(shape) < 0:  # which reshape() would choose
-                raise ValueError(f"{shape[0]} rows and {shape[1]} columns")
-            return np.array([float(x) for x in flat]).reshape(shape)
+            sides = _unpacked(value["sizes"]) if "sizes" in value else [value["rows"], value["cols"]]
+            shape = [operator.index(side) for side in sides]
+            kind = ELEMENT.fullmatch(str(value.get("dt", "d")))
+            if min(shape) < 0 or kind is None:  # reshape() would choose negative ones
+                raise ValueError(f"{' × '.join(map(str, shape))} of {value.get('dt', 'numbers')}")
+            channels = [int(kind[1])] if kind[1] else []
+            return np.array([float(x) for x in _unpacked(value["data"])]).reshape(*shape, *channels)
         rows: Any = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
         if sum(map(len, rows)) > MOST_NUMBERS:
             raise ValueError("too many numbers")
@@ -107,6 +94,13 @@ def matrix(name: str, value: object) -> np.ndarray:
         raise FormatError(
             f"{name}: expected a matrix of OpenCV, or rows, cols and data, or a list of rows, got something else ({error})"
         ) from error
+
+
+def _unpacked(value: Any) -> Any:
+    """Return the numbers of OpenCV's binary data, others as they are."""
+    if not isinstance(value, bytes):
+        return value
+    return np.frombuffer(value, TYPES[value[:HEADER].decode().strip()[-1:]], offset=HEADER).tolist()
 
 
 def image_size(width: float, height: float) -> tuple[int, int]:
@@ -125,8 +119,8 @@ def note_unread(
 
 
 def _says_nothing(value: object) -> bool:
-    if isinstance(value, np.ndarray):
-        return not value.any()
     if isinstance(value, dict):
-        return all(_says_nothing(one) for one in value.values())
+        return all(map(_says_nothing, [value["data"]] if "data" in value else value.values()))
+    if isinstance(value, bytes):
+        return not any(value[HEADER:])
     return all(_says_nothing(one) for one in value) if isinstance(value, list) else not value
