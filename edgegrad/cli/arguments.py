@@ -57,7 +57,11 @@ def add_view(parser: argparse.ArgumentParser) -> None:
         "--camera", type=Path, metavar="CAMERA.json", help="world_to_camera 4 × 4, K 3 × 3, size [H, W]; or glTF"
     )
     view.add_argument("--fov", type=float, metavar="DEGREES", help="vertical field of view (40)")
-    points = {"eye": "where the camera is", "target": "the point in the middle of its view", "up": "up in the image (0 1 0)"}
+    points = {
+        "eye": "where the camera is",
+        "target": "the point in the middle of its view",
+        "up": "up in the image (0 1 0)",
+    }
     for name, help in points.items():
         view.add_argument(f"--{name}", type=float, nargs=3, metavar=("X", "Y", "Z"), help=help)
 
