@@ -63,7 +63,7 @@ def secondary_edges(bench: Bench) -> list[Row]:
     ball = icosphere(5)
     verts = 0.4 * ball.verts.double() + vector(0.15, -0.35, 0.1).double()
     ball = eg.Mesh(verts, ball.faces, material=eg.Material(torch.tensor([0.6], dtype=torch.float64)))
-    found = BounceScene({"room": walls(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "ball": ball}, before_room())
+    found = BounceScene({"room": walls(), "emitter": panel((0.1, 0.97, 0), (0.3, 0.25)), "ball": ball}, before_room())
 
     def gradient(samples: int, seed: int) -> tuple[Tensor, float]:
         shift, begin = torch.zeros(3, dtype=torch.float64, requires_grad=True), time.process_time()
@@ -151,7 +151,7 @@ def images(bench: Bench, room: str) -> list[Row]:
 
 
 def _timed(work: Callable[[], Tensor]) -> Callable[[], tuple[Tensor, float]]:
-    """Return `work` with the seconds of processor time, of all threads, beside its result."""
+    """Return `work` with the seconds of processor time, of all threads, next to its result."""
 
     def call() -> tuple[Tensor, float]:
         begin = time.process_time()

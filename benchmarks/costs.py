@@ -146,7 +146,7 @@ def textures(bench: Bench) -> list[Row]:
 
 @dataclass(frozen=True)
 class Channels:
-    """The image of a sphere, or channels beside it, and perhaps the gradient of all of them by the vertices."""
+    """The image of a sphere, or channels next to it, and perhaps the gradient of all of them by the vertices."""
 
     mesh: eg.Mesh
     camera: eg.Camera

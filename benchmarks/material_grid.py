@@ -1,4 +1,4 @@
-"""Balls of all materials, metallic × roughness as in Khronos' sample, beside the image of Mitsuba's `direct`
+"""Balls of all materials, metallic × roughness as in Khronos' sample, besides the image of Mitsuba's `direct`
 with the same scattering as a plugin: how far apart they are, in standard errors.
 
 Run:  python -m benchmarks.material_grid [--out FILE.png] [--seeds N]          (with mitsuba installed)

@@ -1,9 +1,9 @@
-"""The operators of edgegrad.raster beside render(spp=1), and render_batch: processor time of a step, forward and backward.
+"""The operators of edgegrad.raster next to render(spp=1), and render_batch: processor time of a step, forward and backward.
 
 python -m benchmarks.raster [--rounds 5]
 
 The scene is a textured sphere of 20,480 faces, seen by 8 cameras at 512², with gradients of vertices and texture. All take
-turns. render_batch has 32 spheres of 1,280 faces at 64²: plain ones take one thread each, beside the calling one, lit ones come
+turns. render_batch has 32 spheres of 1,280 faces at 64²: plain ones take one thread each, next to the calling one, lit ones come
 one by one.
 
 Two threads against one, also by turns: by the clock, as the least of all rounds, to be compared on a machine with other work

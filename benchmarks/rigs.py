@@ -9,7 +9,7 @@ picture     the same from one picture with colours in the light of a sun and a s
 anny        pose and shape of a body model from four masks, from rest
 arm         a camera from eight masks of a seven-joint arm with known angles
 walk        the same twenty joints in a walk of 60 frames, tracked in four masks
-evaluation  posed vertices and their gradient, beside a step of the renderer
+evaluation  posed vertices and their gradient, next to a step of the renderer
 Seconds are of the processor, over all cores.
 """
 

@@ -2,7 +2,7 @@
 
     python examples/corner.py [--size 64] [--out corner.png]
 
-Three walls of unknown colours meet, under a lamp that is known. Of the light that the pictures show 17 % has been scattered by
+Three walls of unknown colours meet, under a light that is known. Of the light that the pictures show 17 % has been scattered by
 one wall on another. A fit in direct light alone takes it for the wall's own: colours come out too bright, with those of
 neighbours baked in. With `bounces=4` they are right. The pictures have eight bounces, and noise of their own.
 """
@@ -33,8 +33,8 @@ def scene(colors: dict[str, Tensor]) -> eg.Scene:
         for name, (_, corners) in WALLS.items()
     ]
     along = torch.tensor([0.25, 0.0, 0.0]), torch.tensor([0.0, -0.25, 0.0])
-    lamp = eg.AreaLight.rectangle(torch.tensor([1.1, 1.1, 3.2]), *along, 60.0)
-    return eg.Scene([*walls, lamp])
+    emitter = eg.AreaLight.rectangle(torch.tensor([1.1, 1.1, 3.2]), *along, 60.0)
+    return eg.Scene([*walls, emitter])
 
 
 def cameras(size: int) -> list[eg.Camera]:

@@ -31,7 +31,7 @@ VIEWS = 8
 
 
 def sky() -> eg.Environment:
-    """Brighter above than below, with three lamps."""
+    """Brighter above than below, with three lights."""
     image = torch.linspace(0.9, 0.15, 64)[:, None, None] * torch.tensor([0.9, 1.0, 1.15]).expand(64, 128, 3)
     for row, column, size, radiance in ((12, 20, 9, 6.0), (20, 84, 7, 9.0), (34, 52, 8, 4.0)):
         image[row : row + size, column : column + size] = radiance

@@ -52,7 +52,7 @@ def slope_mask(cosine: Tensor) -> Tensor:
 
 
 def sky() -> Tensor:
-    """(ROWS, COLUMNS, 3): blue over brown, a sun, and two lamps."""
+    """(ROWS, COLUMNS, 3): blue over brown, a sun, and two lights."""
     y, x = torch.meshgrid((torch.arange(ROWS) + 0.5) / ROWS, (torch.arange(COLUMNS) + 0.5) / COLUMNS, indexing="ij")
     x, y = x[..., None], y[..., None]
     above = torch.sigmoid(24 * (0.52 + 0.05 * torch.sin(6 * math.pi * x) - y))

@@ -31,7 +31,7 @@ class Look(NamedTuple):
 
 
 def truth(generator: torch.Generator) -> Look:
-    """A sky over ground, with lamps of all colours."""
+    """A sky over ground, with lights of all colours."""
     center = (torch.arange(SIDE) + 0.5) / SIDE * 2 - 1
     t, s = torch.meshgrid(center, center, indexing="ij")
     one = torch.ones_like(s)
@@ -39,8 +39,8 @@ def truth(generator: torch.Generator) -> Look:
     direction = torch.nn.functional.normalize(torch.stack([torch.stack(side, 2) for side in sides]), dim=3)
     up = direction[..., 1:2]
     sky = torch.where(up > 0, torch.tensor([0.3, 0.5, 0.8]) + 0.3 * up, torch.tensor([0.35, 0.25, 0.15]))
-    lamps = torch.nn.functional.normalize(torch.randn(12, 3, generator=generator), dim=1)
-    glow = torch.exp(40 * (direction @ lamps.T - 1)) @ torch.rand(12, 3, generator=generator)
+    emitters = torch.nn.functional.normalize(torch.randn(12, 3, generator=generator), dim=1)
+    glow = torch.exp(40 * (direction @ emitters.T - 1)) @ torch.rand(12, 3, generator=generator)
     return Look((sky + glow)[None], torch.tensor([0.6, 0.5, 0.3]), torch.tensor(math.log(25.0)))
 
 

@@ -2,7 +2,7 @@
 
     python examples/sun.py [--out sun.png]
 
-Shading and shadow tell the sun's direction; silhouette, texture and shadow tell the pose. The border of the shadow has a
+Shading and shadow show the sun's direction; silhouette, texture and shadow show the pose. The border of the shadow has a
 gradient by both.
 """
 
@@ -89,7 +89,7 @@ class Guess(NamedTuple):
         """Degrees of the sun, degrees of the pose, distance."""
         here, there = (Guess(*(part.double() for part in guess)) for guess in (self, truth))
         a, b = (torch.nn.functional.normalize(guess.sun, dim=0) for guess in (here, there))
-        # By sines, which tell small angles: |a − b| = 2 sin(θ / 2), and the Frobenius norm of R − Q is √8 sin(θ / 2).
+        # By sines, which show small angles: |a − b| = 2 sin(θ / 2), and the Frobenius norm of R − Q is √8 sin(θ / 2).
         sines = (a - b).norm() / 2, (here.R - there.R).norm() / math.sqrt(8)
         angles = [math.degrees(2 * math.asin(sine.item())) for sine in sines]
         return angles[0], angles[1], (here.shift - there.shift).norm().item()

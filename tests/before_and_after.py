@@ -68,7 +68,7 @@ def colored() -> Arrays:
 
 
 def textured() -> Arrays:
-    """Nearest texels, a cut-out and a lens that distorts."""
+    """Nearest texels, an alpha-tested face and a lens that distorts."""
     verts, faces = grid()
     uvs = leaf((verts[:, :2] + 1) / 2)
     verts, texture = leaf(verts), leaf(colors(64, 1).reshape(8, 8, 1))
@@ -81,7 +81,7 @@ def textured() -> Arrays:
 
 
 def lit() -> Arrays:
-    """A material under a lamp, a square and an environment, with shadows."""
+    """A material under a light, a square and an environment, with shadows."""
     verts, faces = grid()
     verts, base, rough = leaf(verts), leaf(colors(len(verts))), leaf(torch.tensor(0.4))
     blocker = torch.tensor([[-0.4, -0.3, 0.8], [0.4, -0.3, 0.9], [0.0, 0.4, 0.8]])

@@ -25,7 +25,7 @@ LAYERS = (
     ("checks",),
     ("python",),
 )
-# The operators on triangles in clip space stand beside the renderer.
+# The operators on triangles in clip space stand next to the renderer.
 STANDS_ON = {"raster": {"core", "texture"}}
 INCLUDE = re.compile(r'^#include "([a-z_]+)/[^"]+"', re.MULTILINE)
 

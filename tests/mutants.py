@@ -3,7 +3,7 @@
     python tests/mutants.py [NAME …] [--list]
 
 Each mutant changes a line of a copy of the kernel's sources (tests/mutants.txt). One kernel is compiled with all of them; the
-environment variable EDGEGRAD_MUTANT names the one that it is, if any. For each, the tests that stand beside it are run until
+environment variable EDGEGRAD_MUTANT names the one that it is, if any. For each, the tests that stand next to it are run until
 one fails, and at first all of them without a mutant: then each must pass. `make mutants` runs this; it is no test itself.
 """
 

@@ -1,1 +1,1 @@
-"""The error of the gradient against the time it takes, beside other renderers."""
+"""The error of the gradient against the time it takes, next to other renderers."""

@@ -17,7 +17,7 @@ from ..scenes import SCENES
 from .methods import FORWARD_SPP, METRICS
 from .references import disagrees
 
-# Colours of Okabe and Ito, which the colour-blind tell apart. (label, colour, width of the line, marker)
+# Colours of Okabe and Ito, which the colour-blind show apart. (label, colour, width of the line, marker)
 STYLES = {
     "edgegrad": ("edgegrad", "#0072B2", 2.0, "o"),
     "interior": ("interior only", "#56B4E9", 1.1, "^"),

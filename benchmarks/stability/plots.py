@@ -170,7 +170,7 @@ motions of the whole), and the table names the part with the largest. The image'
 background. Where a reference is zero, errors are relative to the norm of the adjoint.
 
 *right*: within four standard errors and {percent(TOLERANCE)}, with a standard error below {percent(NOISE)}.
-*limit*: not right, of known cause and size; see below. *too noisy to tell* and *wrong* do not pass.
+*limit*: not right, of known cause and size; see below. *too noisy to decide* and *wrong* do not pass.
 
 {machine_in_words(now)}; {document.get("seconds", 0.0):.0f} s.
 """]  # fmt: skip
@@ -276,7 +276,7 @@ def _steps(found: dict[str, Any]) -> list[str]:
 ![Error against the spacing of lines]({NAME}-steps.png)
 
 The error of the derivative of a painted area by its size: a disc 31 px wide, stripes of 3.2 px with gaps as wide, and a
-rotated checkerboard of texels of 3.2 px. They are declared by a shader, or painted as alpha of a cut-out or nearest texels.
+rotated checkerboard of texels of 3.2 px. They are declared by a shader, or painted as alpha of an alpha-tested face or of nearest texels.
 Mean over {found["seeds"]} seeds ± its standard error, and the root mean square error of one image, with the default of everything
 but the spacing of the lines that find steps (`step_spacing`).
 

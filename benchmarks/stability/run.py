@@ -77,7 +77,7 @@ def stability(out: Path, cases: Sequence[str] | None = None, *, quick: bool = Fa
 
 
 def failures(document: Document) -> list[str]:
-    """Names of the cases that are wrong or too noisy to tell."""
+    """Names of the cases that are wrong or too noisy to decide."""
     return [row["name"] for row in document["cases"] if row["verdict"] in (WRONG, NOISY)]
 
 

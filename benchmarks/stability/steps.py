@@ -24,7 +24,7 @@ SIZE, SCALE = 64, 25.6  # px of the image's side, and of a unit
 SPACINGS = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
 SEEDS = 48
 RADIUS, MIDDLE = 0.6, 0.05  # of the disc: 31 px wide
-STRIPE = 3.2 / SCALE  # the width of a stripe, and of the gap beside it
+STRIPE = 3.2 / SCALE  # the width of a stripe, and of the gap next to it
 TEXELS = 10, 3.2 / SCALE  # of a painting of texels, on a side, and their width
 ALPHAS = 128  # texels of alpha on a side, 0.4 px wide: of lines that lie far apart some texels stand for all
 

@@ -184,7 +184,7 @@ def test_a_wrong_gradient_is_rejected() -> None:
             with pytest.raises(AssertionError, match=f"{name}: exact"):
                 check(name, truth, found)
     for factor in (0.0, 1.0):
-        with pytest.raises(AssertionError, match="too noisy to tell"):
+        with pytest.raises(AssertionError, match="too noisy to decide"):
             check("noise", 1.0, Estimate(factor, 0.005))
 
 

@@ -92,11 +92,11 @@ def leaves(scene: eg.Scene, camera: eg.Camera) -> tuple[eg.Scene, eg.Camera]:
 
 
 def agree(name: str, forward: Estimate, reverse: Estimate) -> None:
-    """⟨v, J u⟩ = ⟨Jᵀ v, u⟩ up to chance, and well enough known to tell either from 0.95 times itself."""
+    """⟨v, J u⟩ = ⟨Jᵀ v, u⟩ up to chance, and well enough known to decide either from 0.95 times itself."""
     error = (forward.error**2 + reverse.error**2) ** 0.5
     said = f"{name}: forward {forward}, reverse {reverse}"
     allowed = 4 * error + 0.005 * abs(reverse.mean)  # as in finite_differences.check()
-    assert allowed < 0.045 * abs(reverse.mean), f"{said}; too noisy to tell"
+    assert allowed < 0.045 * abs(reverse.mean), f"{said}; too noisy to decide"
     assert abs(forward.mean - reverse.mean) <= allowed, said
 
 
@@ -183,7 +183,7 @@ def test_directions_share_samples_and_each_is_what_it_is_alone():
     both = {verts: torch.stack([u, 0 * u]), K: torch.stack([0 * dK, dK])}
     image, dots = eg.jvp(scene, camera, both, 4, 7)
     assert torch.equal(image, eg.render(scene, camera, 4, 7)) and dots.shape == (2, SIZE, SIZE, 3)
-    # Samples inside faces depend on whether a direction asks for them, so each is compared with the other beside it.
+    # Samples inside faces depend on whether a direction asks for them, so each is compared with the other next to it.
     for d, (x, v) in enumerate(((verts, u), (K, dK))):
         torch.testing.assert_close(eg.jvp(scene, camera, {x: v[None]}, 4, 7)[1][0], dots[d], rtol=1e-12, atol=1e-12)
 

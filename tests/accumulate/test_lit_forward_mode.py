@@ -50,8 +50,8 @@ def light(kind: str, place: Tensor, radiance: Tensor) -> Any:
     if kind == "area":
         return eg.AreaLight.rectangle(place, vector(0.5, 0, 0), vector(0, 0.5, 0.1), 10 * radiance)
     if kind == "emitter":
-        lamp = ball(0, smooth=False)
-        return lamp.replace(verts=place + 0.3 * lamp.verts, material=eg.Material(0.0, emission=9 * radiance))
+        emitter = ball(0, smooth=False)
+        return emitter.replace(verts=place + 0.3 * emitter.verts, material=eg.Material(0.0, emission=9 * radiance))
     if kind == "sky":
         return eg.Environment(picture() * radiance + 0.1 * place.square().sum())
     return eg.SphericalHarmonics((torch.linspace(0.8, 0.1, 9, dtype=F64)[:, None] + 0.1 * place.sum()) * radiance)

@@ -236,7 +236,7 @@ def test_references_agree():
 
 
 def test_references_that_are_wrong_are_noticed():
-    """Finite differences tell a gradient without its boundary."""
+    """Finite differences show a gradient without its boundary."""
     scene = scenes.build("triangle", 128)
     correct = exact(scene)
     effort = references.Effort(check_spp=64, check_seeds=3)

@@ -205,7 +205,7 @@ def test_exact_gradient(name: str, projection: str) -> None:
 
 
 def test_interior_gradient_alone_is_rejected() -> None:
-    """The oracle must tell a gradient that lacks its boundary term: of a constant colour, that is all there is."""
+    """The oracle must show a gradient that lacks its boundary term: of a constant colour, that is all there is."""
     camera = front_camera(48)
     for colored in (True, False):
         mesh = one_triangle().meshes[0]

@@ -16,5 +16,5 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path) -> Path:
-    """To be changed or spoilt."""
+    """To be changed or malformed."""
     return Path(shutil.copytree(made, tmp_path / "data"))

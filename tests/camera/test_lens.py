@@ -235,7 +235,7 @@ def check_gradient(
         right_ratio(fd, found)
     else:
         noise = math.hypot(fd.error, found.error) / abs(fd.mean)
-        assert noise < most_noise, f"{what}: too noisy to tell: {fd}, {found}"
+        assert noise < most_noise, f"{what}: too noisy to decide: {fd}, {found}"
         assert abs(found.mean / fd.mean - 1) <= 0.02 + 3 * noise, f"{what}: finite difference {fd}, gradient {found}"
 
 
@@ -312,7 +312,7 @@ def test_a_telephoto_lens_may_fold_near_its_axis() -> None:
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-6, -1e-3, -1e-6])
 def test_a_rational_lens_may_fold_in_a_narrow_ring(gap: float) -> None:
-    """A pole at r = 1.2 and a zero beside it, apart from which the lens is nearly a pinhole: the slope's numerator by NumPy."""
+    """A pole at r = 1.2 and a zero next to it, apart from which the lens is nearly a pinhole: the slope's numerator by NumPy."""
     A, B = np.polynomial.Polynomial([1, -1 / (1.44 * (1 + gap))]), np.polynomial.Polynomial([1, -1 / 1.44])
     s = np.polynomial.Polynomial([0, 1])
     slope = A * B + 2 * s * (A.deriv() * B - A * B.deriv())
@@ -502,7 +502,7 @@ def test_a_lens_of_zeros_renders_as_its_pinhole(spp: int) -> None:
 
 @pytest.mark.parametrize("index", range(4))
 def test_gradient_by_coefficients_of_zero(index: int) -> None:
-    """It is that of coefficients beside zero, through which no image is taken for a pinhole's; in forward mode, too."""
+    """It is that of coefficients next to zero, through which no image is taken for a pinhole's; in forward mode, too."""
     mesh, view = colored_sphere(0.3), camera("four").replace(distortion=None)
     adjoint = smooth_adjoint(*SIZE, 3)
     direction = torch.eye(4, dtype=F64)[index]

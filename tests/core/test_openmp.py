@@ -98,12 +98,12 @@ def whole() -> list[str]:
 
 @functools.cache
 def limited() -> list[str]:
-    """What a process prints that imports edgegrad first, and has one thread beside the calling one."""
+    """What a process prints that imports edgegrad first, and has one thread next to the calling one."""
     return lines_of(RENDER.format(imports=ORDERS["edgegrad first"]), OMP_THREAD_LIMIT="2")
 
 
 def test_one_runtime():
-    """Also in a forked child. A second one would keep threads of its own beside torch's."""
+    """Also in a forked child. A second one would keep threads of its own next to torch's."""
     _, _, parent, own, *child, _ = whole()
     assert parent == own and child == [parent, own]
     assert Path(own).name.startswith(("libgomp", "libomp", "libiomp"))
@@ -120,7 +120,7 @@ def test_the_environment_stays_as_it_is():
 
 
 def test_fewer_threads_than_asked_for():
-    """The runtime may give fewer, here one beside the calling thread; the items are shared by those that there are."""
+    """The runtime may give fewer, here one next to the calling thread; the items are shared by those that there are."""
     bits, *_, dynamic = whole()
     assert bits == dynamic == limited()[0]
 

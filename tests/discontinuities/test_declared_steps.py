@@ -1,4 +1,4 @@
-"""Steps that a shader declares: where they are found, and their gradients beside exact ones."""
+"""Steps that a shader declares: where they are found, and their gradients next to exact ones."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def flat_camera(size: int) -> eg.Camera:
 
 
 def test_a_straight_step_is_exact():
-    """The area beside a line x = a across a square of side 2 is 2 (1 − a) scale² pixels; its derivative is −2 scale²."""
+    """The area next to a line x = a across a square of side 2 is 2 (1 − a) scale² pixels; its derivative is −2 scale²."""
     a = torch.tensor(0.137, dtype=F64, requires_grad=True)
     image = eg.render(
         square(), flat_camera(32), shader=lambda hits: hits.where(hits.position[:, 0] - a, 3.0, 1.0), step_spacing=0.5
@@ -115,7 +115,7 @@ def test_a_jump_of_the_function_is_no_step():
 
 
 def test_steps_beside_silhouettes_are_found():
-    """A step that runs into the shadow line of another surface: the part beside it counts as well."""
+    """A step that runs into the shadow line of another surface: the part next to it counts as well."""
 
     def gradient(seed: int) -> Tensor:
         a = torch.tensor(0.1, dtype=F64, requires_grad=True)
@@ -181,7 +181,7 @@ def test_steps_that_differ_within_a_batch_are_refused():
 
 @pytest.mark.parametrize(("wide", "least", "most"), [(30.0, 0.97, 1.02), (1.0, 0.97, 1.02), (0.5, 0.5, 0.7)])
 def test_a_step_along_a_strip_of_surface(wide: float, least: float, most: float):
-    """0.1 px beside the silhouette of what is wide, and along the middle of what is narrow, as the documents tell."""
+    """0.1 px next to the silhouette of what is wide, and along the middle of what is narrow, as the documents show."""
     turn = torch.linalg.matrix_exp(0.4 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=F64))
     corner = torch.tensor([[0.0, -20, 0], [wide, -20, 0], [wide, 20, 0], [0, 20, 0]], dtype=F64)
     mesh = eg.Mesh(corner @ turn.T, torch.tensor([[0, 1, 2], [0, 2, 3]]))

@@ -244,7 +244,7 @@ def test_equals_the_twin(camera):
     assert (ours - twin).abs().mean().item() < 0.004
 
 
-def test_parts_that_are_cut_out_are_seen_by_nobody():
+def test_parts_that_are_masked_are_seen_by_nobody():
     """Channels, ids, and shaders."""
     mesh = cut()
     scene = eg.Scene([mesh, behind()], BACK)

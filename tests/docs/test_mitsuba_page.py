@@ -102,10 +102,10 @@ def case(mi: Any, page: dict[str, Any], name: str) -> tuple[dict[str, Any], Any,
     if name == "area":
         place = T().translate([0.2, 0.3, 1.5]) @ T().scale([0.4, 0.3, 1.0]) @ T().rotate([1.0, 0.0, 0.0], 180)
         radiance = {"type": "area", "radiance": rgb([5 * c for c in COLOR])}
-        lamp = quad(1.0).replace(material=eg.Material(0.0, emission=5 * color, two_sided=False))
+        light = quad(1.0).replace(material=eg.Material(0.0, emission=5 * color, two_sided=False))
         M = torch.tensor(np.array(place.matrix)).float()
-        lamp = lamp.replace(verts=lamp.verts @ M[:3, :3].T + M[:3, 3])
-        return {"type": "rectangle", "to_world": place, "emitter": radiance}, lamp, bsdf, material
+        light = light.replace(verts=light.verts @ M[:3, :3].T + M[:3, 3])
+        return {"type": "rectangle", "to_world": place, "emitter": radiance}, light, bsdf, material
     if name == "constant":
         return {"type": "constant", "radiance": rgb(COLOR)}, eg.Environment(color), bsdf, material
     if name == "envmap":

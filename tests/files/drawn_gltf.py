@@ -107,7 +107,7 @@ class Storage:
         }  # fmt: skip
 
     def lists(self, glb: bool) -> tuple[dict[str, list], bytes | None, dict[str, bytes]]:
-        """The entries of the file, the chunk of a GLB, and files beside it."""
+        """The entries of the file, the chunk of a GLB, and files next to it."""
         files, entries, chunk = {}, [], None
         for number, buffer in enumerate(self.buffers):
             entry: dict = {"byteLength": len(buffer)}

@@ -334,10 +334,10 @@ def test_what_opencv_does_not_survive_ends_no_process(tmp_path) -> None:
             text = (tmp_path / f"whole.{ending}").read_text()
             line = re.compile(rf"( *{field}:).*\n" if ending == "yml" else rf"( *<{field}>).*\n")
             end = "" if ending == "yml" else f"</{field}>"
-            spoilt = line.sub("" if value is None else rf"\1 {value}{end}\n", text, count=1)
-            assert spoilt != text
+            malformed = line.sub("" if value is None else rf"\1 {value}{end}\n", text, count=1)
+            assert malformed != text
             files.append(tmp_path / f"{i}.{ending}")
-            files[-1].write_text(spoilt)
+            files[-1].write_text(malformed)
     for i, deep in enumerate(
         ("[" * 200000, "{a: " * 200000, "- " * 200000, "\n" + "\n".join(" " * i + "a:" for i in range(2000)))
     ):

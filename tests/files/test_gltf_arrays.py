@@ -79,11 +79,11 @@ def test_draco_that_is_damaged_is_refused(tmp_path):
     whole, random = draco(np.zeros((4, 3), "u1")), np.random.default_rng(0)
     refused = 0
     for _ in range(100):
-        spoilt = bytearray(whole)
-        for at in random.integers(len(spoilt), size=3):
-            spoilt[at] = random.integers(256)
+        malformed = bytearray(whole)
+        for at in random.integers(len(malformed), size=3):
+            malformed[at] = random.integers(256)
         try:
-            eg.load_mesh(save(tmp_path, compressed(bytes(spoilt))))
+            eg.load_mesh(save(tmp_path, compressed(bytes(malformed))))
         except ValueError as error:
             refused += str(error).startswith(str(tmp_path))
     assert refused > 20
@@ -200,11 +200,11 @@ def test_invisible_nodes_are_not_there(tmp_path):
     assert [corners(mesh) for mesh in scene.meshes] == [EXPECTED]
     assert [light.position.tolist() for light in scene.lights] == [[0, 0, 9]]
     assert eg.load_camera(path, size=(8, 8)).eye[0] == 5
-    spoilt = changed(
+    malformed = changed(
         lambda tree: tree["nodes"][0]["extensions"].update(KHR_node_visibility={"visible": 0}), path.read_bytes()
     )
     with pytest.raises(ValueError, match=r"true or false for visible of KHR_node_visibility, got 0"):
-        eg.load_scene(save(tmp_path, spoilt))
+        eg.load_scene(save(tmp_path, malformed))
 
 
 def test_a_file_without_scenes_shows_all_its_nodes(tmp_path):
@@ -229,9 +229,9 @@ def test_cones_that_are_none_are_clamped(tmp_path, cone, shown):
     """To cosines that differ by 0.001, as in the formula of KHR_lights_punctual, and to at most a right angle."""
     angles = dict(zip(("innerConeAngle", "outerConeAngle"), cone, strict=True))
     node = {"mesh": 0, "extensions": {"KHR_lights_punctual": {"light": 0}}}
-    path = file(tmp_path, nodes=[node], lights=[{"type": "spot", "name": "lamp", "spot": angles}])
+    path = file(tmp_path, nodes=[node], lights=[{"type": "spot", "name": "emitter", "spot": angles}])
     with pytest.warns(
-        UserWarning, match=rf"spot light 'lamp' with innerConeAngle {cone[0]:g} and outerConeAngle {cone[1]:g}"
+        UserWarning, match=rf"spot light 'light' with innerConeAngle {cone[0]:g} and outerConeAngle {cone[1]:g}"
     ):
         (light,) = eg.load_scene(path, lit=True).lights
     np.testing.assert_allclose((float(light.inner_angle), float(light.outer_angle)), shown, rtol=1e-6)

@@ -51,7 +51,7 @@ def png_with_alpha(alpha):
     return stream.getvalue()
 
 
-def cut_out_glb(alpha, sampler=None, **material):
+def alpha_mask_glb(alpha, sampler=None, **material):
     """The textured square with an alpha in its texture."""
     base = {"baseColorTexture": {"index": 0}, **material.pop("base", {})}
     more = {} if sampler is None else {"samplers": [sampler]}
@@ -65,9 +65,9 @@ def cut_out_glb(alpha, sampler=None, **material):
 def test_gltf_masks_and_samplers(tmp_path):
     alpha = np.array([[0, 255], [102, 153]])
     file = tmp_path / "s.glb"
-    file.write_bytes(cut_out_glb(alpha))
+    file.write_bytes(alpha_mask_glb(alpha))
     assert load_mesh(file).alpha is None  # opaque
-    file.write_bytes(cut_out_glb(alpha, alphaMode="MASK"))
+    file.write_bytes(alpha_mask_glb(alpha, alphaMode="MASK"))
     mesh = load_mesh(file)
     assert (mesh.alpha_cutoff, mesh.wrap, mesh.filter) == (0.5, "repeat", "linear")
     np.testing.assert_allclose(mesh.alpha, alpha / 255.0, atol=1e-6)
@@ -75,7 +75,7 @@ def test_gltf_masks_and_samplers(tmp_path):
     assert load_mesh(file, materials=False).alpha is None
     sampler = {"wrapS": 33071, "wrapT": 33648, "magFilter": 9728, "minFilter": 9987}
     base = {"baseColorFactor": [1.0, 0.5, 1.0, 0.75]}
-    file.write_bytes(cut_out_glb(alpha, sampler, base=base, alphaMode="MASK", alphaCutoff=0.3))
+    file.write_bytes(alpha_mask_glb(alpha, sampler, base=base, alphaMode="MASK", alphaCutoff=0.3))
     mesh = load_mesh(file)
     assert (mesh.alpha_cutoff, mesh.wrap, mesh.filter) == (0.3, ("clamp", "mirror"), "nearest")
     np.testing.assert_allclose(mesh.alpha, 0.75 * alpha / 255.0, atol=1e-6)
@@ -84,9 +84,9 @@ def test_gltf_masks_and_samplers(tmp_path):
     seen = eg.render_aovs(mesh, camera, ["alpha"], 16)["alpha"]
     assert 0.0 < seen.mean() < 1.0
     del sampler["wrapS"], sampler["magFilter"]
-    file.write_bytes(cut_out_glb(alpha, sampler, alphaMode="MASK"))
+    file.write_bytes(alpha_mask_glb(alpha, sampler, alphaMode="MASK"))
     assert (load_mesh(file).wrap, load_mesh(file).filter) == (("repeat", "mirror"), "linear")
-    file.write_bytes(cut_out_glb(alpha, {"wrapS": 1}))
+    file.write_bytes(alpha_mask_glb(alpha, {"wrapS": 1}))
     with pytest.raises(ValueError, match=r"expected a sampler of glTF 2\.0 for the texture .* got wraps \[1, 10497\]"):
         load_mesh(file)
 

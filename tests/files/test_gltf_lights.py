@@ -78,7 +78,7 @@ def test_lights_stand_where_their_nodes_do(tmp_path):
     ("light", "fault"),
     [
         ({"type": "area", "name": "panel"}, "expected a light of type directional, point or spot, got 'area'"),
-        ({"type": "spot", "name": "lamp", "spot": {"outerConeAngle": -1.0}}, "inner_angle: expected 0 ≤"),
+        ({"type": "spot", "name": "emitter", "spot": {"outerConeAngle": -1.0}}, "inner_angle: expected 0 ≤"),
         ({"type": "point", "intensity": math.nan}, "intensity"),
         ({"type": "point", "color": "red"}, ""),
     ],

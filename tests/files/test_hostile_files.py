@@ -288,7 +288,7 @@ def test_postscript_is_no_texture(tmp_path, monkeypatch, kind, gloss):
 
 
 def test_3mf_that_looks_odd_and_is_not(tmp_path):
-    """Components in components, and files beside the model with any name: none is written anywhere."""
+    """Components in components, and files next to the model with any name: none is written anywhere."""
     path = write(tmp_path, "a.3mf", model(nested(2), {"../../evil.txt": "x", "/tmp/evil.txt": "x"}))
     depths = sorted(mesh.verts[0, 2].item() for mesh in eg.load_scene(path).meshes)
     assert depths == [0.0, 4.0, 8.0, 12.0]

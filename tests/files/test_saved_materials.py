@@ -102,7 +102,7 @@ def test_materials_come_back(name, tmp_path):
     torch.testing.assert_close(found.uvs[found.uv_faces], UVS[UV_FACES])
     torch.testing.assert_close(seen(found), seen(mesh), rtol=1e-4, atol=1e-5)
     other = seen(mesh.replace(material=eg.Material(0.2, 0.5, 0.9)))
-    assert float((seen(mesh) - other).abs().max()) > 0.05  # the pictures tell
+    assert float((seen(mesh) - other).abs().max()) > 0.05  # the pictures show
 
 
 LOOKS = {
@@ -164,7 +164,7 @@ def test_alpha_comes_back(name, tmp_path):
     assert float((seen(mesh) - seen(mesh.replace(alpha=None))).abs().mean()) > 0.005
 
 
-def test_a_cut_out_that_is_not_lit(tmp_path):
+def test_an_alpha_mask_that_is_not_lit(tmp_path):
     mesh = box(alpha=data(1)[..., 0], texture=color(), wrap="clamp")
     eg.save_mesh(tmp_path / "a.glb", mesh)
     camera = eg.Camera.look_at((3, 2, 4), (0, 0, 0), size=(48, 48))

@@ -45,11 +45,11 @@ SCENES = {
         [box(texture=color()), ball(material=eg.Material(0.5), colors=torch.rand(42, 3, generator=random)), ground()],
         lights=[POINT],
     ),
-    "a lamp": eg.Scene(
+    "a light": eg.Scene(
         [ground(material=eg.Material(0.7))],
         lights=[eg.AreaLight.rectangle((0.0, 3.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 0.5), torch.tensor([9.0, 5.0, 2.0]))],
     ),
-    "normals and cut-outs": eg.Scene(
+    "normals and alpha-tested faces": eg.Scene(
         [
             box(eg.Material(0.6, 0.3, 0.5, normal_map=eg.Texture(data(least=128), **OWN)),
                 normals=eg.vertex_normals(VERTS, FACES)),
@@ -83,7 +83,7 @@ def test_scenes_come_back(name, kind, tmp_path):
     for mesh, given in zip(found.meshes, scene.meshes, strict=True):
         torch.testing.assert_close(mesh.verts[mesh.faces], given.verts[given.faces].float())
     torch.testing.assert_close(seen(found), seen(scene), rtol=1e-4, atol=1e-5)
-    assert float(seen(scene).std()) > 0.02  # the pictures tell
+    assert float(seen(scene).std()) > 0.02  # the pictures show
 
 
 def test_lights_are_the_same(tmp_path):

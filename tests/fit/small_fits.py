@@ -116,7 +116,7 @@ def sunlight() -> Problem:
     )
 
 
-def lamp() -> Problem:
+def emitter() -> Problem:
     views, truth = cameras(), torch.tensor([2.4, 2.0, 2.6])
 
     def light(position: Tensor, colour: Tensor) -> eg.PointLight:
@@ -129,7 +129,7 @@ def lamp() -> Problem:
     def error(fit: Fit) -> float:
         return float((fit.values["lights.0.position"] - truth).norm()) / 0.03
 
-    # Farther and brighter is nearly the same: with 8 samples, their noise alone moves the lamp by up to 0.07, with 32 by 0.02.
+    # Farther and brighter is nearly the same: with 8 samples, their noise alone moves the light by up to 0.07, with 32 by 0.02.
     return Problem(start, views, targets, wanted, error, {"spp": 32})
 
 
@@ -248,7 +248,7 @@ def covered() -> Problem:
 
 
 RIGHT = [
-    colours, shift, sunlight, lamp, light_and_colours, pose, pose_with_noise, pose_and_light, pose_and_scale, pose_by_masks,
+    colours, shift, sunlight, emitter, light_and_colours, pose, pose_with_noise, pose_and_light, pose_and_scale, pose_by_masks,
     camera_and_material, metal, vertices, covered,
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""calibrate() and the uncertainty of cameras: lenses that are known, numbers that pictures do not tell, and noise by hand."""
+"""calibrate() and the uncertainty of cameras: lenses that are known, numbers that pictures do not show, and noise by hand."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def test_a_lens_from_several_pictures(tmp_path) -> None:
 
 
 def test_a_calibration_without_rest_names_what_is_not_known() -> None:
-    """No more steps can be had, so numbers that the pictures hardly tell are the reason."""
+    """No more steps can be had, so numbers that the pictures hardly show are the reason."""
     zeros = torch.zeros(2, dtype=torch.float64)
     known = CameraUncertainty(
         torch.eye(6).double(), 1.0, torch.empty(0, 3).double(), 0.0, 5.0, zeros, zeros, ("k2 known to ±1 only",)

@@ -19,7 +19,7 @@ BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
 
 def bracket(plain=False):
-    """An L of 20 triangles, one colour a side, so that no two poses look alike."""
+    """An L of 20 triangles, one colour a side, so that no pose is ambiguous."""
     profile = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 0.6], [0.7, 0.6], [0.7, 1.5], [0.0, 1.5]]).double()
     verts = torch.cat([torch.cat([profile, torch.full((6, 1), z).double()], 1) for z in (0.0, 0.8)])
     cap = [[3, 4, 5], [3, 5, 0], [3, 0, 1], [3, 1, 2]]  # seen from its reflex corner, the L is a fan

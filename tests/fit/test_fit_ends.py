@@ -115,7 +115,7 @@ def test_shaking_steps_do_not_hide_a_slope():
             ends.append(-float((g * (x - monitor._before["x"])).sum()))
         monitor.begin_step()
         adam.step({"x": g})
-    assert sum(ends[300:]) < 0.0  # what the ends of the steps tell
+    assert sum(ends[300:]) < 0.0  # what the ends of the steps show
     assert monitor.predicted_decrease(1) == pytest.approx(0.01, rel=0.15)
 
 

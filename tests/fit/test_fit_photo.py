@@ -90,7 +90,7 @@ def test_the_region_terms_gradient_is_that_of_its_loss():
 
 
 def test_the_posterior_tells_colours_apart_near_the_contour_alone():
-    """Left red on green, right green on red: one pair of histograms for the whole picture would tell nothing."""
+    """Left red on green, right green on red: one pair of histograms for the whole picture would show nothing."""
     view = camera(60)
     alpha = torch.zeros(60, 60)
     alpha[20:40, 5:25] = alpha[20:40, 35:55] = 1.0
@@ -152,16 +152,16 @@ def test_an_exposure_is_found():
         assert float(lit.coefficients[:, 1:].abs().sum()) < 0.02
 
 
-@pytest.mark.parametrize("spoilt", [False, True])
-def test_the_light_of_a_matte_ball_is_found(spoilt, monkeypatch):
+@pytest.mark.parametrize("malformed", [False, True])
+def test_the_light_of_a_matte_ball_is_found(malformed, monkeypatch):
     """With what the model lacks on a tenth of it, a shadow and a highlight, too."""
     view, surface = ball()
     image, inside = under(surface, LIGHT), surface.inside
-    spoilt_image = image.clone()
-    if spoilt:
-        spoilt_image[20:26, 20:36] *= 0.3
-        spoilt_image[40:44, 34:42] = 0.9
-    free = inside & (smoothed((spoilt_image != image).any(-1).float()[None], 1.0)[0] == 0.0)
+    malformed_image = image.clone()
+    if malformed:
+        malformed_image[20:26, 20:36] *= 0.3
+        malformed_image[40:44, 34:42] = 0.9
+    free = inside & (smoothed((malformed_image != image).any(-1).float()[None], 1.0)[0] == 0.0)
 
     def off(lit):
         return float(
@@ -169,12 +169,12 @@ def test_the_light_of_a_matte_ball_is_found(spoilt, monkeypatch):
             / image[free].norm()
         )
 
-    assert off(FittedLight.from_picture(shown(view, spoilt_image), surface, 9)) < 0.03  # the ridge
+    assert off(FittedLight.from_picture(shown(view, malformed_image), surface, 9)) < 0.03  # the ridge
     monkeypatch.setattr(light, "LIGHT_RIDGE", 0.0)
-    lit = FittedLight.from_picture(shown(view, spoilt_image), surface, 9)
-    assert off(lit) < (0.02 if spoilt else 3e-4)
+    lit = FittedLight.from_picture(shown(view, malformed_image), surface, 9)
+    assert off(lit) < (0.02 if malformed else 3e-4)
     # Half of a ball tells the harmonics of z apart hardly, and float32 solves for them: rounding differs by processor.
-    assert float((lit.coefficients - LIGHT).norm() / LIGHT.norm()) < (0.2 if spoilt else 0.08)
+    assert float((lit.coefficients - LIGHT).norm() / LIGHT.norm()) < (0.2 if malformed else 0.08)
 
 
 @pytest.mark.parametrize(("harmonics", "most"), [(1, 0.06), (9, 0.2)])
@@ -265,8 +265,8 @@ def test_how_sharp_a_contour_is(blur):
 # The depth term
 
 
-@pytest.mark.parametrize("spoilt", [False, True])
-def test_a_shift_of_depth_is_found(spoilt):
+@pytest.mark.parametrize("malformed", [False, True])
+def test_a_shift_of_depth_is_found(malformed):
     """Also where a third was not measured, and something stands before the object."""
     view, mesh = camera(48).to(torch.float64), bracket()
     axes = view.world_to_camera[:3, :3].double()
@@ -280,12 +280,12 @@ def test_a_shift_of_depth_is_found(spoilt):
     there = seen(moved(mesh, step, axes, CENTER, SIZE))
     measured = (there["depth"] / there["alpha"].clamp(min=1e-6))[..., 0].float()
     measured[there["alpha"][..., 0] < 0.5] = torch.nan
-    if spoilt:
+    if malformed:
         measured[::3] = torch.nan
         measured[:, 20:24] = 2.0
     normal = depth_term(surface, measured, torch.ones(48, 48), SIZE)
     found = -torch.linalg.solve(normal.curvature, normal.gradient)
-    assert float((found - step).norm()) < (0.0015 if spoilt else 0.0005), found
+    assert float((found - step).norm()) < (0.0015 if malformed else 0.0005), found
     assert float(found[5]) == pytest.approx(0.01, rel=0.03)
     assert depth_term(surface, torch.full((48, 48), torch.nan), torch.ones(48, 48), SIZE) is None
 
@@ -411,7 +411,7 @@ def test_a_photograph_of_something_else_is_not_converged():
 
 @pytest.mark.parametrize(("step", "least", "most"), [(0.2, 0.95, 1.0), (0.05, 0.2, 0.6)])
 def test_a_faint_contour_proves_little(step, least, most):
-    """A plain mesh at its very place: but where colours hardly tell it from what surrounds it, chance finds as much elsewhere."""
+    """A plain mesh at its very place: but where colours hardly show it from what surrounds it, chance finds as much elsewhere."""
     view, generator = camera(96), torch.Generator().manual_seed(0)
     texture = smoothed(torch.randn(3, 96, 96, generator=generator), 0.8).movedim(0, -1)
     display = 0.3 + 0.1 * texture + step * smoothed(silhouette(view)[..., 0][None], 0.7)[0][..., None]

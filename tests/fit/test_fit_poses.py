@@ -41,7 +41,7 @@ def view_of(size=96, distance=6.0):
 
 
 def box(extents=(1.3, 1.0, 1.2), plain=False, seed=3):
-    """With two colours a side, so that no two poses look alike."""
+    """With two colours a side, so that no pose is ambiguous."""
     body = trimesh.creation.box(extents=extents)
     colors = torch.rand(12, 3, generator=torch.Generator().manual_seed(seed)) * 0.8 + 0.1
     verts, faces = torch.from_numpy(np.array(body.vertices)), torch.from_numpy(np.array(body.faces))
@@ -189,7 +189,7 @@ def depth_of(view, count):
     [
         ("colours", 2.5, 1.0),
         pytest.param("colours and other poses", 2.5, 1.0, marks=pytest.mark.slow),
-        # Labels tell of a pixel on a contour which half of it is covered. With 40 % hidden, that leaves the distance known to
+        # Labels show of a pixel on a contour which half of it is covered. With 40 % hidden, that leaves the distance known to
         # ±2.3 %; shares of pixels leave next to nothing.
         pytest.param("labels", 2.3, 1.8, marks=pytest.mark.slow),
         pytest.param("shares", 0.2, 0.2, marks=pytest.mark.slow),
@@ -356,7 +356,7 @@ def covered():
 
 @pytest.mark.parametrize("strength", [1.0, 0.3])
 def test_what_covers_an_object_is_told_by_its_light(covered, strength):
-    """Also a cover whose colours are nearly the object's: pixels around tell what one alone does not."""
+    """Also a cover whose colours are nearly the object's: pixels around show what one alone does not."""
     view, image, over, alpha = covered
     bare = photograph(view, [bracket().replace(material=eg.Material())], seed=2)
     image = torch.lerp(bare, image, strength)

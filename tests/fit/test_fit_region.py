@@ -183,10 +183,10 @@ def test_colours_are_counted_anew_where_the_object_has_moved(taken):
 def test_weights_leave_pixels_out(taken):
     weights = torch.ones(96, 96)
     weights[:, 60:] = 0.0
-    spoilt = torch.where(weights[..., None] > 0.0, taken, taken.flip(0))
+    malformed = torch.where(weights[..., None] > 0.0, taken, taken.flip(0))
     alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
     found = []
-    for image in (taken, spoilt):
+    for image in (taken, malformed):
         views = region_views(views_of(VIEW, image, None, weights))
         regions = RegionLoss(views, 0)
         regions.palettes = [Palette(torch.rand(64, 3, generator=torch.Generator().manual_seed(1)))]

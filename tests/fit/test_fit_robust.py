@@ -191,7 +191,7 @@ def test_masks_from_the_bottom_up_are_named():
 
 
 def test_several_pictures_share_the_pose():
-    """Two views tell the scale from the distance, as one cannot."""
+    """Two views show the scale from the distance, as one cannot."""
     first = camera(48)
     center = torch.tensor([1.0, 0.75, 0.4]).double()
     second = eg.Camera.look_at(center + torch.tensor([4.0, 1.0, 0.5]).double(), center, fov_y=45.0, size=(36, 48))
@@ -403,7 +403,7 @@ def test_pictures_and_masks_of_bytes_are_named():
 
 
 def test_alpha_is_no_colour_of_a_picture():
-    """It would tell nothing of what surrounds the object, or more than a photograph knows."""
+    """It would show nothing of what surrounds the object, or more than a photograph knows."""
     view = camera(16)
     image = torch.cat([picture(view), silhouette(view)[..., None].reshape(16, 16, 1)], -1)
     words = (

@@ -57,11 +57,11 @@ def test_losses_vanish_at_the_target_and_heed_weights(name):
         image, target = image[..., :1], target[..., :1]
     weight = torch.ones(2, 16, 16, 1)
     assert float(loss(image, target, weight)) == pytest.approx(float(loss(image, target, None)), rel=1e-5)
-    spoilt = image.clone()
-    spoilt[:, :8] = 5.0
+    malformed = image.clone()
+    malformed[:, :8] = 5.0
     weight[:, :8] = 0.0
     if name != "ssim":  # whose windows reach across
-        assert float(loss(spoilt, target, weight)) == pytest.approx(float(loss(image, target, weight)), rel=1e-5)
+        assert float(loss(malformed, target, weight)) == pytest.approx(float(loss(image, target, weight)), rel=1e-5)
 
 
 def test_a_multiscale_loss_sees_further_than_a_pixel():

@@ -70,7 +70,7 @@ def test_rotations_cover_all_of_so3() -> None:
     assert farthest(spread(1000)) < 0.42
     assert farthest(spread(30)) < 1.35
     assert farthest(all_sides()) < 0.42
-    assert farthest(all_sides()[::2]) > 0.25  # the measure can tell
+    assert farthest(all_sides()[::2]) > 0.25  # the measure can decide
 
 
 def test_rotations_are_rotations() -> None:

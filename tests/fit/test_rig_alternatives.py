@@ -1,4 +1,4 @@
-"""Poses that outlines hardly tell from another one: two limbs exchanged, a twist shared in another way."""
+"""Poses that outlines hardly separate from another one: two limbs exchanged, a twist shared in another way."""
 
 import sys
 from collections.abc import Sequence

@@ -46,7 +46,7 @@ def random_colors(n: int) -> Tensor:
 
 
 def apart(mesh: eg.Mesh) -> eg.Mesh:
-    """Each face with vertices of its own: none has neighbours that tell whether it was seen."""
+    """Each face with vertices of its own: none has neighbours that show whether it was seen."""
     assert mesh.colors is not None
     corners = mesh.faces.reshape(-1)
     return mesh.replace(

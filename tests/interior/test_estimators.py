@@ -1,5 +1,5 @@
 """Where the samples of the gradient go must not change what they estimate: large textured triangles, hidden layers, faces
-that are smaller than what floats tell apart."""
+that are smaller than what floats show apart."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def translation(mesh: eg.Mesh, camera: eg.Camera, adjoint: Tensor, seeds: int = 
 @pytest.mark.slow
 def test_limb_of_a_fine_mesh() -> None:
     """Faces at the limb of 1.3 M faces are seen less wide than floats are apart: they were hit by rounding and hid the
-    edge beside them, 2 % of the boundary term. The same sphere with coarser faces has the same gradient."""
+    edge next to them, 2 % of the boundary term. The same sphere with coarser faces has the same gradient."""
     camera, adjoint = front_camera(64), smooth_adjoint(64, 64, 3)
     samples = {"surface_samples": 200_000, "edge_samples": 200_000}
     fine, coarse = (translation(icosphere(n), camera, adjoint, **samples) for n in (8, 5))

@@ -1,7 +1,7 @@
 """Properties of the checks: whatever is wrong with an argument, of any entry, is refused with a message that names it; and
 whatever is merely stored in another way gives the same bits, image and gradient.
 
-A case is a good call that is spoilt in one or several places. Each spoiler says which arguments a message may name.
+A case is a good call that is malformed in one or several places. Each spoiler says which arguments a message may name.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ ADJOINT = "the gradient of the image"
 
 @dataclass
 class Case:
-    """The arguments of one call, and which of them are spoilt: empty where the call must work."""
+    """The arguments of one call, and which of them are malformed: empty where the call must work."""
 
     values: dict[str, Any]
-    spoilt: set[str] = field(default_factory=set)
+    malformed: set[str] = field(default_factory=set)
     how: list[str] = field(default_factory=list)
 
     def spoil(self, name: str, value: object, how: str, *also: str) -> None:
         self.values[name] = value
-        self.spoilt |= {name, *also}
+        self.malformed |= {name, *also}
         self.how.append(f"{name} {how}")
 
 
@@ -133,7 +133,7 @@ def spoil_float(draw: st.DrawFn, case: Case) -> None:
         or tensor.numel() == 0
         or tensor.ndim == 0
     ):
-        return  # spoilt already
+        return  # malformed already
     number = st.sampled_from([NAN, INF, -INF] + [1e39, -1e100, 1e300] * (tensor.dtype == F64))
     ways: dict[str, Callable[[], object]] = {
         "holds a number": lambda: put(tensor, at, draw(number)),
@@ -155,7 +155,7 @@ def spoil_float(draw: st.DrawFn, case: Case) -> None:
 
 
 def spoil_uv(draw: st.DrawFn, case: Case) -> None:
-    if "uvs" in case.values and "uvs" not in case.spoilt:
+    if "uvs" in case.values and "uvs" not in case.malformed:
         case.spoil(
             "uvs",
             put(case.values["uvs"], draw(st.integers(0, 100)), draw(st.sampled_from([2e9, -1e12, 1e30]))),
@@ -166,7 +166,7 @@ def spoil_uv(draw: st.DrawFn, case: Case) -> None:
 def spoil_index(draw: st.DrawFn, case: Case) -> None:
     name = draw(st.sampled_from([name for name in ("faces", "uv_faces") if name in case.values]))
     index, at = case.values[name], draw(st.integers(0, 35))
-    if name in case.spoilt:
+    if name in case.malformed:
         return
     rows = 8 if name == "faces" else 7
     beyond = st.sampled_from([-1, -rows, -(2**31), -(2**63), rows, 255, 2**31 - 1, 2**31, 2**32, 2**40, 2**63 - 1])
@@ -191,7 +191,7 @@ def spoil_index(draw: st.DrawFn, case: Case) -> None:
 
 def spoil_camera(draw: st.DrawFn, case: Case) -> None:
     M, K = case.values["world_to_camera"], case.values["K"]
-    if case.spoilt & {"world_to_camera", "K"}:
+    if case.malformed & {"world_to_camera", "K"}:
         return
     linear = torch.eye(4).to(M)
     ways: dict[str, tuple[str, Callable[[], object]]] = {
@@ -261,7 +261,7 @@ def spoil_objects(draw: st.DrawFn, case: Case) -> None:
 def spoil_adjoint(draw: st.DrawFn, case: Case) -> None:
     """Also what only a backward pass meets."""
     values = case.values
-    if case.spoilt:
+    if case.malformed:
         return
     looks = [values[n] for n in (*LOOKS, "background") if n in values]
     dtype = F64 if any(t.dtype == F64 for t in looks) or (not looks and values["verts"].dtype == F64) else F32
@@ -277,13 +277,15 @@ SPOILERS = [spoil_float, spoil_float, spoil_uv, spoil_index, spoil_camera, spoil
 
 
 @st.composite
-def spoilt_cases(draw: st.DrawFn) -> tuple[Case, str]:
+def malformed_cases(draw: st.DrawFn) -> tuple[Case, str]:
     case = good_case(draw)
     if draw(st.booleans()):
         case.values["verts"].requires_grad_()
     for spoiler in draw(st.lists(st.sampled_from(SPOILERS), min_size=1, max_size=3)):
         spoiler(draw, case)
-    return case, "render" if ADJOINT in case.spoilt else draw(st.sampled_from(["render", "render", "plan", "profile"]))
+    return case, "render" if ADJOINT in case.malformed else draw(
+        st.sampled_from(["render", "render", "plan", "profile"])
+    )
 
 
 def check_refused(run: Callable[[], object], names: set[str], how: object) -> None:
@@ -298,10 +300,10 @@ def check_refused(run: Callable[[], object], names: set[str], how: object) -> No
         raise AssertionError(f"{how}: nothing was raised")
 
 
-def refuses(spoilt: tuple[Case, str]) -> None:
-    case, entry = spoilt
-    if case.spoilt:
-        check_refused(lambda: call(case.values, entry), case.spoilt, case.how)
+def refuses(malformed: tuple[Case, str]) -> None:
+    case, entry = malformed
+    if case.malformed:
+        check_refused(lambda: call(case.values, entry), case.malformed, case.how)
     else:
         call(case.values, entry)
 
@@ -444,7 +446,7 @@ BAD_CALLS = [(helper, name, i) for helper, (*_, bad) in HELPERS.items() for name
 
 
 @pytest.mark.parametrize("helper", HELPERS)
-def test_helpers_work_before_they_are_spoilt(helper: str):
+def test_helpers_work_before_they_are_malformed(helper: str):
     function, good, _ = HELPERS[helper]
     if helper != "fit_pose":
         assert function(**good) is not None
@@ -471,8 +473,8 @@ def helper_calls(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
     return helper, {name: draw(st.sampled_from(bad[name])) for name in names}
 
 
-def helper_refuses(spoilt: tuple[str, dict[str, Any]]) -> None:
-    helper, bad = spoilt
+def helper_refuses(malformed: tuple[str, dict[str, Any]]) -> None:
+    helper, bad = malformed
     function, good, _ = HELPERS[helper]
     check_refused(lambda: function(**{**good, **bad}), set(bad), f"{helper} {bad}")
 
@@ -480,7 +482,7 @@ def helper_refuses(spoilt: tuple[str, dict[str, Any]]) -> None:
 # -- the runs -----------------------------------------------------------------------------------------------------
 
 CHECKS = {
-    "refuses": (refuses, spoilt_cases(), 90, 2000),
+    "refuses": (refuses, malformed_cases(), 90, 2000),
     "same_bits": (same_bits, harmless_cases(), 60, 800),
     "helpers": (helper_refuses, helper_calls(), 40, 500),
 }  # the property, its cases, and how many: in the fast suite with a fixed seed, and in the slow one

@@ -43,7 +43,7 @@ def mipmapped(image: Tensor) -> Tensor:
     )
 
 
-def lamp(radiance: Tensor) -> Tensor:
+def emitter(radiance: Tensor) -> Tensor:
     meshes = [FLOOR, eg.AreaLight.rectangle(PLACE, vector(0.5, 0, 0), vector(0, 0.5, 0), radiance)]
     return eg.render(eg.Scene(meshes), CAMERA, 1)
 
@@ -55,7 +55,7 @@ BATCHES: dict[str, tuple[Callable[[Tensor], Tensor], Tensor]] = {
     "roughness": (lambda r: lit(roughness=r), 0.3 * TWO),
     "texture": (lambda i: lit(image=i), IMAGE * TWO[:, None, None, None]),
     "sky": (lambda r: lit(radiance=r), RADIANCE * TWO[:, None]),
-    "lamp": (lamp, RADIANCE * TWO[:, None]),
+    "emitter": (emitter, RADIANCE * TWO[:, None]),
     "K": (lambda k: lit(camera=CAMERA.replace(K=k)), CAMERA.K * torch.stack([torch.ones(3, 1), TWO[[0, 1, 0], None]]).to(F64)),
     "mipmaps": (mipmapped, IMAGE * TWO[:, None, None, None]),
 }  # fmt: skip
@@ -98,7 +98,7 @@ def test_forward_mode_of_a_batch() -> None:
 
 
 def test_a_batch_of_scenes_and_cameras() -> None:
-    """torch.vmap over scenes, each seen by two cameras, with channels beside the image."""
+    """torch.vmap over scenes, each seen by two cameras, with channels besides the image."""
     cameras = CAMERA.replace(K=torch.stack([CAMERA.K, CAMERA.K * torch.tensor([[1.2], [1.2], [1]], dtype=F64)]))
 
     def image(place: Tensor) -> Tensor:

@@ -388,7 +388,7 @@ def test_numbers_that_are_not_python_numbers_are_fine():
 # -- what goes bad after it was checked: the kernel looks again -------------------------------------------------------
 
 
-def spoilt(name: str, index: tuple[int, ...], value: float) -> Callable[[], object]:
+def malformed(name: str, index: tuple[int, ...], value: float) -> Callable[[], object]:
     """Renders after a change in place of one tensor of the scene or the camera."""
 
     def call() -> torch.Tensor:
@@ -420,7 +420,7 @@ def spoilt(name: str, index: tuple[int, ...], value: float) -> Callable[[], obje
     ],
 )
 def test_change_in_place_after_the_checks(name, index, value, parts):
-    check(spoilt(name, index, value), ValueError, *parts)
+    check(malformed(name, index, value), ValueError, *parts)
 
 
 def test_change_in_place_beyond_the_range_of_floats() -> None:

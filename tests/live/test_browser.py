@@ -156,7 +156,7 @@ def test_the_page_shows_the_meshes_where_the_camera_sees_them(browser):
             return np.sum(found & (mask > 0.5)) / max(1, np.sum(found | (mask > 0.5))) > 0.97
 
         wait_for(overlap, "the mesh in its place")
-        # A turn by 5° is seen: the test can tell.
+        # A turn by 5° is seen: the test can decide.
         other = moved.transformed(torch.linalg.matrix_exp(0.09 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]])))
         turned = eg.render_aovs(other, at, ["alpha"], spp=16)["alpha"][..., 0].numpy() > 0.5
         assert np.sum(turned & (mask > 0.5)) / np.sum(turned | (mask > 0.5)) < 0.93

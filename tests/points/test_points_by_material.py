@@ -24,12 +24,12 @@ CAMERA = eg.Camera.look_at((0.4, 0.9, 4.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(2
 
 def scene(base: Tensor, power: Tensor, texels: Tensor) -> eg.Scene:
     gold = eg.Material(base, metallic=0.9, roughness=0.3)
-    lamp = eg.AreaLight.rectangle(vector(-0.5, 2.0, 1.5), vector(1, 0, 0), vector(0, 0.4, -0.6), power)
+    emitter = eg.AreaLight.rectangle(vector(-0.5, 2.0, 1.5), vector(1, 0, 0), vector(0, 0.4, -0.6), power)
     floor = plane(2.0, material=eg.Material(vector(0.4, 0.5, 0.6)))
     bare = plane(0.2).replace(verts=plane(0.2).verts + vector(1.0, 1.0, 0.3))
     floor = floor.replace(verts=floor.verts - vector(0, 0, 1.2))
     sky = eg.Environment(texels, rotation=torch.linalg.qr(vector(1, 2, 3, 0, 1, 5, 2, 1, 0).reshape(3, 3))[0])
-    return eg.Scene([ball(2, material=gold), floor, bare, lamp], lights=[sky.replace(visible=False)])
+    return eg.Scene([ball(2, material=gold), floor, bare, emitter], lights=[sky.replace(visible=False)])
 
 
 def leaves() -> dict[str, Tensor]:
@@ -38,7 +38,7 @@ def leaves() -> dict[str, Tensor]:
     return {"base": vector(0.9, 0.6, 0.3), "power": vector(4.0, 3.0, 2.0), "texels": texels}
 
 
-@pytest.mark.parametrize("light", [0, 1], ids=["sky", "lamp"])
+@pytest.mark.parametrize("light", [0, 1], ids=["sky", "emitter"])
 def test_the_kernel_draws_what_pytorch_draws(light: int):
     frame = Frame(scene(**leaves()), make_request(scene(**leaves()), CAMERA, 2, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
@@ -57,7 +57,7 @@ def test_the_kernel_draws_what_pytorch_draws(light: int):
 
 
 def test_a_shader_of_its_own_gives_what_render_gives():
-    """The image, and gradients by base colour, radiance of the lamp and texels, within the noise of both."""
+    """The image, and gradients by base colour, radiance of the light and texels, within the noise of both."""
 
     def shader(own: dict[str, Tensor]) -> Any:
         material = [(own["base"], vector(0.9), vector(0.3)), (vector(0.4, 0.5, 0.6), None, None)]

@@ -135,7 +135,7 @@ def test_what_joins_at_an_edge_hides_what_lies_beyond_and_no_more(dtype: torch.d
     assert bool(hits.visible(on_wall)[floor].all())
 
 
-def test_rays_pass_through_what_is_cut_out():
+def test_rays_pass_through_what_is_masked():
     """A square screen of which the left half is cut out, before a floor."""
     uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
     corner = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=F64)
@@ -178,7 +178,7 @@ def views() -> dict[str, eg.Camera]:
 
 @pytest.mark.parametrize("view", views())
 def test_places_show_what_pixels_do(view: str):
-    """What is seen at a place, and the ray that goes there and its derivative by the place, beside the hits of an image."""
+    """What is seen at a place, and the ray that goes there and its derivative by the place, next to the hits of an image."""
     primary = eg.primary_hits(ball(1), views()[view], spp=4)
     hits, frame = primary.hits, primary.frame
     x = hits.pixel
@@ -261,7 +261,7 @@ def test_a_pipeline_of_ones_own_is_the_shaders(own_interior: bool):
         a, b = (torch.stack([run[k] for run in r]) for r in runs)
         difference, size = (a.mean(0) - b.mean(0)).norm(), a.mean(0).norm()
         noise = ((a.var(0) + b.var(0)) / 6).sum().sqrt()
-        assert noise < 0.035 * size, f"{name}: too noisy to tell"
+        assert noise < 0.035 * size, f"{name}: too noisy to decide"
         assert difference < 3 * noise, f"{name}: {float(difference / size):.2%}"
 
 

@@ -95,7 +95,7 @@ def test_the_same_as_the_kernels_own(kind: str, view: str, filter: str):
         difference = (a.mean(0) - b.mean(0)).norm()
         noise = (((a.var(0) + b.var(0)) / many).sum()).sqrt()
         size = a.mean(0).norm()
-        assert noise < 0.012 * size, f"{name}: too noisy to tell, {float(noise / size):.2%}"
+        assert noise < 0.012 * size, f"{name}: too noisy to decide, {float(noise / size):.2%}"
         # The norm of noise in many numbers is near its expected value; one number may be three times as far off.
         assert difference < (2 if a[0].numel() > 30 else 3.5) * noise + 0.001 * size, (
             f"{name}: {float(difference / size):.2%}"
@@ -499,8 +499,8 @@ def test_noise_of_shading_falls_with_samples(lit):
     scene = textured()
     texture = torch.rand((32, 32, 1), generator=torch.Generator().manual_seed(1), dtype=F64)
     mesh = scene.meshes[0].replace(texture=texture)
-    lamp = eg.PointLight(torch.tensor([2.0, 3.0, 2.5], dtype=F64), 20.0)
-    scene = eg.Scene([mesh.replace(material=eg.Material())], lights=[lamp]) if lit else eg.Scene([mesh])
+    emitter = eg.PointLight(torch.tensor([2.0, 3.0, 2.5], dtype=F64), 20.0)
+    scene = eg.Scene([mesh.replace(material=eg.Material())], lights=[emitter]) if lit else eg.Scene([mesh])
     more = {} if lit else {"shader": by_hand(scene)}
 
     def images(spp: int) -> Tensor:

@@ -120,7 +120,7 @@ def test_boxes_behind_one_another() -> None:
 
 
 def test_a_thin_strip_is_not_taken_for_one_line() -> None:
-    """Its two sides lie closer than a ray of floats can tell, and each moves the image by itself."""
+    """Its two sides lie closer than a ray of floats can decide, and each moves the image by itself."""
     width = 2e-6
     verts = torch.tensor(
         [[-0.6, -0.5, 0.0], [0.7, 0.4, 0.0], [0.7, 0.4 + width, 0.0], [-0.6, -0.5 + width, 0.0]], dtype=F64

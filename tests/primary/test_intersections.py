@@ -246,7 +246,7 @@ def test_copies_share_what_is_drawn():
     ("copies", "apart"), [(2, False), (2, True), *(pytest.param(1, a, marks=pytest.mark.slow) for a in (False, True))]
 )
 def test_one_side_of_an_edge_in_a_face_is_drawn_without_the_other(copies, apart):
-    """A roof whose ridge lies in a sheet, beside a tangle. The other side of the ridge is mostly hidden, and counts no less."""
+    """A roof whose ridge lies in a sheet, next to a tangle. The other side of the ridge is mostly hidden, and counts no less."""
     verts = torch.tensor(
         [[-2, -2, 0], [2, -2, 0], [0, 3, 0], [0, -0.5, 0], [0, 0.5, 0], [-1, 0, -1], [1, 0, 1]], dtype=F64
     )

@@ -256,7 +256,7 @@ def test_loss_of_a_sparse_adjoint() -> None:
 
 
 def test_the_ratio_check_rejects() -> None:
-    """A gradient without its boundary term, 0.95 and 1.05 times the right one, and what is too noisy to tell."""
+    """A gradient without its boundary term, 0.95 and 1.05 times the right one, and what is too noisy to decide."""
     case = moving(tilted_cube(), front_camera(48))
     with pytest.raises(AssertionError, match="ratio"):
         check_ratio(case, 0.006, visibility=False)
@@ -265,7 +265,7 @@ def test_the_ratio_check_rejects() -> None:
     for factor in (0.95, 1.05):
         with pytest.raises(AssertionError, match="ratio"):
             right_ratio(fd, Estimate(factor * right.mean, factor * right.error))
-    with pytest.raises(AssertionError, match="too noisy to tell"):
+    with pytest.raises(AssertionError, match="too noisy to decide"):
         right_ratio(fd, Estimate(right.mean, 0.02 * abs(right.mean)))
 
 
@@ -308,7 +308,7 @@ def test_corners_on_the_border_up_to_rounding() -> None:
 @pytest.mark.parametrize("angle", [0.0, 0.4, 0.9])
 def test_slivers_hidden_by_a_hair(angle: float) -> None:
     """A tetrahedron whose far corner lies just inside a side of its front: the two faces that meet there are narrower than
-    rays err, which see them beside the front. The corner's gradient is zero: 3e-4 of the whole before."""
+    rays err, which see them next to the front. The corner's gradient is zero: 3e-4 of the whole before."""
     camera = eg.Camera.orthographic((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, (48, 48)).to(F64)
     faces = torch.tensor([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
     colors = torch.rand(4, 3, generator=torch.Generator().manual_seed(1), dtype=F64)

@@ -121,7 +121,7 @@ class Texture(NamedTuple):
         n = self.texels.shape[1]
         if 0 <= column < n and 0 <= row < n:
             return self.texels[side, row, column]
-        # A point just beyond the edge of the side, beside the texel within it.
+        # A point just beyond the edge of the side, next to the texel within it.
         s = min(max((column + 0.5) / n, -0.01 / n), 1 + 0.01 / n)
         t = min(max((row + 0.5) / n, -0.01 / n), 1 + 0.01 / n)
         return self.nearest(direction_of(side, s, t))

@@ -1,4 +1,4 @@
-"""edgegrad.raster: rasterize and interpolate beside a slow twin, exact coverage, and derivatives."""
+"""edgegrad.raster: rasterize and interpolate next to a slow twin, exact coverage, and derivatives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""edgegrad.raster.antialias beside a slow twin, and its derivatives."""
+"""edgegrad.raster.antialias next to a slow twin, and its derivatives."""
 
 from __future__ import annotations
 

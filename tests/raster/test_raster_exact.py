@@ -1,4 +1,4 @@
-"""antialias(…, exact=True): means over pixels and their derivatives beside polygons' areas."""
+"""antialias(…, exact=True): means over pixels and their derivatives next to polygons' areas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""edgegrad.raster.texture beside a slow twin, across the edges of cubes, and its derivatives."""
+"""edgegrad.raster.texture next to a slow twin, across the edges of cubes, and its derivatives."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_pyramids_beside_the_twin(size: tuple[int, int]) -> None:
 
 
 def test_level_of_a_cube() -> None:
-    """How many texels of the side that is seen lie within a pixel: beside differences of the place on it."""
+    """How many texels of the side that is seen lie within a pixel: next to differences of the place on it."""
     tex, uv = draws(12, 1, 6, 16, 16, 1), directions(13, 1, 5, 6)
     uv_da = draws(14, 1, 5, 6, 6, low=-1, high=1) * 0.2
     found = dr.texture(tex, uv, uv_da, boundary_mode="cube")

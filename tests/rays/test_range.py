@@ -78,18 +78,18 @@ def test_products_of_extremes(world: float, radiance: float, adjoint: float):
     found["world_to_camera"][:3, 3] *= world
     both = radiance * adjoint
     factors = {"image": radiance, "verts": both / world, "colors": adjoint, "background": adjoint}
-    # Where the loss looks is kept in float, which moves samples a little.
+    # Where the adjoint is not zero is kept in float, which moves samples a little.
     check_close(found, expected, {**factors, "world_to_camera": both, "K": both}, 2e-3)
 
 
 def shaded(world: float, shader: Callable[[eg.Hits], Tensor] | None) -> tuple[Tensor, Tensor]:
-    """The image of two metal faces under a lamp in other units of length, and its gradient by their vertices in these units."""
+    """The image of two metal faces under a light in other units of length, and its gradient by their vertices in these units."""
     corners = torch.tensor([[-1.0, -0.9, 0.1], [1.0, -0.8, 0.0], [0.9, 1.0, 0.5], [-1.0, 0.8, 0.3]])
     verts, faces = (world * corners).requires_grad_(), torch.tensor([[0, 1, 2], [0, 2, 3]])
     above = world * (0.4 * corners + torch.tensor([1.0, 0.5, 2.0]))
-    lamp = eg.Mesh(above, faces, material=eg.Material(emission=torch.tensor([5.0, 4.0, 3.0])))
+    emitter = eg.Mesh(above, faces, material=eg.Material(emission=torch.tensor([5.0, 4.0, 3.0])))
     metal = eg.Mesh(verts, faces, material=eg.Material(metallic=1.0, roughness=0.5))
-    scene = eg.Scene([metal, lamp], lights=[eg.DirectionalLight(torch.tensor([0.2, -0.3, -1.0]), 3.0)])
+    scene = eg.Scene([metal, emitter], lights=[eg.DirectionalLight(torch.tensor([0.2, -0.3, -1.0]), 3.0)])
     image = eg.render(scene, eg.Camera.look_at((0, 0, 4 * world), (0, 0, 0), size=(12, 12)), shader=shader)
     image.backward(ADJOINT.to(image.dtype))
     assert verts.grad is not None
@@ -97,9 +97,9 @@ def shaded(world: float, shader: Callable[[eg.Hits], Tensor] | None) -> tuple[Te
 
 
 def irradiance(hits: eg.Hits) -> Tensor:
-    lamp = hits.lights[1]
-    points = hits.light_points(lamp)
-    return lamp.arriving(points, hits.position) * lamp.incident(points, hits.position)
+    emitter = hits.lights[1]
+    points = hits.light_points(emitter)
+    return emitter.arriving(points, hits.position) * emitter.incident(points, hits.position)
 
 
 @pytest.mark.parametrize(
@@ -138,11 +138,11 @@ def test_units_of_an_orthographic_camera(power: int):
 def test_beyond_the_range_is_refused(name: str, value: float):
     """Also two that cancel in a sum."""
     values = good("perspective")
-    spoilt = values[name].clone()
+    malformed = values[name].clone()
     at = {"world_to_camera": 7, "K": 2}.get(name, 1)
-    spoilt.view(-1)[at] = value
-    cancelling = torch.cat([spoilt[:1], -spoilt[:1], spoilt[2:]]) if name in ("verts", "colors") else spoilt
-    for tensor in (spoilt, cancelling):
+    malformed.view(-1)[at] = value
+    cancelling = torch.cat([malformed[:1], -malformed[:1], malformed[2:]]) if name in ("verts", "colors") else malformed
+    for tensor in (malformed, cancelling):
         with pytest.raises(ValueError, match=rf"{name}: expected numbers up to 3\.4e\+38, got .*; choose other units"):
             image_and_gradients({**values, name: tensor})
 

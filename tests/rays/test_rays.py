@@ -26,7 +26,7 @@ class Rays(NamedTuple):
 
 class Truth(NamedTuple):
     face: np.ndarray  # (N,), −1: none
-    certain: np.ndarray  # (N,): whether floats can tell
+    certain: np.ndarray  # (N,): whether floats can decide
 
 
 def triangle_soup(faces: int, scale: float, centre: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ def brute_force(corners: np.ndarray, rays: Rays) -> Truth:
     t = (e2 * q).sum(-1) / determinant
     for i, faces in enumerate(rays.ignored):
         u[i, faces] = np.nan
-    inside = np.minimum(np.minimum(u, v), 1 - u - v)  # < 0: beside the face
+    inside = np.minimum(np.minimum(u, v), 1 - u - v)  # < 0: next to the face
     with np.errstate(invalid="ignore"):
         hit = (inside >= 0) & (t >= 0) & (t <= rays.ends[:, None])
     t_hit = np.where(hit, t, np.inf)

@@ -246,7 +246,7 @@ def finite_difference_ratio(lens: str, k: int, names: list[str], step: float = 5
         if abs(fd.mean) > 100 * fd.error:  # no sum of both signs that nearly cancel
             right_ratio(fd, estimate(gradients[name]))
             tested.append(name)
-    assert len(tested) >= len(names) - 2, f"too noisy to tell: {differences}"
+    assert len(tested) >= len(names) - 2, f"too noisy to decide: {differences}"
 
 
 @pytest.mark.unwatched
@@ -382,7 +382,7 @@ def test_jvp_of_channels() -> None:
 
 
 def test_a_texture_gets_the_images_gradient() -> None:
-    """Channels beside the image change nothing about what the image's own loss does to it."""
+    """Channels besides the image change nothing about what the image's own loss does to it."""
     mesh, camera = textured(icosphere(1)), front_camera(SIZE)
     assert mesh.texture is not None
     texture = mesh.texture.clone().requires_grad_()

@@ -35,7 +35,7 @@ def creased() -> eg.Mesh:
 
 
 def textured() -> eg.Scene:
-    """A textured quad beside a box without texture."""
+    """A textured quad next to a box without texture."""
     quad = torch.tensor([[-1.1, -0.9, 0.0], [0.9, -1.0, 0.1], [1.0, 0.8, 0.0], [-0.8, 1.0, 0.2]], dtype=F64)
     uvs = torch.tensor([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]], dtype=F64)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])

@@ -13,7 +13,7 @@ from lit_gltf import file
 from rig_files import Sample, quaternion_matrix, simple_morph, simple_skin
 from scipy.spatial.transform import Rotation, Slerp
 from test_gltf_lights import CAMERAS
-from test_rigs import check, primitive, spoilt
+from test_rigs import check, malformed, primitive
 
 import edgegrad as eg
 
@@ -117,7 +117,7 @@ def test_vertices_without_weights_hang_on_the_first_joint(tmp_path) -> None:
 
 
 def test_a_primitive_without_joints_is_rigid_with_its_node(tmp_path) -> None:
-    """In both loaders, beside another that the skin moves."""
+    """In both loaders, next to another that the skin moves."""
     sample = simple_skin()
     there = primitive(sample)["attributes"]
     sample.tree["meshes"][0]["primitives"].append({"attributes": {"POSITION": there["POSITION"]}, "indices": 2})
@@ -159,7 +159,7 @@ CHANNELS: dict[str, tuple[Callable[[Sample], Any], str]] = {
 @pytest.mark.parametrize("case", CHANNELS)
 def test_channels_that_cannot_be_read_are_left_out(case: str, tmp_path) -> None:
     change, message = CHANNELS[case]
-    sample = spoilt(change)
+    sample = malformed(change)
     rig = load(sample, tmp_path, rf"translation of node 'upper' in animation 'b' \(left out: .*{message}")
     assert list(rig.animations) == ["bend", "b"] and rig.animation("b").channels == ()
     check(sample, rig, rig.posed(**rig.animation("bend").at(0.7)), 0, 0.7)
@@ -170,7 +170,9 @@ def test_a_channel_of_a_node_that_is_not_there_is_named(tmp_path) -> None:
         s.animation("b", (2, "translation", [0.0, 0.5], np.zeros((2, 3)), "LINEAR"))
         s.tree["animations"][-1]["channels"][0]["target"]["node"] = 99
 
-    rig = load(spoilt(change), tmp_path, r"translation of node 99 in animation 'b' \(left out: there is no such node")
+    rig = load(
+        malformed(change), tmp_path, r"translation of node 99 in animation 'b' \(left out: there is no such node"
+    )
     assert rig.animation("b").channels == ()
 
 
@@ -197,11 +199,11 @@ def test_names_differ(tmp_path) -> None:
 
 
 def test_morphs_that_do_not_fit(tmp_path) -> None:
-    sample = spoilt(lambda s: s.tree["meshes"][0].update(weights=[1]), simple_morph)
+    sample = malformed(lambda s: s.tree["meshes"][0].update(weights=[1]), simple_morph)
     rig = load(sample, tmp_path, r"weights of 'mesh 0', 1 for 2 morph targets \(0 for each")
     sample.tree["meshes"][0]["weights"] = [0, 0]
     check(sample, rig, rig.posed(), None, 0.0)
-    sample = spoilt(lambda s: primitive(s)["targets"][1].update(POSITION=s.add([[0, 0, 1]] * 4)), simple_morph)
+    sample = malformed(lambda s: primitive(s)["targets"][1].update(POSITION=s.add([[0, 0, 1]] * 4)), simple_morph)
     rig = load(
         sample, tmp_path, r"morph targets of 'mesh 0' \(left out: expected POSITION of shape \(3, 3\) in morph target 1"
     )

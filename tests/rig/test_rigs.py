@@ -224,7 +224,7 @@ def test_what_a_rig_hides_and_welds(tmp_path) -> None:
 # -- bad input --------------------------------------------------------------------------------------------------------
 
 
-def spoilt(change: Callable[[Sample], Any], make: Callable[[], Sample] = simple_skin) -> Sample:
+def malformed(change: Callable[[Sample], Any], make: Callable[[], Sample] = simple_skin) -> Sample:
     sample = make()
     change(sample)
     return sample
@@ -236,19 +236,19 @@ def primitive(sample: Sample) -> dict[str, Any]:
 
 BAD: dict[str, tuple[Sample, str]] = {
     "joint not in the scene": (
-        spoilt(lambda s: s.tree["scenes"].__setitem__(0, {"nodes": [0]})), r"skin 0: expected joints in the scene, got node 1"
+        malformed(lambda s: s.tree["scenes"].__setitem__(0, {"nodes": [0]})), r"skin 0: expected joints in the scene, got node 1"
     ),
-    "cycle": (spoilt(lambda s: s.tree["nodes"][2].update(children=[1])), "expected a tree of nodes, got node 1"),
+    "cycle": (malformed(lambda s: s.tree["nodes"][2].update(children=[1])), "expected a tree of nodes, got node 1"),
     "negative weights": (
-        spoilt(lambda s: primitive(s)["attributes"].update(WEIGHTS_0=s.add(np.full((10, 4), -1.0)))), "WEIGHTS_0 from 0 up"
+        malformed(lambda s: primitive(s)["attributes"].update(WEIGHTS_0=s.add(np.full((10, 4), -1.0)))), "WEIGHTS_0 from 0 up"
     ),
     "joint beyond the skin": (
-        spoilt(lambda s: primitive(s)["attributes"].update(JOINTS_0=s.add(np.full((10, 4), 2), "<u1"))),
+        malformed(lambda s: primitive(s)["attributes"].update(JOINTS_0=s.add(np.full((10, 4), 2), "<u1"))),
         "JOINTS_0 from 0 to 1, got 2",
     ),
-    "no weights": (spoilt(lambda s: primitive(s)["attributes"].pop("WEIGHTS_0")), "JOINTS_0 and WEIGHTS_0 of shape"),
+    "no weights": (malformed(lambda s: primitive(s)["attributes"].pop("WEIGHTS_0")), "JOINTS_0 and WEIGHTS_0 of shape"),
     "few inverse binds": (
-        spoilt(lambda s: s.tree["skins"][0].update(inverseBindMatrices=s.add(np.eye(4)[None]))), "2 inverse bind matrices"
+        malformed(lambda s: s.tree["skins"][0].update(inverseBindMatrices=s.add(np.eye(4)[None]))), "2 inverse bind matrices"
     ),
 }  # fmt: skip
 

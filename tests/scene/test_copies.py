@@ -109,7 +109,7 @@ def test_a_batch_of_cameras_round_trips():
         assert torch.equal(image(way(batch)), image(batch))
 
 
-def test_spoilt_values_in_a_pickle_do_not_pass():
+def test_malformed_values_in_a_pickle_do_not_pass():
     """A pickle is not checked when it is read, so the render must notice."""
     mesh = pickled(TEXTURED)
     mesh.verts[2, 1] = torch.nan

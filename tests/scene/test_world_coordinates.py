@@ -1,4 +1,4 @@
-"""Positions that float32 cannot tell apart, as in coordinates of a map, stay double; others are float32 as ever."""
+"""Positions that float32 cannot show apart, as in coordinates of a map, stay double; others are float32 as ever."""
 
 import warnings
 

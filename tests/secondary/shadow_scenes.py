@@ -81,7 +81,7 @@ def triangle() -> eg.Mesh:
     )
 
 
-def lamp_shade() -> eg.Mesh:
+def emitter_shade() -> eg.Mesh:
     """An open cone around its axis, narrow above."""
     angle = torch.arange(24, dtype=F64) * (2 * math.pi / 24)
     ring = torch.stack([angle.cos(), angle.sin(), 0 * angle], 1)
@@ -94,19 +94,19 @@ def lamp_shade() -> eg.Mesh:
 # -- lights -------------------------------------------------------------------------------------------------------------
 
 
-LAMP = vector(1.1, -0.7, 2.4)
+EMITTER = vector(1.1, -0.7, 2.4)
 
 
-def point(m: Moved, at: Tensor = LAMP) -> object:
+def point(m: Moved, at: Tensor = EMITTER) -> object:
     return eg.PointLight(at + m.by(LIGHT), 10.0)
 
 
-def sun(m: Moved, at: Tensor = LAMP) -> object:
+def sun(m: Moved, at: Tensor = EMITTER) -> object:
     return eg.DirectionalLight(-(at + m.by(LIGHT)), 1.5)
 
 
 def spot(m: Moved) -> object:
-    at = LAMP + m.by(LIGHT)
+    at = EMITTER + m.by(LIGHT)
     return eg.SpotLight(at, vector(-1.1, 0.7, -2.0), 10.0, inner_angle=0.2, outer_angle=0.6)
 
 
@@ -148,7 +148,7 @@ def sphere_on_sphere(m: Moved) -> list[eg.Mesh]:
 
 
 def across_a_border(m: Moved) -> list[eg.Mesh]:
-    """Part of the shadow falls beside the receiver."""
+    """Part of the shadow falls next to the receiver."""
     return [
         lit(plane(0.5), base=0.8).transformed(t=m.by(RECEIVER)),
         lit(grown(triangle().transformed(t=vector(0.3, 0.1, 1)), m)),
@@ -273,8 +273,8 @@ CASES = {
         for light in (point, sun, panel)
     },
     **{
-        f"lamp shade, {moves} moves": Case(
-            above(lamp_shade().transformed(t=vector(0, 0, 1.1))),
+        f"light shade, {moves} moves": Case(
+            above(emitter_shade().transformed(t=vector(0, 0, 1.1))),
             lambda m: point(m, vector(0.03, 0.02, 1.1)),
             moves,
             step=0.003 if moves == LIGHT else 0.01,

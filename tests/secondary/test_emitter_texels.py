@@ -1,4 +1,4 @@
-"""Borders between nearest texels of lamps, by what they light: against irradiances of polygons in closed form."""
+"""Borders between nearest texels of lights, by what they light: against irradiances of polygons in closed form."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ def derivative(uvs: Tensor, wraps: tuple[str, str], place: Tensor, weights: Tens
 
 def scene(uvs: Tensor, wraps: tuple[str, str] = ("repeat", "repeat"), *others: eg.Mesh) -> eg.Scene:
     emission = eg.Texture(TEXELS, wrap=wraps, filter="nearest", factor=FACTOR)
-    lamp = eg.Mesh(SQUARE, FACES, uvs=uvs, uv_faces=FACES, material=eg.Material(0.0, emission=emission))
-    return eg.Scene([plane(4.0, material=eg.Material(ALBEDO)), lamp, *others])
+    emitter = eg.Mesh(SQUARE, FACES, uvs=uvs, uv_faces=FACES, material=eg.Material(0.0, emission=emission))
+    return eg.Scene([plane(4.0, material=eg.Material(ALBEDO)), emitter, *others])
 
 
-BESIDE = vector(1.0, 0.0, 0.3)  # from where the place is seen, below the lamp
+BESIDE = vector(1.0, 0.0, 0.3)  # from where the place is seen, below the light
 WEIGHTS = vector(1.0, -0.3, 0.5)
 
 
@@ -104,7 +104,7 @@ def by_borders(uvs: Tensor, wraps: tuple[str, str], place: Tensor, weights: Tens
     return torch.autograd.grad((reaches * borders.motion(points)[:, 0]).sum(), uvs)[0]
 
 
-BESIDE = vector(1.0, 0.0, 0.3)  # from where places are seen, below the lamp
+BESIDE = vector(1.0, 0.0, 0.3)  # from where places are seen, below the light
 WEIGHTS = vector(1.0, -0.3, 0.5)
 PLACE = vector(0.3, -0.2, 0.0)
 
@@ -120,7 +120,7 @@ WRAPS = [("repeat", "mirror"), ("clamp", "repeat"), ("mirror", "clamp")]
         for k, wraps in enumerate(WRAPS)
     ],
 )
-def test_texture_coordinates_of_a_lamp(coordinates: str, wraps: tuple[str, str]) -> None:
+def test_texture_coordinates_of_a_emitter(coordinates: str, wraps: tuple[str, str]) -> None:
     uvs = COORDINATES[coordinates]
     exact = derivative(uvs, wraps, PLACE, WEIGHTS)
     assert torch.allclose(
@@ -137,7 +137,7 @@ def test_radiance_itself_stays() -> None:
     assert torch.equal(still, moving)
 
 
-def test_a_lamp_in_shadow_and_its_back() -> None:
+def test_an_emitter_in_shadow_and_its_back() -> None:
     uvs = COORDINATES["askew"].clone().requires_grad_()
     blocked = scene(uvs, ("repeat", "repeat"), plane(3.0).transformed(t=vector(0, 0, 1.5)))
     hits = hits_of(blocked, 50, PLACE, BESIDE)
@@ -145,10 +145,10 @@ def test_a_lamp_in_shadow_and_its_back() -> None:
         (found,) = torch.autograd.grad(radiance(hits, shadows).sum(), uvs)
         assert bool(found.any()) != shadows
     turned = scene(uvs)
-    lamp = turned.meshes[1].replace(faces=FACES.flip(1), uv_faces=FACES.flip(1), material=eg.Material(
+    emitter = turned.meshes[1].replace(faces=FACES.flip(1), uv_faces=FACES.flip(1), material=eg.Material(
         0.0, emission=eg.Texture(TEXELS, filter="nearest"), two_sided=False
     ))  # fmt: skip
-    hits = hits_of(turned.replace(meshes=[turned.meshes[0], lamp]), 50, PLACE, BESIDE)
+    hits = hits_of(turned.replace(meshes=[turned.meshes[0], emitter]), 50, PLACE, BESIDE)
     assert not bool(radiance(hits).any())
     (found,) = torch.autograd.grad(radiance(hits).sum(), uvs)
     assert not bool(found.any())
@@ -193,7 +193,7 @@ def test_a_texture_of_one_colour_has_no_borders() -> None:
 def test_images_in_reverse_and_forward_mode() -> None:
     """Of the floor alone, by the kernel; the exact derivative is that of a fine grid of points."""
     wraps, uvs, motion = ("repeat", "repeat"), COORDINATES["askew"], torch.tensor([0.7, -0.7], dtype=F64)
-    # Below the lamp, one above the floor, of which it sees a square with sides of 1.
+    # Below the light, one above the floor, of which it sees a square with sides of 1.
     w2c = torch.tensor([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]], dtype=F64)
     camera = eg.Camera(w2c, torch.tensor([[3, 0, 1.5], [0, 3, 1.5], [0, 0, 1]], dtype=F64), (3, 3))
     weights = torch.linspace(0.2, 1.0, 9, dtype=F64).reshape(3, 3, 1) * WEIGHTS
@@ -230,8 +230,8 @@ def test_texture_coordinates_in_single_precision() -> None:
     def gradient(dtype: torch.dtype) -> Tensor:
         uvs = COORDINATES["askew"].to(dtype).requires_grad_()
         lit = scene(COORDINATES["askew"]).to(dtype)
-        floor, lamp = lit.meshes
-        image = eg.render(lit.replace(meshes=[floor, lamp.replace(uvs=uvs)]), camera.to(dtype), 4)
+        floor, emitter = lit.meshes
+        image = eg.render(lit.replace(meshes=[floor, emitter.replace(uvs=uvs)]), camera.to(dtype), 4)
         assert image.dtype == dtype
         return torch.autograd.grad(image.sum(), uvs)[0]
 
@@ -261,7 +261,7 @@ def test_steps_are_declared_as_shading_looks_them_up() -> None:
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
 
 
-def test_a_lamp_that_is_cut_out_gives_no_light_there() -> None:
+def test_an_emitter_that_is_masked_gives_no_light_there() -> None:
     """By the kernel and in PyTorch, cut out or blending: that of the half which is left, in closed form."""
     alpha = torch.tensor([[0.2, 0.9]])
     uvs = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
@@ -272,8 +272,8 @@ def test_a_lamp_that_is_cut_out_gives_no_light_there() -> None:
     camera = eg.Camera.look_at((0.3, -2.0, 1.0), PLACE.tolist(), fov_y=2.0, size=(1, 1))
     for mode in ("MASK", "BLEND"):
         glow = eg.Material(0.0, emission=1.0, alpha_mode=mode)
-        lamp = eg.Mesh(SQUARE, FACES, uvs=uvs, uv_faces=FACES, alpha=alpha, filter="nearest", material=glow)
-        lit = eg.Scene([plane(4.0, material=eg.Material(torch.pi * vector(1, 1, 1) / 4)), lamp])
+        emitter = eg.Mesh(SQUARE, FACES, uvs=uvs, uv_faces=FACES, alpha=alpha, filter="nearest", material=glow)
+        lit = eg.Scene([plane(4.0, material=eg.Material(torch.pi * vector(1, 1, 1) / 4)), emitter])
         with torch.no_grad():
             found = [
                 torch.stack([eg.render(lit, camera, 1024, seed=s, light_samples=16) for s in range(4)]),

@@ -30,7 +30,7 @@ def lights_of(kind: str, theta: Tensor) -> tuple[list[eg.Mesh], list[Any]]:
     # So that what a point light gives the floor stays nearly the same, and the shadow's border is all that changes.
     shift = theta * (vector(-0.2, 0.5, 0.0) if kind == "point" else vector(0.5, 0.0, 0.2))
     place, towards = vector(*PLACE) + shift, vector(-3.0, 1.3, 0.2) + shift
-    if kind == "lamp":
+    if kind == "emitter":
         half, up = vector(0, 0, 0.25), vector(0.1, 0.2, 0)
         corners = torch.stack([place + half + up, place - half + up, place - half - up, place + half - up])
         return [mesh(corners, [[0, 2, 1], [0, 3, 2]], 0.0, 30.0)], []
@@ -56,9 +56,9 @@ def case_of(kind: str, moved: str, **of_floor: Any) -> Case:
         if of_floor:
             floor = floor.replace(material=eg.Material(**of_floor))
         ceiling = mesh(square + vector(0, 1.5, 0), QUAD, 0.6)
-        lamps, lights = lights_of(kind, by["light"])
+        emitters, lights = lights_of(kind, by["light"])
         camera = seen_from((0.1, 0.3, 0.0), (0.0, 1.5, 0.05), 0.8)
-        return eg.Scene([floor, ceiling, mesh(corners, QUAD, 0.0), *lamps], lights=lights), camera
+        return eg.Scene([floor, ceiling, mesh(corners, QUAD, 0.0), *emitters], lights=lights), camera
 
     return case
 
@@ -68,8 +68,8 @@ def check(case: Case, spp: int, seeds: int, h: float = 0.2, bounces: int = 2, **
     print(right_ratio(change, indirect_gradient(case, h, seeds, bounces, **samples)))
 
 
-def test_lamp() -> None:
-    check(case_of("lamp", "caster"), 128, 4, **FEW)
+def test_emitter() -> None:
+    check(case_of("emitter", "caster"), 128, 4, **FEW)
 
 
 def test_a_point_light_moves() -> None:
@@ -84,7 +84,7 @@ def test_lights_that_move(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moved", ["caster", "floor"])
-@pytest.mark.parametrize("kind", ["lamp", "point", "spot", "directional", "sky"])
+@pytest.mark.parametrize("kind", ["emitter", "point", "spot", "directional", "sky"])
 def test_surfaces_that_move(kind: str, moved: str) -> None:
     check(case_of(kind, moved), 1024, 8, **{name: 8 * n for name, n in FEW.items()})
 
@@ -92,7 +92,7 @@ def test_surfaces_that_move(kind: str, moved: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("bounces", [3, 4])
 def test_more_bounces(bounces: int) -> None:
-    check(case_of("lamp", "caster"), 1024, 8, bounces=bounces, **{name: 4 * n for name, n in FEW.items()})
+    check(case_of("emitter", "caster"), 1024, 8, bounces=bounces, **{name: 4 * n for name, n in FEW.items()})
 
 
 @pytest.mark.slow
@@ -106,7 +106,7 @@ def derivatives(threads: int) -> tuple[Tensor, Tensor]:
     """Of the image by θ at 0, in forward mode and in reverse."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
-    case, zero = case_of("lamp", "caster"), torch.zeros((), dtype=F64)
+    case, zero = case_of("emitter", "caster"), torch.zeros((), dtype=F64)
 
     def image(theta: Tensor) -> Tensor:
         return eg.render(*case(theta), 1, 0, bounces=3, surface_samples=2_000, edge_samples=1_000)
@@ -129,7 +129,7 @@ def test_plan() -> None:
     row = "indirect shadow edges"
 
     def moving(name: str) -> tuple[eg.Scene, eg.Camera]:
-        return case_of("lamp", name)(torch.zeros((), dtype=F64, requires_grad=True))
+        return case_of("emitter", name)(torch.zeros((), dtype=F64, requires_grad=True))
 
     scene, camera = moving("caster")
     assert (
@@ -137,6 +137,6 @@ def test_plan() -> None:
     )
     assert eg.plan(scene, camera, 16, bounces=2)[row].samples == 32 * 32 * 16 // 8
     assert eg.plan(scene, camera, 16, bounces=2, edge_samples=70)[row].samples == 70
-    still, _ = case_of("lamp", "nothing")(torch.zeros((), dtype=F64))
+    still, _ = case_of("emitter", "nothing")(torch.zeros((), dtype=F64))
     turned = camera.replace(K=camera.K.clone().requires_grad_())
     assert not eg.plan(still, turned, 16, bounces=2)[row].on

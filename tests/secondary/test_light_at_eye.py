@@ -90,12 +90,12 @@ class Case:
             lights = [eg.SpotLight(still.eye + away, -eye, 20.0, inner_angle=0.3, outer_angle=0.6)]
         elif self.light == "sun":
             lights = [eg.DirectionalLight(still.world_to_camera[2, :3] + away, 3.0)]
-        else:  # a lamp of 1e-4, a little behind the eye, so that the camera does not see it
+        else:  # a light of 1e-4, a little behind the eye, so that the camera does not see it
             right, down, forward = still.world_to_camera[:3, :3]
             corners = 1e-4 * torch.stack([-right - down, right - down, down])
-            lamp = still.eye + away - 1e-4 * forward + corners
+            emitter = still.eye + away - 1e-4 * forward + corners
             facing = torch.tensor([[0, 1, 2]])
-            meshes.append(eg.Mesh(lamp, facing, material=eg.Material(0.0, emission=2e9)))
+            meshes.append(eg.Mesh(emitter, facing, material=eg.Material(0.0, emission=2e9)))
         return eg.Scene(meshes, lights=lights), camera
 
 
@@ -116,7 +116,7 @@ def check(case: Case, seeds: int = 4, samples: int = 4_000) -> None:
     right = gradients(case, seeds, edge_samples=samples, shadows=False)
     size = abs(estimate(right).mean)
     off = estimate([a - b for a, b in zip(found, right, strict=True)])
-    assert 4 * off.error < 0.03 * size, f"too noisy to tell 5 %: {off} of {size}"
+    assert 4 * off.error < 0.03 * size, f"too noisy to decide 5 %: {off} of {size}"
     assert abs(off.mean) < 0.015 * size + 4 * off.error, f"off by {off}, right: {size}"
 
 
@@ -157,7 +157,7 @@ def test_of_a_fisheye() -> None:
 @pytest.mark.parametrize("shape", ["grid", "box", "sphere"])
 def test_of_all_small_offsets(shape: str, kind: str, sign: int, dtype: torch.dtype) -> None:
     for offset in (1e-12, 1e-10, 1e-8, 1e-7, 3e-7, 1e-6, 3e-6, 1e-5, 3e-5, 1e-4):
-        # What a lamp lights is noisier, for each sample of a boundary has one of its points.
+        # What a light lights is noisier, for each sample of a boundary has one of its points.
         check(lit(kind, shape=shape, offset=sign * offset, dtype=dtype), 8, 40_000 if kind == "area" else 4_000)
 
 

@@ -204,7 +204,7 @@ def test_motions(scene: str, motion: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bounces", [3, 4])
-@pytest.mark.parametrize("scene", ["cornell", "plates", "lamp upwards", "ball"])
+@pytest.mark.parametrize("scene", ["cornell", "plates", "light upwards", "ball"])
 def test_more_bounces(scene: str, bounces: int) -> None:
     check(case_of(scene, next(iter(SCENES[scene][1]))), 8192, 16, bounces, 4_000_000, 1_000_000)
 

@@ -1,4 +1,4 @@
-"""Rims of cut-outs, and lines along which faces pass through each other, on the way of light from one surface to another: in
+"""Alpha edges, and lines along which faces pass through each other, on the way of light from one surface to another: in
 render(bounces=n), against exact derivatives."""
 
 from __future__ import annotations

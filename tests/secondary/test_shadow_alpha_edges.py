@@ -1,4 +1,4 @@
-"""Shadows of rims of cut-outs: of a rectangle of which a ramp of alpha leaves a part, in closed form, and of curved rims against
+"""Shadows of alpha edges: of a rectangle of which a ramp of alpha leaves a part, in closed form, and of curved rims against
 finite differences."""
 
 from __future__ import annotations
@@ -178,11 +178,11 @@ def test_curved_rims(name: str) -> None:
     at = FD_CASES[name]
     truth = by_quadrature(at, 0.02, 20 if name in QUICK else 24)
     found = derivative(at, 4, step_spacing=1 / 8, edge_samples=8000, surface_samples=20_000)
-    assert found.error < 0.005 * abs(truth), f"too noisy to tell: {found}"
+    assert found.error < 0.005 * abs(truth), f"too noisy to decide: {found}"
     assert abs(found.mean - truth) < 0.02 * abs(truth), f"difference {truth}, gradient {found}"
 
 
-def test_what_blends_casts_the_shadow_of_what_is_cut_out_at_one_half() -> None:
+def test_what_blends_casts_the_shadow_of_what_is_masked_at_one_half() -> None:
     options = {"edge_samples": 8000, "surface_samples": 20_000}
     blends, cut = (derivative(case("alpha", "point", look, camera=BESIDE), 2, **options) for look in ("BLEND", "MASK"))
     assert abs(cut.mean) > 10

@@ -221,7 +221,7 @@ def test_shadow_before_an_even_sky() -> None:
     check("sky, caster grows", of_sky("caster grows"), found)
 
 
-def lamp(s: Setting) -> object:
+def emitter(s: Setting) -> object:
     """The panel as 800 faces."""
     n = 20
     x, y = torch.meshgrid(torch.linspace(-1, 1, n + 1), torch.linspace(-1, 1, n + 1), indexing="ij")
@@ -232,12 +232,12 @@ def lamp(s: Setting) -> object:
 
 
 @pytest.mark.unwatched
-def test_lamp_of_many_faces() -> None:
+def test_emitter_of_many_faces() -> None:
     """It casts the shadows of a panel of two faces, and moves with all its vertices."""
     for motion in ("caster moves", "light moves"):
         few = estimate([gradient(motion, panel, seed) for seed in range(4)])
-        many = estimate([gradient(motion, lamp, seed) for seed in range(4)])
-        check(f"lamp, {motion}", few.mean, many)
+        many = estimate([gradient(motion, emitter, seed) for seed in range(4)])
+        check(f"light, {motion}", few.mean, many)
 
 
 def test_triangles_of_directions() -> None:
@@ -259,7 +259,7 @@ def test_triangles_of_directions() -> None:
 
 @pytest.mark.parametrize("mode", ["MASK", "BLEND"])
 @pytest.mark.parametrize("alpha", [0.4, 0.9])
-def test_what_is_cut_out_casts_no_shadow_whose_border_moves(mode, alpha):
+def test_what_is_masked_casts_no_shadow_whose_border_moves(mode, alpha):
     """Shadow rays pass where alpha is below ½: the gradient is then that without shadows; above, it is another."""
     square = torch.tensor([[-0.8, -0.3, 1.0], [0.8, -0.3, 1.0], [0.8, 0.9, 1.0], [-0.8, 0.9, 1.0]])
     faces, uvs = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])

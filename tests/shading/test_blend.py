@@ -169,7 +169,7 @@ def sheets(heights: dict[float, tuple[float, float]], square: eg.Mesh) -> eg.Sce
 
 
 def check_growth(heights: dict[float, tuple[float, float]], opacity: float, behind: float) -> None:
-    """A square of radiance 0.9 at z = 0 grows behind panes that let through what they do; `behind` is what it hides."""
+    """A square of radiance 0.9 at z = 0 grows behind transparent sheets; `behind` is what it hides."""
     grown = torch.zeros((), dtype=F64, requires_grad=True)
     square = sheet(0.0, 0.9, opacity, 0.5)
     camera = from_above(16).replace(K=from_above(16).K + vector(0.3, 0.2, 0)[:, None] * vector(0, 0, 1))
@@ -188,12 +188,12 @@ def check_growth(heights: dict[float, tuple[float, float]], opacity: float, behi
 def test_border_of_a_square_behind_panes() -> None:
     check_growth({1.0: (0.7, 0.25)}, 1.0, 0.4)
     check_growth({1.0: (0.7, 0.25), 2.0: (0.1, 0.5)}, 1.0, 0.4)
-    check_growth({1.0: (0.7, 0.25)}, 0.3, 0.4)  # a pane itself
+    check_growth({1.0: (0.7, 0.25)}, 0.3, 0.4)  # a transparent sheet itself
     check_growth({1.0: (0.7, 0.25), -1.0: (0.2, 0.5)}, 1.0, 0.5 * 0.2 + 0.5 * 0.4)  # before another
 
 
 def behind_glass(kind: str, t: Tensor, pane: bool) -> tuple[eg.Scene, eg.Camera]:
-    """A black pane of alpha 0.4, or none, before something that moves."""
+    """A black transparent sheet of alpha 0.4, or none, before something that moves."""
     camera = eg.Camera.look_at((0.3, -0.4, 5.0), (0, 0, 0), up=(0.1, 1, 0), fov_y=40, size=(32, 32)).to(F64)
     look, lights = eg.Material(), [eg.PointLight(vector(1.2, 0.9, 2.6) + t * vector(0.5, 0.1, 0), 9.0)]
     floor = plane(1.6, material=look).transformed(t=vector(0, 0, -0.6))
@@ -215,14 +215,16 @@ def behind_glass(kind: str, t: Tensor, pane: bool) -> tuple[eg.Scene, eg.Camera]
 
 @pytest.mark.parametrize("kind", ["edges", "intersection", "shadow", "cut-out"])
 def test_all_that_moves_behind_a_pane(kind: str) -> None:
-    """It moves as without the pane, of which six tenths come through."""
+    """It moves as without the transparent sheet, of which six tenths come through."""
     options = {"edge_samples": 6000, "surface_samples": 20_000, "step_spacing": 0.125}
     through, alone = (
         derivative(lambda t, pane=pane: behind_glass(kind, t, pane), 4, **options) for pane in (True, False)
     )
     noise = (through.error**2 + (0.6 * alone.error) ** 2) ** 0.5
-    assert noise < 0.007 * abs(through.mean), f"too noisy to tell: {through}, {alone}"
-    assert abs(through.mean - 0.6 * alone.mean) < 0.02 * abs(through.mean), f"{through}, without a pane {alone}"
+    assert noise < 0.007 * abs(through.mean), f"too noisy to decide: {through}, {alone}"
+    assert abs(through.mean - 0.6 * alone.mean) < 0.02 * abs(through.mean), (
+        f"{through}, without a transparent sheet {alone}"
+    )
 
 
 @pytest.mark.parametrize(("moving", "searched"), [("alpha", False), ("light", False), ("uvs", True), ("verts", True)])

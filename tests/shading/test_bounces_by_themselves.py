@@ -26,8 +26,8 @@ def moved(theta: Tensor, floor: str) -> tuple[eg.Scene, eg.Camera]:
     if floor == "even sky":
         return eg.Scene([block, ground], lights=list(scene.lights)), scene.camera
     metal = eg.Material(vector(0.9), metallic=1.0, roughness=0.2)
-    lamp = panel((0.3, 2.0, 0.3), (0.5, 0.5))
-    return eg.Scene([block, ground.replace(face_colors=None, material=metal), lamp]), scene.camera
+    emitter = panel((0.3, 2.0, 0.3), (0.5, 0.5))
+    return eg.Scene([block, ground.replace(face_colors=None, material=metal), emitter]), scene.camera
 
 
 def loss(theta: Tensor, floor: str, spp: int, seed: int, **samples: Any) -> Tensor:

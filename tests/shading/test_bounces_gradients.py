@@ -26,7 +26,7 @@ def test_paths_that_no_border_crosses() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bounces", [2, 3])
-@pytest.mark.parametrize("motion", ["right vertex", "left y", "lamp y"])
+@pytest.mark.parametrize("motion", ["right vertex", "left y", "light y"])
 def test_all_motions_of_paths_that_no_border_crosses(motion: str, bounces: int) -> None:
     check("open plates", motion, 4096, 8, bounces=bounces, **{name: 8 * n for name, n in OPEN.items()})
 

@@ -29,7 +29,7 @@ def test_images(room: str, bounces: int) -> None:
     peer, scene = MitsubaRoom(without_alpha(room), camera, bounces), ROOMS[room]()
     theirs = torch.stack([peer.render(SPP, seed) for seed in range(SEEDS)]).double()
     own = torch.stack([eg.render(scene, camera, SPP, seed, bounces=bounces).detach() for seed in range(SEEDS)])
-    # Welch 1947. What hardly varies, such as a lamp that fills a pixel, may differ by rounding.
+    # Welch 1947. What hardly varies, such as a light that fills a pixel, may differ by rounding.
     noise = torch.stack([own.var(0), theirs.var(0)]).flatten(1) / SEEDS + 1e-10
     t = (own.mean(0) - theirs.mean(0)).flatten() / noise.sum(0).sqrt()
     freedom = noise.sum(0) ** 2 * (SEEDS - 1) / (noise**2).sum(0)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from path_oracle import PathOracle
 from room_scenes import ROOMS as ALL_ROOMS
-from room_scenes import box_room, lamp, quad, towards_room, vector
+from room_scenes import box_room, emitter, quad, towards_room, vector
 from scenes import icosphere
 from torch import Tensor
 
@@ -19,10 +19,10 @@ from edgegrad.points.frame import Frame
 
 F64 = torch.float64
 ROOMS: dict[str, dict[str, Any]] = {
-    "lamp": {},
+    "emitter": {},
     "point": {"lights": "point", "metallic": 1.0, "roughness": 0.4},
     "sky": {"lights": "sky", "floor": {"base_color": vector(0.8, 0.6, 0.4), "metallic": 0.7, "roughness": 0.5}},
-    "lamp glossy": {"floor": {"base_color": vector(0.8, 0.6, 0.4), "metallic": 0.5, "roughness": 0.5}},
+    "light glossy": {"floor": {"base_color": vector(0.8, 0.6, 0.4), "metallic": 0.5, "roughness": 0.5}},
 }
 
 
@@ -49,7 +49,7 @@ def check_points(room: str, bounces: int, rows: tuple[int, ...], paths: int) -> 
         )
 
 
-@pytest.mark.parametrize("room", ["lamp", pytest.param("point", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("room", ["emitter", pytest.param("point", marks=pytest.mark.slow)])
 def test_points(room: str) -> None:
     check_points(room, 3, (20, 55), 30_000)
 
@@ -61,9 +61,9 @@ def test_points_of_all_rooms(room: str, bounces: int) -> None:
     check_points(room, bounces, (20, 45, 55), 300_000)
 
 
-# Shares of the radiance are drawn in two ways where a path may meet a lamp (csrc/shading/lit/path.h); with two light samples
+# Shares of the radiance are drawn in two ways where a path may meet a light (csrc/shading/lit/path.h); with two light samples
 # nothing is, each point has one path, and no pixel is asked again.
-@pytest.mark.parametrize("room", ["sky", "sky through an opening", "large lamp", "point"])
+@pytest.mark.parametrize("room", ["sky", "sky through an opening", "large light", "point"])
 def test_images_whose_points_have_several_paths(room: str) -> None:
     scene, camera = ALL_ROOMS[room](), towards_room(12)
     with torch.no_grad():
@@ -124,7 +124,7 @@ def test_same_bits_at_any_number_of_threads() -> None:
     for count in (1, 2, 3):
         torch.set_num_threads(count)
         color = vector(0.6, 0.5, 0.4).requires_grad_()
-        scene = box_room("lamp", floor={"base_color": color, "roughness": 0.4})
+        scene = box_room("emitter", floor={"base_color": color, "roughness": 0.4})
         image = eg.render(scene, towards_room(12), 4, bounces=4)
         found.append((image.detach(), *torch.autograd.grad((image * image).sum(), color)))
     torch.set_num_threads(threads)
@@ -137,9 +137,9 @@ def test_one_bounce_is_direct_light_and_more_add_to_it() -> None:
     assert torch.equal(images[0], eg.render(scene, camera, 16))
     means = [float(image.mean()) for image in images]
     assert means[0] < 0.95 * means[1] < 0.95 * means[2]
-    alone = eg.Scene([quad((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), base_color=0.5), lamp()])
+    alone = eg.Scene([quad((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), base_color=0.5), emitter()])
     flat = [eg.render(alone, towards_room(12), 16, bounces=n).mean() for n in (1, 2)]
-    assert torch.allclose(*flat, rtol=0.02)  # nothing scatters to the floor: the lamp is black
+    assert torch.allclose(*flat, rtol=0.02)  # nothing scatters to the floor: the light is black
 
 
 def test_channels_batches_and_transforms() -> None:
@@ -213,7 +213,7 @@ def test_creases_that_no_light_reaches_directly() -> None:
 
 @pytest.mark.parametrize("bounces", [2, 4])
 def test_what_moves(bounces: int) -> None:
-    scene, camera = box_room("lamp"), towards_room(8)
+    scene, camera = box_room("emitter"), towards_room(8)
     leaves = [mesh.verts.clone().requires_grad_() for mesh in scene.meshes]
     moved = scene.replace(meshes=[mesh.replace(verts=v) for mesh, v in zip(scene.meshes, leaves, strict=True)])
     pose = camera.world_to_camera.clone().requires_grad_()

@@ -19,7 +19,7 @@ SEEDS, H, LEVEL = 256, 0.1, 0.05
 SCENES = (
     ("cornell", "block x"),
     ("standing", "block z"),
-    ("lamp upwards", "lamp x"),
+    ("light upwards", "light x"),
     ("under sky", "ground y"),
     ("plates", "strip y"),
     ("ball", "ball x"),
@@ -52,5 +52,5 @@ def test_six_scenes() -> None:
         error = math.hypot(change.error, mean.error)
         chances.append(math.erfc(abs(mean.mean - change.mean) / error / math.sqrt(2)))
         print(f"{scene}, {motion}: {mean.mean / change.mean:.3f} ± {error / abs(change.mean):.3f}, p {chances[-1]:.2f}")
-        assert error < 0.1 * abs(change.mean), "too noisy to tell"
+        assert error < 0.1 * abs(change.mean), "too noisy to decide"
     assert all(p > LEVEL / (len(chances) - k) for k, p in enumerate(sorted(chances)))

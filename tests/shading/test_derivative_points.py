@@ -91,11 +91,11 @@ def test_fours_have_the_density_that_is_said(roughness: float):
     assert float(((observed - expected) ** 2 / expected).sum()) < chi2.ppf(1 - 1e-4, rings * sectors)
 
 
-def sky(lamps: bool) -> eg.Environment:
-    """A smooth one, or with lamps, of which one lies where the point mirrors."""
+def sky(emitters: bool) -> eg.Environment:
+    """A smooth one, or with lights, of which one lies where the point mirrors."""
     image = torch.linspace(0.4, 1.2, 16, dtype=F64)[:, None, None].expand(16, 32, 3).clone()
     turn = torch.linalg.qr(uniform(3, 3))[0]
-    if lamps:
+    if emitters:
         light = eg.Environment(image, rotation=turn)
         mirror = light.points_at(2 * dot(V[None], N[None]) * N - V)
         image.reshape(-1, 3)[mirror.index] = 40.0
@@ -137,11 +137,11 @@ def estimates(light: eg.Environment, roughness: float, seeds: int, antithetic: b
 
 @pytest.mark.slow
 @pytest.mark.unwatched
-@pytest.mark.parametrize("lamps", [False, True], ids=["smooth", "lamps"])
+@pytest.mark.parametrize("emitters", [False, True], ids=["smooth", "emitters"])
 @pytest.mark.parametrize("roughness", [0.2, 0.5])
-def test_derivatives_are_unbiased(roughness: float, lamps: bool):
+def test_derivatives_are_unbiased(roughness: float, emitters: bool):
     """The mean over draws against quadrature."""
-    light, seeds = sky(lamps), 10_000
+    light, seeds = sky(emitters), 10_000
     found = estimates(light, roughness, seeds, antithetic=True)
     l, solid = directions(350)
     l = l @ AXES

@@ -87,7 +87,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_the_shape_of_a_lamp(name: str):
+def test_the_shape_of_a_emitter(name: str):
     mesh, flat, convex = SHAPES[name]
     tree = tree_of(MeshLight(eg.AreaLight.of(mesh, 1.0)))
     assert (tree.is_flat, tree.is_convex) == (flat, convex)
@@ -133,7 +133,7 @@ def test_directions_to_a_ball_have_their_density(distance: float):
     light = MeshLight(eg.AreaLight.of(mesh, 1.0))
     meets = MeshTowards.of(light, torch.zeros((n, 3), dtype=F64), torch.full((n,), -1))
     ray, points = meets.towards(meets.draw_by_ball(sobol_parts(torch.arange(n), 5, 1)))
-    assert len(ray.unique()) == len(ray)  # of a convex lamp only what lies in front
+    assert len(ray.unique()) == len(ray)  # of a convex light only what lies in front
     cone = 2 * math.pi * (1 - math.sqrt(1 - 1 / distance**2))
     chance = solid_angles(mesh.verts[mesh.faces]).clamp(min=0) / cone
     assert 0.6 < float(chance.sum()) < 1
@@ -153,15 +153,15 @@ def test_directions_to_a_ball_have_their_density(distance: float):
         torch.testing.assert_close(stands_for, area[of_face][0], rtol=4 / math.sqrt(int(of_face.sum())), atol=0)
 
 
-def test_all_directions_may_miss_a_lamp():
+def test_all_directions_may_miss_a_emitter():
     """There is nothing then; one surface at a time, for what others meet would hide it."""
-    lamp = MeshLight(eg.AreaLight.of(together(moved(block(1, 1, 1), 1.0, 0, 0, 3)), 1.0))
+    emitter = MeshLight(eg.AreaLight.of(together(moved(block(1, 1, 1), 1.0, 0, 0, 3)), 1.0))
     n, y = vector(0, 0, 1)[None], vector(0.1, 0.2, 0)[None]
     rough = Scattering(vector(0.5)[None], vector(1.0)[None], vector(0.9)[None])
     drawn = []
     for seed in range(40):
         one = Glossy.of(n, n, n, rough, torch.tensor([seed * 7919]))
-        (points,) = resampled(lamp, 5, one, 1, MeshTowards.of(lamp, y, torch.tensor([-1])))
+        (points,) = resampled(emitter, 5, one, 1, MeshTowards.of(emitter, y, torch.tensor([-1])))
         drawn.append(bool(points.density.isfinite()))
     assert 5 < sum(drawn) < 35
 
@@ -170,9 +170,9 @@ def test_the_kernel_draws_what_pytorch_draws():
     """Of a ball that emits, for surfaces where the lobe is asked and where it is not."""
     metal = eg.Material(torch.ones(3, dtype=F64), metallic=1.0, roughness=0.3)
     rough = eg.Material(torch.ones(3, dtype=F64), metallic=1.0, roughness=0.9)
-    lamp = eg.AreaLight.of(eg.Mesh(icosphere(1).verts * 0.6 + vector(1.7, 0.1, 0.8), icosphere(1).faces), 3.0)
+    emitter = eg.AreaLight.of(eg.Mesh(icosphere(1).verts * 0.6 + vector(1.7, 0.1, 0.8), icosphere(1).faces), 3.0)
     floor = plane(2.0, material=rough).replace(verts=plane(2.0).verts - vector(0, 0, 1.2))
-    scene = eg.Scene([ball(2, material=metal), floor, lamp])
+    scene = eg.Scene([ball(2, material=metal), floor, emitter])
     frame = Frame(scene, make_request(scene, from_above(20), 2, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
     hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, frame.seeds("image", len(found.face)))
@@ -206,7 +206,7 @@ def moved(mesh: eg.Mesh, scale: float, *by: float) -> tuple[Tensor, Tensor]:
     return mesh.verts.double() * scale + vector(*by), mesh.faces
 
 
-LAMPS = {
+EMITTERS = {
     "softbox": (together(quad(1.5, 1.2, 0.3)), False),
     "one behind the other": (together(quad(1.5, 0.7), quad(2.0, 2.0, 0.2)), True),
     "twice": (together(quad(1.5, 0.9), quad(1.5, 0.9)), True),
@@ -229,10 +229,10 @@ def seen_from_origin(corner: Tensor, there: Tensor) -> Tensor:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LAMPS)
+@pytest.mark.parametrize("name", EMITTERS)
 def test_points_are_unbiased(name: str):
-    """The mean over draws against quadrature over the lamp's faces, of what reaches the origin past the lamp itself."""
-    mesh, two_sided = LAMPS[name]
+    """The mean over draws against quadrature over the light's faces, of what reaches the origin past the light itself."""
+    mesh, two_sided = EMITTERS[name]
     light = MeshLight(eg.AreaLight.of(mesh, 1.0, two_sided))
     n, v, y = vector(0, 0, 1), normalize(vector(0.5, -0.2, 0.9), dim=0), vector(0, 0, 0)
     corner = mesh.verts.double()[mesh.faces]
@@ -281,7 +281,7 @@ def test_points_are_unbiased(name: str):
 
 
 def test_lobes_draw_only_where_they_gain():
-    """By the lamp's size against the lobe's, and by where it lies."""
+    """By the light's size against the lobe's, and by where it lies."""
     n, v = vector(0, 0, 1), normalize(vector(0.3, 0.0, 1.0), dim=0)
 
     def asked(size: float, roughness: float, x: float) -> bool:
@@ -300,11 +300,11 @@ def studio(kind: str, roughness: float) -> tuple[eg.Scene, eg.Camera]:
     metal = eg.Material(torch.ones(3), metallic=1.0, roughness=roughness)
     if kind == "softbox":
         corners = vector(0, 2.5, -3), vector(2.5, 0, 0), vector(0, 1.6, 0.8)
-        lamp = eg.AreaLight.rectangle(*corners, 2.0, two_sided=False)
+        emitter = eg.AreaLight.rectangle(*corners, 2.0, two_sided=False)
     else:
-        lamp = eg.AreaLight.of(eg.Mesh(icosphere(2).verts * 0.5 + vector(-1.2, 2.0, 1.5), icosphere(2).faces), 10.0)
+        emitter = eg.AreaLight.of(eg.Mesh(icosphere(2).verts * 0.5 + vector(-1.2, 2.0, 1.5), icosphere(2).faces), 10.0)
     camera = eg.Camera.look_at((0.0, 1.6, 3.6), (0.0, 0.2, 0.0), (0.0, 1.0, 0.0), 36.0, (32, 32))
-    return eg.Scene([ball(3, material=metal), lamp]), camera
+    return eg.Scene([ball(3, material=metal), emitter]), camera
 
 
 # Relative noise of the image as it was measured, and three tenths more. Drawn by the light alone it was 2.4, 0.135, 3.3, 0.28.
@@ -324,16 +324,16 @@ def test_the_plan_says_how_light_is_drawn():
         mesh = ball(1, material=eg.Material(**material))
         return eg.plan(eg.Scene([mesh], lights=list(lights)), studio("ball", 0.3)[1])["lights"].why
 
-    lamp, sky = eg.AreaLight.of(plane(), 1.0), eg.Environment(torch.ones(3))
-    assert "drawn by the light, for no surface is glossy" in said(lamp, sky)
-    glossy = said(lamp, sky, metallic=1.0, roughness=0.3)
+    emitter, sky = eg.AreaLight.of(plane(), 1.0), eg.Environment(torch.ones(3))
+    assert "drawn by the light, for no surface is glossy" in said(emitter, sky)
+    glossy = said(emitter, sky, metallic=1.0, roughness=0.3)
     assert "8 candidates" in glossy and "(skies, meshes that emit)" in glossy and "by the light alone" in glossy
     assert "by the light alone" not in said(sky, metallic=1.0, roughness=0.3)
     assert "candidates" not in said(eg.PointLight(vector(0, 0, 1)), metallic=1.0, roughness=0.3)
 
 
 def by(name: str) -> Case:
-    """A floor of brushed gold beside a lamp that it mirrors, of which one number changes."""
+    """A floor of brushed gold next to a light that it mirrors, of which one number changes."""
 
     def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
         def changed(what: str, value: Tensor, by: Tensor) -> Tensor:
@@ -347,16 +347,18 @@ def by(name: str) -> Case:
         corner, faces = quad(0.0, 1.0)
         corner = torch.stack(
             [0.6 * corner[:, 2] + 1.6, corner[:, 1], corner[:, 0] + 1.6], 1
-        )  # upright, beside the view
-        corner = corner + changed("lamp", vector(0, 0, 0), vector(0.3, -0.4, 0.2))
-        lamp = eg.AreaLight.of(eg.Mesh(corner, faces), changed("power", vector(3.0, 2.0, 1.0), vector(1.0, 0.5, 0.2)))
-        return eg.Scene([plane(2.0, material=material), lamp]), from_above(16)
+        )  # upright, next to the view
+        corner = corner + changed("emitter", vector(0, 0, 0), vector(0.3, -0.4, 0.2))
+        emitter = eg.AreaLight.of(
+            eg.Mesh(corner, faces), changed("power", vector(3.0, 2.0, 1.0), vector(1.0, 0.5, 0.2))
+        )
+        return eg.Scene([plane(2.0, material=material), emitter]), from_above(16)
 
     return case
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["base color", "roughness", "lamp", "power"])
+@pytest.mark.parametrize("name", ["base color", "roughness", "emitter", "power"])
 def test_gradients_are_finite_differences(name: str):
-    truth = by_quadrature(by(name), 0.1 if name == "lamp" else 0.02, fine=2, light_samples=256)
+    truth = by_quadrature(by(name), 0.1 if name == "emitter" else 0.02, fine=2, light_samples=256)
     check(name, truth, gradient(by(name), 8, filter="box", surface_samples=20_000, light_samples=8))

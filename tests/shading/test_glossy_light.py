@@ -168,7 +168,7 @@ def test_the_same_bits_at_any_number_of_threads():
 
 
 def by(name: str) -> Case:
-    """A ball of brushed gold under a sky with lamps, of which one number changes."""
+    """A ball of brushed gold under a sky with lights, of which one number changes."""
 
     def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
         def moved(what: str, value: Tensor, by: Tensor) -> Tensor:

@@ -42,8 +42,8 @@ def few(scene: eg.Scene, camera: eg.Camera, seed: int) -> Tensor:
     return eg.render(scene, camera, seed=seed, light_samples=1, **FEW)
 
 
-def sky_lamps() -> list[Ball]:
-    """Far away, around the middles of the lamps of a sky."""
+def sky_emitters() -> list[Ball]:
+    """Far away, around the middles of the lights of a sky."""
     found = []
     for row, column, _ in LIGHTS:
         polar, turn = math.pi * (row + 1) / 16, math.pi * (column + 1) / 16 - math.pi
@@ -56,7 +56,7 @@ def sky_lamps() -> list[Ball]:
 def by_oracle(scene: eg.Scene, camera: eg.Camera, seed: int) -> Tensor:
     shining = [m for m in scene.meshes if m.material is not None and m.material.emission is not None]
     skies = any(isinstance(light, eg.Environment) for light in scene.lights)
-    oracle = Oracle([around(mesh) for mesh in shining] + sky_lamps() * skies, seed)
+    oracle = Oracle([around(mesh) for mesh in shining] + sky_emitters() * skies, seed)
     traits = ShadingTraits(points=16, blended=scene.blends, glossy=True)
     return render_shaded(scene, camera, oracle, make_request(scene, camera, seed=seed, **MANY), "auto", False, traits)
 

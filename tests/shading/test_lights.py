@@ -35,7 +35,7 @@ WHITE = eg.Material(base_color=1.0)
 HERE = torch.tensor([[0.1, 0.2, 0.0], [0.4, -0.3, 0.1], [-0.6, 0.1, 0.2]], dtype=F64)
 
 
-def lamp(verts: Tensor, emission: Tensor, two_sided: bool = True) -> Any:
+def emitter(verts: Tensor, emission: Tensor, two_sided: bool = True) -> Any:
     """The light of an emissive mesh, as the scene has it."""
     mesh = eg.Mesh(
         verts, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=eg.Material(0.0, emission=emission, two_sided=two_sided)
@@ -57,7 +57,7 @@ LIGHTS: dict[str, tuple[Callable[..., Any], list[Tensor]]] = {
             vector(0.9).sum(),
         ],
     ),
-    "area": (lamp, [QUAD, picture(1, 4)[0]]),
+    "area": (emitter, [QUAD, picture(1, 4)[0]]),
     "environment": (eg.Environment, [picture(), rotation((0.0, 1.0, 0.0), vector(0.5).sum())]),
 }
 
@@ -155,7 +155,7 @@ def test_dark_texels_and_dark_faces_are_drawn_too():
     image[0, 0] = 1e6
     assert eg.Environment(image).draw(uniform(2000)).index.bincount(minlength=8).min() > 0
     assert eg.Environment(0 * image).draw(uniform(2000)).index.bincount(minlength=8).min() > 50
-    assert lamp(QUAD, vector(0.0)).draw(uniform(2000)).index.bincount(minlength=2).min() > 500
+    assert emitter(QUAD, vector(0.0)).draw(uniform(2000)).index.bincount(minlength=2).min() > 500
 
 
 def test_area_light_is_the_closed_form_and_so_is_its_gradient():
@@ -164,7 +164,7 @@ def test_area_light_is_the_closed_form_and_so_is_its_gradient():
     flat[:, 2] = 1.0 + 0.2 * flat[:, 0]
     verts = flat.clone().requires_grad_()
     place, normal = vector(0.1, 0.2, 0.0), torch.nn.functional.normalize(vector(0.1, -0.2, 1), dim=0)
-    light = lamp(verts, vector(1.0))
+    light = emitter(verts, vector(1.0))
     points = light.draw(uniform(200_000))
     there = light.place(points)
     assert light.mesh.verts is verts
@@ -179,7 +179,7 @@ def test_area_light_is_the_closed_form_and_so_is_its_gradient():
 
 
 def test_area_light_of_one_side():
-    behind = lamp(QUAD, vector(1.0), two_sided=False)
+    behind = emitter(QUAD, vector(1.0), two_sided=False)
     points = behind.draw(uniform(10))
     assert (behind.arriving(points, HERE[:1].expand(10, 3)) == 0).all()
     assert (behind.arriving(points, vector(0, 0, 5).expand(10, 3)) > 0).all()
@@ -253,7 +253,7 @@ def by_light(name: str) -> Case:
             "intensity": lambda: eg.PointLight(vector(0.8, 0.7, 1.5), 2.0 + theta),
             "direction": lambda: eg.DirectionalLight(vector(0.5, -0.6, -1) + move, 2.0),
             "cone": lambda: eg.SpotLight(vector(0.4, 0.3, 2.0), vector(-0.1, 0, -1), 4.0, None, 0.1, 0.5 + 0.3 * theta),
-            "lamp": lambda: eg.AreaLight.rectangle(vector(1.6, 0.7, 1.5) + move, [0.3, 0, 0], [0, 0.3, 0], 4.0),
+            "emitter": lambda: eg.AreaLight.rectangle(vector(1.6, 0.7, 1.5) + move, [0.3, 0, 0], [0, 0.3, 0], 4.0),
             "radiance": lambda: eg.Environment(picture() * (1 + theta), visible=False),
         }[name]()
         floor = plane(1.0, material=eg.Material([0.5, 0.6, 0.7], metallic=0.2, roughness=0.5))
@@ -263,12 +263,12 @@ def by_light(name: str) -> Case:
 
 
 @pytest.mark.parametrize(
-    "name", ["position", "intensity", "direction", "cone", "lamp", pytest.param("radiance", marks=pytest.mark.slow)]
+    "name", ["position", "intensity", "direction", "cone", "emitter", pytest.param("radiance", marks=pytest.mark.slow)]
 )
 def test_gradients_by_lights_are_finite_differences(name: str):
-    wide = name in ("lamp", "radiance")
+    wide = name in ("emitter", "radiance")
     options = {"shadows": False, "light_samples": 8 if wide else 1}
-    exact = by_quadrature(by_light(name), 1e-3, 4 if name == "lamp" else 8, **options)
+    exact = by_quadrature(by_light(name), 1e-3, 4 if name == "emitter" else 8, **options)
     check(
         name,
         exact,

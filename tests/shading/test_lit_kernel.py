@@ -92,8 +92,8 @@ def numbers_of(words: str) -> Leaves:
         "harmonics": lambda: {"harmonics": rand(9, 3), "harmonics_turn": torch.linalg.qr(rand(3, 3))[0]},
         "environment": lambda: {"environment": rand(8, 16, 3), "environment_turn": torch.linalg.qr(rand(3, 3))[0]},
         "sky": lambda: {"sky": rand(3)},
-        "bulb": lambda: {"lamp": number([1.0, 2.0, 1.0]), "lamp_radiance": number([5.0, 4.0, 3.0])},
-        "area": lambda: {"lamp": number([1.0, 3.0, 0.0]), "lamp_radiance": number([5.0, 4.0, 3.0])},
+        "bulb": lambda: {"emitter": number([1.0, 2.0, 1.0]), "emitter_radiance": number([5.0, 4.0, 3.0])},
+        "area": lambda: {"emitter": number([1.0, 3.0, 0.0]), "emitter_radiance": number([5.0, 4.0, 3.0])},
     }  # fmt: skip
     ground = number([[-3, -1.2, -3], [3, -1.2, -3], [3, -1.2, 3], [-3, -1.2, 3]])
     found: Leaves = {"verts": verts, "ground": ground, "ground_color": number([0.5, 0.6, 0.7])}
@@ -138,15 +138,15 @@ def scene_of(words: str, n: Leaves) -> eg.Scene:
         lights.append(eg.Environment(n["environment"], n["environment_turn"]))
     if "sky" in n:
         lights.append(eg.Environment(n["sky"]))
-    if "lamp" in n:
+    if "emitter" in n:
         if "bulb" in words:
             bulb = icosphere(1)
-            bulb = eg.Mesh(0.7 * bulb.verts.double() + n["lamp"], bulb.faces)
-            lights.append(eg.AreaLight.of(bulb, n["lamp_radiance"]))
+            bulb = eg.Mesh(0.7 * bulb.verts.double() + n["emitter"], bulb.faces)
+            lights.append(eg.AreaLight.of(bulb, n["emitter_radiance"]))
         else:
             u, v = number([0.5, 0.0, 0.0]), number([0.0, 0.1, 0.5])
             sides = "one_sided" not in words
-            lights.append(eg.AreaLight.rectangle(n["lamp"], u, v, n["lamp_radiance"], two_sided=sides))
+            lights.append(eg.AreaLight.rectangle(n["emitter"], u, v, n["emitter_radiance"], two_sided=sides))
     return eg.Scene([mesh, ground], lights=lights)
 
 
@@ -384,7 +384,7 @@ def test_all_tensors_get_gradients_though_the_image_depends_on_few() -> None:
     """Zeros of those that it does not depend on: alpha that cuts nothing out, a light that is behind, the lens."""
     ball = icosphere(1)
     alpha = torch.ones(2, 2, requires_grad=True)
-    lamp = eg.SpotLight(*(torch.tensor(v, requires_grad=True) for v in ([0.0, 0.0, 9.0], [0.0, 0.0, 1.0])), 3.0)
+    emitter = eg.SpotLight(*(torch.tensor(v, requires_grad=True) for v in ([0.0, 0.0, 9.0], [0.0, 0.0, 1.0])), 3.0)
     distortion = torch.zeros(8, requires_grad=True)
     mesh = eg.Mesh(
         ball.verts.float().requires_grad_(), ball.faces, uvs=torch.rand(len(ball.verts), 2), uv_faces=ball.faces,
@@ -392,8 +392,8 @@ def test_all_tensors_get_gradients_though_the_image_depends_on_few() -> None:
     )  # fmt: skip
     camera = CAMERAS["perspective"].replace(distortion=distortion)
     sun = eg.DirectionalLight(torch.tensor([-0.2, -0.5, -1.0]), 2.0)
-    image = eg.render(eg.Scene([mesh], lights=[sun, lamp]), camera, 4)
-    leaves = [mesh.verts, alpha, lamp.position, lamp.direction, distortion]
+    image = eg.render(eg.Scene([mesh], lights=[sun, emitter]), camera, 4)
+    leaves = [mesh.verts, alpha, emitter.position, emitter.direction, distortion]
     found = torch.autograd.grad(image.sum(), leaves)
     assert all(bool(torch.isfinite(g).all()) for g in found)
     assert [bool((g != 0).any()) for g in found] == [True, False, False, False, True]
@@ -475,12 +475,12 @@ def many_channels(leaves: Leaves, **material: Any) -> eg.Scene:
     mesh, C = icosphere(2), len(leaves["base"])
     mesh = eg.Mesh(mesh.verts.double(), mesh.faces, material=eg.Material(leaves["base"], **material))
     corner, across = torch.tensor([-0.5, 1.5, 1.0]).double(), torch.eye(3).double()
-    lamp = eg.AreaLight.rectangle(corner, across[0], across[2], torch.linspace(3.0, 1.0, C, dtype=F64))
+    emitter = eg.AreaLight.rectangle(corner, across[0], across[2], torch.linspace(3.0, 1.0, C, dtype=F64))
     lights = [
         eg.PointLight(torch.tensor([1.0, 2.0, 3.0]).double(), 9.0, leaves["color"]),
         eg.Environment(leaves["sky"]),
     ]
-    return eg.Scene([mesh, lamp], lights=lights)
+    return eg.Scene([mesh, emitter], lights=lights)
 
 
 def colors_of_many(channels: int) -> Leaves:
@@ -507,8 +507,10 @@ def test_glossy_surfaces_of_many_channels_are_those_of_few() -> None:
         leaves = {name: value.clone().requires_grad_() for name, value in leaves.items()}
         scene = many_channels(leaves, metallic=0.8, roughness=0.15)
         if few:  # the area light's colour is that of the first channels
-            lamp = eg.AreaLight.of(scene.meshes[1].replace(material=None), torch.linspace(3.0, 1.0, 20, dtype=F64)[:3])
-            scene = scene.replace(meshes=[scene.meshes[0], lamp])
+            emitter = eg.AreaLight.of(
+                scene.meshes[1].replace(material=None), torch.linspace(3.0, 1.0, 20, dtype=F64)[:3]
+            )
+            scene = scene.replace(meshes=[scene.meshes[0], emitter])
         image = eg.render(scene, CAMERAS["perspective"], spp=64, light_samples=4)[..., :3]
         grads = torch.autograd.grad(image.mean(), list(leaves.values()))
         found.append([image.mean((0, 1)), grads[0][:3], grads[1][:3], grads[2][..., :3].sum((0, 1))])

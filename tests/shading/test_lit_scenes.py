@@ -58,10 +58,10 @@ def test_a_rectangle_casts_its_shadow(kind: str):
     assert bool((lit == ~inside).all())
 
 
-def test_a_lamp_does_not_hide_itself():
+def test_an_emitter_does_not_hide_itself():
     """Its faces are thin triangles in one plane, seen at an angle."""
-    lamp = eg.AreaLight.disc([1.6, 0.0, 1.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.1], 5.0)
-    scene = eg.Scene([plane(1.0, material=WHITE), lamp])
+    emitter = eg.AreaLight.disc([1.6, 0.0, 1.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.1], 5.0)
+    scene = eg.Scene([plane(1.0, material=WHITE), emitter])
     xy = 2 * uniform(20_000)[:, :2] - 1
     hits = eg.trace(scene, torch.cat([xy, torch.full((len(xy), 1), -1.0, dtype=F64)], 1), vector(0, 0, 1))
     (light,) = hits.lights
@@ -69,11 +69,13 @@ def test_a_lamp_does_not_hide_itself():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_lamp_in_floats_does_not_hide_itself_in_a_scene_of_doubles(dtype: torch.dtype) -> None:
-    lamp = eg.AreaLight.rectangle(vector(0.9, -0.6, 2.4), vector(0, 0.3, 0), vector(0.4, 0, 0.1), 8.0, two_sided=False)
+def test_an_emitter_in_floats_does_not_hide_itself_in_a_scene_of_doubles(dtype: torch.dtype) -> None:
+    emitter = eg.AreaLight.rectangle(
+        vector(0.9, -0.6, 2.4), vector(0, 0.3, 0), vector(0.4, 0, 0.1), 8.0, two_sided=False
+    )
     ground = plane(material=eg.Material(base_color=0.7), colors=torch.ones((4, 1), dtype=F64))
     images = [
-        eg.render(eg.Scene([ground, lamp.to(to)]), from_above(), spp=1, shadows=shadows)
+        eg.render(eg.Scene([ground, emitter.to(to)]), from_above(), spp=1, shadows=shadows)
         for to, shadows in ((dtype, True), (F64, False))
     ]
     assert torch.allclose(*images, rtol=1e-5, atol=1e-7)
@@ -131,9 +133,9 @@ def test_random_numbers_of_points():
 
 def test_random_numbers_of_a_pixel_are_its_own():
     """So that with a constant seed what changes in one corner leaves the noise of all other pixels as it is."""
-    lamp = eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0])
+    emitter = eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0])
     floor, dot = plane(1.0, material=WHITE), ball(0, material=WHITE).transformed(scale=0.1, t=vector(-0.8, 0.8, 0.1))
-    images = [eg.render(eg.Scene(m, lights=[lamp]), from_above(), shadows=False) for m in ([floor], [floor, dot])]
+    images = [eg.render(eg.Scene(m, lights=[emitter]), from_above(), shadows=False) for m in ([floor], [floor, dot])]
     same = (images[0] == images[1]).all(2)
     assert bool(same[4:].all()) and bool(same[:, 4:].all()) and not bool(same[:4, :4].all())
 
@@ -363,22 +365,22 @@ def test_nothing_in_view_has_gradients_of_zero(filter: str):
     for place, light in ((100, eg.PointLight), (100, eg.SphericalHarmonics), (0, eg.PointLight)):
         verts, texels = ball(1).verts.clone().requires_grad_(), picture().requires_grad_()
         uvs, faces = torch.rand(3, 2), torch.arange(3).expand(len(ball(1).faces), 3)
-        lamp = torch.tensor([0, 0, -5], dtype=F64) if light is eg.PointLight else torch.ones((9, 3), dtype=F64)
+        emitter = torch.tensor([0, 0, -5], dtype=F64) if light is eg.PointLight else torch.ones((9, 3), dtype=F64)
         material = eg.Material(eg.Texture(texels, uvs, faces, filter=filter))
         mesh = ball(1).replace(verts=verts, material=material).transformed(t=vector(place, 0, 0))
-        image = eg.render(eg.Scene([mesh], lights=[light(lamp.requires_grad_())]), from_above(8), spp=4)
-        for own in torch.autograd.grad(image.sum(), [verts, texels, lamp]):
+        image = eg.render(eg.Scene([mesh], lights=[light(emitter.requires_grad_())]), from_above(8), spp=4)
+        for own in torch.autograd.grad(image.sum(), [verts, texels, emitter]):
             assert float(own.abs().max()) == 0
 
 
-def test_lamps_that_are_cut_out_are_said_to_lack_a_gradient() -> None:
+def test_emitters_that_are_masked_are_said_to_lack_a_gradient() -> None:
     floor, alpha = plane(material=eg.Material()), torch.eye(4, dtype=F64)
-    lamp = plane(0.5, material=eg.Material(emission=1.0, two_sided=True), alpha=alpha).transformed(t=vector(0, 0, 1))
-    moving = lamp.replace(alpha=alpha.clone().requires_grad_())
+    emitter = plane(0.5, material=eg.Material(emission=1.0, two_sided=True), alpha=alpha).transformed(t=vector(0, 0, 1))
+    moving = emitter.replace(alpha=alpha.clone().requires_grad_())
     with pytest.warns(UserWarning, match="an alpha edge ends a mesh that emits"):
         eg.render(eg.Scene([floor, moving]), from_above())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        eg.render(eg.Scene([floor, lamp]), from_above())
+        eg.render(eg.Scene([floor, emitter]), from_above())
         leaf = moving.replace(material=eg.Material())
         eg.render(eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0.3, 0.2, 3))]), from_above())

@@ -283,8 +283,8 @@ def test_edges_where_no_light_jumps(specular: bool):
         eg.PointLight([0.0, 3, 1.5], 20.0),
         eg.SpotLight([0.0, 0.5, -4.0], [0.0, 0, 1.0], 9.0, outer_angle=0.05),
     ]
-    for lamps in (lights[:1], lights[1:]):
-        hits = eg.primary_hits(eg.Scene([ball_], lights=lamps), from_above()).hits
+    for emitters in (lights[:1], lights[1:]):
+        hits = eg.primary_hits(eg.Scene([ball_], lights=emitters), from_above()).hits
         radiance(hits)
         noted = hits._surfaces.crease_attributes().double()
         edges: dict[tuple[int, int], list[tuple[int, int, int]]] = {}

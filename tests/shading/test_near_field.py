@@ -86,7 +86,7 @@ def check(case: Case, h: float) -> None:
     change, found = indirect_change(case, h, 2048, 8), indirect_gradient(case, h, 8, **COUNTS)
     error = math.hypot(change.error, found.error)
     print(f"{found.mean / change.mean:.4f} ± {error / abs(change.mean):.4f}")
-    assert error < 0.08 * abs(change.mean), f"too noisy to tell: {change}, {found}"
+    assert error < 0.08 * abs(change.mean), f"too noisy to decide: {change}, {found}"
     assert abs(found.mean - change.mean) < 3 * error, f"{change}, {found}"
 
 

@@ -179,5 +179,5 @@ def check_gradient(case: Case, spp: int = 2048, seeds: int = 4, step: float = 0.
         assert abs(found.mean - fd.mean) < 0.01 * size + 4 * noise
         return
     # No more than 4 %, so that a gradient that is 5 % off does not pass.
-    assert noise < 0.015 * abs(fd.mean), f"too noisy to tell: {fd}, {found}"
+    assert noise < 0.015 * abs(fd.mean), f"too noisy to decide: {fd}, {found}"
     assert abs(found.mean - fd.mean) <= 0.01 * abs(fd.mean) + 2 * noise, f"finite difference {fd}, gradient {found}"

@@ -92,7 +92,7 @@ def room() -> eg.Mesh:
 
 
 def panel(centre: Sequence[float], half: tuple[float, float], down: bool = True) -> eg.Mesh:
-    """A lamp that shines down or up."""
+    """A light that shines down or up."""
     (x, y, z), (p, q) = centre, half
     corners = [[x - p, y, z - q], [x + p, y, z - q], [x + p, y, z + q], [x - p, y, z + q]]
     return mesh(corners, QUAD if down else [[0, 2, 1], [0, 3, 2]], 0.0, 8.0)
@@ -109,23 +109,27 @@ def before_room() -> eg.Camera:
 
 
 def cornell() -> BounceScene:
-    """A room with a lamp and a block that floats."""
+    """A room with a light and a block that floats."""
     floating = block((0.15, -0.35, 0.1), (0.3, 0.35, 0.3), 0.4, 0.15)
-    return BounceScene({"room": room(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "block": floating}, before_room())
+    return BounceScene(
+        {"room": room(), "emitter": panel((0.1, 0.97, 0), (0.3, 0.25)), "block": floating}, before_room()
+    )
 
 
 def standing() -> BounceScene:
     """The block stands on the floor."""
     on_floor = block((0.15, -0.65, 0.1), (0.3, 0.35, 0.3), 0.4)
-    return BounceScene({"room": room(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "block": on_floor}, before_room())
+    return BounceScene(
+        {"room": room(), "emitter": panel((0.1, 0.97, 0), (0.3, 0.25)), "block": on_floor}, before_room()
+    )
 
 
-def lamp_upwards() -> BounceScene:
-    """The lamp shines at the ceiling alone, of which a shelf shadows a part; floor and block are lit by the bounce."""
+def emitter_upwards() -> BounceScene:
+    """The light shines at the ceiling alone, of which a shelf shadows a part; floor and block are lit by the bounce."""
     return BounceScene(
         {
             "room": room(),
-            "lamp": panel((-0.2, 0.3, 0), (0.25, 0.25), down=False),
+            "emitter": panel((-0.2, 0.3, 0), (0.25, 0.25), down=False),
             "shelf": block((0.25, 0.55, 0.05), (0.25, 0.03, 0.3), 0.5, 0.1, albedo=0.5),
             "block": block((0.15, -0.45, 0.1), (0.3, 0.25, 0.3), 0.4, 0.15),
         },
@@ -143,16 +147,16 @@ def under_sky() -> BounceScene:
 
 
 def plates() -> BounceScene:
-    """A plate on the left is lit by a lamp, one on the right is seen and lit by the first alone, a strip is between them."""
+    """A plate on the left is lit by a light, one on the right is seen and lit by the first alone, a strip is between them."""
     left = [[-1, -0.8, -0.8], [-1, 0.8, -0.8], [-1, 0.8, 0.8], [-1, -0.8, 0.8]]
     right = [[1, -1.2, -1.2], [1, -1.2, 1.2], [1, 1.2, 1.2], [1, 1.2, -1.2]]
     strip = [[0.1, -0.5, -0.2], [0.15, 0.6, -0.25], [0.1, 0.55, 0.2], [0.05, -0.5, 0.25]]
-    lamp = [[-0.2, 1.2, -0.4], [-0.2, 1.2, 0.4], [-0.4, 1.6, 0.4], [-0.4, 1.6, -0.4]]
+    emitter = [[-0.2, 1.2, -0.4], [-0.2, 1.2, 0.4], [-0.4, 1.6, 0.4], [-0.4, 1.6, -0.4]]
     meshes = {
         "left": mesh(left, QUAD, 0.9),
         "right": mesh(right, QUAD, 0.8),
         "strip": mesh(strip, QUAD, 0.0),
-        "lamp": mesh(lamp, QUAD, 0.0, 12.0),
+        "emitter": mesh(emitter, QUAD, 0.0, 12.0),
     }
     return BounceScene(meshes, seen_from((-1.2, 0.9, 3.4), (0.6, 0, 0), 0.36))
 
@@ -168,7 +172,7 @@ def ball() -> BounceScene:
     sphere = icosphere(3)
     verts = 0.4 * sphere.verts.to(F64) + torch.tensor([0.15, -0.35, 0.1], dtype=F64)
     round_ = eg.Mesh(verts, sphere.faces, material=eg.Material(torch.tensor([0.6], dtype=F64)))
-    return BounceScene({"room": room(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "ball": round_}, before_room())
+    return BounceScene({"room": room(), "emitter": panel((0.1, 0.97, 0), (0.3, 0.25)), "ball": round_}, before_room())
 
 
 def sunk() -> BounceScene:
@@ -178,9 +182,12 @@ def sunk() -> BounceScene:
 
 
 def shelf() -> BounceScene:
-    """A shelf is stuck through a wall, and a lamp shines at the ceiling."""
-    board, lamp = block((-0.9, -0.1, 0.1), (0.5, 0.05, 0.5), 0.2, 0.1), panel((-0.3, 0.3, 0), (0.3, 0.25), down=False)
-    return BounceScene({"room": room(), "lamp": lamp, "shelf": board}, before_room())
+    """A shelf is stuck through a wall, and a light shines at the ceiling."""
+    board, emitter = (
+        block((-0.9, -0.1, 0.1), (0.5, 0.05, 0.5), 0.2, 0.1),
+        panel((-0.3, 0.3, 0), (0.3, 0.25), down=False),
+    )
+    return BounceScene({"room": room(), "emitter": emitter, "shelf": board}, before_room())
 
 
 def leaf() -> BounceScene:
@@ -193,7 +200,7 @@ def leaf() -> BounceScene:
     own = eg.Mesh(
         corners, faces, uvs=uvs, uv_faces=faces, alpha=alpha, material=eg.Material(torch.tensor([0.6], dtype=F64))
     )
-    return BounceScene({"room": room(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "leaf": own}, before_room())
+    return BounceScene({"room": room(), "emitter": panel((0.1, 0.97, 0), (0.3, 0.25)), "leaf": own}, before_room())
 
 
 def texels() -> BounceScene:
@@ -216,11 +223,11 @@ SCENES: dict[str, tuple[Callable[[], BounceScene], dict[str, Motion]]] = {
             "block x": ("block", X),
             "block y": ("block", Y),
             "block vertex": ("block", ASKEW, 7),
-            "lamp x": ("lamp", X),
+            "light x": ("emitter", X),
         },
     ),
     "standing": (standing, {"block x": ("block", X), "block z": ("block", Z)}),
-    "lamp upwards": (lamp_upwards, {"block x": ("block", X), "shelf x": ("shelf", X), "lamp x": ("lamp", X)}),
+    "light upwards": (emitter_upwards, {"block x": ("block", X), "shelf x": ("shelf", X), "light x": ("emitter", X)}),
     "under sky": (
         under_sky,
         {"block y": ("block", Y), "block vertex": ("block", ASKEW, 7), "ground y": ("ground", Y)},
@@ -234,12 +241,12 @@ SCENES: dict[str, tuple[Callable[[], BounceScene], dict[str, Motion]]] = {
             "right vertex": ("right", (1.0, 0.3, 0.2), 2),
             "left x": ("left", X),
             "left y": ("left", Y),
-            "lamp y": ("lamp", Y),
+            "light y": ("emitter", Y),
         },
     ),
     "open plates": (
         open_plates,
-        {"right vertex": ("right", (1.0, 0.3, 0.2), 2), "left y": ("left", Y), "lamp y": ("lamp", Y)},
+        {"right vertex": ("right", (1.0, 0.3, 0.2), 2), "left y": ("left", Y), "light y": ("emitter", Y)},
     ),
     "texels": (texels, {"block x": ("block", X)}),
     "sunk": (sunk, {"block x": ("block", X), "block y": ("block", Y)}),

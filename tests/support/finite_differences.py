@@ -1,5 +1,5 @@
 """Comparisons of a gradient that has statistical noise, with what is exact and with central finite differences of the forward
-renderer. Each must be able to tell the gradient from 0.95 and from 1.05 times itself, or it fails.
+renderer. Each must be able to decide the gradient from 0.95 and from 1.05 times itself, or it fails.
 
 Finite differences are of a case, a function θ ↦ (scene, camera) of one number. The loss is the image times a fixed smooth
 adjoint, so its gradient needs no forward samples. Both sides are means over seeds with a standard error each.
@@ -63,7 +63,7 @@ def check(name: str, truth: float, found: Estimate, slack: float = 0.005, most: 
     """
     allowed = 4 * found.error + slack * abs(truth)
     said = f"{name}: exact {truth:.6g}, gradient {found.mean:.6g} ± {found.error:.2g}, ratio {found.mean / truth:.4f}"
-    assert allowed < most * abs(truth), f"{said}; too noisy to tell"
+    assert allowed < most * abs(truth), f"{said}; too noisy to decide"
     assert abs(found.mean - truth) <= allowed, said
 
 
@@ -79,7 +79,7 @@ def right_ratio(fd: Estimate, g: Estimate) -> float:
     """The gradient over the finite difference lies within 1 ± 0.02, and both are known well enough to say so."""
     ratio = g.mean / fd.mean
     noise = (fd.error**2 + g.error**2) ** 0.5 / abs(fd.mean)
-    assert noise < 0.01, f"too noisy to tell: {fd}, {g}"
+    assert noise < 0.01, f"too noisy to decide: {fd}, {g}"
     assert abs(ratio - 1) <= 0.02, f"finite difference {fd}, gradient {g}, ratio {ratio:.4f} ± {noise:.4f}"
     return ratio
 

@@ -32,14 +32,14 @@ def block(low: tuple[float, float, float], high: tuple[float, float, float], **m
     return eg.Mesh(verts, faces, material=eg.Material(**material))
 
 
-def lamp(side: float = 0.4, height: float = 1.9, power: float = 6.0) -> eg.Mesh:
+def emitter(side: float = 0.4, height: float = 1.9, power: float = 6.0) -> eg.Mesh:
     """Square, below the ceiling, that shines down."""
     s = side
     return quad((-s, -s, height), (-s, s, height), (s, s, height), (s, -s, height),
                 base_color=0.0, emission=vector(power, 0.9 * power, 0.7 * power), two_sided=False)  # fmt: skip
 
 
-def box_room(lights: str = "lamp", floor: dict[str, Any] | None = None, **of_block: Any) -> eg.Scene:
+def box_room(lights: str = "emitter", floor: dict[str, Any] | None = None, **of_block: Any) -> eg.Scene:
     """|x|, |y| < 1, 0 < z < 2, open towards −y, with walls in colours and a block inside."""
     white, red, green = vector(0.75, 0.75, 0.75), vector(0.7, 0.15, 0.1), vector(0.15, 0.6, 0.2)
     meshes = [
@@ -52,8 +52,8 @@ def box_room(lights: str = "lamp", floor: dict[str, Any] | None = None, **of_blo
     if lights != "sky":
         meshes.append(quad((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2), base_color=white))
     given: list[Any] = []
-    if lights == "lamp":
-        meshes.append(lamp())
+    if lights == "emitter":
+        meshes.append(emitter())
     elif lights == "point":
         given.append(eg.PointLight(vector(0.5, -0.3, 1.7), 4.0))
     else:
@@ -119,7 +119,7 @@ def bumpy_room() -> eg.Scene:
 
 
 def room_lit_by(*meshes: eg.Mesh) -> eg.Scene:
-    """Meshes in place of the lamp."""
+    """Meshes in place of the light."""
     room = box_room()
     return room.replace(meshes=[*room.meshes[:-1], *meshes])
 
@@ -145,7 +145,7 @@ STRIPES = 8
 
 
 def striped_room(as_quads: bool = False) -> eg.Scene:
-    """A screen before the lamp, of which alpha cuts out every second stripe; or the stripes that are left, as quads."""
+    """A screen before the light, of which alpha cuts out every second stripe; or the stripes that are left, as quads."""
     room = box_room()
     screen = quad((-0.6, -0.6, 1.5), (0.6, -0.6, 1.5), (0.6, 0.6, 1.5), (-0.6, 0.6, 1.5), base_color=0.5)
     if as_quads:
@@ -160,7 +160,7 @@ def striped_room(as_quads: bool = False) -> eg.Scene:
 
 
 ROOMS: dict[str, Callable[[], eg.Scene]] = {
-    "lamp": box_room,
+    "emitter": box_room,
     "glossy block": lambda: box_room(roughness=0.3),
     "sky": lambda: box_room("sky"),
     "sky through an opening": lambda: box_room("point").replace(lights=[eg.Environment(sky())]),
@@ -171,8 +171,8 @@ ROOMS: dict[str, Callable[[], eg.Scene]] = {
     "sun": lambda: box_room("sky").replace(lights=[eg.DirectionalLight(vector(0.3, 0.5, -1.0), 3.0)]),
     "textured walls": textured_room,
     "normal map": bumpy_room,
-    "small lamp": lambda: room_lit_by(_ball(0.05, (0.3, -0.2, 1.6), 1, base_color=0.0, emission=120.0)),
-    "large lamp": lambda: room_lit_by(_ball(0.35, (0.3, -0.2, 1.4), 2, base_color=0.5, emission=2.0)),
+    "small light": lambda: room_lit_by(_ball(0.05, (0.3, -0.2, 1.6), 1, base_color=0.0, emission=120.0)),
+    "large light": lambda: room_lit_by(_ball(0.35, (0.3, -0.2, 1.4), 2, base_color=0.5, emission=2.0)),
     "metal ball": metal_room,
     "two sheets": sheets_room,
     "cut-out": striped_room,
@@ -180,5 +180,5 @@ ROOMS: dict[str, Callable[[], eg.Scene]] = {
 
 
 def without_alpha(name: str) -> eg.Scene:
-    """The same room for those who know no cut-outs."""
+    """The same room for those who know no alpha-tested faces."""
     return striped_room(as_quads=True) if name == "cut-out" else ROOMS[name]()

@@ -31,7 +31,7 @@ class Problem:
 
     parts      where the gradient is taken; that of each is compared relative to its own size
     make       parts ↦ (scene, camera)
-    exact      parts ↦ the image (H, W, C) without sampling, differentiable; None where only finite differences can tell
+    exact      parts ↦ the image (H, W, C) without sampling, differentiable; None where only finite differences can decide
     image      (scene, camera) ↦ the image without sampling, where there are finite differences
     equal      parts ↦ (scene, camera) with the same image, of which they are taken; `make` when None
     steps      of those, one for each part
@@ -69,7 +69,7 @@ class Case:
     limit: str = ""  # why it cannot be right, where that is known
     most: float = 0.0  # relative error that a limit may show before it counts as wrong
     slow: bool = False
-    more: int = 1  # times the seeds, where the gradient of a part is small beside its noise
+    more: int = 1  # times the seeds, where the gradient of a part is small next to its noise
     seeds: int = 512  # no more than these, where each takes long
 
 

@@ -17,8 +17,8 @@ from ...supersampling import supersampled
 from .case import Case, Parts, Problem
 
 TOLERANCE = 0.02  # what may be missing, beyond four standard errors
-NOISE = 0.01  # a larger standard error is too much to tell
-RIGHT, LIMIT, WRONG, NOISY, RAISED = "right", "limit", "wrong", "too noisy to tell", "error raised"
+NOISE = 0.01  # a larger standard error is too much to decide
+RIGHT, LIMIT, WRONG, NOISY, RAISED = "right", "limit", "wrong", "too noisy to decide", "error raised"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Scale and place: any unit, far from the origin, near and far from the camera, small beside large."""
+"""Scale and place: any unit, far from the origin, near and far from the camera, small next to large."""
 
 from __future__ import annotations
 
