@@ -17,7 +17,7 @@ from edgegrad.kernel.request import make_request
 from edgegrad.library import core
 from edgegrad.light.radiance import Lighting
 from edgegrad.points.frame import Frame
-from edgegrad.shader import Effort, UserShader, _Image
+from edgegrad.shader import ShadingTraits, UserShader, _Image
 
 from .common import Kernel, parts
 from .scenes import ReportScene, build
@@ -116,7 +116,11 @@ def shadow_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, 
     moved = scene.moved(verts)
     request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
     image = ShadowBoundaries(
-        Frame(moved, request, 0), UserShader(Lighting(True, 1)), False, False, Effort(keeps_little=True, additive=True)
+        Frame(moved, request, 0),
+        UserShader(Lighting(True, 1)),
+        False,
+        False,
+        ShadingTraits(keeps_little=True, additive=True),
     )
     found = image.render()
     begin = time.perf_counter()

@@ -231,7 +231,7 @@ def test_cones_that_are_none_are_clamped(tmp_path, cone, shown):
     node = {"mesh": 0, "extensions": {"KHR_lights_punctual": {"light": 0}}}
     path = file(tmp_path, nodes=[node], lights=[{"type": "spot", "name": "emitter", "spot": angles}])
     with pytest.warns(
-        UserWarning, match=rf"spot light 'light' with innerConeAngle {cone[0]:g} and outerConeAngle {cone[1]:g}"
+        UserWarning, match=rf"spot light 'emitter' with innerConeAngle {cone[0]:g} and outerConeAngle {cone[1]:g}"
     ):
         (light,) = eg.load_scene(path, lit=True).lights
     np.testing.assert_allclose((float(light.inner_angle), float(light.outer_angle)), shown, rtol=1e-6)
