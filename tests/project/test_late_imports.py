@@ -17,7 +17,7 @@ trimesh = pytest.importorskip("trimesh")
 
 
 def test_libraries_that_are_missing_are_named(tmp_path, monkeypatch):
-    """That they are imported late is seen where a whole fit must do without them, in test_house.py."""
+    """That they are imported late is seen where a whole fit must do without them, in test_layers.py."""
     write_image(tmp_path / "a.png", torch.zeros(1, 1, 3))
     mesh = Mesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     for name in ("OpenImageIO", "trimesh", "trimesh.exchange.load"):
@@ -74,7 +74,7 @@ def test_ipython_knows_the_pictures_of_meshes_and_scenes() -> None:
 
 @pytest.mark.slow
 def test_a_library_is_asked_for_by_its_extra(tmp_path):
-    """As Pillow is, in test_house.py."""
+    """As Pillow is, in test_layers.py."""
     trimesh.creation.box().export(tmp_path / "a.3mf")
     assert len(load_mesh(tmp_path / "a.3mf").faces) == 12
     code = (

@@ -1,12 +1,13 @@
-"""Draws the packages of edgegrad and what they import, from the imports themselves:  python docs/house.py [FILE.svg]
+"""Draw the packages of edgegrad and what they import, from the imports themselves:  python docs/layers.py [FILE.svg]
 
-Floors are counted from below: a package stands one floor above the highest that it imports. An arrow is left out where a chain
+Layers are counted from below: a package stands one layer above the highest that it imports. An arrow is left out where a chain
 of others says the same.
 """
 
 from __future__ import annotations
 
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import grimp
@@ -24,7 +25,7 @@ INK, BLUE, GREY = "#222222", "#1f6fb2", "#b9bec6"
 
 
 def imports() -> dict[str, set[str]]:
-    """Of each package or module in edgegrad, those that it imports."""
+    """Return for each package or module in edgegrad those that it imports."""
     graph = grimp.build_graph("edgegrad", cache_dir=None)
     left_out = {f"edgegrad.{name}" for name in LEFT_OUT}
     children = sorted(graph.find_children("edgegrad") - left_out)
@@ -38,22 +39,19 @@ def imports() -> dict[str, set[str]]:
     }
 
 
-def floors(imported: dict[str, set[str]]) -> list[list[str]]:
-    """From below. Raises ValueError where packages import each other in a circle."""
-    done: list[list[str]] = []
-    left = dict(imported)
-    while left:
-        below = {name for floor in done for name in floor}
-        floor = sorted(name for name, needs in left.items() if needs <= below)
-        if not floor:
-            raise ValueError(f"imports: expected an order, got a circle among {', '.join(sorted(left))}")
-        done.append(floor)
-        left = {name: needs for name, needs in left.items() if name not in floor}
-    return done
+def layers(imported: dict[str, set[str]]) -> list[list[str]]:
+    """Return the layers from below. Raises graphlib.CycleError where packages import each other in a circle."""
+    sorter = TopologicalSorter(imported)
+    sorter.prepare()
+    found: list[list[str]] = []
+    while sorter.is_active():
+        found.append(sorted(sorter.get_ready()))
+        sorter.done(*found[-1])
+    return found
 
 
 def reduced(imported: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Without imports that a chain of others implies."""
+    """Return the imports that no chain of others implies."""
 
     def reached(name: str) -> set[str]:
         return imported[name].union(*(reached(other) for other in imported[name])) if imported[name] else set()
@@ -69,17 +67,17 @@ def draw(file: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    matplotlib.rcParams["svg.hashsalt"] = "edgegrad"  # so that the same house is the same file
+    matplotlib.rcParams["svg.hashsalt"] = "edgegrad"  # so that the same layers are the same file
     import matplotlib.pyplot as plt
     from matplotlib.patches import FancyBboxPatch
 
     imported = imports()
-    storeys = floors(imported)
-    figure, axis = plt.subplots(figsize=(9.0, 0.62 * len(storeys)), layout="constrained")
+    every = layers(imported)
+    figure, axis = plt.subplots(figsize=(9.0, 0.62 * len(every)), layout="constrained")
     place = {}
-    for y, floor in enumerate(storeys):
-        for x, name in enumerate(floor):
-            place[name] = ((x + 1) / (len(floor) + 1) * 10.0, float(y))
+    for y, layer in enumerate(every):
+        for x, name in enumerate(layer):
+            place[name] = ((x + 1) / (len(layer) + 1) * 10.0, float(y))
     for name, needs in reduced(imported).items():
         for other in needs:
             (x0, y0), (x1, y1) = place[name], place[other]
@@ -95,15 +93,15 @@ def draw(file: Path) -> None:
         axis.add_patch(box)
         axis.text(x, y, name, ha="center", va="center", fontsize=9, color=INK, zorder=3)
     axis.set_xlim(0.0, 10.0)
-    axis.set_ylim(-0.5, len(storeys) - 0.5)
+    axis.set_ylim(-0.5, len(every) - 0.5)
     axis.axis("off")
-    figure.savefig(file, metadata={"Date": None, "Description": description(storeys)})
+    figure.savefig(file, metadata={"Date": None, "Description": description(every)})
 
 
-def description(storeys: list[list[str]]) -> str:
-    """What the file says of itself, so that a test sees whether it is that of the imports."""
-    return "Floors of edgegrad from below: " + "; ".join(", ".join(floor) for floor in storeys)
+def description(every: list[list[str]]) -> str:
+    """Return the text in the file by which a test sees whether it shows the imports of today."""
+    return "Layers of edgegrad from below: " + "; ".join(", ".join(layer) for layer in every)
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER / "house.svg")
+    draw(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER / "layers.svg")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from graphlib import CycleError
 from pathlib import Path
 
 import grimp
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.quick
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "docs"))
-import house  # noqa: E402
+import layers  # noqa: E402
 
 
 def test_imports_run_downward(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,15 +41,15 @@ def test_an_import_upward_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_figure_is_that_of_the_imports() -> None:
-    """`python docs/house.py` was run after the last change."""
-    storeys = house.floors(house.imports())
-    assert house.description(storeys) in (ROOT / "docs" / "house.svg").read_text(encoding="utf-8")
-    assert len(storeys) > 8
+    """`python docs/layers.py` was run after the last change."""
+    every = layers.layers(layers.imports())
+    assert layers.description(every) in (ROOT / "docs" / "layers.svg").read_text(encoding="utf-8")
+    assert len(every) > 8
 
 
-def test_a_circle_has_no_floors() -> None:
-    with pytest.raises(ValueError, match="a circle among a, b"):
-        house.floors({"a": {"b"}, "b": {"a"}, "c": set()})
+def test_a_circle_has_no_layers() -> None:
+    with pytest.raises(CycleError):
+        layers.layers({"a": {"b"}, "b": {"a"}, "c": set()})
 
 
 FIRST_STEP = """
@@ -97,6 +98,6 @@ def test_names_of_the_package_are_public() -> None:
     """What is public, and the packages below: nothing that was imported on the way."""
     import edgegrad as eg
 
-    inside = {name for floor in house.floors(house.imports()) for name in floor} | house.LEFT_OUT
+    inside = {name for layer in layers.layers(layers.imports()) for name in layer} | layers.LEFT_OUT
     found = {name for name in vars(eg) if not name.startswith("_")}
     assert found <= {*eg.__all__, *inside}, sorted(found - set(eg.__all__) - inside)
