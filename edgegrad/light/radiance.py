@@ -48,8 +48,8 @@ AT_CURVES = 4
 # By which lines that look for alpha edges and borders of nearest texels lie closer where surfaces light each other: these
 # have some samples a pixel, and each side of a sample has one path.
 CLOSER_STEPS = 8.0
-# The kernel reads the texel in which a point lies. So both sides of a texel edge are shaded this far from it, in texels.
-NEXT_TO_TEXELS = 1e-3
+# Distance, in texels, from a texel edge at which both of its sides are shaded: the kernel reads the texel in which a point lies.
+NEXT_TO_TEXELS = 1e-4
 
 LIGHTING = ("shadows", "light_samples", "bounces")  # the options of render() that it is made of
 
