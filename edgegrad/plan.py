@@ -22,7 +22,7 @@ from .light.bounces import check_bounces
 from .light.radiance import LIGHTING, Lighting
 from .light.sampling import MOST_SETS, SETS, how_drawn
 from .light.unused_options import warn_of_unused
-from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, without_colors
+from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, with_attributes
 from .points.shadows import ShadowLight
 from .points.surfaces import every_face
 from .render import SHADING, check_options
@@ -113,7 +113,7 @@ def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | 
     """Return the terms with a shader, of which nothing is asked before it runs: neither what it needs nor at which edges it may
     jump."""
     attributes = every_face(len(request.scene.faces)) if creases is True else None
-    request = request._replace(scene=without_colors(request.scene, attributes))
+    request = request._replace(scene=with_attributes(request.scene, attributes))
     moving = [name for name in required(request) if name in MOVING]
     # It is not known either whether a tensor of the shader's own requires a gradient.
     wanted = [*moving, "colors"] if torch.is_grad_enabled() else []

@@ -86,7 +86,7 @@ def render(
                      edges if it asked for `face` or `barycentrics`); True, at all; False, at none
     check_shader     asks the shader twice, the second time with half of the points in another order, and compares
     step_spacing     px between the lines along which steps within faces are looked for: those that a shader declares, of which
-                     two borders that lie closer may be missed; alpha_edges of what alpha cuts out, and borders of nearest texels.
+                     two borders that lie closer may be missed; alpha edges, and borders of nearest texels.
                      Closer lines cost more and err less
     shadows          of lit scenes: False lets light pass through everything
     light_samples    of lit scenes: points drawn of each light that has an extent, for each point that is shaded. Of a face in a

@@ -33,7 +33,7 @@ from .points.discontinuities import UNEQUAL
 from .points.discontinuity_terms import DiscontinuityTerms
 from .points.frame import Frame
 from .points.hits import Hits
-from .points.records import PixelRecords, without_colors
+from .points.records import PixelRecords, with_attributes
 from .points.sampler import shaded_memory
 from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
@@ -351,7 +351,7 @@ class _Image:
             else:
                 attributes = frame.fixed.crease_attributes().cpu() if self._creases else None
         gradient = frame.request.gradient._replace(step_spacing=self._step_spacing)
-        return frame.request._replace(scene=without_colors(frame.request.scene, attributes), gradient=gradient)
+        return frame.request._replace(scene=with_attributes(frame.request.scene, attributes), gradient=gradient)
 
     # -- the shader ----------------------------------------------------------------------------------------------------
 

@@ -218,7 +218,7 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
         found = core.light_points(lit, points, options, hits._index(light), torch.get_num_threads())
         return [torch.from_numpy(x) for x in found]
 
-    given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), surfaces.bare.faces]
+    given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), surfaces.geometry.faces]
     given += [*([hits._spread.cpu()] if filtered else ()), *tables]
     index, uv, density = (x.to(hits._face.device) for x in without_derivatives(compute, *given))
     density = torch.where(density > 0, density, math.inf)

@@ -62,7 +62,7 @@ class Layout(NamedTuple):
     @classmethod
     def from_surfaces(cls, surfaces: Surfaces, view: View, tables: _Tables) -> Layout:
         scene = surfaces.scene
-        verts, seen_from = tables.add(surfaces.bare.verts, 3), tables.add(view.eye, 3)
+        verts, seen_from = tables.add(surfaces.geometry.verts, 3), tables.add(view.eye, 3)
         firsts = np.cumsum([0, *(len(mesh.verts) for mesh in scene.meshes)])
         meshes = [_mesh(surfaces, index, int(vertex), tables) for index, vertex in enumerate(firsts[:-1])]
         eps = torch.finfo(surfaces.verts.dtype).eps
@@ -203,7 +203,11 @@ def _kernel_light(scene: Scene, light: Light, number: int, eps: float, tables: _
     if isinstance(light, SphericalHarmonics):
         coefficients = tables.add(light.coefficients, light.coefficients.shape[1])
         return described("spherical harmonics", radiance=coefficients, rotation=tables.add_numbers(light.rotation))
-    assert isinstance(light, (DirectionalLight, PointLight, SpotLight))
+    if not isinstance(light, (DirectionalLight, PointLight, SpotLight)):
+        raise TypeError(
+            f"lights: expected lights that edgegrad shades with, got {type(light).__name__}; shade with it in a shader= of "
+            "your own, by hits.light_points()"
+        )
     power = {"intensity": tables.add(light.intensity, 1), "color": tables.add_numbers(light.color)}
     if isinstance(light, DirectionalLight):
         return described("directional", direction=tables.add(light.direction, 3), **power)

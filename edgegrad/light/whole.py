@@ -16,17 +16,11 @@ from ..check import values_visible
 from ..kernel.first_order import Tensors, apply
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request, make_request
-from ..scene.environment import Environment
-from ..scene.lights import DirectionalLight, PointLight, SphericalHarmonics, SpotLight
-from ..scene.material import Material, Texture
-from ..scene.mesh import Mesh
-from ..scene.scene import Scene
+from ..scene.scene import CLASSES, Scene
 from ..scene.tree import from_text, tensors_in, to_text
 from .radiance import Lighting
 
-_PARTS = (
-    Scene, Mesh, Material, Texture, Camera, Environment, DirectionalLight, PointLight, SpotLight, SphericalHarmonics
-)  # fmt: skip
+_CLASSES = (*CLASSES, Camera)
 
 
 def lit_image(
@@ -70,7 +64,7 @@ class _Whole(NamedTuple):
     moving: Sequence[int]
 
     def image(self, tensors: Sequence[Tensor]) -> Tensor:
-        scene, camera, options = from_text(self.recipe, tensors, _PARTS)
+        scene, camera, options = from_text(self.recipe, tensors, _CLASSES)
         spp, seed, surface, edge, grad_seed, samples, bounces = self.numbers
         own = dict(options)
         lighting, creases = Lighting(own.pop("shadows"), samples, bounces), own.pop("creases")

@@ -40,7 +40,7 @@ class Blended:
         """Return the radiance (N, C) of what rays meet behind hits."""
         frame = self._frame
         with torch.no_grad():
-            found = trace(hits._surfaces.bare, hits.position.double(), -hits.view.double(), hits._face)
+            found = trace(hits._surfaces.geometry, hits.position.double(), -hits.view.double(), hits._face)
             face = frame.here(found.face)
             meets = (face >= 0).nonzero()[:, 0]
             x, seed = hits.pixel.double().cpu(), hits._seed[meets]

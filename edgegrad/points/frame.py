@@ -14,7 +14,7 @@ from ..kernel.request import Request
 from ..scene.scene import Scene
 from .discontinuities import Discontinuities
 from .hits import Hits
-from .records import RayRecords, SurfaceRecords, barycentrics, without_colors
+from .records import RayRecords, SurfaceRecords, barycentrics, with_attributes
 from .sampler import Sampler
 from .seeds import sample_seeds
 from .shadow_rays import Forced
@@ -34,7 +34,7 @@ class Frame:
 
     def __init__(self, scene: Scene, request: Request, index: int = 0) -> None:
         packed = request.camera
-        self.request, self._index = request._replace(scene=without_colors(request.scene)), index
+        self.request, self._index = request._replace(scene=with_attributes(request.scene)), index
         self.surfaces = Surfaces(scene, self.request.scene)
         self.device, self.dtype = self.surfaces.verts.device, self.surfaces.verts.dtype
         self.sampler = Sampler(self.request, index, torch.finfo(self.dtype).eps ** (2 / 3))

@@ -29,7 +29,7 @@ from ..scene.scene import Scene, as_scene
 from .frame import Frame
 from .hits import Hits
 from .moving import Form, velocity
-from .records import CurveRecords, SurfaceRecords, without_colors
+from .records import CurveRecords, SurfaceRecords, with_attributes
 from .sampler import shaded_memory
 from .shadow_rays import Forced
 from .shadows import ShadowLight
@@ -238,7 +238,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
         attributes = every_face(F)
     elif creases is not False:
         raise TypeError(f"creases: expected True, False or a tensor (F, 3, K), got {type(creases).__name__}")
-    request = request._replace(scene=without_colors(request.scene, attributes))
+    request = request._replace(scene=with_attributes(request.scene, attributes))
     frame = primary.frame
     with shaded_memory(request._replace(gradient=request.gradient._replace(surface_samples=0)), gradient=True):
         _, curves = frame.sampler.samples(
