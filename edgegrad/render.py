@@ -22,9 +22,9 @@ from .kernel.autograd import render_image
 from .kernel.batch import render_images
 from .kernel.operators import forward_kernel, screen_gradient_kernel
 from .kernel.request import Request, make_request
+from .light.lit_operator import lit_image
 from .light.radiance import LIGHTING, Lighting, check_unlit
 from .light.unused_options import warn_of_unused
-from .light.whole import lit_image
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
 from .scene.tree import map_tensors, savable, tensors_in
@@ -127,7 +127,7 @@ def render(
     return image.to(scene.meshes[0].verts.device)
 
 
-SMALL = 1 << 22  # samples of an image, up to which one thread an image is better than all of them
+SAMPLES_OF_SMALL_IMAGE = 1 << 22  # samples of an image, up to which one thread an image is better than all of them
 
 
 def render_batch(
@@ -205,7 +205,7 @@ def _is_small(camera: Camera, spp: int) -> bool:
     """And without a lens that may fold, of which a warning would have to find the caller's line."""
     height, width = camera.size
     known = values_visible(camera.coefficients)
-    return height * width * spp <= SMALL and known and not bool(camera.coefficients.any())
+    return height * width * spp <= SAMPLES_OF_SMALL_IMAGE and known and not bool(camera.coefficients.any())
 
 
 @overload

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..check import all_below, values_visible
 from ..scene.material import WRAPS
-from ..scene.mesh import FILTERS, PLAIN, Mesh
+from ..scene.mesh import DEFAULT_RADIANCE, FILTERS, Mesh
 from ..scene.scene import Scene
 
 
@@ -36,7 +36,7 @@ class Flat(NamedTuple):
     spacing: list[float]
 
     @property
-    def has_steps(self) -> bool:
+    def has_discontinuities(self) -> bool:
         """Return whether something jumps within a face: it is cut out, or its texels are."""
         if len(self.alpha_masks) > 0 or len(self.textures) == 0:
             return len(self.alpha_masks) > 0
@@ -157,7 +157,7 @@ def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
                 rows = mesh.face_colors
                 index = torch.arange(F, dtype=torch.int32, device=cpu)[:, None].expand(F, 3)
             else:
-                rows = torch.full((1, C), PLAIN, dtype=dtype, device=cpu)
+                rows = torch.full((1, C), DEFAULT_RADIANCE, dtype=dtype, device=cpu)
                 index = torch.zeros((F, 3), dtype=torch.int32, device=cpu)
             colors.append(rows.cpu().to(dtype))
             if not by_vertex:

@@ -77,7 +77,7 @@ class LightParts(NamedTuple):
     two_sided: bool
 
 
-class PlaceRecords(NamedTuple):
+class ImagePointRecords(NamedTuple):
     """Points of surfaces that are seen at places in the image."""
 
     face: Tensor  # (N,) int64, −1: none

@@ -133,10 +133,10 @@ class Surfaces:
         """Return (F, 3, K): all properties that may jump and were asked for, each divided by its largest value."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
         attributes = columns([scaled(p) for p in parts if p.shape[-1]], len(self.faces), self.verts)
-        return _NextToSteps.apply(attributes) if transformed() else attributes
+        return _BatchedAttributes.apply(attributes) if transformed() else attributes
 
 
-class _NextToSteps(torch.autograd.Function):
+class _BatchedAttributes(torch.autograd.Function):
     """Attributes (F, 3, K). Under torch.vmap, those of all elements side by side: these share the samples of one image."""
 
     @staticmethod
@@ -158,7 +158,7 @@ class _NextToSteps(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int, ...], *args: Any) -> tuple[Tensor, None]:
         (attributes,), (batch,) = args, in_dims
-        return _NextToSteps.apply(attributes.movedim(batch, -1).flatten(2)), None
+        return _BatchedAttributes.apply(attributes.movedim(batch, -1).flatten(2)), None
 
 
 def every_face(count: int) -> Tensor:
@@ -167,7 +167,7 @@ def every_face(count: int) -> Tensor:
     return (torch.arange(count).double() * 0.6180339887498949 % 1 + 0.5)[:, None, None].expand(-1, 3, 1)
 
 
-def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
+def intersect_planes(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
     """Return (N, 3) barycentrics where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
     e1, e2, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
     p, q = torch.linalg.cross(direction, e2), torch.linalg.cross(s, e1)
@@ -176,14 +176,14 @@ def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
     return torch.stack([1 - u - v, u, v], 1)
 
 
-class View:
+class CameraView:
     """A camera's view: points in its coordinates, and where its rays meet faces."""
 
     def __init__(self, world_to_camera: Tensor, perspective: bool) -> None:
         self.world_to_camera, self.perspective = world_to_camera, perspective  # (4, 4) float64
 
-    def detach(self) -> View:
-        return View(self.world_to_camera.detach(), self.perspective)
+    def detach(self) -> CameraView:
+        return CameraView(self.world_to_camera.detach(), self.perspective)
 
     def in_camera(self, points: Tensor) -> Tensor:
         """Return world points (..., 3) in camera coordinates, float64."""
@@ -231,7 +231,7 @@ class Rays(NamedTuple):
 
     def barycentrics(self, corners: Tensor, b: Tensor) -> Tensor:
         """Return the barycentrics b (N, 3) of hits, as functions of the corners (N, 3, 3) and the rays."""
-        moved = meet(corners, self.origin, self.direction)
+        moved = intersect_planes(corners, self.origin, self.direction)
         return b + (moved - moved.detach())
 
     def depth(self, points: Tensor) -> Tensor:

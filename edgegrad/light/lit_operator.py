@@ -42,7 +42,7 @@ def lit_image(
     )  # fmt: skip
     if not torch.compiler.is_compiling():
         moving = tuple(k for k, tensor in enumerate(tensors) if tensor.is_floating_point())
-        return apply(_Whole(recipe, numbers, moving), tensors)[0]
+        return apply(_LitImageOperation(recipe, numbers, moving), tensors)[0]
     size = (*(() if camera.batch is None else (request.cameras,)), *camera.size, scene.channels)
     return torch.ops.edgegrad.lit(tensors, recipe, numbers, size, _dtype(scene))
 
@@ -54,7 +54,7 @@ def _dtype(scene: Scene) -> torch.dtype:
     return torch.float64 if any(mesh.verts.dtype == torch.float64 for mesh in scene.meshes) else torch.float32
 
 
-class _Whole(NamedTuple):
+class _LitImageOperation(NamedTuple):
     """The operation (kernel/first_order.py) that renders `tensors`."""
 
     recipe: str  # what else the scene, the camera and the options are
@@ -110,7 +110,7 @@ torch.library.define("edgegrad::lit_backward", f"(Tensor adjoint, {_ARGUMENTS}, 
 
 @torch.library.impl("edgegrad::lit", "CompositeExplicitAutograd")
 def _lit(tensors: list[Tensor], recipe: str, numbers: list[int], size: list[int], dtype: torch.dtype) -> Tensor:
-    return _Whole(recipe, numbers, ()).value(tensors)[0].to(dtype)
+    return _LitImageOperation(recipe, numbers, ()).value(tensors)[0].to(dtype)
 
 
 @torch.library.register_fake("edgegrad::lit")
@@ -122,7 +122,7 @@ def _lit_fake(tensors: list[Tensor], recipe: str, numbers: list[int], size: list
 def _lit_backward(
     adjoint: Tensor, tensors: list[Tensor], recipe: str, numbers: list[int], moving: list[int]
 ) -> list[Tensor]:
-    return list(_Whole(recipe, numbers, moving).vjp(adjoint, [True] * len(moving), (), tensors))
+    return list(_LitImageOperation(recipe, numbers, moving).vjp(adjoint, [True] * len(moving), (), tensors))
 
 
 @torch.library.register_fake("edgegrad::lit_backward")
