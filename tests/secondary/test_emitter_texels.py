@@ -89,7 +89,7 @@ def by_borders(uvs: Tensor, wraps: tuple[str, str], place: Tensor, weights: Tens
     """(4, 2): the same by the borders that points are drawn from, integrated along each of them by the midpoint rule."""
     uvs = uvs.clone().requires_grad_()
     light = MeshLight(scene(uvs, wraps).meshes[1])
-    borders, n = light.borders((0.5, 0.5)), 40
+    borders, n = light.texel_edges((0.5, 0.5)), 40
     assert borders is not None
     measure = borders.running.diff(prepend=torch.zeros(1, dtype=F64)) / borders.running[-1]
     along = (torch.arange(n, dtype=F64) + 0.5) / n
@@ -186,7 +186,7 @@ def test_a_texture_of_one_colour_has_no_borders() -> None:
     mesh = scene(COORDINATES["askew"]).meshes[1]
     assert mesh.material is not None
     plain = mesh.replace(material=mesh.material.replace(emission=eg.Texture(TEXELS[:1, :1], filter="nearest")))
-    assert MeshLight(plain).borders((0.5, 0.5)) is None
+    assert MeshLight(plain).texel_edges((0.5, 0.5)) is None
 
 
 @pytest.mark.slow
