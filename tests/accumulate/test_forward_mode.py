@@ -10,6 +10,7 @@ from combinations import diagonal
 from finite_differences import Estimate, estimate
 from oracles.exact import exact_image
 from scenes import cube, front_camera, icosphere, one_triangle, smooth_adjoint, smooth_colors
+from threads import check_threads
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -246,20 +247,10 @@ def test_types():
     assert eg.screen_gradient(scene, camera, ADJOINT.float()).dtype == torch.float32
 
 
-@pytest.mark.parametrize("call", ["jvp", "screen"])
-def test_same_bits_at_any_number_of_threads(call):
-    scene, threads = mixed_scene(), torch.get_num_threads()
-    found = []
-    for count in (1, 3):
-        torch.set_num_threads(count)
-        try:
-            if call == "jvp":
-                found.append(eg.jvp(scene, CAMERA, {x: u[None] for x, u in inputs(scene, CAMERA)["verts"]}, 4)[1])
-            else:
-                found.append(eg.screen_gradient(scene, CAMERA, ADJOINT))
-        finally:
-            torch.set_num_threads(threads)
-    assert found[0].any() and torch.equal(*found)
+def test_same_bits_at_any_number_of_threads():
+    scene = mixed_scene()
+    tangents = {x: u[None] for x, u in inputs(scene, CAMERA)["verts"]}
+    check_threads(lambda: [eg.jvp(scene, CAMERA, tangents, 4)[1], eg.screen_gradient(scene, CAMERA, ADJOINT)])
 
 
 @pytest.mark.parametrize(

@@ -356,21 +356,6 @@ def test_batches_and_files(tmp_path: Path) -> None:
     assert torch.equal(eg.render(scene, back, 4), eg.render(scene, one, 4))
 
 
-def test_same_bits_at_any_number_of_threads() -> None:
-    scene, view = both(PLACES["pole"]), camera().crop(-3, -5, 30, 50)
-    K = view.K.clone().requires_grad_()
-    found = []
-    threads = torch.get_num_threads()
-    try:
-        for n in (1, 3):
-            torch.set_num_threads(n)
-            image = eg.render(scene, view.replace(K=K), 8)
-            found.append((image, torch.autograd.grad(image.sum(), K)[0]))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-
-
 def test_plan() -> None:
     """What it counts is what is done; samples that are asked for are shared out between the frames."""
     scene = both(PLACES["seam"])

@@ -389,17 +389,3 @@ def test_batches_and_memory() -> None:
     torch.testing.assert_close(images[0], eg.render(scene, narrow, 16), rtol=0, atol=0)
     sizes = [core.image_bytes(pass_size(make_request(scene, v)), 1)["vertices in view"] for v in (narrow, both_of_them)]
     assert sizes[1] == 6 * sizes[0]
-
-
-def test_same_bits_at_any_number_of_threads() -> None:
-    scene, view = both(PLACES["behind"]), camera()
-    d = view.coefficients.clone().requires_grad_()
-    found, threads = [], torch.get_num_threads()
-    try:
-        for n in (1, 3):
-            torch.set_num_threads(n)
-            image = eg.render(scene, view.replace(distortion=d), 8)
-            found.append((image, torch.autograd.grad(image.sum(), d)[0]))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))

@@ -11,6 +11,7 @@ from alpha_masks import F64, checkerboard, disc, quad
 from finite_differences import Case, check_ratio, estimate, gradient, loss, right_ratio, rotation
 from oracles import reference
 from scenes import cube, front_camera, icosphere, smooth_adjoint
+from threads import check_threads
 from torch import Tensor
 
 import edgegrad as eg
@@ -323,20 +324,14 @@ def test_gradient_by_place(mesh):
 
 
 def test_same_bits_at_any_number_of_threads():
-    mesh, found = cut(3), []
-    before = torch.get_num_threads()
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            leaves = {n: getattr(mesh, n).clone().requires_grad_() for n in ("verts", "uvs", "alpha")}
-            image = eg.render(eg.Scene([mesh.replace(**leaves), behind()]), CAMERA, 8)
-            found.append(
-                [image, *torch.autograd.grad((image * smooth_adjoint(*image.shape)).sum(), [*leaves.values()])]
-            )
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+    mesh = cut(3)
+    leaves = {n: getattr(mesh, n).clone().requires_grad_() for n in ("verts", "uvs", "alpha")}
+
+    def compute() -> list[Tensor]:
+        image = eg.render(eg.Scene([mesh.replace(**leaves), behind()]), CAMERA, 8)
+        return [image, *torch.autograd.grad((image * smooth_adjoint(*image.shape)).sum(), [*leaves.values()])]
+
+    check_threads(compute)
 
 
 # -- the plan ---------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import torch
 from around import BACKGROUND, ball, moved, pose, room
 from finite_differences import Case, check_ratio
 from scenes import cube, smooth_adjoint
+from threads import check_threads
 from torch import Tensor
 
 import edgegrad as eg
@@ -311,12 +312,4 @@ def test_plan() -> None:
 
 
 def test_same_bits_at_any_number_of_threads() -> None:
-    results, threads = [], torch.get_num_threads()
-    try:
-        for n in (1, 3):
-            torch.set_num_threads(n)
-            results.append(found(camera("wide fisheye"), torch.sum, balls()))
-    finally:
-        torch.set_num_threads(threads)
-    for a, b in zip(*results, strict=True):
-        assert torch.equal(a, b)
+    check_threads(lambda: found(camera("wide fisheye"), torch.sum, balls()))

@@ -129,18 +129,6 @@ def test_lines_of_floats() -> None:
 
 
 @pytest.mark.usefixtures("alone")
-def test_same_bits_at_any_number_of_threads() -> None:
-    threads, found = torch.get_num_threads(), []
-    for count in (1, 2, 3):
-        torch.set_num_threads(count)
-        found.append(
-            gradients(Strip.standard(), ("glossy", "lambert"), weights_of(Strip.standard()), 20_000, bounces=3)
-        )
-    torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0].values(), other.values(), strict=True))
-
-
-@pytest.mark.usefixtures("alone")
 def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
     strip, weights = Strip.standard(), weights_of(Strip.standard())
     found = gradients(strip, ("lambert", "glossy"), weights, 5_000)

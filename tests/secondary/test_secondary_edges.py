@@ -11,6 +11,7 @@ import torch
 from bounce_scenes import QUAD
 from strip_oracle import Strip, border, sent_from_line
 from test_secondary_edge_points import LOOKS, alone, weights_of
+from threads import check_threads
 from torch import Tensor
 
 import edgegrad as eg
@@ -172,17 +173,8 @@ def test_line_through_the_sender(looks: tuple[str, str], monkeypatch: pytest.Mon
     check(blade_through_sender(looks, WIDE), looks, 400_000, side=1)
 
 
-@pytest.mark.usefixtures("alone")
-def test_same_bits_at_any_number_of_threads() -> None:
-    threads, found = torch.get_num_threads(), []
-    for count in (1, 3):
-        torch.set_num_threads(count)
-        of = [
-            gradients_of(make(("lambert", "lambert")), 20_000, bounces=3) for make in (cut_sheet, blade_through_sender)
-        ]
-        found.append([tensor for gradients in of for tensor in gradients])
-    torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+def test_same_bits_at_any_number_of_threads(make: Callable[[tuple[str, str]], Border]) -> None:
+    check_threads(lambda: gradients_of(make(("lambert", "lambert")), 20_000, bounces=3))
 
 
 @pytest.mark.unwatched

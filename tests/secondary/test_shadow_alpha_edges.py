@@ -13,6 +13,7 @@ from finite_differences import gradient as derivative
 from lit_scenes import by_quadrature, from_above, plane
 from test_shadows import LIGHTS, exact, gradient, of_panel, of_sky, panel, sky, vector
 from test_shadows import Setting as Whole
+from threads import check_threads
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -203,15 +204,7 @@ def gradient_of_alpha() -> Tensor:
 
 
 def test_same_bits_at_any_number_of_threads() -> None:
-    found, before = [], torch.get_num_threads()
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            found.append(gradient_of_alpha())
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(*found)
-    assert float(found[0].abs().sum()) > 1
+    check_threads(lambda: [gradient_of_alpha()])
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 import torch
 from combinations import diagonal
 from kernel_parts import parts
-from test_lit_kernel import CAMERAS, Leaves, numbers_of, scene_of
+from lit_words import CAMERAS, Leaves, numbers_of, scene_of
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -37,7 +37,7 @@ FEW = 30  # points of the image
 
 
 def numbers(words: str) -> Leaves:
-    """Those of test_lit_kernel.py, and of glossy walls around, so that light goes to and fro."""
+    """Return the numbers of lit_words.py, and those of glossy walls around, so that light goes to and fro."""
     corner = [(-2.0, -2.0), (2.0, -2.0), (2.0, 4.5), (-2.0, 4.5)]
     wall = [[x, y, z] for y in (-1.2, 3.0) for x, z in corner]
     own = {"wall": wall, "wall_color": [0.8, 0.3, 0.5], "wall_roughness": 0.5, "wall_metallic": 0.6}

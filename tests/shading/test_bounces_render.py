@@ -118,19 +118,6 @@ def test_gradients_of_a_room() -> None:
     assert abs(float((by_wall * step).sum() / ((up - down) / 2)) - 1) < 0.02
 
 
-def test_same_bits_at_any_number_of_threads() -> None:
-    found = []
-    threads = torch.get_num_threads()
-    for count in (1, 2, 3):
-        torch.set_num_threads(count)
-        color = vector(0.6, 0.5, 0.4).requires_grad_()
-        scene = box_room("emitter", floor={"base_color": color, "roughness": 0.4})
-        image = eg.render(scene, towards_room(12), 4, bounces=4)
-        found.append((image.detach(), *torch.autograd.grad((image * image).sum(), color)))
-    torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
-
-
 def test_one_bounce_is_direct_light_and_more_add_to_it() -> None:
     scene, camera = box_room(), towards_room(12)
     images = [eg.render(scene, camera, 16, bounces=n) for n in (1, 2, 3)]
