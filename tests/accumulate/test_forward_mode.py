@@ -25,7 +25,7 @@ TRIANGLE = one_triangle()
 MESH, BACKGROUND = TRIANGLE.meshes[0], TRIANGLE.background
 CAMERA = front_camera(SIZE)
 ORTHOGRAPHIC = eg.Camera.orthographic((0.4, 0.3, 4.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.6, (SIZE, SIZE)).to(F64)
-BENT = CAMERA.replace(distortion=torch.tensor([-0.15, 0.05, 0.01, -0.02, 0.02], dtype=F64))
+DISTORTED = CAMERA.replace(distortion=torch.tensor([-0.15, 0.05, 0.01, -0.02, 0.02], dtype=F64))
 ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
 
 
@@ -117,7 +117,7 @@ def crossing_scene() -> eg.Scene:
         (mixed_scene, CAMERA.crop(3, 2, 12, 14), "tent"),
         pytest.param(crossing_scene, CAMERA, "tent", marks=pytest.mark.unwatched),
         pytest.param(crossing_scene, ORTHOGRAPHIC, "box", marks=pytest.mark.unwatched),
-        pytest.param(crossing_scene, BENT, "gaussian", marks=pytest.mark.unwatched),
+        pytest.param(crossing_scene, DISTORTED, "gaussian", marks=pytest.mark.unwatched),
         (crossing_scene, PANORAMA, "box"),
         pytest.param(mixed_scene, PANORAMA, "tent", marks=pytest.mark.unwatched),
     ],
@@ -127,7 +127,7 @@ def crossing_scene() -> eg.Scene:
         "crop tent",
         "crossing perspective",
         "crossing orthographic",
-        "bent",
+        "distorted",
         "crossing panorama",
         "panorama",
     ],
@@ -279,7 +279,7 @@ def test_tangents_that_do_not_fit(tangents, message):
 @pytest.mark.unwatched
 @pytest.mark.parametrize(
     ("camera", "scene", "filter"),
-    diagonal([CAMERA, ORTHOGRAPHIC, BENT, PANORAMA], [mixed_scene, crossing_scene], ["gaussian", "box"]),
+    diagonal([CAMERA, ORTHOGRAPHIC, DISTORTED, PANORAMA], [mixed_scene, crossing_scene], ["gaussian", "box"]),
 )
 def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter):
     """By (1, 0) and (0, 1) px, as the principal point does."""

@@ -64,7 +64,7 @@ def test_position_gradient(lens: str) -> None:
 
 @lenses
 def test_boxes_hold_what_they_say(lens: str) -> None:
-    """All of a box of the straight image is seen in the box that the kernel names, also where that reaches far outside."""
+    """All of a box of the undistorted image is seen in the box that the kernel names, also where that reaches far outside."""
     kernel = kernel_camera(pack_camera(camera(lens)))
     rng = np.random.default_rng(1)
     for _ in range(200):
@@ -93,8 +93,8 @@ TRIANGLE = torch.tensor([[-0.6, -0.5, 0.3], [0.8, -0.2, -0.6], [-0.1, 0.7, 0.2]]
 def test_area_of_a_triangle(lens: str) -> None:
     view = camera(lens)
     check_area(view, TRIANGLE)
-    straight = area(view.replace(distortion=None, projection="perspective"), TRIANGLE)
-    assert abs(float(straight / area(view, TRIANGLE)) - 1) > 0.01, "a pinhole would pass as well"
+    undistorted_area = area(view.replace(distortion=None, projection="perspective"), TRIANGLE)
+    assert abs(float(undistorted_area / area(view, TRIANGLE)) - 1) > 0.01, "a pinhole would pass as well"
 
 
 @pytest.mark.filterwarnings("ignore:distortion")
@@ -122,7 +122,7 @@ def test_wall(lens: str) -> None:
     grid = 6
     x, y = ((torch.arange(n * grid, dtype=F64) + 0.5) / grid for n in (W, H))
     points = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
-    n = straightened(view, points)
+    n = undistorted(view, points)
     q = verts @ M[:3, :3].mT + M[:3, 3]
     b = torch.linalg.solve(q.mT, torch.cat([n, torch.ones_like(n[:, :1])], 1).mT).mT
     assert bool((b > 0).all()), "it must fill the view"
@@ -136,15 +136,15 @@ def test_wall(lens: str) -> None:
         torch.testing.assert_close(b, a, rtol=5e-3, atol=5e-3 * float(a.abs().max()), msg=lambda m, n=name: f"{n}: {m}")
 
 
-def straightened(view: eg.Camera, x: Tensor) -> Tensor:
+def undistorted(view: eg.Camera, x: Tensor) -> Tensor:
     """n (N, 2) of what is seen at the pixels x (N, 2): Newton's method, its last step differentiable."""
     m = torch.linalg.solve(view.K[:2, :2], (x - view.K[:2, 2])[..., None])[..., 0]
     n = m.detach()
     for _ in range(30):
         n = n.detach().requires_grad_()
-        bent = distort(view.projection, torch.cat([n, torch.ones_like(n[:, :1])], 1), view.coefficients)
-        rows = [torch.autograd.grad(bent[:, i].sum(), n, retain_graph=True)[0] for i in (0, 1)]
-        n = n.detach() + torch.linalg.solve(torch.stack(rows, 1), (m - bent)[..., None])[..., 0]
+        distorted = distort(view.projection, torch.cat([n, torch.ones_like(n[:, :1])], 1), view.coefficients)
+        rows = [torch.autograd.grad(distorted[:, i].sum(), n, retain_graph=True)[0] for i in (0, 1)]
+        n = n.detach() + torch.linalg.solve(torch.stack(rows, 1), (m - distorted)[..., None])[..., 0]
     return n
 
 
@@ -153,7 +153,7 @@ WHAT = ["vertices", "pose", "K00", "K11", "K01", "K02", "K12"]
 
 @pytest.mark.parametrize(("lens", "what"), diagonal(list(DISTORTION), ["d0", "vertices", "K00"]))
 def test_gradient(lens: str, what: str) -> None:
-    """Of a crop that reaches beyond the image, where the lens bends most."""
+    """Of a crop that reaches beyond the image, where the lens distorts most."""
     check_gradient("both", camera(lens).crop(-5, 15, 25, 30), what, spp=3072 if what == "K00" else 1024)
 
 
@@ -164,7 +164,7 @@ def test_gradient(lens: str, what: str) -> None:
 def test_every_gradient(lens: str, kind: str, crop: bool) -> None:
     view = camera(lens, size=(80, 96))
     if crop:
-        view = view.crop(-10, 30, 50, 60)  # reaches beyond the image, where the lens bends most
+        view = view.crop(-10, 30, 50, 60)  # reaches beyond the image, where the lens distorts most
     for what in [*WHAT, *(f"d{i}" for i in range(len(DISTORTION[lens])))]:
         # Coefficients of high powers move little, so differences say less of them; test_area_of_a_triangle is exact.
         check_gradient(kind, view, what, spp=4096, seeds=8, most_noise=0.05)
@@ -330,9 +330,9 @@ def test_gradient_by_coefficients_of_zero(index: int) -> None:
         return float(torch.autograd.grad(loss_at(t), t)[0])
 
     one = torch.ones((), dtype=F64)
-    beside = gradient_at(1e-9)
-    assert gradient_at(0.0) == pytest.approx(beside, rel=0.01)
-    assert float(torch.func.jvp(loss_at, (0 * one,), (one,))[1]) == pytest.approx(beside, rel=0.01)
+    near_zero = gradient_at(1e-9)
+    assert gradient_at(0.0) == pytest.approx(near_zero, rel=0.01)
+    assert float(torch.func.jvp(loss_at, (0 * one,), (one,))[1]) == pytest.approx(near_zero, rel=0.01)
 
 
 @lenses

@@ -87,9 +87,9 @@ def test_the_warning_comes_once_a_line_and_points_there() -> None:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("default")
         for step in range(3):
-            bent = view.replace(distortion=d * (1 - 0.01 * step))
-            Renders()(bent).sum().backward(retain_graph=True)
-            sample(bent).sum().backward()
+            distorted = view.replace(distortion=d * (1 - 0.01 * step))
+            Renders()(distorted).sum().backward(retain_graph=True)
+            sample(distorted).sum().backward()
     first = Renders.forward.__code__.co_firstlineno
     assert [w.filename for w in told] == [__file__] * 2
     assert [w.lineno for w in told] == [first + 1, sample.__code__.co_firstlineno + 1]

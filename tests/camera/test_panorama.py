@@ -59,22 +59,22 @@ def directions(view: eg.Camera, x: np.ndarray) -> np.ndarray:
     return direction(np.linalg.solve(K[:2, :2], (x - K[:2, 2])[..., None])[..., 0]) @ R
 
 
-def windows(view: eg.Camera, reach: float = 0.0) -> list:
+def sub_cameras(view: eg.Camera, reach: float = 0.0) -> list:
     return parts.sub_cameras(kernel_camera(pack_camera(view)), reach)
 
 
-def seen_through(window, turn: list, q: np.ndarray) -> np.ndarray | None:
-    """Where a point in camera coordinates is seen; None if not through this window."""
+def seen_through(sub_camera, turn: list, q: np.ndarray) -> np.ndarray | None:
+    """Where a point in camera coordinates is seen; None if not through this sub-camera."""
     x, y, z = np.array(turn) @ q
     if z <= 0 or max(abs(x), abs(y)) > z:
         return None
-    low, high = parts.view_box(window)
-    scale = np.abs(parts.project_straight(window, [1.0, 1.0, 1.0]))
-    u = parts.project_straight(window, [x, y, z])
+    low, high = parts.view_box(sub_camera)
+    scale = np.abs(parts.project_straight(sub_camera, [1.0, 1.0, 1.0]))
+    u = parts.project_straight(sub_camera, [x, y, z])
     slack = 1e-9 * scale
     if (np.array(u) < np.array(low) - slack).any() or (np.array(u) > np.array(high) + slack).any():
         return None
-    return np.array(parts.project(window, [x, y, z]))
+    return np.array(parts.project(sub_camera, [x, y, z]))
 
 
 @cameras
@@ -82,7 +82,7 @@ def test_points_agree_with_the_formula(view: eg.Camera) -> None:
     """Every place of a direction in the image is found, and once."""
     rng = np.random.default_rng(0)
     K, (H, W) = view.K.numpy(), view.size
-    through = windows(view)
+    through = sub_cameras(view)
     count = 0
     for q in rng.normal(size=(100, 3)):
         longitude, latitude = math.atan2(q[0], q[2]), math.asin(q[1] / np.linalg.norm(q))
@@ -96,7 +96,7 @@ def test_points_agree_with_the_formula(view: eg.Camera) -> None:
             if (i + j) % 2 == 0
         ]
         inside = sorted(tuple(x) for x in all_places if 0 < x[0] < W and 0 < x[1] < H)
-        found = [seen_through(window, turn, q) for window, turn in through]
+        found = [seen_through(sub_camera, turn, q) for sub_camera, turn in through]
         found = sorted(tuple(x) for x in found if x is not None and 0 < x[0] < W and 0 < x[1] < H)
         assert len(found) == len(inside)
         if inside:
@@ -106,23 +106,23 @@ def test_points_agree_with_the_formula(view: eg.Camera) -> None:
 
 
 @cameras
-def test_every_pixel_position_belongs_to_one_window(view: eg.Camera) -> None:
+def test_every_pixel_position_belongs_to_one_sub_camera(view: eg.Camera) -> None:
     """Also on the borders between them, as at 45°, and at the image's."""
     H, W = view.size
     x = [
         *np.random.default_rng(0).uniform((0, 0), (W, H), (300, 2)),
         *np.mgrid[0 : W + 1 : 3, 0 : H + 1 : 3].reshape(2, -1).T,
     ]
-    through = [window for window, _ in windows(view)]
+    through = [sub_camera for sub_camera, _ in sub_cameras(view)]
     for place in x:
-        found = [np.array(parts.normalised(window, place)) for window in through]
+        found = [np.array(parts.normalised(sub_camera, place)) for sub_camera in through]
         assert sum(np.isfinite(n).all() for n in found) == 1
 
 
 @cameras
 def test_boxes_hold_what_they_say(view: eg.Camera) -> None:
-    for window, _ in windows(view):
-        check_boxes(window, shown_whole=True)
+    for sub_camera, _ in sub_cameras(view):
+        check_boxes(sub_camera, shown_whole=True)
 
 
 def test_position_gradient() -> None:
@@ -149,7 +149,7 @@ def balls() -> list[eg.Mesh]:
 def test_image_against_traced_rays(view: eg.Camera) -> None:
     scene = eg.Scene([*balls(), room()], BACKGROUND)
     expected, image = traced(scene, view, 3, lambda x: directions(view, x)), eg.render(scene, view, 256)
-    # The rim of a face may pass anywhere between the rays of the grid.
+    # The border of a face may pass anywhere between the rays of the grid.
     assert float((image - expected).abs().mean()) < 0.01
     assert float((image - expected).abs().max()) < 0.3
 
@@ -181,11 +181,11 @@ def test_more_than_one_turn() -> None:
 
 TRIANGLES = {
     "ahead": [[-0.6, -0.5, 1.3], [0.8, -0.2, 1.6], [-0.1, 0.7, 1.2]],
-    "beside": [[1.3, -0.5, -0.6], [1.6, -0.2, 0.8], [1.2, 0.7, -0.1]],
+    "aside": [[1.3, -0.5, -0.6], [1.6, -0.2, 0.8], [1.2, 0.7, -0.1]],
     "seam": [[-0.6, -0.5, -1.3], [0.8, -0.2, -1.6], [-0.1, 0.7, -1.2]],
     "pole": [[-0.6, 1.3, -0.5], [0.8, 1.6, -0.2], [-0.1, 1.2, 0.7]],
     "above": [[-0.6, -1.3, -0.5], [0.8, -1.6, -0.2], [-0.1, -1.2, 0.7]],
-    "beside a pole": [[0.1, 1.3, 0.12], [0.8, 1.6, 0.2], [0.3, 1.2, 0.7]],
+    "next to a pole": [[0.1, 1.3, 0.12], [0.8, 1.6, 0.2], [0.3, 1.2, 0.7]],
     "huge": [[-9.0, -8.0, 0.4], [30.0, 0.5, 0.3], [-9.0, 20.0, 0.5]],
 }
 
@@ -230,7 +230,7 @@ def test_area_of_a_triangle(place: str, shift: int) -> None:
         torch.testing.assert_close(b, a, rtol=5e-3, atol=2e-3 * float(a.abs().max()), msg=lambda m, n=name: f"{n}: {m}")
 
 
-@pytest.mark.parametrize("place", ["ahead", "beside"])
+@pytest.mark.parametrize("place", ["ahead", "aside"])
 def test_area_by_intrinsics(place: str) -> None:
     view = camera(skew=1.5)
     K = view.K.clone().requires_grad_()
@@ -291,7 +291,7 @@ def test_gradient_of_the_room_alone(what: str) -> None:
 
 
 @pytest.mark.parametrize("filter", ["box", pytest.param("gaussian", marks=pytest.mark.slow)])
-def test_edges_between_windows_count_once(filter: str) -> None:
+def test_edges_between_sub_cameras_count_once(filter: str) -> None:
     """An upright square room around the eye: its edges run exactly where the frames of the panorama meet, and its corners lie in
     three of them. Each side has one colour, so the diagonals that run through the poles are no edges."""
     box = cube(2.0)

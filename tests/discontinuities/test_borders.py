@@ -1,4 +1,4 @@
-"""Pixels that a shader's steps run through, shaded at several points: unbiased, less noise, and nothing else is changed."""
+"""Pixels that a shader's discontinuities cross, shaded at several points: unbiased, with less noise, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_shaders_without_steps_keep_their_bits(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_bound_of_what_is_shaded():
-    """Where every pixel is a border, four times the points of the first look more."""
+    """Where every pixel is a border, four times the points of the first pass more."""
     counts = []
 
     def shader(hits: eg.Hits) -> Tensor:

@@ -1,4 +1,4 @@
-"""Steps that a shader declares: where they are found, and their gradients next to exact ones."""
+"""Discontinuities that a shader declares: where they are found, and their gradients against exact ones."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_jump_of_the_function_is_no_step():
     assert float(grad) == 0
 
 
-def test_steps_beside_silhouettes_are_found():
+def test_discontinuities_next_to_silhouettes_are_found():
     """A step that runs into the shadow line of another surface: the part next to it counts as well."""
 
     def gradient(seed: int) -> Tensor:

@@ -251,7 +251,7 @@ def test_default_samples_at_creases(name: str) -> None:
 
 def test_hidden_creases_seen_through_a_gap() -> None:
     """A hole of half a pixel, which one ray a pixel misses every other time: then what lies behind it was not hit, and only its
-    rim tells that it may be seen."""
+    border tells that it may be seen."""
     ball = coloured_sphere(3)
     corner = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], dtype=F64)
     verts = torch.cat([torch.cat([size * corner, torch.full((4, 1), 1.3, dtype=F64)], 1) for size in (2.0, 0.03)])
@@ -300,12 +300,12 @@ def test_creases_that_something_hides() -> None:
     assert float(errors.square().mean().sqrt()) < 0.05, errors
 
 
-def test_a_crease_beside_a_face_that_is_seen_edge_on() -> None:
+def test_a_crease_next_to_a_face_that_is_seen_edge_on() -> None:
     """Rays, placed in float, slip past a face that is a hundred-thousandth of a pixel wide, and see the crease behind it. It must
     not be taken for visible: what samples then take away again is 0.6 % of the whole gradient, in one seed of two."""
     scene = build("flat-colors")
-    behind, beside = 43, 10492  # the crease's vertices
+    behind, adjacent = 43, 10492  # the crease's vertices
     for seed in range(6):
         gradient, *_ = differentiate(scene, spp=16, seed=seed)
-        assert float(gradient[beside].norm()) > 0
+        assert float(gradient[adjacent].norm()) > 0
         assert float(gradient[behind].norm() / gradient.norm()) < 1e-3

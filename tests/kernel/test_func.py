@@ -91,11 +91,11 @@ TWICE = {
 
 
 @pytest.mark.parametrize("loss", [linear, quadratic, shaded, lit])
-@pytest.mark.parametrize("way", TWICE)
-def test_second_derivatives_are_refused(way, loss):
+@pytest.mark.parametrize("method", TWICE)
+def test_second_derivatives_are_refused(method, loss):
     """Zeros came, without a word, where the loss is linear in the image, and from some of these for any loss."""
     with pytest.raises(RuntimeError, match=SECOND):
-        TWICE[way](loss)
+        TWICE[method](loss)
 
 
 def test_a_gradient_in_the_graph_is_no_second_derivative():

@@ -100,7 +100,7 @@ def test_mipmaps_need_neighbours():
     ("wrap", "expected"),
     [("repeat", [2, 0, 1, 2, 0]), ("clamp", [0, 0, 1, 2, 2]), ("mirror", [0, 0, 1, 2, 2])],
 )
-def test_beyond_the_rim(wrap: str, expected: list[int]):
+def test_beyond_the_border(wrap: str, expected: list[int]):
     texture = torch.arange(3.0, dtype=F64).reshape(1, 3, 1)
     mesh, camera = facing(texture, 1.0)
     hits = eg.primary_hits(mesh, camera, spp=1).hits
@@ -141,7 +141,7 @@ def test_meshes_with_mipmaps_have_gradients():
     """Along the texture it is the image; along a shift across the image, which changes no level, finite differences."""
     generator = torch.Generator().manual_seed(2)
     mesh, camera = facing(torch.rand((48, 48, 2), generator=generator, dtype=F64), 0.4)
-    K = camera.K + torch.tensor([[0, 0, 3], [0, 0, 3], [0, 0, 0]], dtype=F64)  # so that the rim is in the image
+    K = camera.K + torch.tensor([[0, 0, 3], [0, 0, 3], [0, 0, 0]], dtype=F64)  # so that the border is in the image
     camera = camera.replace(K=K, size=(25, 25))
     weights = torch.arange(25, dtype=F64)[None, :, None].expand(25, 25, 2)
     shift = torch.tensor([1.0, 0.5, 0.0], dtype=F64)

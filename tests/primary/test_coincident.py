@@ -21,12 +21,12 @@ F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
 ALONG = torch.tensor([0.7, 0.6, -0.2], dtype=F64)
 SAMPLES = {"surface_samples": 20_000, "edge_samples": 20_000}
-STRAIGHT = eg.Camera.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 35.0, (48, 48)).to(F64)
+FACING = eg.Camera.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 35.0, (48, 48)).to(F64)
 FROM_ABOVE = eg.Camera.look_at((0.8, 1.2, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 35.0, (48, 48)).to(F64)
 ORTHOGRAPHIC = eg.Camera.orthographic((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, (48, 48)).to(F64)
 # Off the borders of pixels, where the box filter's adjoint jumps.
 ORTHOGRAPHIC = ORTHOGRAPHIC.replace(K=ORTHOGRAPHIC.K + torch.tensor([[0, 0, 0.31], [0, 0, 0.27], [0, 0, 0]], dtype=F64))
-VIEWS = {"orthographic": ORTHOGRAPHIC, "straight": STRAIGHT, "above": FROM_ABOVE}
+VIEWS = {"orthographic": ORTHOGRAPHIC, "facing": FACING, "above": FROM_ABOVE}
 
 
 def face_colored(mesh: eg.Mesh, seed: int = 0) -> eg.Mesh:
@@ -44,8 +44,8 @@ def check(
 
 @pytest.mark.parametrize("moved", ["along", "scale", "turn"])
 @pytest.mark.parametrize("faces", [False, True], ids=["smooth", "face colours"])
-def test_box_seen_straight_on(faces: bool, moved: str) -> None:
-    """Its front and back rims fall on the same lines, and its sides on them too: 0 to 2.2 before."""
+def test_box_seen_head_on(faces: bool, moved: str) -> None:
+    """The borders of its front and back fall on the same lines, and its sides on them too: 0 to 2.2 before."""
     box = face_colored(cube(0.5)) if faces else cube(0.5)
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=F64)
     motion = {
@@ -58,7 +58,7 @@ def test_box_seen_straight_on(faces: bool, moved: str) -> None:
 
 @pytest.mark.parametrize("moved", ["both", "front", "back"])
 def test_two_sheets_behind_one_another(moved: str) -> None:
-    """Their rims fall on the same lines. A motion that parts them has a derivative for each direction, and central
+    """Their borders fall on the same lines. A motion that parts them has a derivative for each direction, and central
     differences are their mean; so is the gradient, for two."""
     flat = torch.tensor([[-0.5, -0.4, 0.0], [0.6, -0.4, 0.0], [0.6, 0.5, 0.0], [-0.5, 0.5, 0.0]], dtype=F64)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
@@ -112,7 +112,7 @@ def test_boxes_on_one_another(view: str) -> None:
 
 
 def test_boxes_behind_one_another() -> None:
-    """Six rims on one line, at six depths."""
+    """Six borders on one line, at six depths."""
     boxes = [face_colored(cube(0.25), seed) for seed in range(3)]
     place = [torch.tensor([0.0, 0.0, 0.8 * k - 0.8], dtype=F64) for k in range(3)]
     along = torch.tensor([0.9, -0.7, 0.3], dtype=F64)
@@ -143,7 +143,7 @@ def test_a_thin_strip_is_not_taken_for_one_line() -> None:
 
 
 def test_thin_plate_far_from_the_origin() -> None:
-    """Its front hides the rim of its back, though they lie closer than what may touch for rounding: 2.9 before."""
+    """Its front hides the border of its back, though they lie closer than what may touch for rounding: 2.9 before."""
     place = torch.tensor([100.0, -40.0, 60.0], dtype=F64)
     size = torch.tensor([1.0, 1.0, 3e-5], dtype=F64)
     plate = face_colored(cube(0.5), 7)
@@ -180,7 +180,7 @@ def test_curves_of_which_no_sample_is_seen(flat: bool) -> None:
 
 @pytest.mark.parametrize("edge_samples", [50, None])
 def test_few_samples_are_unbiased(edge_samples: int | None) -> None:
-    """Three sheets whose rims fall on the same lines. What a sample sees on either side once went by its place on the
+    """Three sheets whose borders fall on the same lines. What a sample sees on either side once went by its place on the
     curve, which seeds do not change: 2 to 6 % off at default samples, and nothing like the gradient at few."""
     corners = torch.tensor([[-0.7, -0.6], [0.5, -0.6], [0.5, 0.7], [-0.7, 0.7]], dtype=F64)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])

@@ -35,7 +35,7 @@ def random_triangles(seed: int, count: int = 12, spread: float = 1.0) -> tuple[T
 
 
 @pytest.mark.parametrize("seed, spread", [(0, 0.7), (1, 1.0), (2, 2.5), (3, 4.0)])
-def test_rasterize_beside_the_twin(seed: int, spread: float) -> None:
+def test_rasterize_equal_the_twin(seed: int, spread: float) -> None:
     pos, tri = random_triangles(seed, spread=spread)
     behind = (pos[tri][..., 3] < 0).any(1).sum()
     assert (behind > 0) == (spread > 2), behind
@@ -196,7 +196,7 @@ def test_layers_behind_one_another() -> None:
         peeler.rasterize_next_layer()
 
 
-def test_interpolate_beside_its_definition() -> None:
+def test_interpolate_equals_its_definition() -> None:
     pos, tri = random_triangles(8)
     rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (9, 9))
     attr = torch.rand(1, len(pos), 4, dtype=torch.float64)

@@ -25,7 +25,7 @@ def directions(seed: int, *shape: int) -> Tensor:
 
 @pytest.mark.parametrize("border", ["wrap", "clamp", "zero"])
 @pytest.mark.parametrize("filter_mode", ["nearest", "linear"])
-def test_planes_beside_the_twin(border: str, filter_mode: str) -> None:
+def test_planes_equal_the_twin(border: str, filter_mode: str) -> None:
     tex, uv = draws(0, 2, 5, 7, 3), draws(1, 2, 6, 9, 2, low=-1.5, high=2.5)
     found = dr.texture(tex, uv, filter_mode=filter_mode, boundary_mode=border)
     for b in range(2):
@@ -37,7 +37,7 @@ def test_planes_beside_the_twin(border: str, filter_mode: str) -> None:
 
 @pytest.mark.parametrize("filter_mode", ["nearest", "linear"])
 @pytest.mark.parametrize("size", [1, 4, 5])
-def test_cubes_beside_the_twin(filter_mode: str, size: int) -> None:
+def test_cubes_equal_the_twin(filter_mode: str, size: int) -> None:
     tex, uv = draws(2, 1, 6, size, size, 2), directions(3, 1, 20, 30)
     uv[0, :4] = uv[0, :4].round()  # along edges and to corners of the cube too
     found = dr.texture(tex, uv, filter_mode=filter_mode, boundary_mode="cube")
@@ -81,7 +81,7 @@ def levels_of(uv: Tensor, uv_da: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 @pytest.mark.parametrize("size", [(8, 8), (16, 4), (1, 8)])
-def test_pyramids_beside_the_twin(size: tuple[int, int]) -> None:
+def test_pyramids_equal_the_twin(size: tuple[int, int]) -> None:
     tex, uv = draws(8, 1, *size, 2), draws(9, 1, 6, 7, 2, low=-1, high=2)
     uv_da = draws(10, 1, 6, 7, 4, low=-1, high=1) * torch.logspace(-2.5, 1, 7, dtype=torch.float64)[:, None]
     bias = draws(11, 1, 6, 7, low=-1, high=1)

@@ -73,12 +73,12 @@ def brute_force(corners: np.ndarray, rays: Rays) -> Truth:
     # Seen at a grazing angle, a face is so much narrower.
     normal, length = np.cross(e1, e2), np.linalg.norm(rays.directions, axis=1)[:, None]
     cosine = np.abs(determinant) / (np.linalg.norm(normal, axis=-1) * length)
-    near_rim = (np.abs(inside) * np.maximum(cosine, 1e-9) < slack) & (t <= nearest + slack * size)
+    near_border = (np.abs(inside) * np.maximum(cosine, 1e-9) < slack) & (t <= nearest + slack * size)
     with np.errstate(invalid="ignore"):
         near_end = (inside > -slack) & (np.abs(t - rays.ends[:, None]) < slack * size)
         near_start = (inside > -slack) & (np.abs(t) < slack * size)
         tied = (inside > -slack) & (t != nearest) & (np.abs(t - nearest) < slack * size)
-    return Truth(face, ~(near_rim | near_end | near_start | tied).any(1))
+    return Truth(face, ~(near_border | near_end | near_start | tied).any(1))
 
 
 def cast(corners: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:

@@ -49,11 +49,11 @@ def requiring(scene: eg.Scene | eg.Mesh, camera: eg.Camera, kinds: tuple[str, ..
         have = {name: getattr(thing, name) for name in names if getattr(thing, name) is not None}
         return thing.replace(**{name: value.clone().requires_grad_() for name, value in have.items()})
 
-    def look(kind):
+    def fields(kind):
         return ("colors", "face_colors", "corner_colors") if kind == "colors" else (kind,)
 
     meshes = [
-        leaves(mesh, *(name for kind in kinds if kind in KINDS[:4] for name in look(kind))) for mesh in scene.meshes
+        leaves(mesh, *(name for kind in kinds if kind in KINDS[:4] for name in fields(kind))) for mesh in scene.meshes
     ]
     scene = scene.replace(meshes=meshes)
     scene = leaves(scene, "background") if "background" in kinds else scene

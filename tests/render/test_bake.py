@@ -81,7 +81,7 @@ def test_a_normal_map_shades_as_the_fine_mesh(smooth: bool) -> None:
     assert off[0] < 0.015 and min(off[1:]) > 0.027, off
 
 
-def test_visibility_beside_a_wall() -> None:
+def test_visibility_next_to_a_wall() -> None:
     """Of a floor next to an endless wall half of the sky is covered at its foot, and (1 + cos) / 2 away from it."""
     wall = torch.tensor([[0.0, -400, 0], [0, 400, 0], [0, 400, 0.5], [0, -400, 0.5]])
     texture = eg.bake(

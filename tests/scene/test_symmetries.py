@@ -16,12 +16,12 @@ DISPLACED = trimesh.transformations.random_rotation_matrix(np.array([0.2, 0.5, 0
 DISPLACED[:3, 3] = 3.0, -2.0, 5.0
 
 
-def mesh_of(solid: trimesh.Trimesh, displaced: bool = True, **looks: torch.Tensor) -> eg.Mesh:
+def mesh_of(solid: trimesh.Trimesh, displaced: bool = True, **fields: torch.Tensor) -> eg.Mesh:
     """With axes and centre where nobody would expect them."""
     solid = solid.copy()
     if displaced:
         solid.apply_transform(DISPLACED)
-    return eg.Mesh(torch.tensor(np.array(solid.vertices)), torch.tensor(np.array(solid.faces)), **looks)
+    return eg.Mesh(torch.tensor(np.array(solid.vertices)), torch.tensor(np.array(solid.faces)), **fields)
 
 
 def prism(sides: int, height: float = 0.9) -> trimesh.Trimesh:

@@ -1,4 +1,4 @@
-"""Borders of shadows, against exact areas: a rectangle casts its shadow on a plane, and a camera below it sees nothing else."""
+"""Shadow boundaries, against exact areas: a rectangle casts its shadow on a plane, and a camera below it sees nothing else."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ def test_triangles_of_directions() -> None:
 
 @pytest.mark.parametrize("mode", ["MASK", "BLEND"])
 @pytest.mark.parametrize("alpha", [0.4, 0.9])
-def test_what_is_masked_casts_no_shadow_whose_border_moves(mode, alpha):
+def test_masked_faces_cast_no_shadow(mode, alpha):
     """Shadow rays pass where alpha is below ½: the gradient is then that without shadows; above, it is another."""
     square = torch.tensor([[-0.8, -0.3, 1.0], [0.8, -0.3, 1.0], [0.8, 0.9, 1.0], [-0.8, 0.9, 1.0]])
     faces, uvs = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
@@ -269,9 +269,9 @@ def test_what_is_masked_casts_no_shadow_whose_border_moves(mode, alpha):
     found = []
     for shadows in (True, False):
         verts = square.clone().requires_grad_()
-        look = {"alpha": torch.full((2, 2), alpha), "material": eg.Material(0.5, alpha_mode=mode)}
-        pane = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, **look)
-        scene = eg.Scene([pane, floor], lights=[eg.PointLight(torch.tensor([1.2, 2.5, 2.5]), 15.0)])
+        appearance = {"alpha": torch.full((2, 2), alpha), "material": eg.Material(0.5, alpha_mode=mode)}
+        sheet = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, **appearance)
+        scene = eg.Scene([sheet, floor], lights=[eg.PointLight(torch.tensor([1.2, 2.5, 2.5]), 15.0)])
         image = eg.render(scene, camera, spp=16, shadows=shadows)
         (image * torch.linspace(-1, 1, 32)[:, None, None]).sum().backward()
         found.append(verts.grad)
@@ -282,8 +282,8 @@ def test_what_is_masked_casts_no_shadow_whose_border_moves(mode, alpha):
         assert float((with_shadows - without).norm()) > 0.2 * float(without.norm())
 
 
-def test_shadows_fall_on_each_of_the_panes_that_let_light_through():
-    """Panes of alpha 0.4, one behind the other as seen from the light, side by side as seen from the camera, before black: the
+def test_shadows_fall_on_each_of_two_transparent_sheets():
+    """Sheets of alpha 0.4, one behind the other as seen from the light, side by side as seen from the camera, before black: the
     image and its gradient are 0.4 of those of each as if it were opaque and the other were not there."""
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]], dtype=DOUBLE)
@@ -297,12 +297,15 @@ def test_shadows_fall_on_each_of_the_panes_that_let_light_through():
 
     near, far = upright(-1.5, 0.3, -1, 1, 0), upright(0.5, 3, -1.4, 1.4, -1.5)
 
-    def gradient(alpha: float | None, *panes: Tensor) -> Tensor:
+    def gradient(alpha: float | None, *sheets: Tensor) -> Tensor:
         caster, light = upright(-1.9, -1.4, -0.4, 0.3, 1.2).requires_grad_(), vector(-3.5, 0.3, 3.4).requires_grad_()
-        look = {"material": eg.Material(0.8)}
+        appearance = {"material": eg.Material(0.8)}
         if alpha is not None:
-            look = {"material": eg.Material(0.8, alpha_mode="BLEND"), "alpha": torch.full((2, 2), alpha, dtype=DOUBLE)}
-        meshes = [eg.Mesh(pane, faces, uvs=uvs, uv_faces=faces, **look) for pane in panes]
+            appearance = {
+                "material": eg.Material(0.8, alpha_mode="BLEND"),
+                "alpha": torch.full((2, 2), alpha, dtype=DOUBLE),
+            }
+        meshes = [eg.Mesh(sheet, faces, uvs=uvs, uv_faces=faces, **appearance) for sheet in sheets]
         scene = eg.Scene(
             [*meshes, eg.Mesh(caster, faces, material=eg.Material(0.3))], lights=[eg.PointLight(light, 30.0)]
         )

@@ -100,19 +100,19 @@ def scene_of(words: str, n: Leaves) -> eg.Scene:
     if "uvs" in own:
         own["uv_faces"] = faces
     filter = next((kind for kind in ("nearest", "mipmap") if kind in words), "linear")
-    looks: dict[str, Any] = {name: n[name] for name in ("metallic", "roughness", "emission") if name in n}
+    material: dict[str, Any] = {name: n[name] for name in ("metallic", "roughness", "emission") if name in n}
     if "map" in n:
-        looks |= {
+        material |= {
             "normal_map": eg.Texture(n["map"], filter=filter, factor=n["map_factor"]), "normal_scale": n["map_scale"]
         }  # fmt: skip
     if "base" in n:
-        looks["base_color"] = eg.Texture(
+        material["base_color"] = eg.Texture(
             n["base"], uvs=n["base_uvs"], uv_faces=faces, wrap=("mirror", "clamp"), factor=n["base_factor"],
             filter=filter,
         )  # fmt: skip
     if "texture" in own:
         own["filter"] = filter
-    mesh = eg.Mesh(n["verts"], faces, material=eg.Material(two_sided="one_sided" not in words, **looks), **own)
+    mesh = eg.Mesh(n["verts"], faces, material=eg.Material(two_sided="one_sided" not in words, **material), **own)
     ground = eg.Mesh(n["ground"], torch.tensor([[0, 2, 1], [0, 3, 2]]), material=eg.Material(n["ground_color"]))
     lights: list[Any] = []
     if "point" in n:

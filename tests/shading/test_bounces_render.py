@@ -162,12 +162,12 @@ def test_borders_without_samples_are_refused() -> None:
         lights = [scene.lights[0].replace(position=vector(0.5, -0.3, 1.7) if light is None else light)]
         return scene.replace(meshes=[mesh.replace(verts=verts, **fields), *others], lights=lights)
 
-    pane = {**uvs, "alpha": half, "material": eg.Material(0.5, alpha_mode="BLEND")}
+    sheet = {**uvs, "alpha": half, "material": eg.Material(0.5, alpha_mode="BLEND")}
     nearest = eg.Texture(torch.rand(2, 2, 3, dtype=F64), filter="nearest", uvs=leaf[:, :2], uv_faces=mesh.faces)
-    moved_light = room(mesh.verts, vector(0, 0, 1).requires_grad_(), **pane)
+    moved_light = room(mesh.verts, vector(0, 0, 1).requires_grad_(), **sheet)
     verts = r"meshes\[0\].verts"
     for other, name, why in (
-        (room(leaf, **pane), verts, "sees through"),
+        (room(leaf, **sheet), verts, "sees through"),
         (moved_light, r"lights\[0\].position", "sees through"),
         (room(mesh.verts, material=eg.Material(nearest)), r"uvs of a nearest texture of meshes\[0\]", "nearest texels"),
     ):
@@ -175,10 +175,10 @@ def test_borders_without_samples_are_refused() -> None:
             with pytest.raises(ValueError, match=f"bounces: {name} requires a gradient.*{why}"):
                 function(other, camera, 4, bounces=2)
     # Without borders there is nothing to leave out; and direct light has all of them.
-    assert eg.render(room(leaf, **pane), camera, 4, bounces=3, visibility=False).requires_grad
-    assert eg.render(room(leaf, **pane), camera, 4).requires_grad
+    assert eg.render(room(leaf, **sheet), camera, 4, bounces=3, visibility=False).requires_grad
+    assert eg.render(room(leaf, **sheet), camera, 4).requires_grad
     with torch.no_grad():
-        eg.render(room(leaf, **pane), camera, 4, bounces=3)
+        eg.render(room(leaf, **sheet), camera, 4, bounces=3)
     with pytest.raises(ValueError, match="bounces: expected an int from 1"):
         eg.render(scene, camera, 4, bounces=0)
 

@@ -87,7 +87,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_the_shape_of_a_emitter(name: str):
+def test_the_shape_of_an_emitter(name: str):
     mesh, flat, convex = SHAPES[name]
     tree = tree_of(MeshLight(eg.AreaLight.of(mesh, 1.0)))
     assert (tree.is_flat, tree.is_convex) == (flat, convex)
@@ -153,7 +153,7 @@ def test_directions_to_a_ball_have_their_density(distance: float):
         torch.testing.assert_close(stands_for, area[of_face][0], rtol=4 / math.sqrt(int(of_face.sum())), atol=0)
 
 
-def test_all_directions_may_miss_a_emitter():
+def test_all_directions_may_miss_an_emitter():
     """There is nothing then; one surface at a time, for what others meet would hide it."""
     emitter = MeshLight(eg.AreaLight.of(together(moved(block(1, 1, 1), 1.0, 0, 0, 3)), 1.0))
     n, y = vector(0, 0, 1)[None], vector(0.1, 0.2, 0)[None]
@@ -292,7 +292,7 @@ def test_lobes_draw_only_where_they_gain():
 
     assert asked(1.0, 0.2, -0.6) and asked(0.3, 0.1, -0.6) and asked(5.0, 0.6, 0.0)
     assert not asked(0.05, 0.3, -0.6)  # all of it lies within the lobe
-    assert not asked(0.5, 0.1, 6.0)  # the lobe looks elsewhere
+    assert not asked(0.5, 0.1, 6.0)  # the lobe points elsewhere
     assert not asked(5.0, 0.9, 0.0)  # the lobe is too wide
 
 

@@ -58,8 +58,8 @@ def test_derivatives_of_scattering():
         return Scattering(base, metallic, roughness).evaluate(*vectors)
 
     assert gradcheck(of, leaves)
-    bent = [normalize(UP + vector(0.3, 0, 0), dim=0), UP, normalize(vector(0.8, 0.1, 0.2), dim=0)]
-    assert gradcheck(terminator, [x[None].clone().requires_grad_() for x in bent])
+    tilted = [normalize(UP + vector(0.3, 0, 0), dim=0), UP, normalize(vector(0.8, 0.1, 0.2), dim=0)]
+    assert gradcheck(terminator, [x[None].clone().requires_grad_() for x in tilted])
 
 
 @pytest.mark.parametrize("roughness", [0.4, 0.7, 1.0])
@@ -178,7 +178,7 @@ def test_emission_alone_is_the_unlit_image():
     images = [eg.render(eg.Scene([mesh]), from_above(), 64) for mesh in (unlit, emitting)]
     torch.testing.assert_close(images[1].mean((0, 1)), images[0].mean((0, 1)), rtol=0.01, atol=0)
     torch.testing.assert_close(*images, rtol=0.1, atol=0.05)
-    # Beside a mesh that is lit, one without a material keeps its colours.
+    # Next to a mesh that is lit, one without a material keeps its colours.
     both = eg.Scene([unlit, ball(1, material=eg.Material()).transformed(t=vector(0, 0, -9))])
     torch.testing.assert_close(
         eg.render(both, from_above(), 64)[4:12, 4:12], images[0][4:12, 4:12], rtol=0.1, atol=0.05
@@ -209,28 +209,28 @@ def test_vertex_normals():
 
 
 def test_normal_maps():
-    bent = normalize(vector(0.3, 0.2, 1), dim=0)
-    image = ((bent + 1) / 2).expand(2, 2, 3)
+    tilted = normalize(vector(0.3, 0.2, 1), dim=0)
+    image = ((tilted + 1) / 2).expand(2, 2, 3)
     light = [eg.DirectionalLight([-0.2, -0.4, -1.0])]
     # The uvs of the plane run along x and y, so the tangent frame is the world's.
     mapped = at_origin(eg.Material(1.0, normal_map=eg.Texture(image)), light, 1)
-    given = at_origin(eg.Material(1.0), light, 1, normals=bent.expand(4, 3))
+    given = at_origin(eg.Material(1.0), light, 1, normals=tilted.expand(4, 3))
     torch.testing.assert_close(mapped, given)
     flat = at_origin(eg.Material(1.0, normal_map=eg.Texture(image), normal_scale=0.0), light, 1)
     torch.testing.assert_close(flat, at_origin(eg.Material(1.0), light, 1))
-    # An image that is mirrored along u bends the other way along x.
+    # An image that is mirrored along u tilts normals the other way along x.
     mirror = plane().uvs
     assert mirror is not None
     mirror = mirror * vector(-1, 1)
     other = at_origin(eg.Material(1.0, normal_map=eg.Texture(image, mirror, plane().uv_faces)), light, 1)
     torch.testing.assert_close(
-        other, at_origin(eg.Material(1.0), light, 1, normals=(bent * vector(-1, 1, 1)).expand(4, 3))
+        other, at_origin(eg.Material(1.0), light, 1, normals=(tilted * vector(-1, 1, 1)).expand(4, 3))
     )
     # Normals that oppose the faces are turned.
-    torch.testing.assert_close(at_origin(eg.Material(1.0), light, 1, normals=-bent.expand(4, 3)), given)
+    torch.testing.assert_close(at_origin(eg.Material(1.0), light, 1, normals=-tilted.expand(4, 3)), given)
     # Normals of another index.
     rows = torch.zeros(2, 3, dtype=torch.int64)
-    torch.testing.assert_close(at_origin(eg.Material(1.0), light, 1, normals=bent[None], normal_faces=rows), given)
+    torch.testing.assert_close(at_origin(eg.Material(1.0), light, 1, normals=tilted[None], normal_faces=rows), given)
 
 
 def test_light_ends_where_the_face_turns_away():

@@ -1,4 +1,4 @@
-"""Light that nearby surfaces scatter on what is seen, as that slides on its face: gradients by the camera in corners."""
+"""The near-field term: gradients by the camera in corners, where nearby surfaces light what is seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes that show light which came by way of other surfaces, what moves in them, and how images of that light alone change.
+"""Scenes that show light that other surfaces scatter, what moves in them, and how images of that light alone change.
 
 A change over [−h, h] is compared with the mean of the derivative there (Gauss and Legendre, three points), so that h may be large
 and the difference quiet.
@@ -162,7 +162,7 @@ def plates() -> BounceScene:
 
 
 def open_plates() -> BounceScene:
-    """The same without the strip: no border on the way of light moves."""
+    """The same without the strip: no secondary edge moves."""
     found = plates()
     return found._replace(meshes={name: mesh for name, mesh in found.meshes.items() if name != "strip"})
 
@@ -191,7 +191,7 @@ def shelf() -> BounceScene:
 
 
 def leaf() -> BounceScene:
-    """A sheet in the room of which alpha leaves a leaf."""
+    """A sheet in the room of which alpha masks all but a leaf."""
     corners = torch.tensor([[-0.4, -0.6, 0.4], [0.6, -0.65, 0.35], [0.6, 0.05, -0.4], [-0.4, 0.0, -0.35]], dtype=F64)
     at = (torch.arange(6, dtype=F64) + 0.5) / 6
     away = ((at[:, None] - 0.52) ** 2 + (at[None, :] - 0.45) ** 2).sqrt()
@@ -207,9 +207,9 @@ def texels() -> BounceScene:
     """The block has texels of which the nearest is taken."""
     found = cornell()
     own = found.meshes["block"]
-    look = eg.Texture(torch.rand(4, 4, 1, dtype=F64, generator=torch.Generator().manual_seed(1)), filter="nearest")
+    texture = eg.Texture(torch.rand(4, 4, 1, dtype=F64, generator=torch.Generator().manual_seed(1)), filter="nearest")
     uvs = 1.5 * own.verts[:, :2]
-    own = own.replace(face_colors=None, uvs=uvs, uv_faces=own.faces, material=eg.Material(look))
+    own = own.replace(face_colors=None, uvs=uvs, uv_faces=own.faces, material=eg.Material(texture))
     return found._replace(meshes=found.meshes | {"block": own})
 
 

@@ -175,10 +175,10 @@ ROOMS: dict[str, Callable[[], eg.Scene]] = {
     "large light": lambda: room_lit_by(_ball(0.35, (0.3, -0.2, 1.4), 2, base_color=0.5, emission=2.0)),
     "metal ball": metal_room,
     "two sheets": sheets_room,
-    "cut-out": striped_room,
+    "alpha-tested": striped_room,
 }
 
 
 def without_alpha(name: str) -> eg.Scene:
     """The same room for those who know no alpha-tested faces."""
-    return striped_room(as_quads=True) if name == "cut-out" else ROOMS[name]()
+    return striped_room(as_quads=True) if name == "alpha-tested" else ROOMS[name]()
