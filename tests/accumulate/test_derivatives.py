@@ -176,7 +176,7 @@ def test_gradients_are_exact_derivatives_to_a_fraction_of_a_percent(view: str, f
 
 
 def test_a_wrong_gradient_is_rejected() -> None:
-    """Without the boundary term most are wrong, and what is not known well enough is not compared."""
+    """Most derivatives are wrong without the boundary term. What is not known well enough is not compared."""
     for name, (truth, found) in compared("perspective", "box", 15_000, 8, visibility=False).items():
         if name in SIGNS:
             check(name, truth, found)
@@ -202,7 +202,7 @@ def test_exact_image_is_what_is_rendered(view: str, filter: str) -> None:
 
 @every_view_and_filter
 def test_exact_derivatives_are_those_of_the_exact_image(view: str, filter: str) -> None:
-    """Of all parameters at once, by central differences; a step of 1e-6 leaves 1e-9 of rounding."""
+    """Compare all parameters at once with central differences; a step of 1e-6 leaves 1e-9 of rounding."""
     render = partial(exact_image, order=9, filter=filter)
     direction = torch.randn(len(PARAMETERS), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     high, low = (loss(step * direction, view, render).item() for step in (1e-6, -1e-6))

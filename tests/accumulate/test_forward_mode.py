@@ -30,7 +30,7 @@ ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
 
 
 def panorama() -> eg.Camera:
-    """With what CAMERA sees behind it, across the seam; the middle of the image is turned to there."""
+    """Return a panorama that has what CAMERA sees behind it, across the seam: the middle of its image is turned there."""
     M = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=F64)) @ CAMERA.world_to_camera
     f = 0.8 * float(CAMERA.K[0, 0])
     K = torch.tensor([[f, 0.3, SIZE / 2 - math.pi * f + 1.3], [0.0, f, SIZE / 2 + 0.2], [0.0, 0.0, 1.0]], dtype=F64)
@@ -58,7 +58,7 @@ def mixed_scene() -> eg.Scene:
 
 
 def smooth_direction(x: Tensor) -> Tensor:
-    """Of an array, one that does not cancel out in sums."""
+    """Return a direction for an array that does not cancel out in sums."""
     n = torch.arange(x.numel(), dtype=F64).reshape(x.shape)
     return 1 + 0.5 * torch.sin(0.7 * n)
 
@@ -282,7 +282,7 @@ def test_tangents_that_do_not_fit(tangents, message):
     diagonal([CAMERA, ORTHOGRAPHIC, DISTORTED, PANORAMA], [mixed_scene, crossing_scene], ["gaussian", "box"]),
 )
 def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter):
-    """By (1, 0) and (0, 1) px, as the principal point does."""
+    """The image moves by (1, 0) and (0, 1) px, as the principal point does."""
     scene = scene()
     K = camera.K.clone().requires_grad_()
     adjoint, samples = ADJOINT + 0.4, {"surface_samples": 12_000, "edge_samples": 12_000}
@@ -296,7 +296,7 @@ def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter
 
 
 def test_screen_gradient_lies_where_things_are():
-    """Of two objects apart, each has in its pixels what moving it alone gives; none is where the loss does not look."""
+    """Each of two objects apart has in its pixels what moving it alone gives. There is none where the adjoint is zero."""
     left, right = (cube(0.5).transformed(t=torch.tensor([x, 0.0, 0.0], dtype=F64)) for x in (-0.7, 0.7))
     scene = eg.Scene([left, right])
     pixels = float(ORTHOGRAPHIC.K[0, 0])

@@ -25,7 +25,7 @@ TEXTURES = ("none", "linear", "nearest", "mipmap", "normal map")
 
 
 def camera(lens: str, eye: Tensor) -> eg.Camera:
-    """In front of the origin, at `eye`."""
+    """Return a camera at `eye`, in front of the origin."""
     size = (HEIGHT, WIDTH)
     view = eg.Camera.look_at(eye, (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), fov_y=45.0, size=size).to(F64)
     if lens == "orthographic":

@@ -178,7 +178,7 @@ def test_a_wrong_gradient_is_rejected(triangle):
     ],
 )
 def test_bounces_without_borders_are_rejected(name, monkeypatch):
-    """Without the borders of what surfaces see of one another the gradient is wrong."""
+    """The gradient is wrong without secondary edges."""
     if name == "bounced-million":
         monkeypatch.setitem(CASES, name, dataclasses.replace(CASES[name], build=lambda: bounced.million(3)))
     problem = CASES[name].build()
@@ -224,7 +224,7 @@ def test_what_is_raised_is_told(triangle):
 
 
 def shifted_triangle(visibility: bool = True) -> Problem:
-    """Without exact integrals: its gradient is compared with finite differences."""
+    """Return a problem without exact integrals: its gradient is compared with finite differences."""
     scene, camera = one_triangle(), front_camera(32)
     direction = torch.tensor([0.7, 0.6, -0.2], dtype=torch.float64)
     return Problem(
@@ -236,7 +236,7 @@ def shifted_triangle(visibility: bool = True) -> Problem:
 
 @pytest.mark.parametrize("visibility", [True, False])
 def test_finite_differences_tell(visibility):
-    """Of the renderer: a triangle's shift, with and without its boundary term."""
+    """The renderer shifts a triangle, with and without its boundary term."""
     row = measure.measure(case_of(shifted_triangle(visibility)), QUICK)
     assert row["verdict"] == (RIGHT if visibility else WRONG), row
 
@@ -327,7 +327,7 @@ def test_ill_conditioned_fits():
 
 @pytest.mark.parametrize("name", list(steps.cases()))
 def test_painted_areas(name):
-    """From lines that are close: within 3.5 %, which a derivative that is 5 % off is not."""
+    """Lines that are close give the area within 3.5 %, which a derivative that is 5 % off does not."""
     case = steps.cases()[name]
     found = torch.stack([steps.derivative(case, 0.25, seed) for seed in range(4)]) / (case.area * steps.SCALE**2)
     error = float(found.std()) / 4**0.5

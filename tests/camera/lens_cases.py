@@ -107,6 +107,6 @@ def check_gradient(
 
 
 def gradient_size(case: Case) -> float:
-    """Of what the derivative is a sum: |adjoint| · |image| change, about."""
+    """Return about |adjoint| · |image| change, the terms that the derivative sums."""
     high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256) for h in (0.01, -0.01))
     return float((high - low).abs().sum()) / 0.02

@@ -59,7 +59,7 @@ def test_project_vjp(lens, q):
 
 @lenses
 def test_normalised_vjp(lens):
-    """In K and the distortion; a pixel position is given, and has no derivative."""
+    """K and the distortion have derivatives; a pixel position is given, and has none."""
     x = np.array([11.3, 40.2])
     perspective, name, distortion = LENSES[lens]
 
@@ -74,7 +74,7 @@ def test_normalised_vjp(lens):
 
 @lenses
 def test_bend_jvp_and_area_scale(lens):
-    """Of the undistorted image, against differences of the positions in the image."""
+    """Compare derivatives by the undistorted image with differences of the positions in the image."""
     perspective, name, distortion = LENSES[lens]
     camera, pinhole = kernel_camera(K6, perspective, name, distortion), kernel_camera(K6, perspective)
     u = np.array(parts.project(pinhole, [0.2, -0.3, 0.9]))

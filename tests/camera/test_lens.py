@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from around import area, check_area
-from combinations import diagonal
 from finite_differences import loss, rotation
 from kernel_parts import parts
 from lens_cases import DISTORTION, F64, SIZE, camera, check_gradient, colored_sphere, scene
@@ -79,13 +78,6 @@ def test_boxes_hold_what_they_say(lens: str) -> None:
 # -- images -------------------------------------------------------------------------------------------------------------
 
 
-def test_no_distortion_is_a_pinhole() -> None:
-    """Coefficients of zero: every pixel is right; the last digits may differ."""
-    mesh, view = colored_sphere(), camera("four").replace(distortion=None)
-    zero = view.replace(distortion=torch.zeros(5, dtype=F64))
-    torch.testing.assert_close(eg.render(mesh, zero, 64), eg.render(mesh, view, 64), rtol=0, atol=1e-9)
-
-
 TRIANGLE = torch.tensor([[-0.6, -0.5, 0.3], [0.8, -0.2, -0.6], [-0.1, 0.7, 0.2]], dtype=F64)
 
 
@@ -108,7 +100,6 @@ def test_area_in_a_wide_fisheye(degrees: int) -> None:
     check_area(view, ahead @ turn.mT)
 
 
-@pytest.mark.slow
 @lenses
 def test_wall(lens: str) -> None:
     """A triangle that fills the view has an interior term alone: against quadrature in double, differentiated by autograd."""
@@ -128,8 +119,8 @@ def test_wall(lens: str) -> None:
     assert bool((b > 0).all()), "it must fill the view"
     radiance = (b / b.sum(1, keepdim=True)) @ wall.colors
     expected = radiance.reshape(H, grid, W, grid, 3).mean((1, 3))
-    image = eg.render(wall.replace(verts=verts), view, 1024, surface_samples=100_000)
-    torch.testing.assert_close(image, expected, rtol=0, atol=2e-3)
+    image = eg.render(wall.replace(verts=verts), view, 64, surface_samples=100_000)
+    torch.testing.assert_close(image, expected, rtol=0, atol=5e-3)
     adjoint = smooth_adjoint(H, W, 3)
     truth, found = (torch.autograd.grad((value * adjoint).sum(), leaves) for value in (expected, image))
     for name, a, b in zip(("verts", "world_to_camera", "K", "distortion"), truth, found, strict=True):
@@ -149,12 +140,6 @@ def undistorted(view: eg.Camera, x: Tensor) -> Tensor:
 
 
 WHAT = ["vertices", "pose", "K00", "K11", "K01", "K02", "K12"]
-
-
-@pytest.mark.parametrize(("lens", "what"), diagonal(list(DISTORTION), ["d0", "vertices", "K00"]))
-def test_gradient(lens: str, what: str) -> None:
-    """Of a crop that reaches beyond the image, where the lens distorts most."""
-    check_gradient("both", camera(lens).crop(-5, 15, 25, 30), what, spp=3072 if what == "K00" else 1024)
 
 
 @pytest.mark.slow
@@ -300,7 +285,7 @@ def test_threads_that_change_lenses_find_their_own() -> None:
 
 @pytest.mark.parametrize("spp", [1, 16])
 def test_a_lens_of_zeros_renders_as_its_pinhole(spp: int) -> None:
-    """The same bits, of images and of gradients that leave the coefficients alone."""
+    """Images have the same bits, and so have gradients that leave the coefficients alone."""
     mesh, view = colored_sphere(), camera("four").replace(distortion=None)
     zero = view.replace(distortion=torch.zeros(5, dtype=F64))
     adjoint = smooth_adjoint(*SIZE, 3)

@@ -1,4 +1,4 @@
-"""Where a lens folds, and what it shows ends."""
+"""A lens that folds shows nothing beyond its fold, and says so."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_rational_lens_may_fold_in_a_narrow_ring(gap: float) -> None:
 
 
 def test_the_warning_comes_once_a_line_and_points_there() -> None:
-    """Through operators, modules and whatever else lies between: fits that move the distortion are not told at each step."""
+    """The warning passes operators, modules and whatever else lies between. Fits that move the distortion get it once."""
     view, sphere = folding_camera(), colored_sphere()
     d = view.coefficients.clone().requires_grad_()
 

@@ -97,7 +97,8 @@ def position(view: eg.Camera, q: np.ndarray) -> np.ndarray:
 
 
 def directions(view: eg.Camera, x: np.ndarray) -> np.ndarray:
-    """In the world, of what is seen at pixels (N, 2), from a table of the polynomial; not numbers beyond the end of the lens."""
+    """Return the directions in the world of what is seen at pixels (N, 2), from a table of the polynomial; NaN beyond the end
+    of the lens."""
     K, R = view.K.numpy(), view.world_to_camera[:3, :3].numpy()
     m = np.linalg.solve(K[:2, :2], (x - K[:2, 2])[..., None])[..., 0]
     size = np.linalg.norm(m, axis=-1)
@@ -116,7 +117,7 @@ def sub_cameras(view: eg.Camera, reach: float = 0.0) -> list:
 @pytest.mark.unwatched
 @cameras
 def test_points_agree_with_the_formula(view: eg.Camera) -> None:
-    """Up to 110° and beyond; through one sub-camera, and in the image as Camera.project says."""
+    """One sub-camera shows each point up to 110° and beyond, at the position that Camera.project says."""
     (H, W), end, count = view.size, end_angle(view), 0
     through = sub_cameras(view)
     for q in np.random.default_rng(0).normal(size=(200, 3)):
@@ -138,7 +139,7 @@ def test_points_agree_with_the_formula(view: eg.Camera) -> None:
 
 
 def test_points_agree_with_opencv() -> None:
-    """Where OpenCV has them, before the camera; up to 89.9°."""
+    """OpenCV has points before the camera; compare up to 89.9°."""
     view = camera()
     K = view.K.numpy() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     rng = np.random.default_rng(0)
@@ -150,7 +151,8 @@ def test_points_agree_with_opencv() -> None:
 
 @cameras
 def test_every_pixel_position_belongs_to_one_sub_camera(view: eg.Camera) -> None:
-    """Also on the borders between them; beyond the end of the lens to none. And the direction there is seen at that position."""
+    """This holds on the borders between them, too; positions beyond the end of the lens belong to none. The direction there is
+    seen at that position."""
     H, W = view.size
     x = [
         *np.random.default_rng(0).uniform((0, 0), (W, H), (300, 2)),
@@ -264,7 +266,7 @@ def test_area_of_a_triangle(degrees: int, skew: float) -> None:
 
 
 def test_area_of_a_triangle_that_reaches_around() -> None:
-    """From ahead to behind, through several sub-cameras, and past the eye."""
+    """The triangle reaches from ahead to behind, through several sub-cameras, and past the eye."""
     check_area(camera(8.0), world(torch.tensor([[0.3, -2.0, 1.5], [2.5, 0.4, -1.2], [0.2, 1.6, 0.5]], dtype=F64)))
 
 
@@ -303,7 +305,7 @@ SOME = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("place", "kind", "view", "what"), SOME)
 def test_gradients(place: str, kind: Callable[..., eg.Scene], view: str, what: str) -> None:
-    """With a filter through which the loss is smooth."""
+    """The filter makes the loss smooth."""
     case = moved(lambda dx=0.0: kind(PLACES[place], dx), CAMERAS[view], what)
     check_gradient(case, spp=4096, seeds=6, step=0.01 if what[0] == "d" else 0.02, filter="tent")
 
@@ -313,35 +315,6 @@ def test_around_the_antipode() -> None:
     """A ball right behind, which a lens that shows all around draws as a ring: areas grow without bound there."""
     case = moved(lambda dx=0.0: both((0.2, 0.1, -2.5), dx), CAMERAS["all around"], "vertices")
     check_gradient(case, filter="tent", step=0.01)
-
-
-def test_forward_mode_and_gradient_by_place() -> None:
-    """⟨v, J u⟩ = ⟨Jᵀ v, u⟩ for vertices, pose, K and distortion; and by place, the same for a shift of the whole image."""
-    scene, view, adjoint = both(PLACES["behind"]), camera(), smooth_adjoint(*SIZE, 3)
-    leaves = [view.world_to_camera, view.K, view.coefficients, *(m.verts for m in scene.meshes)]
-    generator = torch.Generator().manual_seed(3)
-    tangents = [torch.randn(t.shape, generator=generator, dtype=F64) * 0.02 for t in leaves]
-    tangents[0][3], tangents[1][2] = 0, 0
-    tangents[0][:3, :3] = (
-        rotation((0.0, 0.6, 0.8), torch.tensor(0.02, dtype=F64)) @ leaves[0][:3, :3] - leaves[0][:3, :3]
-    )
-    tangents[2] *= 0.1
-
-    def image(M: Tensor, K: Tensor, d: Tensor, *verts: Tensor) -> Tensor:
-        meshes = [m.replace(verts=v) for m, v in zip(scene.meshes, verts, strict=True)]
-        distorted = view.replace(world_to_camera=M, K=K, distortion=d)
-        return eg.render(scene.replace(meshes=meshes), distorted, 16, surface_samples=200_000, edge_samples=50_000)
-
-    forward = torch.func.jvp(image, tuple(leaves), tuple(tangents))[1]
-    leaves = [t.clone().requires_grad_() for t in leaves]
-    reverse = torch.autograd.grad((image(*leaves) * adjoint).sum(), leaves)
-    a, b = float((forward * adjoint).sum()), sum(float((g * t).sum()) for g, t in zip(reverse, tangents, strict=True))
-    assert a == pytest.approx(b, rel=0.02)
-    # K's last column moves all of the image.
-    place = eg.screen_gradient(scene, view, adjoint, surface_samples=200_000, edge_samples=50_000)
-    torch.testing.assert_close(
-        place.sum((0, 1)), reverse[1][:2, 2], rtol=0.05, atol=0.05 * float(reverse[1][:2, 2].abs().max())
-    )
 
 
 def test_channels() -> None:
@@ -356,7 +329,7 @@ def test_channels() -> None:
 
 
 def test_shader() -> None:
-    """The same as without: image, and gradient by everything that moves it."""
+    """A shader gives the image, and the gradient by everything that moves it, that the kernel gives without one."""
     scene, view, adjoint = both(PLACES["behind"]), camera(), smooth_adjoint(*SIZE, 3)
     colors = torch.cat([m.colors for m in scene.meshes if m.colors is not None])
 

@@ -1,4 +1,4 @@
-"""The same bits: at any number of threads, whatever came before, for each seed."""
+"""Bits do not depend on the number of threads nor on what came before, but on the seed."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def without_borders(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def dots(hits: eg.Hits) -> Tensor:
-    """In the middle of every third pixel, 0.6 px wide: no other pixel knows of them."""
+    """Paint a dot of 0.6 px in the middle of every third pixel: no other pixel knows of it."""
     x = hits.pixel % 3 - 1.5
     return hits.where(0.3 - x.norm(dim=1), 1.0, 0.0)
 
@@ -75,7 +75,7 @@ def test_shaders_without_steps_keep_their_bits(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_bound_of_what_is_shaded():
-    """Where every pixel is a border, four times the points of the first pass more."""
+    """Every pixel is a border, so at most four times the points of the first pass are shaded more."""
     counts = []
 
     def shader(hits: eg.Hits) -> Tensor:

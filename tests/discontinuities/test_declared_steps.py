@@ -100,7 +100,7 @@ def test_a_step_that_is_said_twice_counts_once():
 
 
 def test_a_jump_of_the_function_is_no_step():
-    """Where s jumps over zero, at a silhouette before another surface or by itself, nothing is said to move."""
+    """Nothing is said to move where s jumps over zero, at a silhouette before another surface or by itself."""
     a = torch.tensor(0.0, dtype=F64, requires_grad=True)
     back, front = square(), square(0.4)
     scene = eg.Scene([back, front.replace(verts=0.5 * front.verts - torch.tensor([0.0, 0.0, 1.0], dtype=F64))])

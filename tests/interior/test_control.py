@@ -78,7 +78,7 @@ SCENES = {
 
 
 class Gradient:
-    """What the interior term gives for a few motions that no control was made for, and for the colours."""
+    """The interior term for the colours and for a few motions that no control was made for."""
 
     def __init__(self, meshes: list[eg.Mesh], adjoint: Tensor) -> None:
         self.meshes, self.adjoint = meshes, adjoint
@@ -125,7 +125,7 @@ def test_few_samples_estimate_what_is_exact(name: str, rough: bool, filter: str)
 
 
 def test_a_smooth_loss_needs_few_samples() -> None:
-    """Without the control, a sample or two somewhere on each face: 11 % with three times the samples."""
+    """The error was 11 % without the control, with three times the samples."""
     mesh, adjoint = icosphere(4), smooth_adjoint(96, 96, 3)
     camera = front_camera(96)
 
@@ -143,8 +143,8 @@ def test_a_smooth_loss_needs_few_samples() -> None:
 
 @pytest.mark.parametrize("signs", [False, True])
 def test_a_rough_loss_gets_its_samples(signs: bool) -> None:
-    """Where neighbouring pixels have nothing to do with one another, corners say little of what is between them, and less
-    where they agree by chance, as the signs of an L1 loss do: then a face was sampled a sixteenth as often, error × 3."""
+    """Corners say little of what is between them where neighbouring pixels are independent. They say less where they agree by
+    chance, as the signs of an L1 loss do: then a face was sampled a sixteenth as often, error × 3."""
     mesh, camera = icosphere(4), front_camera(64)
     assert mesh.colors is not None
     mesh = mesh.replace(colors=mesh.colors[:, :1])

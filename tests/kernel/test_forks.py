@@ -105,10 +105,11 @@ if __name__ == "__main__":
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fork() as on Linux")
 @pytest.mark.parametrize("forks, more", [(2, 20), pytest.param(40, 500, marks=pytest.mark.slow)])
 def test_forked_children_render(forks, more, tmp_path):
-    """Before and after the parent rendered with several threads, with threads of their own, as workers of a DataLoader.
+    """Children render before and after the parent did with several threads, with threads of their own, and as workers of a
+    DataLoader.
 
-    Then while other threads build: Embree's threads leave a build after it is over, and held locks of their own in 2 % of the
-    children.
+    Then they render while other threads build: Embree's threads leave a build after it is over, and held locks of their own in
+    2 % of the children.
     """
     found = script(FORK, forks, more, timeout=400, folder=tmp_path)
     expected = found["expected"]

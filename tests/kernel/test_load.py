@@ -65,7 +65,7 @@ def test_memory_stays_and_results_repeat_over_many_steps(steps, tmp_path):
 
 
 def bits(mesh, seed=0):
-    """Of the image and the gradients by vertices and colours."""
+    """Return a hash of the image and of the gradients by vertices and colours."""
     verts, colors = (t.detach().clone().requires_grad_() for t in (mesh.verts, mesh.colors))
     image = eg.render(mesh.replace(verts=verts, colors=colors), front_camera(40), spp=4, seed=seed)
     image.square().mean().backward()
@@ -195,7 +195,7 @@ found |= {"rendered": len(rendered), "wrong": wrong + sum(r != alone[0] for r in
 
 @pytest.fixture(scope="module")
 def threads(tmp_path_factory):
-    """What one process finds of its threads, for the tests below: it takes longer to import torch than to render."""
+    """Return what one process finds of its threads, for the tests below: it takes longer to import torch than to render."""
     code = WAITING + NAMES
     if hasattr(signal, "SIGALRM"):
         code += HANDLER + INTERRUPTED
@@ -204,7 +204,7 @@ def threads(tmp_path_factory):
 
 
 def test_workers_that_wait_sleep(threads):
-    """By default OpenMP's threads spin for some milliseconds; longer would take the processors from other processes."""
+    """OpenMP's threads spin for some milliseconds by default; longer would take the processors from other processes."""
     assert threads["worked"] > 0, "no worker did anything"
     assert max(threads["waited"]) < 0.005, "workers took seconds of processor time while nothing was to do"
 
@@ -274,7 +274,7 @@ def check_interrupted(found):
 @posix
 @pytest.mark.parametrize("kind", ["edge samples", "last tile"])
 def test_ctrl_c_ends_a_long_render(kind, threads):
-    """Also where the calling thread has nothing left to do."""
+    """The calling thread may have nothing left to do."""
     check_interrupted(threads["interrupted"][kind])
 
 

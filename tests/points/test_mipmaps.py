@@ -57,8 +57,8 @@ def test_texels_get_gradients_through_mipmaps():
 @pytest.mark.unwatched
 @pytest.mark.parametrize("view", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
 def test_levels_of_mipmaps_have_derivatives(view: str):
-    """By what is seen and by the camera, at fixed places in the image; of a square that is turned away from it, so that the level
-    differs from place to place."""
+    """Differentiate by the square and by the camera at fixed places in the image. The square is turned away from the camera, so
+    the level differs from place to place."""
     texture = torch.rand((64, 64, 2), generator=torch.Generator().manual_seed(0), dtype=F64)
     mesh, camera = facing(texture, 1.0)
     R = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], dtype=F64)
@@ -138,7 +138,8 @@ def test_meshes_with_mipmaps_are_shaded_by_them():
 
 @pytest.mark.unwatched
 def test_meshes_with_mipmaps_have_gradients():
-    """Along the texture it is the image; along a shift across the image, which changes no level, finite differences."""
+    """The derivative along the texture is the image. That along a shift across the image, which changes no level, is a finite
+    difference."""
     generator = torch.Generator().manual_seed(2)
     mesh, camera = facing(torch.rand((48, 48, 2), generator=generator, dtype=F64), 0.4)
     K = camera.K + torch.tensor([[0, 0, 3], [0, 0, 3], [0, 0, 0]], dtype=F64)  # so that the border is in the image

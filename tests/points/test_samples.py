@@ -178,7 +178,7 @@ def views() -> dict[str, eg.Camera]:
 
 @pytest.mark.parametrize("view", views())
 def test_places_show_what_pixels_do(view: str):
-    """What is seen at a place, and the ray that goes there and its derivative by the place, next to the hits of an image."""
+    """Compare what is seen at a place, the ray that goes there and its derivative by the place with the hits of an image."""
     primary = eg.primary_hits(ball(1), views()[view], spp=4)
     hits, frame = primary.hits, primary.frame
     x = hits.pixel
@@ -288,7 +288,7 @@ def test_jumps_at_edges_alone_move_a_silhouette():
 
 
 def test_attached_edges_keep_the_type_and_have_no_second_derivatives():
-    """Nor by what the image depends on: how coverage moves is not in its graph."""
+    """The image's own graph does not have how coverage moves, so second derivatives by it are refused, too."""
     verts, color = ball().verts.clone().requires_grad_(), torch.rand(3, dtype=F64, requires_grad=True)
     primary = eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE))
     edges = eg.edge_samples(primary, 200)

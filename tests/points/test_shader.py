@@ -14,7 +14,7 @@ import edgegrad as eg
 
 
 def gradients(scene: eg.Scene, camera: eg.Camera, shaded: bool, seed: int, **options: object) -> dict[str, Tensor]:
-    """Of the loss by every tensor of scene and camera."""
+    """Return the gradient of the loss by every tensor of scene and camera."""
     leaves: dict[str, Tensor] = {}
 
     def leaf(name: str, tensor: Tensor) -> Tensor:
@@ -284,7 +284,7 @@ def test_a_batch_of_attributes_of_faces_under_vmap():
 
 
 def test_in_parts_of_bounded_size(monkeypatch: pytest.MonkeyPatch):
-    """What is given to the shader at once changes nothing."""
+    """The number of points that the shader is given at once changes nothing."""
     mesh, camera = bumpy(), front_camera(SIZE)
     net = network(6)
     sizes = []
@@ -308,7 +308,7 @@ def test_in_parts_of_bounded_size(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_nothing_in_view_has_gradients_of_zero():
-    """As without a shader: a loop goes on where the mesh has left the image."""
+    """A loop goes on where the mesh has left the image, as without a shader."""
     mesh, camera = bumpy(), front_camera(SIZE)
     net = network(6)
     verts = (mesh.verts + 100.0).requires_grad_()

@@ -1,4 +1,4 @@
-"""Which faces pass through each other, against exhaustion, and what of them is drawn."""
+"""The faces that pass through each other, against exhaustion, and which of them are drawn."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def sheet(n: int, m: int, closed: bool, place) -> tuple[Tensor, Tensor]:
 
 
 def torus(wave: float, times: int) -> tuple[Tensor, Tensor]:
-    """Whose tube is as thick as its hole is wide, but for waves of it."""
+    """Return a torus whose tube is as thick as its hole is wide, but for waves of it."""
     turn = 2 * torch.pi
 
     def place(u: Tensor, v: Tensor) -> list[Tensor]:
@@ -77,7 +77,7 @@ def shells(apart: float, wave: float) -> tuple[Tensor, Tensor]:
 
 
 def split(verts: Tensor, faces: Tensor, every: int = 7) -> tuple[Tensor, Tensor]:
-    """The same surface with vertices of its own for each block of faces, as along the seams of a texture."""
+    """Return the same surface with vertices of its own for each block of faces, as along the seams of a texture."""
     block = torch.arange(len(faces)) * every // len(faces)
     keys, index = torch.unique(
         torch.stack([faces, block[:, None].expand(-1, 3)], -1).reshape(-1, 2), dim=0, return_inverse=True
@@ -107,8 +107,8 @@ THROUGH = set(SMOOTH) - {"torus", "spiral", "shells", "large beside small"}
 @pytest.mark.parametrize("name", SMOOTH)
 @pytest.mark.parametrize("turned", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_height_fields_hide_no_pair(name, turned):
-    """Where a closed surface is a height field no pairs are compared. With every second face turned round there is no
-    surface that goes on, so all are; and which faces pass through each other is the same."""
+    """No pairs are compared where a closed surface is a height field. With every second face turned round no surface goes on,
+    so all pairs are compared, and the same faces pass through each other."""
     verts, faces = SMOOTH[name]
     verts = (verts @ rotation((0.48, -0.6, 0.64), torch.tensor(turned)).T).float()
     reversed_faces = torch.where(torch.arange(len(faces))[:, None] % 2 == 0, faces, faces.flip(1))

@@ -156,7 +156,8 @@ def check_vertices(seed: int, kind: str, seeds: int, edge_samples: int) -> tuple
 
 @pytest.mark.parametrize("kind", ["head-on", "eye in the side planes"])
 def test_single_vertices(kind: str) -> None:
-    """Where no faces touch: between the one-sided derivatives. About half of the vertices were not before."""
+    """The derivative lies between the one-sided derivatives where no faces touch. About half of the vertices were not
+    before."""
     found = [check_vertices(seed, kind, 4, 3000) for seed in range(4)]
     assert sum(outside for outside, _ in found) == 0, found
 

@@ -99,7 +99,7 @@ def white_room() -> eg.Mesh:
 
 
 def derivative(value: Callable[[Tensor, Tensor], Tensor], view: eg.Camera) -> tuple[Tensor, Tensor]:
-    """By K (2, 3) and by the coefficients: central differences of what has no noise."""
+    """Return central differences, without noise, by K (2, 3) and by the coefficients."""
     step, out = 1e-6, []
     for which, origin in enumerate((view.K, view.coefficients)):
         rows = torch.zeros_like(origin)
@@ -238,7 +238,7 @@ def test_every_finite_difference(lens: str, what: str) -> None:
 
 @pytest.mark.parametrize("lens", ["decentred", "wide fisheye"])
 def test_forward_mode_and_gradient_by_place(lens: str) -> None:
-    """Of a white room, so that nothing but the lens boundary moves."""
+    """The room is white, so that nothing but the lens boundary moves."""
     view, scene = camera(lens), eg.Scene([white_room()], torch.zeros(1, dtype=F64))
     adjoint = smooth_adjoint(*SIZE, 1)
     reverse = found(view, lambda image: (image * adjoint).sum(), scene, edge_samples=20_000)
@@ -270,7 +270,7 @@ def test_channels(lens: str) -> None:
 
 @pytest.mark.parametrize("lens", ["fold", "all around"])
 def test_shader(lens: str) -> None:
-    """As without one. The places of samples show something: a ray goes there."""
+    """The gradient is that without a shader. The places of samples show something: a ray goes there."""
     scene = eg.Scene([white_room()], torch.full((1,), 0.25, dtype=F64))
     view, adjoint = camera(lens), smooth_adjoint(*SIZE, 1)
     expected = found(view, lambda image: (image * adjoint).sum(), scene, edge_samples=20_000)

@@ -229,8 +229,8 @@ def test_non_manifold_edge(faces_on_edge: int) -> None:
 
 
 def test_loss_of_a_sparse_adjoint() -> None:
-    """Where the loss does not look, no samples go, and the gradient stays right: one pixel on a silhouette, against the
-    exact integral."""
+    """No samples go where the adjoint is zero, and the gradient stays right: one pixel on a silhouette, against the exact
+    integral."""
     mesh, camera = tilted_cube(), front_camera(48)
     with torch.no_grad():
         covered = eg.render(mesh.replace(face_colors=torch.ones(12, 1, dtype=F64)), camera, spp=256)[..., 0]

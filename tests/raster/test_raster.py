@@ -29,7 +29,7 @@ def clip(points: Tensor, distance: float = 3.0) -> Tensor:
 
 
 def random_triangles(seed: int, count: int = 12, spread: float = 1.0) -> tuple[Tensor, Tensor]:
-    """In clip space; some reach behind the eye where `spread` is above 2."""
+    """Return triangles in clip space; some reach behind the eye where `spread` is above 2."""
     points = torch.randn(3 * count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * spread
     return clip(points), torch.arange(3 * count).reshape(count, 3)
 
@@ -79,7 +79,7 @@ def faces_front(pos: Tensor, tri: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_each_centre_of_a_closed_surface_is_hit_once(seed: int) -> None:
-    """Of a convex mesh: all whose vertices lie on centres, or between them, so that edges pass through many."""
+    """All vertices of a convex mesh lie on centres, or between them, so that edges pass through many."""
     n = 16
     mesh = icosphere(2)
     verts = mesh.verts.double() * 0.9
@@ -218,7 +218,7 @@ def test_interpolate_equals_its_definition() -> None:
 
 @pytest.mark.parametrize("mode", ["instanced", "ranges"])
 def test_derivatives_of_rasterize_and_interpolate(mode: str) -> None:
-    """Through all four outputs that have any; positions move so little that no centre changes its triangle."""
+    """All four outputs that have derivatives are used; positions move so little that no centre changes its triangle."""
     pos, tri = random_triangles(9, 4)
     ranges = None
     if mode == "instanced":

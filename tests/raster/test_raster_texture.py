@@ -51,7 +51,7 @@ def test_cubes_equal_the_twin(filter_mode: str, size: int) -> None:
 
 
 def test_cubes_have_no_seams() -> None:
-    """From one side of an edge to the other, and around a corner, the value goes on."""
+    """The value goes on from one side of an edge to the other, and around a corner."""
     tex = draws(4, 1, 6, 4, 4, 1)
     across = torch.randint(0, 2, (2, 300, 3), generator=torch.Generator().manual_seed(5)) * 2.0 - 1
     across[0] = torch.where(
@@ -173,7 +173,7 @@ def test_derivatives(border: str, textures: int) -> None:
 
 
 def test_gradients_of_levels() -> None:
-    """Those of texture_construct_mip go to the texture, as if made at the call; those of a list stay with its levels."""
+    """Gradients of texture_construct_mip go to the texture, as if made at the call; those of a list stay with its levels."""
     tex, uv = draws(22, 1, 8, 8, 1).requires_grad_(), draws(23, 1, 6, 6, 2)
     level, weight = draws(24, 1, 6, 6, high=3), draws(25, 1, 6, 6, 1)
     (whole,) = torch.autograd.grad((dr.texture(tex, uv, mip_level_bias=level) * weight).sum(), tex)

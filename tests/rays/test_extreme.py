@@ -139,7 +139,7 @@ def test_an_orthographic_eye_very_far_away():
 
 
 def seconds_of_edges(verts: Tensor) -> float:
-    """Of the processor, to find the edges of a soup, and how many there are."""
+    """Return the seconds of processor time to find the edges of a soup."""
     faces = torch.arange(len(verts), dtype=torch.int32).reshape(-1, 3).numpy()
     begin = time.process_time()
     parts.edges(verts.numpy(), faces, [0], [2.0**-52])
@@ -176,7 +176,7 @@ def test_welding_takes_a_linear_time(soup):
 
 
 def cone(n: int) -> eg.Mesh:
-    """Around −z, its tip in the origin."""
+    """Return a cone around −z with its tip in the origin."""
     a = torch.linspace(0, 2 * math.pi, n + 1, dtype=F64)[:-1]
     verts = torch.cat(
         [torch.zeros(1, 3, dtype=F64), torch.stack([0.3 * a.cos(), 0.3 * a.sin(), -torch.ones_like(a)], -1)]

@@ -37,7 +37,7 @@ def triangle_soup(faces: int, scale: float, centre: np.ndarray) -> np.ndarray:
 
 
 def rays_through(corners: np.ndarray, n: int, far: float, infinite: bool) -> Rays:
-    """From points about `far` sizes of the scene away towards points near it."""
+    """Return rays from points about `far` sizes of the scene away towards points near it."""
     rng = np.random.default_rng(4)
     faces, centre = len(corners), corners.mean((0, 1))
     size = np.abs(corners - centre).max()

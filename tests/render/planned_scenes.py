@@ -42,7 +42,7 @@ def nowhere() -> eg.Mesh:
 
 
 def requiring(scene: eg.Scene | eg.Mesh, camera: eg.Camera, kinds: tuple[str, ...]) -> tuple[eg.Scene, eg.Camera]:
-    """The same with copies of the tensors of these kinds that require gradients."""
+    """Return the same with copies of the tensors of these kinds that require gradients."""
     scene = eg.Scene([scene]) if isinstance(scene, eg.Mesh) else scene
 
     def leaves(thing, *names):

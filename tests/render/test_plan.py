@@ -37,7 +37,7 @@ WANTED = [(kind,) for kind in KINDS] + [(), KINDS, ("verts", "colors"), ("backgr
 
 @pytest.fixture
 def kernel(monkeypatch):
-    """What the kernel is given and says when render() and the backward pass call it."""
+    """Record what the kernel is given and says when render() and the backward pass call it."""
     seen = SimpleNamespace(scenes=[], forward=[], backward=[], grads=None, adjoint=None, everything=False)
     forward, backward, scene = operators.forward_kernel, operators.backward_kernel, operators.kernel_scene
 
@@ -65,7 +65,7 @@ def kernel(monkeypatch):
 
 
 def step(kernel, scene, camera=CAMERA, kinds=(), adjoint=None, **options) -> dict[str, float]:
-    """What the kernel did in the backward pass of render(), summed over the cameras; zeros if there was none."""
+    """Return what the kernel did in the backward pass of render(), summed over the cameras; zeros if there was none."""
     scene, camera = requiring(scene, camera, kinds)
     kernel.scenes.clear(), kernel.forward.clear(), kernel.backward.clear()
     image = eg.render(scene, camera, **{"spp": 4, **options})
@@ -117,7 +117,7 @@ def test_plan_is_what_the_kernel_does(name, kernel):
 
 
 def test_samples_are_an_upper_bound(kernel):
-    """Where the loss does not look, or the image saw nothing, fewer are taken."""
+    """Fewer are taken where the adjoint is zero, or the image saw nothing."""
     scene, camera = requiring(icosphere(3), CAMERA, ("verts",))
     planned = eg.plan(scene, camera, 1)
     adjoint = torch.zeros(24, 24, 3, dtype=F64)
@@ -287,7 +287,7 @@ def test_no_creases_where_nothing_jumps(kernel):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_what_is_required_is_differentiated(kind, kernel):
-    """What is not wanted has no array that the kernel could write to."""
+    """The kernel gets no array to write to for what is not wanted."""
     step(kernel, textured(), kinds=(kind,))
     assert [label(slot) for slot in kernel.grads] == [kind]
     step(kernel, textured(), kinds=tuple(k for k in KINDS if k != kind))

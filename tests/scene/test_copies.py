@@ -31,7 +31,7 @@ def pickled(thing: object) -> object:
 
 
 def saved(thing: object) -> object:
-    """Through a file of torch.save, as a whole object."""
+    """Return what torch.load reads from a file of torch.save, as a whole object."""
     stream = io.BytesIO()
     torch.save(thing, stream)
     stream.seek(0)
@@ -51,7 +51,7 @@ def tensors(thing: object) -> dict[str, Tensor]:
 
 
 def with_gradients(thing: object) -> object:
-    """The same, with leaves that require gradients in place of its floating-point tensors."""
+    """Return the same with leaves that require gradients in place of its floating-point tensors."""
     if isinstance(thing, eg.Scene):
         background = thing.background.clone().requires_grad_()
         return eg.Scene([with_gradients(mesh) for mesh in thing.meshes], background)
@@ -79,7 +79,7 @@ def test_round_trip(name: str, copied: Callable[[object], object]):
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_detach_cuts_the_graph(name: str):
-    """Also what deepcopy needs: torch copies no tensor that was computed."""
+    """Deepcopy needs this, for torch copies no tensor that was computed."""
     leaves = with_gradients(OBJECTS[name])
     computed = leaves.to(torch.float32)
     with pytest.raises(RuntimeError, match="deepcopy"):

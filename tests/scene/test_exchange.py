@@ -34,7 +34,7 @@ APPEARANCES = {
 
 
 def close(a: eg.Mesh, b: eg.Mesh, linear: bool = False) -> None:
-    """The same faces of the same appearance, up to the rounding to 8 bit."""
+    """Assert the same faces and appearance, up to the rounding to 8 bit."""
     torch.testing.assert_close(a.verts[a.faces.long()], b.verts[b.faces.long()])
 
     def shown(mesh: eg.Mesh) -> torch.Tensor | None:
@@ -103,7 +103,7 @@ def test_save_shapes_and_faults(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scale", [1e-30, 1e-6, 1.0, 1e12])
 def test_text_keeps_every_number(tmp_path: Path, ending: str, dtype: torch.dtype, scale: float) -> None:
-    """Of any size: vertices come back as they were, and so do texture coordinates."""
+    """Vertices and texture coordinates of any size come back as they were."""
     mesh = eg.Mesh((torch.rand(8, 3, generator=torch.Generator().manual_seed(5)).double() * scale).to(dtype), FACES)
     if ending == "obj":
         mesh = mesh.replace(**APPEARANCES["texture"])

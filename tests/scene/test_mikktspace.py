@@ -67,7 +67,7 @@ def test_derivatives_of_tangents() -> None:
 
 
 def test_nothing_without_a_direction() -> None:
-    """Of faces, edges, images and normals without a size: zeros, and finite derivatives."""
+    """Faces, edges, images and normals without a size give zeros, and finite derivatives."""
     position, normal, uv = (
         torch.rand(3, 3, 3, dtype=F64),
         torch.rand(3, 3, 3, dtype=F64),

@@ -17,7 +17,7 @@ DISPLACED[:3, 3] = 3.0, -2.0, 5.0
 
 
 def mesh_of(solid: trimesh.Trimesh, displaced: bool = True, **fields: torch.Tensor) -> eg.Mesh:
-    """With axes and centre where nobody would expect them."""
+    """Return a mesh with axes and centre where nobody would expect them."""
     solid = solid.copy()
     if displaced:
         solid.apply_transform(DISPLACED)
@@ -32,7 +32,7 @@ def prism(sides: int, height: float = 0.9) -> trimesh.Trimesh:
 
 
 def blob(mirror: bool = False) -> trimesh.Trimesh:
-    """Without a symmetry; or the same on both sides, as most animals."""
+    """Return a mesh without a symmetry, or the same on both sides, as most animals."""
     ball = trimesh.creation.icosphere(3)
     x, y, z = ball.vertices.T
     x = np.abs(x) if mirror else x
@@ -118,7 +118,7 @@ def test_tolerance() -> None:
 
 
 def test_a_propeller() -> None:
-    """Of order 5, without flips; orders above max_order are not found, but those that divide it."""
+    """It has order 5, without flips. Orders above max_order are not found, but those that divide it."""
     blades = [
         trimesh.creation.box((1.0, 0.2, 0.1), trimesh.transformations.translation_matrix((0.7, 0.15, 0.3)))
         .apply_transform(trimesh.transformations.rotation_matrix(2 * np.pi * k / 5, (0, 0, 1)))

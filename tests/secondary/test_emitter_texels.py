@@ -125,7 +125,7 @@ def test_texture_coordinates_of_an_emitter(coordinates: str, wraps: tuple[str, s
 
 
 def test_radiance_itself_stays() -> None:
-    """What borders add is zero, and there is none where nothing moves."""
+    """Borders add zero, and there are none where nothing moves."""
     uvs = COORDINATES["askew"]
     hits = [hits_of(scene(u), 50, PLACE, ASIDE) for u in (uvs, uvs.clone().requires_grad_())]
     still, moving = map(radiance, hits)
@@ -151,7 +151,7 @@ def test_an_emitter_in_shadow_and_its_back() -> None:
 
 
 def test_borders_that_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there are too many, those that a number picks do, and the mean over that number is what all give."""
+    """Where there are too many, a number picks some. The mean over that number is what all give."""
     mesh = scene(COORDINATES["askew"]).meshes[1]
     assert mesh.material is not None
     texture = mesh.material.emission
@@ -187,7 +187,7 @@ def test_a_texture_of_one_colour_has_no_borders() -> None:
 
 @pytest.mark.slow
 def test_images_in_reverse_and_forward_mode() -> None:
-    """Of the floor alone, by the kernel; the exact derivative is that of a fine grid of points."""
+    """The kernel shades the floor alone; the exact derivative is that of a fine grid of points."""
     wraps, uvs, motion = ("repeat", "repeat"), COORDINATES["askew"], torch.tensor([0.7, -0.7], dtype=F64)
     # Below the light, one above the floor, of which it sees a square with sides of 1.
     w2c = torch.tensor([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]], dtype=F64)
@@ -220,7 +220,7 @@ def test_images_in_reverse_and_forward_mode() -> None:
 
 
 def test_texture_coordinates_in_single_precision() -> None:
-    """The same scene in float32 has the same derivative."""
+    """The scene in float32 has the same derivative."""
     camera = eg.Camera.look_at((0.3, -2.0, 1.0), PLACE.tolist(), fov_y=30.0, size=(4, 4)).to(F64)
 
     def gradient(dtype: torch.dtype) -> Tensor:
@@ -237,7 +237,7 @@ def test_texture_coordinates_in_single_precision() -> None:
 
 
 def test_steps_are_declared_as_shading_looks_them_up() -> None:
-    """By declare_texel_edges() alone, in the same order."""
+    """declare_texel_edges() alone declares them in the same order."""
     draw = torch.Generator().manual_seed(5)
 
     def nearest(channels: int) -> eg.Texture:
@@ -258,7 +258,7 @@ def test_steps_are_declared_as_shading_looks_them_up() -> None:
 
 
 def test_an_emitter_that_is_masked_gives_no_light_there() -> None:
-    """By the kernel and in PyTorch, masked or blended: that of the half which is left, in closed form."""
+    """The kernel and PyTorch give the light of the half that is left, masked or blended, in closed form."""
     alpha = torch.tensor([[0.2, 0.9]])
     uvs = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
     left = (SQUARE[[1, 2]] + SQUARE[[0, 3]]) / 2

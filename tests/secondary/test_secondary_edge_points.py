@@ -34,7 +34,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def leaves_of(strip: Strip) -> Strip:
-    """With tensors that require gradients."""
+    """Return the strip with tensors that require gradients."""
     receiver, reflector, own = (x.clone().requires_grad_() for x in (strip.receiver, strip.reflector, strip.strip))
     pose, K = (x.clone().requires_grad_() for x in (strip.camera.world_to_camera, strip.camera.K))
     return Strip(receiver, reflector, own, strip.camera.replace(world_to_camera=pose, K=K), strip.light)
@@ -102,8 +102,8 @@ def test_strip_between_mirrors(materials: tuple[str, str]) -> None:
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("materials", [("lambert", "lambert"), ("glossy", "lambert")], ids="-".join)
 def test_light_that_is_followed_to_the_camera(materials: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """From ends of lines that could be out of sight, light goes on to the camera; without any step in between, the same border is
-    found that the camera sees."""
+    """Light goes on to the camera from ends of lines that could be out of sight. Without any step in between, it finds the
+    border that the camera sees."""
     follow = in_kernel.towards_camera
     monkeypatch.setattr(in_kernel, "towards_camera", lambda frame, arrivals, _: follow(frame, arrivals, (0, 0)))
 
@@ -123,7 +123,7 @@ def test_light_that_is_followed_to_the_camera(materials: tuple[str, str], monkey
 
 @pytest.mark.usefixtures("alone")
 def test_lines_of_floats() -> None:
-    """In float32 lines are the same, but for rounding."""
+    """Lines are the same in float32, but for rounding."""
     weights = weights_of(Strip.standard())
     fine, coarse = (gradients(Strip.standard(t), ("lambert", "lambert"), weights, 40_000) for t in (F64, torch.float32))
     for name, exact in fine.items():

@@ -40,7 +40,7 @@ class Border(NamedTuple):
 
 
 def gradients_of(found: Border, samples: int, bounces: int = 2) -> tuple[Tensor, ...]:
-    """Of the weighted image, by all tensors."""
+    """Return the gradients of the weighted image by all tensors."""
     weights = weights_of(Strip.standard())
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in found.leaves.items()}
     options: dict[str, Any] = {"shadows": False, "bounces": bounces, "edge_samples": samples, "surface_samples": 1}
@@ -170,7 +170,7 @@ def test_whole_borders(make: Callable[[tuple[str, str]], Border], materials: tup
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("materials", [("glossy", "lambert"), ("lambert", "glossy")], ids="-".join)
 def test_intersection_with_the_reflector(materials: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the blade passes through the reflector, without its edges."""
+    """The blade passes through the reflector, and its edges are left out."""
     monkeypatch.setattr(secondary_edges, "_seen", lambda *_: [])
     check(blade_through_reflector(materials, WIDE), materials, 400_000, side=1)
 

@@ -77,7 +77,7 @@ def moment(polygon: Tensor) -> Tensor:
 
 
 def adjoint() -> Tensor:
-    """Whose image through a tent filter is 1 + x / 40, away from the border."""
+    """Return an adjoint whose image through a tent filter is 1 + x / 40, away from the border."""
     x = torch.arange(SIZE, dtype=DOUBLE) + 0.5
     return (1 + x / 40).expand(SIZE, SIZE)[:, :, None]
 
@@ -134,7 +134,7 @@ def gradient(
 
 
 def exact(motion: str, points: Tensor | None = None, infinite: bool = False, kind: type[Setting] = Setting) -> float:
-    """Of what is lit, minus the shadow; the mean over points of a light as offsets (K, 3) if given."""
+    """Return the derivative of what is lit, minus the shadow; the mean over points of a light as offsets (K, 3) if given."""
     setting, theta = kind(), torch.zeros((), dtype=DOUBLE, requires_grad=True)
     setting.motions[motion](setting, theta)
     offsets = torch.zeros((1, 3), dtype=DOUBLE) if points is None else points
@@ -196,7 +196,8 @@ def sky(s: Setting) -> object:
 
 
 def of_sky(motion: str, kind: type[Setting] = Setting) -> float:
-    """Of all directions, the caster hides the solid angle that it is seen under (van Oosterom and Strackee 1983)."""
+    """Return the derivative of the sky's light: the caster hides the solid angle that it is seen under (van Oosterom and
+    Strackee 1983)."""
     setting, theta = kind(), torch.zeros((), dtype=DOUBLE, requires_grad=True)
     setting.motions[motion](setting, theta)
     pixel = torch.arange(SIZE, dtype=DOUBLE) + 0.5 - SIZE / 2

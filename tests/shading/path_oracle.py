@@ -18,7 +18,8 @@ F64 = torch.float64
 
 
 class PathOracle:
-    """Of a scene whose materials are constants. `indirect()` is what light brings to a point after at least two scatterings."""
+    """Paths of a scene whose materials are constants. `indirect()` is what light brings to a point after at least two
+    scatterings."""
 
     def __init__(self, scene: eg.Scene, seed: int = 0) -> None:
         self._draw = torch.Generator().manual_seed(seed)

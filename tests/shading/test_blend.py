@@ -81,7 +81,7 @@ def test_gradients_by_alpha_radiance_and_background() -> None:
 
 
 def test_a_shader_is_composed_with_what_it_gives_behind() -> None:
-    """As the materials are: values, and gradients by alpha and by what moves before what is seen through."""
+    """Values, and gradients by alpha and by what moves, are those of materials."""
     scene = eg.Scene([sheet(0, 0.9, 0.25), sheet(-1, 0.5, 0.6, size=0.6)], torch.full((3,), 0.4, dtype=F64))
 
     def shader(hits: eg.Hits) -> Tensor:
@@ -231,7 +231,7 @@ def test_all_that_moves_behind_a_transparent_sheet(kind: str) -> None:
 def test_borders_of_nearest_texels_are_searched_where_they_move(
     moving: str, searched: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of what requires a gradient, alpha and lights move none."""
+    """Alpha and lights that require a gradient move none."""
     searches: list[DiscontinuityTerms] = []
 
     def found(terms: DiscontinuityTerms, watch: object) -> list[object]:

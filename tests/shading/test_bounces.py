@@ -69,9 +69,11 @@ class Point(NamedTuple):
 
 
 class Oracle:
-    """What PyTorch makes of paths in float64, point by point: the recursion of csrc/shading/lit/path_radiance.h by the surfaces,
-    materials and lights of edgegrad/light. Textures of points that no pixel sees are those of `unfiltered`, hits of
-    the same scene."""
+    """Paths in float64 by PyTorch, point by point.
+
+    It is the recursion of csrc/shading/lit/path_radiance.h by the surfaces, materials and lights of edgegrad/light. Textures of
+    points that no pixel sees are those of `unfiltered`, hits of the same scene.
+    """
 
     def __init__(self, hits: Hits, unfiltered: Hits, bounces: int) -> None:
         self._hits, self._unfiltered = hits, unfiltered

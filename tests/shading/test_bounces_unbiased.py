@@ -27,7 +27,7 @@ SCENES = (
 
 
 def of_few_samples(case: Case) -> Estimate:
-    """By places of the motion in [−H, H], one for each seed, spread evenly."""
+    """Return the mean over places of the motion in [−H, H], one for each seed, spread evenly."""
     found = []
     for seed in range(SEEDS):
         at = H * ((2 * seed + 1) / SEEDS - 1)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from finite_differences import Case, check, gradient
-from lit_scenes import F64, ball, by_quadrature, from_above, plane, vector
+from lit_scenes import F64, ball, from_above, plane, vector
 from oracles import shading
 from oracles.lobes import Lobes, sobol_parts
 from oracles.mesh_light_sampling import MeshTowards
@@ -167,7 +166,7 @@ def test_all_directions_may_miss_an_emitter():
 
 
 def test_the_kernel_draws_what_pytorch_draws():
-    """Of a ball that emits, for surfaces where the lobe is asked and where it is not."""
+    """A ball emits, for surfaces where the lobe is asked and where it is not."""
     metal = eg.Material(torch.ones(3, dtype=F64), metallic=1.0, roughness=0.3)
     rough = eg.Material(torch.ones(3, dtype=F64), metallic=1.0, roughness=0.9)
     emitter = eg.AreaLight.of(eg.Mesh(icosphere(1).verts * 0.6 + vector(1.7, 0.1, 0.8), icosphere(1).faces), 3.0)
@@ -281,7 +280,7 @@ def test_points_are_unbiased(name: str):
 
 
 def test_lobes_draw_only_where_they_gain():
-    """By the light's size against the lobe's, and by where it lies."""
+    """They do by the light's size against the lobe's, and by where it lies."""
     n, v = vector(0, 0, 1), normalize(vector(0.3, 0.0, 1.0), dim=0)
 
     def asked(size: float, roughness: float, x: float) -> bool:
@@ -330,35 +329,3 @@ def test_the_plan_says_how_light_is_drawn():
     assert "8 candidates" in glossy and "(skies, meshes that emit)" in glossy and "by the light alone" in glossy
     assert "by the light alone" not in said(sky, metallic=1.0, roughness=0.3)
     assert "candidates" not in said(eg.PointLight(vector(0, 0, 1)), metallic=1.0, roughness=0.3)
-
-
-def by(name: str) -> Case:
-    """A floor of brushed gold next to a light that it mirrors, of which one number changes."""
-
-    def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        def changed(what: str, value: Tensor, by: Tensor) -> Tensor:
-            return value + theta * by if what == name else value
-
-        material = eg.Material(
-            changed("base color", vector(0.9, 0.6, 0.3), vector(-0.3, 0.2, 0.1)),
-            metallic=0.8,
-            roughness=changed("roughness", vector(0.45), vector(0.3))[0],
-        )
-        corner, faces = quad(0.0, 1.0)
-        corner = torch.stack(
-            [0.6 * corner[:, 2] + 1.6, corner[:, 1], corner[:, 0] + 1.6], 1
-        )  # upright, next to the view
-        corner = corner + changed("emitter", vector(0, 0, 0), vector(0.3, -0.4, 0.2))
-        emitter = eg.AreaLight.of(
-            eg.Mesh(corner, faces), changed("power", vector(3.0, 2.0, 1.0), vector(1.0, 0.5, 0.2))
-        )
-        return eg.Scene([plane(2.0, material=material), emitter]), from_above(16)
-
-    return case
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["base color", "roughness", "emitter", "power"])
-def test_gradients_are_finite_differences(name: str):
-    truth = by_quadrature(by(name), 0.1 if name == "emitter" else 0.02, fine=2, light_samples=256)
-    check(name, truth, gradient(by(name), 8, filter="box", surface_samples=20_000, light_samples=8))

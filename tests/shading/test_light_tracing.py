@@ -39,7 +39,7 @@ def camera(kind: str) -> eg.Camera:
 
 
 def room(floor: dict[str, Any] | None = None) -> eg.Scene:
-    """With a point light, and a ball with smooth normals in place of the block."""
+    """Return a room with a point light, and a ball with smooth normals in place of the block."""
     scene = box_room("point", floor)
     ball = icosphere(1)
     verts = 0.45 * ball.verts.to(F64) + vector(-0.2, 0.1, 0.6)

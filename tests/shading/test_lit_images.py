@@ -18,8 +18,8 @@ pytestmark = pytest.mark.watched
 
 
 def test_borders_of_shadows_by_what_the_light_adds() -> None:
-    """As by the radiance on both sides of the boundary, as far off it as the kernel takes them, some 1e-4 px. Any other shader is
-    asked there."""
+    """The gradient is that of the radiance on both sides of the boundary, some 1e-4 px from it, where any other shader is
+    asked."""
     leaves = {
         name: value.clone().requires_grad_() for name, value in numbers_of("normals point area sky colors").items()
     }
@@ -34,7 +34,7 @@ def test_borders_of_shadows_by_what_the_light_adds() -> None:
 
 
 def test_borders_of_shadows_of_what_is_looked_up_nearest() -> None:
-    """What emits is left out of what a light adds, and its nearest texels with it: as one texel, looked up linearly."""
+    """Emission is left out of what a light adds, and its nearest texels with it: one texel is looked up linearly."""
     found = []
     for filter in ("nearest", "linear"):
         leaves = {name: value.clone().requires_grad_() for name, value in numbers_of("normals point").items()}
@@ -69,7 +69,8 @@ AROUND = {
     ),
 )
 def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As from hits that are shaded one by one, with the pixels that borders of shadows and texels run through shaded again."""
+    """They are those of hits that are shaded one by one, where pixels that borders of shadows and texels cross are shaded
+    again."""
     leaves = numbers_of(words)
     camera = AROUND[view].replace(world_to_camera=AROUND[view].world_to_camera.double())
     plain = scene_of(words, leaves)

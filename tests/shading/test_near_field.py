@@ -91,7 +91,8 @@ def check(case: Case, h: float) -> None:
 
 
 def test_all_light_is_near_or_not() -> None:
-    """Of all that is near values are whole, and no derivatives by places are left; of what is not, none and all of them."""
+    """Values of the near field are whole, and no derivatives by places are left; elsewhere there are no values and all
+    derivatives."""
     scene, camera = camera_of(corner())(torch.zeros((), dtype=F64))
     frame = Frame(scene, make_request(scene, camera, 1, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 20)
@@ -126,7 +127,7 @@ def test_rooms(scene: str) -> None:
 
 @pytest.mark.slow
 def test_a_wider_filter_has_the_same_slope() -> None:
-    """Of the mean of an image, which compares within a quarter of a pixel."""
+    """Compare the slope of the mean of an image, which agrees within a quarter of a pixel."""
     scene, camera = camera_of(corner())(torch.zeros((), dtype=F64))
     slopes: dict[str, list[float]] = {"box": [], "tent": []}
     for seed in range(24):

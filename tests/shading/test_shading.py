@@ -128,7 +128,8 @@ STEP, ATOL, RTOL = 1e-6, 1e-6, 1e-6
 
 
 def check_gradient(scene: eg.Scene, camera: eg.Camera, inputs: dict[str, Tensor]) -> None:
-    """In fields of the scene's first mesh, and in the upper rows of "world_to_camera" and "K"; the last are fixed."""
+    """Check gradients in fields of the first mesh, and in the upper rows of "world_to_camera" and "K"; their last rows are
+    fixed."""
     faces, points = samples(scene, camera)
     names = list(inputs)
 
@@ -216,7 +217,7 @@ def mixed_scene() -> eg.Scene:
 
 
 def leaves_of(scene: eg.Scene, camera: eg.Camera) -> tuple[eg.Scene, eg.Camera, dict[str, Tensor]]:
-    """The same, all their floating-point tensors made leaves that require gradients."""
+    """Return the same, with leaves that require gradients for all floating-point tensors."""
     leaves = {}
 
     def leaf(name: str, tensor: Tensor) -> Tensor:

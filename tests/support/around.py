@@ -43,7 +43,7 @@ def pose() -> Tensor:
 
 
 def world(q: Tensor) -> Tensor:
-    """Of points in the coordinates of the camera at pose()."""
+    """Return points in the world from their coordinates in the camera at pose()."""
     M = pose()
     return (q - M[:3, 3]) @ M[:3, :3]
 
@@ -57,7 +57,7 @@ def ball(place: Place, radius: float = 1.0, one_colour: bool = False) -> eg.Mesh
 
 
 def room(dx: Tensor | float = 0.0) -> eg.Mesh:
-    """Around the camera, of few large faces; moved askew by dx."""
+    """Return a room of few large faces around the camera, moved askew by dx."""
     box = cube(4.0)
     verts = box.verts @ rotation((0.6, 0.0, 0.8), torch.tensor(0.7, dtype=F64)).mT
     colors = torch.rand(verts.shape, generator=torch.Generator().manual_seed(2), dtype=F64)

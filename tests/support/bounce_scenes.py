@@ -41,7 +41,7 @@ class BounceScene(NamedTuple):
     lights: tuple[Light, ...] = ()
 
     def moving(self, name: str, by: Sequence[float], vertex: int | None = None) -> Case:
-        """As a mesh, or one of its vertices, moves by θ times a direction."""
+        """Return the scene as a mesh, or one of its vertices, moves by θ times a direction."""
 
         def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
             mesh = self.meshes[name]
@@ -54,7 +54,7 @@ class BounceScene(NamedTuple):
 
 
 def mesh(verts: Places, faces: list[list[int]], albedo: float | list[float], emission: float = 0.0) -> eg.Mesh:
-    """With albedos of its faces; one that emits does so from its front."""
+    """Return a mesh with albedos of its faces; one that emits does so from its front."""
     colors = torch.as_tensor(albedo, dtype=F64).expand(len(faces)).reshape(-1, 1).clone()
     shines: dict[str, Any] = {"emission": torch.tensor([emission], dtype=F64), "two_sided": False} if emission else {}
     material = eg.Material(**shines)
@@ -162,7 +162,7 @@ def plates() -> BounceScene:
 
 
 def open_plates() -> BounceScene:
-    """The same without the strip: no secondary edge moves."""
+    """Return the same scene without the strip: no secondary edge moves."""
     found = plates()
     return found._replace(meshes={name: mesh for name, mesh in found.meshes.items() if name != "strip"})
 

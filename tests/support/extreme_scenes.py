@@ -37,7 +37,8 @@ def _magnitude(r: np.random.Generator) -> float:
 
 
 def _numbers(r: np.random.Generator, n: int, width: int) -> np.ndarray:
-    """Of ordinary size, all of another size, each of its own, on a lattice, or with zeros and copies among them."""
+    """Return numbers of ordinary size, all of another size, each of its own, on a lattice, or with zeros and copies among
+    them."""
     x = r.normal(size=(n, width))
     match r.integers(7):
         case 0:
@@ -162,7 +163,7 @@ def _adjoint(r: np.random.Generator, image: Tensor) -> Tensor:
 
 
 def most_samples(scene: eg.Scene, camera: eg.Camera) -> int:
-    """What the defaults may come to: every face over the whole view, and all of its sides across it."""
+    """Return what the defaults may come to: every face over the whole view, and all of its sides across it."""
     faces = sum(len(mesh.faces) for mesh in scene.meshes)
     h, w = (n + 3 for n in camera.size)  # with the filter
     return int(faces * (4 * (h * w + math.hypot(h, w)) + 3 * 24 * math.hypot(h, w)) + 4 * h * w + 2)

@@ -69,14 +69,14 @@ def towards_room(size: int = 32) -> eg.Camera:
 
 
 def _with(room: eg.Scene, number: int, **fields: Any) -> eg.Scene:
-    """As one of its meshes is changed."""
+    """Return the room with one of its meshes changed."""
     meshes = list(room.meshes)
     meshes[number] = meshes[number].replace(**fields)
     return room.replace(meshes=meshes)
 
 
 def _square_uvs(mesh: eg.Mesh) -> dict[str, Tensor]:
-    """Of a quad: its first side is along u."""
+    """Return texture coordinates of a quad whose first side is along u."""
     return {"uvs": torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64), "uv_faces": mesh.faces}
 
 
@@ -180,5 +180,5 @@ ROOMS: dict[str, Callable[[], eg.Scene]] = {
 
 
 def without_alpha(name: str) -> eg.Scene:
-    """The same room for those who know no alpha-tested faces."""
+    """Return the same room for renderers that know no alpha-tested faces."""
     return striped_room(as_quads=True) if name == "alpha-tested" else ROOMS[name]()

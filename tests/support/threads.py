@@ -1,4 +1,4 @@
-"""The same bits at any number of threads."""
+"""A check that results have the same bits at any number of threads."""
 
 from __future__ import annotations
 
