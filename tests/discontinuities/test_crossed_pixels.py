@@ -67,7 +67,7 @@ def test_means_are_exact_and_noise_is_less(monkeypatch: pytest.MonkeyPatch):
     assert float(variance.mean()) < 0.2 * float(once.mean())
 
 
-def test_shaders_without_steps_keep_their_bits(monkeypatch: pytest.MonkeyPatch):
+def test_shaders_without_discontinuities_keep_their_bits(monkeypatch: pytest.MonkeyPatch):
     camera = front_camera(SIZE)
     one = images(1, lambda hits: hits.position, quad(), camera, 16)
     without_borders(monkeypatch)

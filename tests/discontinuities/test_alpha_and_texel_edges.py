@@ -291,7 +291,7 @@ def test_forward_mode_is_reverse_mode(move):
 
 
 @pytest.mark.parametrize("move", ["verts", "uvs", "alpha", "pose", "K"])
-def test_shaders_have_the_same_steps(move):
+def test_shaders_have_the_same_discontinuities(move):
     """The scene's own colours written as a shader."""
     first = tilted(quad(1, alpha=disc(), colors=noise(4, 3).abs()))
     at = case([first], move)

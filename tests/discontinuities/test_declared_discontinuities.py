@@ -32,7 +32,7 @@ def flat_camera(size: int) -> eg.Camera:
     return eg.Camera(torch.eye(4, dtype=F64), K, (size, size), "orthographic")
 
 
-def test_a_straight_step_is_exact():
+def test_a_straight_discontinuity_is_exact():
     """The area next to a line x = a across a square of side 2 is 2 (1 − a) scale² pixels; its derivative is −2 scale²."""
     a = torch.tensor(0.137, dtype=F64, requires_grad=True)
     image = eg.render(
@@ -85,7 +85,7 @@ def test_texels_between_neighbouring_points_all_count():
     assert float(found.mean()) == pytest.approx(exact, abs=4 * error + 5e-3 * exact)
 
 
-def test_a_step_that_is_said_twice_counts_once():
+def test_a_discontinuity_declared_twice_counts_once():
     def gradient(twice: bool) -> Tensor:
         a = torch.tensor(0.137, dtype=F64, requires_grad=True)
 
@@ -99,7 +99,7 @@ def test_a_step_that_is_said_twice_counts_once():
     assert torch.allclose(gradient(True), gradient(False))
 
 
-def test_a_jump_of_the_function_is_no_step():
+def test_a_jump_of_the_function_is_not_declared():
     """Nothing is said to move where s jumps over zero, at a silhouette before another surface or by itself."""
     a = torch.tensor(0.0, dtype=F64, requires_grad=True)
     back, front = square(), square(0.4)
@@ -115,7 +115,7 @@ def test_a_jump_of_the_function_is_no_step():
 
 
 def test_discontinuities_next_to_silhouettes_are_found():
-    """A step that runs into the shadow line of another surface: the part next to it counts as well."""
+    """A discontinuity that runs into the shadow line of another surface: the part next to it counts as well."""
 
     def gradient(seed: int) -> Tensor:
         a = torch.tensor(0.1, dtype=F64, requires_grad=True)
@@ -142,7 +142,7 @@ def test_discontinuities_next_to_silhouettes_are_found():
     assert float(found.mean()) == pytest.approx(exact, abs=4 * error + 0.005 * abs(exact))
 
 
-def test_steps_in_forward_mode_and_under_transforms():
+def test_forward_mode_and_transforms():
     adjoint = smooth_adjoint(SIZE, SIZE, 3)
     mesh, camera = ball(), front_camera(SIZE)
 
@@ -165,7 +165,7 @@ def test_steps_in_forward_mode_and_under_transforms():
         assert torch.allclose(x, y, rtol=1e-6, atol=1e-9)
 
 
-def test_steps_that_differ_within_a_batch_are_refused():
+def test_discontinuities_that_differ_within_a_batch_are_refused():
     def image(a: Tensor, color: Tensor) -> Tensor:
         return eg.render(
             ball(), front_camera(SIZE), shader=lambda hits: hits.where(hits.position[:, 0] - a, color, 0.0)
@@ -180,7 +180,7 @@ def test_steps_that_differ_within_a_batch_are_refused():
 
 
 @pytest.mark.parametrize(("wide", "least", "most"), [(30.0, 0.97, 1.02), (1.0, 0.97, 1.02), (0.5, 0.5, 0.7)])
-def test_a_step_along_a_strip_of_surface(wide: float, least: float, most: float):
+def test_a_discontinuity_along_a_strip_of_surface(wide: float, least: float, most: float):
     """0.1 px next to the silhouette of what is wide, and along the middle of what is narrow, as the documents show."""
     turn = torch.linalg.matrix_exp(0.4 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=F64))
     corner = torch.tensor([[0.0, -20, 0], [wide, -20, 0], [wide, 20, 0], [0, 20, 0]], dtype=F64)
@@ -201,7 +201,7 @@ def test_a_step_along_a_strip_of_surface(wide: float, least: float, most: float)
     assert least < float(found.mean()) < most
 
 
-def test_steps_that_are_not_always_asked_for():
+def test_calls_that_are_not_always_made_are_refused():
     def shader(hits: eg.Hits) -> Tensor:
         return hits.where(hits.depth - 3, 1.0, 0.0) if len(hits) > 50 else torch.ones(len(hits), 1)
 
@@ -212,7 +212,7 @@ def test_steps_that_are_not_always_asked_for():
         )
 
 
-def test_what_steps_are_given_is_checked():
+def test_bad_arguments_are_refused():
     def refused(shader: object, message: str, kind: type[Exception] = ValueError) -> None:
         with pytest.raises(kind, match=message):
             eg.render(ball(), front_camera(SIZE), shader=shader)  # type: ignore[arg-type]
@@ -232,10 +232,6 @@ def test_what_steps_are_given_is_checked():
     )
     refused(lambda hits: hits.select(hits.depth).normal, r"index: expected integers", TypeError)
     refused(lambda hits: hits.floor(hits.face), r"t: ", TypeError)
-    with pytest.raises(ValueError, match=r"step_spacing: expected a number from 0\.015625 to 64, got 0"):
-        eg.render(ball(), front_camera(SIZE), step_spacing=0)
-    with pytest.raises(TypeError, match=r"step_spacing: expected a number, got str"):
-        eg.render(ball(), front_camera(SIZE), step_spacing="1")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["where", "floor", "nearest"])
@@ -266,7 +262,7 @@ def test_borders_along_edges(kind: str):
     assert float(found) == pytest.approx(-2 * (0.4 * 32) ** 2, rel=0.03)
 
 
-def test_steps_of_some_points_are_steps_of_all():
+def test_discontinuities_of_some_points_are_those_of_all():
     """Two materials, each asked for its own points."""
 
     def gradient(selected: bool) -> Tensor:
@@ -296,7 +292,7 @@ def test_steps_of_some_points_are_steps_of_all():
     assert float(one) == pytest.approx(float(all), rel=1e-6)
 
 
-def test_many_directions_of_steps_in_one_pass():
+def test_many_directions_in_one_pass():
     mesh, camera = ball(), front_camera(SIZE)
 
     def shader(hits: eg.Hits) -> Tensor:
