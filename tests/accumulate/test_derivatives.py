@@ -14,6 +14,7 @@ import pytest
 import torch
 from combinations import diagonal
 from finite_differences import Estimate, check, estimate, rotation
+from lit_scenes import vector
 from oracles.exact import exact_image
 from scenes import cube, front_camera, smooth_adjoint, smooth_colors
 from torch import Tensor
@@ -88,10 +89,6 @@ SIGNS = {
     "background image": (1.0, -0.7, -0.8),
     "background colour": (0.9, -0.8, -0.4),
 }
-
-
-def vector(*numbers: float) -> Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 def waves(like: Tensor, kind: str) -> Tensor:

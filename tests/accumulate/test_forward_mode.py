@@ -9,24 +9,19 @@ import torch
 from combinations import diagonal
 from finite_differences import Estimate, estimate
 from oracles.exact import exact_image
-from scenes import cube, front_camera, icosphere, one_triangle, smooth_adjoint, smooth_colors
+from scenes import cube, icosphere, smooth_adjoint, smooth_colors
 from threads import check_threads
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch_scenes import ADJOINT, BACKGROUND, CAMERA, F64, MESH, SIZE, TRIANGLE
 
 import edgegrad as eg
 from edgegrad.kernel import memory, operators
 
 pytestmark = pytest.mark.watched
 
-F64 = torch.float64
-SIZE = 20
-TRIANGLE = one_triangle()
-MESH, BACKGROUND = TRIANGLE.meshes[0], TRIANGLE.background
-CAMERA = front_camera(SIZE)
 ORTHOGRAPHIC = eg.Camera.orthographic((0.4, 0.3, 4.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.6, (SIZE, SIZE)).to(F64)
 DISTORTED = CAMERA.replace(distortion=torch.tensor([-0.15, 0.05, 0.01, -0.02, 0.02], dtype=F64))
-ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
 
 
 def panorama() -> eg.Camera:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from scenes import cube, front_camera, icosphere
+from scenes import cube, front_camera, icosphere, soup
 from threads import check_threads
 from torch_scenes import CAMERA, F32, F64, TRIANGLE, image_and_gradients, mixed_scene, same_bits
 
@@ -17,12 +17,6 @@ REPEATABLE = {
     "20,480 faces": lambda: (eg.Scene(icosphere(5)), front_camera(64)),
     "soup": lambda: (eg.Scene(soup(icosphere(4))), front_camera(64)),
 }
-
-
-def soup(mesh: eg.Mesh) -> eg.Mesh:
-    """Each face with vertices of its own."""
-    corners = mesh.faces.reshape(-1)
-    return eg.Mesh(mesh.verts[corners], torch.arange(len(corners)).reshape(-1, 3), colors=mesh.colors[corners])
 
 
 @pytest.mark.parametrize("case", REPEATABLE)

@@ -6,22 +6,10 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from scenes import front_camera, one_triangle, smooth_adjoint
 from torch import Tensor
+from torch_scenes import ADJOINT, BACKGROUND, CAMERA, F64, MESH, SIZE, leaf
 
 import edgegrad as eg
-
-F64 = torch.float64
-SIZE = 20
-TRIANGLE = one_triangle()
-MESH, BACKGROUND = TRIANGLE.meshes[0], TRIANGLE.background
-CAMERA = front_camera(SIZE)
-ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
-
-
-def leaf(tensor: Tensor) -> Tensor:
-    return tensor.detach().clone().requires_grad_()
-
 
 SECOND = "second derivatives of a rendered image are not available.*Gauss-Newton"
 

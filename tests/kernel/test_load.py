@@ -9,7 +9,7 @@ import threading
 import pytest
 import torch
 from load_scripts import posix, script
-from scenes import cube, front_camera, icosphere
+from scenes import cube, front_camera, icosphere, soup
 
 import edgegrad as eg
 
@@ -75,12 +75,6 @@ def bits(mesh, seed=0):
 
 def moved(mesh, k):
     return mesh.replace(verts=mesh.verts * (1.0 + 0.01 * k) + 0.002 * k)
-
-
-def soup(mesh):
-    """Each face with corners of its own: they are welded anew wherever the vertices are."""
-    faces = torch.arange(mesh.faces.numel()).reshape(-1, 3)
-    return eg.Mesh(mesh.verts[mesh.faces].reshape(-1, 3), faces, colors=mesh.colors[mesh.faces].reshape(-1, 3))
 
 
 SPHERE = icosphere(3)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from finite_differences import check, estimate
+from lit_scenes import vector
 from torch import Tensor
 
 import edgegrad as eg
@@ -18,10 +19,6 @@ pytestmark = [pytest.mark.quick, pytest.mark.watched]
 FOCAL, HEIGHT, SIZE = 45.0, 0.9, 96  # of the camera: px, world units above the plane, px
 CORNERS = ((-0.3, -0.2), (0.35, -0.2), (0.35, 0.25), (-0.3, 0.25))
 DOUBLE = torch.float64
-
-
-def vector(*numbers: float) -> Tensor:
-    return torch.tensor(numbers, dtype=DOUBLE)
 
 
 class Setting:

@@ -13,7 +13,7 @@ from oracles import shading
 from oracles.lobes import Lobes, sobol_parts
 from oracles.mesh_light_sampling import MeshTowards
 from oracles.resampled import Glossy, resampled
-from scenes import icosphere
+from scenes import icosphere, soup
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -68,10 +68,6 @@ def open_ball() -> eg.Mesh:
 def two_balls() -> eg.Mesh:
     mesh = icosphere(1)
     return eg.Mesh(torch.cat([mesh.verts, mesh.verts + 3]), torch.cat([mesh.faces, mesh.faces + len(mesh.verts)]))
-
-
-def soup(mesh: eg.Mesh) -> eg.Mesh:
-    return eg.Mesh(mesh.verts[mesh.faces].reshape(-1, 3), torch.arange(3 * len(mesh.faces)).reshape(-1, 3))
 
 
 def inside_out(mesh: eg.Mesh) -> eg.Mesh:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from lit_scenes import vector
 from scenes import icosphere
 from torch import Tensor
 
@@ -13,10 +14,6 @@ import edgegrad as eg
 
 F64 = torch.float64
 _QUAD = torch.tensor([[0, 1, 2], [0, 2, 3]])
-
-
-def vector(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=F64)
 
 
 def quad(*corners: tuple[float, float, float], **material: Any) -> eg.Mesh:
