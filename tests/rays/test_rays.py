@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from combinations import diagonal
 from kernel_parts import parts
 
 import edgegrad as eg
@@ -100,9 +101,7 @@ def cast(corners: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     return face, hidden.astype(bool)
 
 
-@pytest.mark.parametrize("infinite", [True, False], ids=["rays", "segments"])
-@pytest.mark.parametrize("far", [0.3, 3.0, 1e6], ids=["within", "outside", "far"])
-@pytest.mark.parametrize("scale", [1.0, 1e-12, 1e12])
+@pytest.mark.parametrize(("scale", "far", "infinite"), diagonal([1.0, 1e-12, 1e12], [0.3, 3.0, 1e6], [False, True]))
 def test_any_rays(far: float, infinite: bool, scale: float) -> None:
     corners = triangle_soup(150, scale, scale * np.array([30.0, -70.0, 5.0]))
     rays = rays_through(corners, 1001, far, infinite)  # not whole packets

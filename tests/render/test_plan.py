@@ -369,12 +369,11 @@ def test_plan_prints_as_a_table():
 @pytest.mark.parametrize(
     ("change", "error"),
     [
-        ({"scene": "cube"}, TypeError), ({"camera": None}, TypeError), ({"spp": 0}, ValueError),
-        ({"spp": 1.5}, TypeError), ({"seed": -1}, ValueError), ({"filter": "hat"}, ValueError),
-        ({"visibility": 1}, TypeError), ({"edge_samples": 0}, ValueError),
+        ({"scene": "cube"}, TypeError),
+        ({"spp": 0}, ValueError),
         ({"scene": eg.Scene([cube()], torch.zeros(3, 3, 3))}, ValueError),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("function", [eg.plan, eg.profile])
 def test_errors_are_those_of_render(function, change, error):
     arguments = {"scene": cube(), "camera": CAMERA, **change}
