@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from both_modes import check_both_modes
 from scenes import front_camera, icosphere, smooth_adjoint, smooth_colors
 from torch import Tensor
 
@@ -155,11 +156,7 @@ def test_forward_mode_and_transforms():
     a, verts = torch.tensor(0.2, dtype=F64), mesh.verts
     a_dot = torch.tensor(0.7, dtype=F64)
     verts_dot = 0.1 * torch.sin(3 * verts)
-    leaves = a.clone().requires_grad_(), verts.clone().requires_grad_()
-    bars = torch.autograd.grad((image(*leaves) * adjoint).sum(), leaves)
-    expected = (bars[0] * a_dot).sum() + (bars[1] * verts_dot).sum()
-    dot = torch.func.jvp(image, (a, verts), (a_dot, verts_dot))[1]
-    assert torch.allclose((dot * adjoint).sum(), expected, rtol=1e-6)
+    bars = check_both_modes(image, [a, verts], [a_dot, verts_dot], adjoint, rel=1e-6)
     func = torch.func.grad(lambda a, v: (image(a, v) * adjoint).sum(), argnums=(0, 1))(a, verts)
     for x, y in zip(func, bars, strict=True):
         assert torch.allclose(x, y, rtol=1e-6, atol=1e-9)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from both_modes import check_both_modes
 from bounce_scenes import QUAD, SCENES, BounceScene, indirect_change, indirect_gradient, mesh
 from finite_differences import Case, estimate
 from torch import Tensor
@@ -69,11 +70,7 @@ def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
         lit = eg.Scene(list(scene.meshes.values()), lights=list(scene.lights))
         return eg.render(lit, moved, 1, bounces=2, surface_samples=2_000, edge_samples=1_000)
 
-    own = pose.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad((weights * image(own)).sum(), own)
-    moved: Tensor = torch.func.jvp(image, (pose,), (tangent,))[1]
-    expected = float((gradient * tangent).sum())
-    assert abs(float((weights * moved).sum()) - expected) < 1e-9 * abs(expected)
+    check_both_modes(image, [pose], [tangent], weights)
 
 
 COUNTS = {"surface_samples": 100_000, "edge_samples": 100_000}
