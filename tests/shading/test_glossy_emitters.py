@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from lit_scenes import F64, ball, from_above, plane, vector
+from lit_words import hits_of
 from oracles import shading
 from oracles.lobes import Lobes, sobol_parts
 from oracles.mesh_light_sampling import MeshTowards
@@ -18,11 +19,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
-from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel
 from edgegrad.light.bsdf import Scattering
 from edgegrad.light.sampling import tree_of
-from edgegrad.points.frame import Frame
 from edgegrad.scene.mesh_light import MeshLight
 
 
@@ -168,9 +167,7 @@ def test_the_kernel_draws_what_pytorch_draws():
     emitter = eg.AreaLight.of(eg.Mesh(icosphere(1).verts * 0.6 + vector(1.7, 0.1, 0.8), icosphere(1).faces), 3.0)
     floor = plane(2.0, material=rough).replace(verts=plane(2.0).verts - vector(0, 0, 1.2))
     scene = eg.Scene([ball(2, material=metal), floor, emitter])
-    frame = Frame(scene, make_request(scene, from_above(20), 2, 0))
-    ((_, found),) = frame.sampler.pixel_hits(1 << 40)
-    hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, frame.seeds("image", len(found.face)))
+    hits = hits_of(scene, from_above(20))
     (light,) = hits.lights
     assert isinstance(light, MeshLight)
     position, own = hits.position.detach().double(), torch.full_like(hits.mesh, -1)
