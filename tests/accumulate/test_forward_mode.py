@@ -110,21 +110,15 @@ def crossing_scene() -> eg.Scene:
         pytest.param(mixed_scene, CAMERA, "box", marks=pytest.mark.unwatched),
         (mixed_scene, ORTHOGRAPHIC, "gaussian"),
         (mixed_scene, CAMERA.crop(3, 2, 12, 14), "tent"),
-        pytest.param(crossing_scene, CAMERA, "tent", marks=pytest.mark.unwatched),
-        pytest.param(crossing_scene, ORTHOGRAPHIC, "box", marks=pytest.mark.unwatched),
         pytest.param(crossing_scene, DISTORTED, "gaussian", marks=pytest.mark.unwatched),
         (crossing_scene, PANORAMA, "box"),
-        pytest.param(mixed_scene, PANORAMA, "tent", marks=pytest.mark.unwatched),
     ],
     ids=[
         "perspective box",
         "orthographic gaussian",
         "crop tent",
-        "crossing perspective",
-        "crossing orthographic",
-        "distorted",
+        "crossing distorted",
         "crossing panorama",
-        "panorama",
     ],
 )
 def test_forward_is_the_adjoint_of_reverse(scene, camera, filter):
@@ -193,9 +187,9 @@ def test_all_directions_take_one_pass(monkeypatch):
 
     jvp_kernel = operators.jvp_kernel
     monkeypatch.setattr(operators, "jvp_kernel", watched)
-    eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(40, 3, 3, dtype=F64)}, 4)
+    eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(12, 3, 3, dtype=F64)}, 4)
     torch.func.jacfwd(lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4))(torch.zeros(3, dtype=F64))
-    assert calls == [40, 3]
+    assert calls == [12, 3]
 
 
 def test_more_directions_than_memory(monkeypatch):

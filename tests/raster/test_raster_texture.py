@@ -149,7 +149,7 @@ def test_levels_given() -> None:
 )
 def test_derivatives(border: str, textures: int) -> None:
     cube = border == "cube"
-    tex = draws(18, textures, *((6, 8, 8, 2) if cube else (8, 4, 2))).requires_grad_()
+    tex = draws(18, textures, *((6, 4, 4, 2) if cube else (8, 4, 2))).requires_grad_()
     uv = (directions(19, 2, 4, 5) if cube else draws(19, 2, 4, 5, 2, low=-0.3, high=1.3)).requires_grad_()
     uv_da = (draws(20, 2, 4, 5, 6 if cube else 4, low=-1, high=1) * 0.7).requires_grad_()
     bias = draws(21, 2, 4, 5, low=-0.5, high=0.5).requires_grad_()

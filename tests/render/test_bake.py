@@ -151,7 +151,7 @@ def test_wrong_arguments() -> None:
         (lambda: eg.bake(mesh, plain, what="gloss"), ValueError, "what: expected one of"),
         (lambda: eg.bake(mesh, plain, by="luck"), ValueError, "by: expected"),
         (lambda: eg.bake(mesh, plain, 0), ValueError, "size: expected"),
-        (lambda: eg.bake(mesh, lambda points: torch.ones(3)), ValueError, "source: expected shape"),
+        (lambda: eg.bake(mesh, lambda points: torch.ones(3), 4), ValueError, "source: expected shape"),
         (lambda: eg.bake(mesh, plain, (4, 4, 3)), ValueError, "size: expected an int or"),
         (lambda: eg.bake(mesh, plain, 4.0), TypeError, "size: expected an int"),
         (lambda: eg.bake(mesh, lambda points: points.normal * torch.nan, 4), ValueError, "source: expected finite"),

@@ -151,8 +151,6 @@ def test_colors_break_them() -> None:
     x, _, z = solid.face_normals.T
     top = painted(z > 0.5)
     assert len(eg.find_symmetries(top).motions) == 4
-    assert len(eg.find_symmetries(painted(np.abs(z) > 0.5)).motions) == 8
-    assert len(eg.find_symmetries(painted(np.abs(x) > 0.5)).motions) == 4
     assert len(eg.find_symmetries(painted(x > 0.5)).motions) == 2
     assert len(eg.find_symmetries(top, textured=False).motions) == 8
     assert len(eg.find_symmetries(top, color_tolerance=1.0).motions) == 8

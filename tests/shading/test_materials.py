@@ -332,7 +332,7 @@ def by_material(name: str) -> Case:
     "name",
     [
         "roughness",
-        "normals",
+        pytest.param("normals", marks=pytest.mark.slow),
         pytest.param("verts", marks=pytest.mark.slow),
         pytest.param("flat", marks=pytest.mark.slow),
     ],

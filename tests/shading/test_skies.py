@@ -90,9 +90,9 @@ def compare(name: str, case: Case, seeds: int, directions: int, samples: int) ->
         check(f"{name}, {what}", truth.mean, Estimate(found.mean, error))
 
 
-@pytest.mark.parametrize(("seed", "level", "tilt"), [(7, -1.6, 0.15), (9, -0.5, 0.15)], ids=["above", "through"])
-def test_gradient_of_triangles_with_normals(seed: int, level: float, tilt: float) -> None:
-    compare(f"seed {seed}", Case(seed, level, tilt), 4, 1024, 30_000)
+def test_gradient_of_triangles_with_normals() -> None:
+    """They pass through the ground."""
+    compare("through", Case(9, -0.5, 0.15), 4, 1024, 30_000)
 
 
 def test_gradient_of_a_sliver_with_its_own_normal() -> None:
