@@ -213,7 +213,9 @@ def behind_glass(kind: str, t: Tensor, covered: bool) -> tuple[eg.Scene, eg.Came
     return eg.Scene([*meshes, glass] if glass else meshes, lights=lights), camera
 
 
-@pytest.mark.parametrize("kind", ["edges", "intersection", "shadow", "alpha edge"])
+@pytest.mark.parametrize(
+    "kind", ["edges", "shadow", "alpha edge", pytest.param("intersection", marks=pytest.mark.slow)]
+)
 def test_all_that_moves_behind_a_transparent_sheet(kind: str) -> None:
     """It moves as without the transparent sheet, of which six tenths come through."""
     options = {"edge_samples": 6000, "surface_samples": 20_000, "step_spacing": 0.125}

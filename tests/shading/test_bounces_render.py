@@ -84,7 +84,7 @@ def furnace(albedo: Tensor) -> eg.Scene:
     return eg.Scene([eg.Mesh(ball.verts.double(), ball.faces, material=eg.Material(albedo, emission=1.0))])
 
 
-@pytest.mark.parametrize("bounces", [1, 2, 16])
+@pytest.mark.parametrize("bounces", [1, 8])
 def test_white_furnace(bounces: int) -> None:
     albedo = torch.full((3,), 0.8, dtype=F64, requires_grad=True)
     camera = eg.Camera.look_at((0.3, 0.1, 0.2), (1.0, 0.4, 0.1), fov_y=60.0, size=(32, 32))

@@ -259,7 +259,9 @@ def by_light(name: str) -> Case:
     return case
 
 
-@pytest.mark.parametrize("name", ["cone", "emitter", pytest.param("radiance", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["cone", *(pytest.param(name, marks=pytest.mark.slow) for name in ("emitter", "radiance"))]
+)
 def test_gradients_by_lights_are_finite_differences(name: str):
     wide = name in ("emitter", "radiance")
     options = {"shadows": False, "light_samples": 8 if wide else 1}
