@@ -85,15 +85,19 @@ def test_gradient_against_the_exact_one(name, projection):
 SAMPLES: dict[str, Any] = {"surface_samples": 20_000, "edge_samples": 20_000}
 
 
-def test_boxes_through_each_other():
-    """0.20 in another renderer: it had no edge there. Two meshes of float32, of which one moves."""
+def two_boxes() -> tuple[eg.Mesh, eg.Mesh]:
+    """Return two boxes of different colours that pass through each other."""
     box = cube(0.45).transformed(rotation((0.6, 0.0, 0.8), torch.tensor(0.4, dtype=F64)))
     other = box.transformed(
         rotation((0.0, 1.0, 0.0), torch.tensor(0.9, dtype=F64)), torch.tensor([0.35, 0.2, 0.15], dtype=F64)
     )
-
     assert other.colors is not None
-    other = other.replace(colors=1 - other.colors)
+    return box, other.replace(colors=1 - other.colors)
+
+
+def test_boxes_through_each_other():
+    """0.20 in another renderer: it had no edge there. Two meshes of float32, of which one moves."""
+    box, other = two_boxes()
 
     def one_moves(theta: Tensor):
         moved = box.transformed(t=theta * ALONG)
@@ -156,12 +160,7 @@ def test_a_face_seen_edge_on_contributes_nothing(projection):
 
 def test_copies_share_the_line():
     """A box listed twice by index, or three times by place, through another: the line between them is there once."""
-    box = cube(0.45).transformed(rotation((0.6, 0.0, 0.8), torch.tensor(0.4, dtype=F64)))
-    other = box.transformed(
-        rotation((0.0, 1.0, 0.0), torch.tensor(0.9, dtype=F64)), torch.tensor([0.35, 0.2, 0.15], dtype=F64)
-    )
-    assert other.colors is not None
-    other = other.replace(colors=1 - other.colors)
+    box, other = two_boxes()
     twice = box.replace(faces=torch.cat([box.faces, box.faces[:, [1, 2, 0]]]))
     camera, adjoint = front_camera(48), smooth_adjoint(48, 48, 3).to(F64)
 

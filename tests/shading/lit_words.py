@@ -145,3 +145,10 @@ def hits_of(scene: eg.Scene, camera: eg.Camera) -> Hits:
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
     seed = frame.seeds("image", len(found.face))
     return frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
+
+
+def cotangents(radiance: Tensor, tensors: Leaves) -> tuple[Tensor, ...]:
+    """Return the gradients of the radiance by the tensors, zeros where there are none, for one random cotangent."""
+    bar = torch.randn(radiance.shape, dtype=F64, generator=torch.Generator().manual_seed(1))
+    loss = (radiance * bar).sum()
+    return torch.autograd.grad(loss, list(tensors.values()), allow_unused=True, materialize_grads=True)
