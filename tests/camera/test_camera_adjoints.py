@@ -73,7 +73,7 @@ def test_normalised_vjp(lens):
 
 
 @lenses
-def test_bend_jvp_and_area_scale(lens):
+def test_distortion_jvp_and_area_scale(lens):
     """Compare derivatives by the undistorted image with differences of the positions in the image."""
     perspective, name, distortion = LENSES[lens]
     camera, pinhole = kernel_camera(K6, perspective, name, distortion), kernel_camera(K6, perspective)

@@ -101,7 +101,7 @@ def test_area_in_a_wide_fisheye(degrees: int) -> None:
 
 
 @lenses
-def test_wall(lens: str) -> None:
+def test_interior_derivatives_of_a_wall(lens: str) -> None:
     """A triangle that fills the view has an interior term alone: against quadrature in double, differentiated by autograd."""
     view = camera(lens)
     wall = scene("interior").meshes[0]
@@ -321,7 +321,7 @@ def test_gradient_by_coefficients_of_zero(index: int) -> None:
 
 
 @lenses
-def test_pixels_that_are_left_out_show_nothing(lens: str) -> None:
+def test_pixels_without_rays_show_nothing(lens: str) -> None:
     """Only pixels near the mesh get rays; a far wall behind it makes that all pixels, and hides nothing of the mesh."""
     view = camera(lens)
     mesh = colored_sphere(0.4)

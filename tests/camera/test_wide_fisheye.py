@@ -311,7 +311,7 @@ def test_gradients(place: str, kind: Callable[..., eg.Scene], view: str, what: s
 
 
 @pytest.mark.slow
-def test_around_the_antipode() -> None:
+def test_gradient_around_the_antipode() -> None:
     """A ball right behind, which a lens that shows all around draws as a ring: areas grow without bound there."""
     case = moved(lambda dx=0.0: both((0.2, 0.1, -2.5), dx), CAMERAS["all around"], "vertices")
     check_gradient(case, filter="tent", step=0.01)

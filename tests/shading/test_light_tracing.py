@@ -101,17 +101,17 @@ def check(scene: eg.Scene, seen_from: eg.Camera, spp: int, bounces: int, seeds: 
     print(expected, found)
 
 
-def test_image() -> None:
+def test_light_tracing_gives_the_image_of_paths() -> None:
     check(room(), camera("perspective"), 40, 3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["perspective", "distorted", "orthographic", "fisheye", "panorama"])
-def test_cameras(kind: str) -> None:
+def test_light_tracing_through_every_lens(kind: str) -> None:
     check(room({"base_color": vector(0.8, 0.6, 0.4), **GLOSSY}), camera(kind), 192, 2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bounces", [2, 3, 5])
-def test_bounces(bounces: int) -> None:
+def test_light_tracing_at_any_number_of_bounces(bounces: int) -> None:
     check(room({"base_color": vector(0.8, 0.6, 0.4), **GLOSSY}), camera("perspective"), 192, bounces)

@@ -112,13 +112,13 @@ def test_all_light_is_near_or_not() -> None:
 
 
 @pytest.mark.slow
-def test_a_corner() -> None:
+def test_gradient_in_a_corner() -> None:
     check(camera_of(corner()), 0.2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["cornell", "standing", "ball"])
-def test_rooms(scene: str) -> None:
+def test_gradient_in_rooms(scene: str) -> None:
     check(camera_of(SCENES[scene][0](), ROLLED), 0.15)
 
 
