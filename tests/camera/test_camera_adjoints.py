@@ -189,7 +189,7 @@ def test_inside_keeps_what_is_inside():
 
 
 @pytest.mark.parametrize("u, v", [(-0.1, 0.4), (0.3, -1e9), (0.8, 0.9), (1e300, 1e-3), (-1.0, -1.0), (2.0, -0.5)])
-def test_inside_moves_to_the_rim(u, v):
+def test_inside_moves_to_the_border(u, v):
     a, b = parts.inside(u, v)
     assert a >= 0 and b >= 0 and a + b <= 1 + 1e-15
     assert min(a, b, 1 - a - b) <= 1e-15  # on the border, to rounding

@@ -179,7 +179,7 @@ def test_from_colmap(model: str) -> None:
         agree(camera.project(POINTS), torch.from_numpy(expected), 1e-8)
 
 
-def test_colmap_faults() -> None:
+def test_bad_colmap_parameters() -> None:
     with pytest.raises(ValueError, match=r"model: expected one of SIMPLE_PINHOLE, .* got 'FOV'; undistort"):
         eg.Camera.from_colmap(R, SHIFT, "FOV", [1.0] * 5, SIZE)
     with pytest.raises(ValueError, match=r"params: expected shape \(4,\), got \(3,\); these are what PINHOLE has"):

@@ -239,7 +239,7 @@ def test_what_lies_beyond_the_end_of_the_lens() -> None:
     assert not image.any() and verts.grad is not None and not verts.grad.any()
 
 
-def test_no_warning_where_the_rim_lies_outside() -> None:
+def test_no_warning_where_the_lens_ends_outside() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("edgegrad.kernel.operators.warn", lambda *_: pytest.fail("warned"))
         eg.render(ball(PLACES["ahead"]), CAMERAS["usual"], 1)

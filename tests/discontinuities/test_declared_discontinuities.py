@@ -232,7 +232,7 @@ def test_bad_arguments_are_refused():
 
 
 @pytest.mark.parametrize("kind", ["where", "floor", "nearest"])
-def test_borders_along_edges(kind: str):
+def test_discontinuities_along_edges(kind: str):
     """A border that runs exactly along edges of the mesh, of a grid of 4 × 4 squares: x = θ, with an edge at 0."""
     grid = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, 5, dtype=F64)] * 2, indexing="ij"), -1).reshape(-1, 2)
     corner = torch.tensor(

@@ -236,7 +236,7 @@ def test_texture_coordinates_in_single_precision() -> None:
     torch.testing.assert_close(gradient(torch.float32).double(), exact, rtol=1e-3, atol=1e-3 * float(exact.abs().max()))
 
 
-def test_steps_are_declared_as_shading_looks_them_up() -> None:
+def test_texel_edges_are_declared_as_shading_looks_them_up() -> None:
     """declare_texel_edges() alone declares them in the same order."""
     draw = torch.Generator().manual_seed(5)
 

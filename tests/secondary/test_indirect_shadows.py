@@ -69,7 +69,7 @@ def check(case: Case, spp: int, seeds: int, h: float = 0.2, bounces: int = 2, **
     print(right_ratio(change, indirect_gradient(case, h, seeds, bounces, **samples)))
 
 
-def test_emitter() -> None:
+def test_a_caster_before_an_emitter() -> None:
     check(case_of("emitter", "caster"), 128, 4, **FEW)
 
 

@@ -143,16 +143,16 @@ def test_a_light_at_the_eye_adds_no_visible_shadow(kind: str, offset: float, dty
 
 @pytest.mark.parametrize("shape", ["box", "sphere"])
 @pytest.mark.parametrize("offset", [0.0, 1e-6])
-def test_of_closed_bodies(shape: str, offset: float) -> None:
+def test_a_light_at_the_eye_of_closed_bodies(shape: str, offset: float) -> None:
     check(lit("point", shape=shape, offset=offset, dtype=torch.float32))
 
 
 @pytest.mark.parametrize("moves", ["camera+light", "wall", "body+wall"])
-def test_of_other_motions(moves: str) -> None:
+def test_a_light_at_the_eye_and_other_motions(moves: str) -> None:
     check(lit("point", offset=1e-7, moves=moves), seeds=6)
 
 
-def test_of_a_fisheye() -> None:
+def test_a_light_at_the_eye_of_a_fisheye() -> None:
     check(Case(offset=1e-6, projection="fisheye"))
 
 
@@ -161,7 +161,7 @@ def test_of_a_fisheye() -> None:
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("kind", LIGHTS)
 @pytest.mark.parametrize("shape", ["grid", "box", "sphere"])
-def test_of_all_small_offsets(shape: str, kind: str, sign: int, dtype: torch.dtype) -> None:
+def test_a_light_at_all_small_offsets_from_the_eye(shape: str, kind: str, sign: int, dtype: torch.dtype) -> None:
     for offset in (1e-12, 1e-10, 1e-8, 1e-7, 3e-7, 1e-6, 3e-6, 1e-5, 3e-5, 1e-4):
         # What a light lights is noisier, for each sample of a boundary has one of its points.
         check(lit(kind, shape=shape, offset=sign * offset, dtype=dtype), 8, 40_000 if kind == "area" else 4_000)

@@ -44,7 +44,7 @@ def of_few_samples(case: Case) -> Estimate:
 
 
 @pytest.mark.slow
-def test_six_scenes() -> None:
+def test_few_samples_are_unbiased_in_six_scenes() -> None:
     chances = []
     for scene, motion in SCENES:
         case = case_of(scene, motion)

@@ -17,7 +17,7 @@ from edgegrad.points import borders
 pytestmark = pytest.mark.watched
 
 
-def test_borders_of_shadows_by_what_the_light_adds() -> None:
+def test_shadow_boundaries_by_what_the_light_adds() -> None:
     """The gradient is that of the radiance on both sides of the boundary, some 1e-4 px from it, where any other shader is
     asked."""
     leaves = {
@@ -33,7 +33,7 @@ def test_borders_of_shadows_by_what_the_light_adds() -> None:
         assert float((a - b).norm()) < 1e-4 * float(a.norm()) > 0
 
 
-def test_borders_of_shadows_of_what_is_looked_up_nearest() -> None:
+def test_shadow_boundaries_with_nearest_texels() -> None:
     """Emission is left out of what a light adds, and its nearest texels with it: one texel is looked up linearly."""
     found = []
     for filter in ("nearest", "linear"):

@@ -55,7 +55,7 @@ def test_values_and_cotangents(words: str, view: str) -> None:
 
 @pytest.mark.parametrize("grey", [0.5, 128 / 255, 127 / 255], ids=["half", "128", "127"])
 @pytest.mark.parametrize("noise", [0.0, 1e-15])
-def test_a_grey_normal_map_does_not_bend(grey: float, noise: float) -> None:
+def test_a_grey_normal_map_changes_nothing(grey: float, noise: float) -> None:
     """The kernel and PyTorch shade as without the map, and so are derivatives, which rounding would make as large as 1e15."""
     words, found = "normals normal_map microfacets point", []
     draw = torch.Generator().manual_seed(5)
@@ -263,7 +263,7 @@ def test_glossy_surfaces_of_many_channels_are_those_of_few() -> None:
         assert float((a - b).norm()) < 0.02 * float(b.norm()), (a, b)
 
 
-def test_nearest_texels_that_one_sees_through_are_shaded_as_in_pytorch() -> None:
+def test_transparent_nearest_texels_are_shaded_as_in_pytorch() -> None:
     """So are their discontinuities, in the same order."""
     leaves = numbers_of("nearest texture base point area")
     scene = scene_of("nearest texture base point area", leaves)
