@@ -198,9 +198,8 @@ def test_sweep_stops_where_the_next_point_would_cost_too_much():
     assert module._expected([(1, 2.0), (4, 2.3)], 16) == pytest.approx(3.5)  # mostly a cost that does not grow
 
 
-@pytest.mark.parametrize(
-    "scene", [name if name == "lit-area" else pytest.param(name, marks=pytest.mark.slow) for name in scenes.LIT]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", scenes.LIT)
 def test_lit_scenes(scene, tmp_path):
     """The reference is computed anew. Their terms are not timed alone."""
     document, _ = error_time(tmp_path, [scene], ["edgegrad", "boundary"], size=16, seeds=2, limit=60.0, quick=True)

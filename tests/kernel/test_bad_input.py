@@ -214,8 +214,8 @@ def helper_refuses(malformed: tuple[str, dict[str, Any]]) -> None:
 # -- the runs -----------------------------------------------------------------------------------------------------
 
 CHECKS = {
-    "refuses": (refuses, malformed_cases(), 90, 2000),
-    "same_bits": (same_bits, harmless_cases(), 60, 800),
+    "refuses": (refuses, malformed_cases(), 60, 2000),
+    "same_bits": (same_bits, harmless_cases(), 40, 800),
     "helpers": (helper_refuses, helper_calls(), 40, 500),
 }  # the property, its cases, and how many: in the fast suite with a fixed seed, and in the slow one
 

@@ -81,7 +81,6 @@ SPHERE = icosphere(3)
 SCENES = {
     "different scenes": [icosphere(k) for k in (1, 2, 3, 4)] + [moved(cube(), k) for k in range(4)],
     "one mesh": [SPHERE] * 8,
-    "one mesh that moves": [moved(SPHERE, k) for k in range(8)],
     "edges that move": [moved(soup(icosphere(2)), k) for k in range(8)],
 }
 

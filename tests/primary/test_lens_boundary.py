@@ -127,7 +127,11 @@ def check(gradient: Tensor, truth: Tensor, relative: float = 2e-3) -> None:
 
 @pytest.mark.parametrize(
     ("lens", "mirror"),
-    [*((lens, 1) for lens in LENSES), pytest.param("decentred", -1, marks=pytest.mark.slow), ("wide fisheye", -1)],
+    [
+        *(("fold", 1), ("decentred", 1), ("wide fisheye", -1)),
+        *(pytest.param(lens, 1, marks=pytest.mark.slow) for lens in LENSES if lens not in ("fold", "decentred")),
+        pytest.param("decentred", -1, marks=pytest.mark.slow),
+    ],
 )
 def test_area(lens: str, mirror: int) -> None:
     """A white room before grey is an ellipse, for what is radial π |det K| ρ²: its area, and the derivative of that."""

@@ -168,7 +168,7 @@ def test_wrong_arguments() -> None:
         (lambda: eg.bake_pictures(mesh, [camera], []), ValueError, "images: expected one for each"),
         (lambda: eg.bake_pictures(mesh, [camera], [image[1:]]), ValueError, r"images\[0\]: expected shape"),
         (lambda: eg.bake_pictures(mesh, [camera], [image], masks=[image]), ValueError, r"masks\[0\]: expected shape"),
-        (lambda: eg.bake_pictures(mesh, [away], [image]), ValueError, "cameras: expected some that see"),
+        (lambda: eg.bake_pictures(mesh, [away], [image], 4), ValueError, "cameras: expected some that see"),
     ):
         with pytest.raises(error, match=words):
             call()  # pyright: ignore[reportArgumentType]

@@ -173,6 +173,8 @@ def test_intersection_with_the_reflector(monkeypatch: pytest.MonkeyPatch) -> Non
     check(blade_through_reflector(("lambert", "glossy"), WIDE), ("lambert", "glossy"), 400_000, side=1)
 
 
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize("make", [masked_sheet, blade_through_reflector])
 def test_same_bits_at_any_number_of_threads(make: Callable[[tuple[str, str]], Border]) -> None:
     check_threads(lambda: gradients_of(make(("lambert", "lambert")), 20_000, bounces=3))
 

@@ -173,15 +173,14 @@ FD_CASES = {
     "light, point": case("light", "point"),
     "verts, nearest, point": case("verts", "point", filter="nearest"),
 }
-QUICK = ("alpha, point",)
 
 
-@pytest.mark.unwatched
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FD_CASES])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FD_CASES)
 def test_curved_alpha_edges(name: str) -> None:
     """Central differences of images by a regular grid of rays."""
     at = FD_CASES[name]
-    truth = by_quadrature(at, 0.02, 20 if name in QUICK else 24)
+    truth = by_quadrature(at, 0.02, 24)
     found = derivative(at, 4, step_spacing=1 / 8, edge_samples=8000, surface_samples=20_000)
     assert found.error < 0.005 * abs(truth), f"too noisy to decide: {found}"
     assert abs(found.mean - truth) < 0.02 * abs(truth), f"difference {truth}, gradient {found}"

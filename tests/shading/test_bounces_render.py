@@ -63,7 +63,7 @@ def test_points_of_all_rooms(room: str, bounces: int) -> None:
 
 # Shares of the radiance are drawn in two ways where a path may meet a light (csrc/shading/lit/path.h); with two light samples
 # nothing is, each point has one path, and no pixel is asked again.
-@pytest.mark.parametrize("room", ["sky", "sky through an opening", "large light", "point"])
+@pytest.mark.parametrize("room", ["sky", "large light"])
 def test_images_whose_points_have_several_paths(room: str) -> None:
     scene, camera = ALL_ROOMS[room](), towards_room(12)
     with torch.no_grad():
