@@ -73,6 +73,10 @@ def test_a_caster_before_an_emitter() -> None:
     check(case_of("emitter", "caster"), 128, 4, **FEW)
 
 
+def test_a_point_light_moves() -> None:
+    check(case_of("point", "light"), 128, 4, **FEW)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["point", "spot", "directional", "sky"])
 def test_lights_that_move(kind: str) -> None:
