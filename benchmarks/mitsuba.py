@@ -21,7 +21,7 @@ from edgegrad.light.bsdf import DIELECTRIC, LEAST_ALPHA
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import PointLight
 from edgegrad.scene.material import Material, Texture
-from edgegrad.scene.mesh import PLAIN, Mesh
+from edgegrad.scene.mesh import DEFAULT_RADIANCE, Mesh
 from edgegrad.scene.scene import Scene
 
 BSDF = "metallic_roughness"  # the plugin of edgegrad's materials
@@ -387,7 +387,7 @@ def _shape(mi: Any, dr: Any, mesh: Mesh, name: str, lit: bool) -> Any:
     that both its faces run along in one direction, for two open borders."""
     verts, faces = mesh.verts.detach().cpu().double(), mesh.faces.cpu().long()
     attributes: dict[str, Tensor] = {}
-    uvs, radiance = None, _rgb(torch.full((3,), PLAIN))
+    uvs, radiance = None, _rgb(torch.full((3,), DEFAULT_RADIANCE))
     if mesh.texture is not None:
         assert mesh.uvs is not None and mesh.uv_faces is not None
         radiance = {

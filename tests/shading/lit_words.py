@@ -11,8 +11,8 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
-from edgegrad.points.frame import Frame
 from edgegrad.points.hits import Hits
+from edgegrad.points.image_context import ImageContext
 
 F64 = torch.float64
 Leaves = dict[str, Tensor]
@@ -141,7 +141,7 @@ def scene_of(words: str, n: Leaves) -> eg.Scene:
 
 
 def hits_of(scene: eg.Scene, camera: eg.Camera) -> Hits:
-    frame = Frame(scene, make_request(scene, camera, 2, 0))
+    frame = ImageContext(scene, make_request(scene, camera, 2, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
     seed = frame.seeds("image", len(found.face))
     return frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)

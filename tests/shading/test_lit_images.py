@@ -12,7 +12,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.light import radiance
-from edgegrad.points import borders
+from edgegrad.points import discontinuous_pixels
 
 pytestmark = pytest.mark.watched
 
@@ -74,7 +74,11 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
     leaves = numbers_of(words)
     camera = AROUND[view].replace(world_to_camera=AROUND[view].world_to_camera.double())
     plain = scene_of(words, leaves)
-    pictured, again, kept = plain.replace(background=torch.rand(*camera.size, 3).double()), [], borders.Borders.found
+    pictured, again, kept = (
+        plain.replace(background=torch.rand(*camera.size, 3).double()),
+        [],
+        discontinuous_pixels.DiscontinuousPixels.found,
+    )
     for scene, options in (
         (pictured, {"spp": 7, "seed": 5}),
         (plain, {"spp": 1}),
@@ -89,7 +93,7 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
                     if "nearest" in words:  # whose borders only PyTorch tells
                         patch.setattr(radiance, "is_fused", lambda scene: False)
                     keep = lambda self: (again.append(found := kept(self)), found)[1]  # noqa: E731
-                    patch.setattr(borders.Borders, "found", keep)
+                    patch.setattr(discontinuous_pixels.DiscontinuousPixels, "found", keep)
                 found.append(eg.render(scene, camera, **options))
         assert float(found[0].max()) > 0.1
         assert float((found[0] - found[1]).abs().max()) <= 1e-12 * float(found[0].abs().max())

@@ -18,8 +18,8 @@ from edgegrad.kernel.derivatives import transformed
 from edgegrad.kernel.first_order import unreached
 from edgegrad.kernel.request import make_request
 from edgegrad.light import creases, in_kernel, radiance
-from edgegrad.points.frame import Frame
 from edgegrad.points.hits import Hits
+from edgegrad.points.image_context import ImageContext
 from edgegrad.points.shadow_rays import Forced
 from edgegrad.scene.lights import LightPoints
 
@@ -154,7 +154,7 @@ def test_light_on_flat_faces(view: str) -> None:
     """E max(0, n·l) at corners, with the normal on the viewer's side; over the greatest."""
     leaves = numbers_of("point directional")
     scene = scene_of("point directional", leaves).replace(meshes=scene_of("point", leaves).meshes[:1])
-    frame = Frame(scene, make_request(scene, CAMERAS[view], 2, 0))
+    frame = ImageContext(scene, make_request(scene, CAMERAS[view], 2, 0))
     found = creases._flat_radiance(frame.fixed, 0, frame.fixed_view, indirect=False)
     (mesh,) = scene.meshes
     corner = mesh.verts[mesh.faces.long()]

@@ -27,7 +27,7 @@ COARSEST_OBJECT = 24  # Pixels across the object on the coarsest level, where 15
 SMALLEST_SIDE = 12  # pixels on the shorter side of the coarsest level
 PYRAMID_BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on finer ones
 MAX_COARSE_SPP = 64  # samples a pixel on coarse levels
-FADED = 0.25  # brightness of the picture behind a render, where the background is unknown
+BACKGROUND_BRIGHTNESS = 0.25  # brightness of the picture behind a render, where the background is unknown
 # A border is clutter when more than 0.3 of it is further from its median than 0.1 of the range.
 UNIFORM_BORDER = (0.1, 0.3)
 
