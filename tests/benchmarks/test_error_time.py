@@ -198,11 +198,10 @@ def test_sweep_stops_where_the_next_point_would_cost_too_much():
     assert module._expected([(1, 2.0), (4, 2.3)], 16) == pytest.approx(3.5)  # mostly a cost that does not grow
 
 
-@pytest.mark.parametrize(
-    "scene", [name if name == "lit-area" else pytest.param(name, marks=pytest.mark.slow) for name in scenes.LIT]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", scenes.LIT)
 def test_lit_scenes(scene, tmp_path):
-    """From a reference that is computed anew. Their terms are not timed alone."""
+    """The reference is computed anew. Their terms are not timed alone."""
     document, _ = error_time(tmp_path, [scene], ["edgegrad", "boundary"], size=16, seeds=2, limit=60.0, quick=True)
     of_scene = document["scenes"][scene]
     assert "not timed apart" in of_scene["left_out"]["boundary"]
@@ -326,7 +325,7 @@ def test_what_mitsuba_gets_is_the_same_view(open_ball):
 
 
 def test_mitsuba_gets_the_same_sky() -> None:
-    """By its rows, the first and the last of which are at the poles; as one finds by asking its `envmap`, where it is there."""
+    """The first and the last row are at the poles, as one finds by asking Mitsuba's `envmap`, where it is there."""
     image = torch.rand((5, 8, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     theirs, ours = mitsuba.sky_image(image), eg.Environment(image)
     theta = math.pi * (torch.arange(40, dtype=torch.float64) + 0.3) / 40

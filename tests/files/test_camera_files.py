@@ -62,7 +62,7 @@ def test_colmap(reconstruction, tmp_path, binary) -> None:
     assert views["b.png"].camera.size == SIZE and eg.load_cameras(folder)["a.png"].camera.K.dtype == torch.float32
 
 
-def test_colmap_faults(reconstruction, tmp_path) -> None:
+def test_bad_colmap_parameters(reconstruction, tmp_path) -> None:
     _, folder = reconstruction
     text = (folder / "images.txt").read_text()
     (folder / "images.txt").write_text(text.replace("1 a.png", "2 a.png"))

@@ -49,7 +49,7 @@ def loaded(*arguments, **options):
 
 
 def shown(mesh, size=8):
-    """What the square looks like from the front, row 0 on top; where it emits, and nothing else lights it, its emission."""
+    """Return how the square appears from the front, row 0 on top; its emission where it emits, and nothing else lights it."""
     camera = eg.Camera.look_at([0.5, 0.5, 100.0], [0.5, 0.5, 0.0], size=(size, size), fov_y=math.degrees(0.01))
     return eg.render(eg.Scene([mesh]), camera, spp=16).detach().numpy()
 
