@@ -15,7 +15,7 @@ from edgegrad.fit import fit_camera, fit_pose, fit_poses, track
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
 from edgegrad.fit.pose.photo.depth import warn_of_units
-from edgegrad.fit.pose.photo.photo_search import CONTOUR_SUPPORT, most_steps
+from edgegrad.fit.pose.photo.photo_descent import CONTOUR_SUPPORT, most_steps
 
 SIZE = 48
 QUICK = {"init": START, "search": False, "progress": False, "steps": 1, "spp": 2, "max_size": 24}

@@ -20,7 +20,7 @@ from edgegrad.fit.contour_colors import CONTOUR_BLURS, PIXEL_NOISE, ContourColor
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.jacobian import Rendered
-from edgegrad.fit.pose.photo import light, photo_search
+from edgegrad.fit.pose.photo import light, photo_descent, photo_search
 from edgegrad.fit.pose.photo.contour import contour_term
 from edgegrad.fit.pose.photo.depth import depth_term
 from edgegrad.fit.pose.photo.level import photo_levels
@@ -29,7 +29,8 @@ from edgegrad.fit.pose.photo.picture import Picture
 from edgegrad.fit.pose.photo.region_term import region_term
 from edgegrad.fit.pose.photo.surface_interior import AOVS, SurfaceInterior
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import PoseTask, Unknowns, is_clutter
+from edgegrad.fit.pose.target_images import is_clutter
+from edgegrad.fit.pose.task import PoseTask, Unknowns
 from edgegrad.fit.region import OUTLIERS, Windows, palette, posterior, smoothed
 from edgegrad.fit.views import area_mean
 
@@ -355,7 +356,7 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     fit = fit_pose(bracket(kind == "plain"), image, view, init=START, progress=False, **given)
     off = errors(fit)
     assert off[0] < degrees and off[1] < percent, (off, fit.explained)  # 12.3° and 8.4 % off at the start
-    assert fit.explained >= photo_search.PHOTO_SUPPORT and fit.converged == (kind != "plain")
+    assert fit.explained >= photo_descent.PHOTO_SUPPORT and fit.converged == (kind != "plain")
     # So small a contour does not show all turns to 2°.
     words = "directions unknown: rotation about (" if kind == "plain" else "converged"
     assert fit.reason.startswith(words), fit.reason
@@ -405,7 +406,7 @@ def test_a_camera_in_a_photograph(taken):
 def test_a_photograph_of_something_else_is_not_converged():
     view = camera(64)
     fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, progress=False)
-    assert not fit.converged and fit.explained < photo_search.PHOTO_SUPPORT
+    assert not fit.converged and fit.explained < photo_descent.PHOTO_SUPPORT
     assert fit.reason.startswith("edges not explained")
 
 
@@ -429,7 +430,7 @@ def test_noise_is_refused_without_following_other_starts():
     assert not fit.converged and fit.explained < 0.1
     assert fit.reason.startswith("edges not explained")
     finest = [step for step in fit.history if step.size == fit.history[-1].size]
-    assert len(finest) <= photo_search.LAST_STEPS + photo_search.FINE_STEPS + 1  # of the given start alone
+    assert len(finest) <= photo_descent.LAST_STEPS + photo_descent.FINE_STEPS + 1  # of the given start alone
 
 
 def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, tmp_path):
@@ -479,7 +480,7 @@ def test_what_looks_alike_in_unknown_light_is_not_converged():
     start = torch.eye(4, dtype=torch.float64)
     start[:3, :3] = turned(torch.tensor([0.05, -0.2, 0.0], dtype=torch.float64))
     fit = fit_pose(box, photograph(view, box.transformed(R), seed=4), view, init=start, spp=8, progress=False)
-    assert fit.explained >= photo_search.PHOTO_SUPPORT and not fit.uncertainty.unknown and not fit.converged
+    assert fit.explained >= photo_descent.PHOTO_SUPPORT and not fit.uncertainty.unknown and not fit.converged
     assert fit.reason.startswith("ambiguous: the pictures hardly separate it from a pose that is turned by "), (
         fit.reason
     )
@@ -507,7 +508,7 @@ def test_what_looks_alike_is_not_converged(monkeypatch):
         found.append(fit_pose(box, image, view, init=start, progress=False))
     for fit in found:
         assert math.degrees(math.acos(min(1.0, (float((fit.R.T @ R).trace()) - 1.0) / 2.0))) < 3.0
-        assert fit.explained >= photo_search.CONTOUR_SUPPORT
+        assert fit.explained >= photo_descent.CONTOUR_SUPPORT
     assert found[0].converged and not found[1].converged
     words = r"ambiguous: the pictures hardly separate it from a pose that is turned by (\d+)°"
     said = re.match(words, found[1].reason)

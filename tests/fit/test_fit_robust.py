@@ -19,7 +19,8 @@ from edgegrad.fit.pose.blur_estimate import estimate_blur
 from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.robust_loss import Comparison
-from edgegrad.fit.pose.task import STEP_PARTS, PoseTask, Unknowns, blurred, is_clutter
+from edgegrad.fit.pose.target_images import blurred, is_clutter
+from edgegrad.fit.pose.task import STEP_PARTS, PoseTask, Unknowns
 from edgegrad.fit.views import over_black
 
 
