@@ -13,7 +13,7 @@ import torch
 import trimesh
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
-from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
+from brackets import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
 from edgegrad import cli, demo

@@ -9,14 +9,12 @@ from typing import Any
 
 import torch
 import trimesh
-from test_fit import bracket, rotation
+from brackets import CENTER, SIZE, bracket, rotation
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import Fit, Parameter, Pose, PoseParameter, fit_scene
 
-CENTER = torch.tensor([1.0, 0.75, 0.4]).double()
-SIZE = 2.62  # the bracket's diagonal
 SKY = torch.tensor([0.1, 0.2, 0.3])
 
 

@@ -8,17 +8,16 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from test_fit import BACKGROUND, about_center, bracket, camera, picture, rotation, silhouette
+from brackets import BACKGROUND, about_center, bracket, camera, picture, rotation, silhouette, task_of
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import Calibration, calibrate, fit_camera
 from edgegrad.fit.ending import Ending
 from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.loss_model import ColorLoss, score_covariance
 from edgegrad.fit.pose.pose import Pose
-from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, PoseTask, Unknowns
+from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, Unknowns
 
 LENS = torch.tensor([-0.15, 0.05, 0.0, 0.0], dtype=torch.float64)
 SIMPLE = torch.tensor([-0.15, 0.0, 0.0, 0.0], dtype=torch.float64)
@@ -98,9 +97,7 @@ def test_deviations_are_those_of_pictures_with_noise(blocks: int) -> None:
     pose = Pose(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), one, one)
     for seed in range(10):
         lens = Unknowns(False, True, True, 2)
-        task = PoseTask.from_arguments(
-            scene(), noisy(clean, blocks, seed), true, None, None, BACKGROUND, lens, 1.0, ArgumentNames()
-        )
+        task = task_of(noisy(clean, blocks, seed), true, background=BACKGROUND, unknowns=lens)
         told = ColorLoss(task, pose, 512, 16, seed).at(pose)
         step = torch.linalg.solve(told.curvature, told.gradient)
         found.append(float(told.gradient @ torch.linalg.solve(told.scores, told.gradient)) / len(step))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from test_fit import START, bracket, camera, picture
+from brackets import START, bracket, camera, picture
 
 import edgegrad.fit
 from edgegrad import cli

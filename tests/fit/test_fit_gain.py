@@ -6,17 +6,15 @@ import math
 
 import pytest
 import torch
-from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation
-from test_fit_photo import clutter
+from brackets import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, task_of
+from photographs import clutter
 
 import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import PoseFit, PoseParameter, fit_pose, fit_scene
 from edgegrad.fit.edge_support import edge_support
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.robust_loss import Comparison
-from edgegrad.fit.pose.task import PoseTask, Unknowns
 from edgegrad.fit.views import has_levels, white_level
 
 
@@ -61,7 +59,7 @@ def test_the_gains_of_object_and_background(gain: float, behind: float) -> None:
     with torch.no_grad():
         alpha = eg.render_aovs(bracket(), view, ["image", "alpha"], spp=64)
     image = gain * alpha["image"] + behind * (1.0 - alpha["alpha"]) * BACKGROUND.to(alpha["image"])
-    task = PoseTask.from_arguments(bracket(), image, view, None, None, BACKGROUND, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(image, view, background=BACKGROUND)
     level = task.level(1.0, 0.0, 1.0, 64, task.dofs)
     with torch.no_grad():
         compared = Comparison(task, level, task.images(level, pose_from_matrix("", torch.eye(4)), 64, 1))

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from test_fit import BACKGROUND, bracket, camera, rotation
+from brackets import BACKGROUND, bracket, camera, rotation
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses

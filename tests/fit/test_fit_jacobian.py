@@ -4,18 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from brackets import BACKGROUND, CENTER, START, about_center, bracket, camera, task_of
 from motions import about, derivatives
-from test_fit import BACKGROUND, START, about_center, bracket, camera
 
 import edgegrad as eg
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.jacobian import Motion
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import DISTORTION, PoseTask, Unknowns
+from edgegrad.fit.pose.task import DISTORTION
 
 pytestmark = pytest.mark.quick
 
-CENTER = torch.tensor([1.0, 0.75, 0.4], dtype=torch.float64)
 CHANNELS = ["image", "alpha", "position", "depth", "shading_normal", "normal"]
 
 
@@ -82,7 +80,7 @@ def test_the_motion_of_a_step(dofs, kind):
     if kind == "perspective":
         view = view.replace(distortion=torch.tensor([0.1, 0.0, 0.01, 0.0]).double())
     picture = eg.render(eg.Scene([bracket()], BACKGROUND), view)
-    task = PoseTask.from_arguments(bracket(), picture, view, None, None, BACKGROUND, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(picture, view, background=BACKGROUND)
     task = replace(task, dofs=dofs)
     level = task.level(1.0, 0.0, 1.0, 4, dofs)
     pose = pose_from_matrix("", about_center(1.1 * START[:3, :3], (0.2, 0.1, -0.1)))._replace(

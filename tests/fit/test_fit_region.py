@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 import trimesh
-from test_fit import START, bracket, camera, errors
-from test_fit_photo import clutter, photograph
+from brackets import START, bracket, camera, errors
+from photographs import clutter, photograph
+from vases import AROUND, RADII, VIEW, vase
 
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
@@ -17,24 +18,6 @@ from edgegrad.fit.contour_colors import CONTOUR_BLURS, ContourColors
 from edgegrad.fit.descent.region_loss import RENEWAL_STEPS, RegionLoss
 from edgegrad.fit.region import OUTLIERS, Palette, smoothed
 from edgegrad.fit.views import region_views, views_of
-
-RADII = torch.tensor([0.55, 0.75, 0.35, 0.5])
-AROUND = 24
-VIEW = eg.Camera.look_at((0.3, 1.4, 4.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(96, 96))
-
-
-def vase(radii):
-    """Return a solid of revolution about the y axis."""
-    angle = torch.arange(AROUND) * (2.0 * math.pi / AROUND)
-    r = torch.cat([torch.full((1,), 1e-3), radii, torch.full((1,), 1e-3)])
-    y = torch.tensor([-0.9, -0.9, -0.3, 0.3, 0.9, 0.9])
-    verts = torch.stack([r[:, None] * angle.cos(), y[:, None].expand(-1, AROUND), r[:, None] * angle.sin()], -1)
-    a = torch.arange(5)[:, None] * AROUND + torch.arange(AROUND)
-    b = torch.arange(5)[:, None] * AROUND + (torch.arange(AROUND) + 1) % AROUND
-    faces = torch.cat([torch.stack([a, a + AROUND, b], -1), torch.stack([b, a + AROUND, b + AROUND], -1)]).reshape(
-        -1, 3
-    )
-    return eg.Mesh(verts.reshape(-1, 3), faces)
 
 
 def picture(light_samples=1):

@@ -7,20 +7,19 @@ import math
 import numpy as np
 import pytest
 import torch
+from brackets import bracket, task_of
 from objects import pebble
-from test_fit import bracket
 from torch import Tensor
 
 import edgegrad as eg
 from benchmarks import photo_cases
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import fit_pose
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.photo.match import BEAM_ROUNDS, SIZE_SPACING, VIEW_PIXELS, Matches, Mips, _in_mask, closer
 from edgegrad.fit.pose.photo.nearby import EVERYWHERE, comparable, nearby
 from edgegrad.fit.pose.photo.template_views import TemplateViews, all_sides, ball, pose_at, seen_at, spread
 from edgegrad.fit.pose.pose import Pose, angle, pose_from_matrix
-from edgegrad.fit.pose.task import PoseTask, Unknowns
+from edgegrad.fit.pose.task import PoseTask
 
 CENTER = torch.tensor([1.0, 0.75, 0.4])
 SIZE = 96
@@ -88,7 +87,7 @@ def test_a_ball_begins_with_no_turn_and_is_filled_evenly() -> None:
 
 def test_a_pose_off_the_axis_shows_the_object_where_it_should_and_turned_alike() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    task = PoseTask.from_arguments(mesh, picture, camera(), mask, None, None, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(picture, camera(), mesh, mask)
     R = rotation(torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64))
     pose = pose_at(task, R, torch.tensor([80.0, 20.0]), 5.0)
     center = pose.R @ task.center + pose.t
@@ -114,7 +113,7 @@ def test_matches_come_closer_than_views_are_apart() -> None:
     """Views are 20° apart, and places a tenth of the object's size: the rounds after them bring matches nearer."""
     R, t = truth((2.5, 0.3, 0.2), (0.3, -0.2, 0.4))
     mesh, picture, mask = pictured(R, t)
-    task = PoseTask.from_arguments(mesh, picture, camera(), mask, None, None, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(picture, camera(), mesh, mask)
     mips = Mips(task, VIEW_PIXELS)
     found = _in_mask(TemplateViews.from_rotations(task, all_sides()[::2], VIEW_PIXELS, 0), mips).distinct(
         24, 0.2, 0.1, SIZE_SPACING
@@ -136,9 +135,7 @@ def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch)
     """Of a quarter nothing is seen: one side has to be left out, and the right one."""
     monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.NEARBY_ROTATIONS", 24)
     case = photo_cases.rendered("pebble", pebble(), [photo_cases.clutter(k) for k in range(2)], "covered", 4)
-    task = PoseTask.from_arguments(
-        case.mesh, case.picture, case.camera, None, None, None, Unknowns(), 1.0, ArgumentNames()
-    )
+    task = task_of(case.picture, case.camera, case.mesh)
     start = pose_from_matrix(
         "init", case.perturbed(case.truth, 15.0, 0.05 * case.size, np.random.default_rng(4)).matrix
     )

@@ -6,13 +6,13 @@ import math
 
 import pytest
 import torch
+from brackets import task_of
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import PoseFit, Uncertainty, fit_pose
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.pose import Pose
-from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask, Unknowns
+from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask
 from edgegrad.fit.pose.uncertainty import CORRELATION_LENGTH
 from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
 
@@ -48,9 +48,7 @@ def picture(mesh: eg.Mesh) -> Tensor:
 
 
 def task() -> PoseTask:
-    return PoseTask.from_arguments(
-        vase(), picture(vase()), camera(), None, None, None, Unknowns(), 1.0, ArgumentNames()
-    )
+    return task_of(picture(vase()), camera(), vase())
 
 
 def standing() -> Pose:

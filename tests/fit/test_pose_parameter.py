@@ -7,8 +7,8 @@ import math
 
 import pytest
 import torch
-from test_fit import BACKGROUND, bracket, camera, rotation
-from test_fit import START as START_MATRIX
+from brackets import BACKGROUND, CENTER, bracket, camera, rotation
+from brackets import START as START_MATRIX
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene
@@ -35,21 +35,20 @@ def fitted(size=24, **options):
 
 def test_steps_are_rotation_vectors_about_the_middle_and_shifts_in_sizes():
     mesh, size = bracket(), math.sqrt(2.0**2 + 1.5**2 + 0.8**2)
-    center = torch.tensor([1.0, 0.75, 0.4], dtype=F64)
     scaled = START._replace(scale=torch.tensor(1.3, dtype=F64))
     placement = PoseParameter(scaled, mesh, scale=0.01).placed("pose")
     at = {name: p.value for name, p in placement.coordinates.items()}
     torch.testing.assert_close(placement.pose(at).matrix, scaled.matrix)
-    where = 1.3 * START.R @ center + START.t
+    where = 1.3 * START.R @ CENTER + START.t
     turn = torch.tensor([0.3, -2.0, 0.4], dtype=F64)
     turned = placement.pose({**at, "rotation": turn})
     torch.testing.assert_close(turned.R, rotation(*turn.tolist()) @ START.R)
-    torch.testing.assert_close(1.3 * turned.R @ center + turned.t, where)
+    torch.testing.assert_close(1.3 * turned.R @ CENTER + turned.t, where)
     moved = placement.pose({**at, "shift": torch.tensor([0.5, 0.0, -1.0], dtype=F64)})
     torch.testing.assert_close(moved.t - scaled.t, 1.3 * size * torch.tensor([0.5, 0.0, -1.0], dtype=F64))
     grown = placement.pose({**at, "scale": torch.tensor(math.log(2.0), dtype=F64)})
     assert float(grown.scale) == pytest.approx(2.6)
-    torch.testing.assert_close(2.6 * grown.R @ center + grown.t, where)
+    torch.testing.assert_close(2.6 * grown.R @ CENTER + grown.t, where)
 
 
 def test_a_pose_is_differentiable_in_all_its_steps():
@@ -84,9 +83,8 @@ def test_finds_a_pose_by_name():
     pose = fit.poses["meshes.0.pose"]
     torch.testing.assert_close(fit.history[0].values["meshes.0.pose"], START_MATRIX, rtol=0, atol=1e-12)
     apart = math.degrees(math.asin(float((pose.R - torch.eye(3)).norm()) / 8**0.5) * 2.0)
-    middle = torch.tensor([1.0, 0.75, 0.4], dtype=F64)
     assert fit.converged and apart < 0.5
-    assert float((pose.R @ middle + pose.t - middle).norm()) < 0.005 * 2.62
+    assert float((pose.R @ CENTER + pose.t - CENTER).norm()) < 0.005 * 2.62
     torch.testing.assert_close(fit.mesh.verts, bracket().transformed(pose.R, pose.t).verts)
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from test_fit import BACKGROUND, START, bracket, camera, picture
-from test_fit_scene import pictures, views
+from brackets import BACKGROUND, START, bracket, camera, picture
+from small_scenes import pictures, views
 
 import edgegrad as eg
 from edgegrad import cli
@@ -95,8 +95,8 @@ def test_a_camera_moves_before_a_scene_at_rest(viewer):
 
 
 def test_the_skeleton_of_a_rig_is_drawn(viewer, monkeypatch):
-    from test_fit_rig import arm, shown
-    from test_fit_rig import views as around
+    from arms import arm, shown
+    from arms import views as around
 
     monkeypatch.setattr(view, "MIN_INTERVAL", 0.0)
     rig, cameras = arm(3), around(24, 2)

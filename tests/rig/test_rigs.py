@@ -308,7 +308,7 @@ def test_bad_arguments() -> None:
 
 def two_bars() -> eg.Rig:
     """One rig of two bodies: coloured bars on joints of their own, the second across the first."""
-    from test_fit_rig import arm
+    from arms import arm
 
     one, skin = arm(), arm().deformer.skins[0]
     meshes = [

@@ -1,4 +1,4 @@
-"""What a fit of a rig says of its joints: which the pictures show, and how exactly; and light that is sought with a pose."""
+"""What a fit of a rig says of its joints: which the pictures show, and how exactly; and light that is found with a pose."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from test_fit_rig import arm, shown, views
+from arms import arm, shown, views
 
 import edgegrad as eg
 from edgegrad.fit import Options, Parameter, fit_rig

@@ -1,4 +1,4 @@
-"""What a search for poses is given: arrays of any kind that work, and errors that name what is wrong with the others."""
+"""Arguments of pose searches: arrays of any kind that work, and errors and warnings that name what is wrong with the others."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from test_fit import START, bracket, camera
-from test_fit_photo import depth_of, photograph, silhouette
+from brackets import BACKGROUND, START, bracket, camera, picture, silhouette
+from photographs import coverage, depth_of, photograph
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera, fit_pose, fit_poses, track
+from edgegrad.fit import fit_camera, fit_pose, fit_poses, fit_scene, track
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
 from edgegrad.fit.pose.photo.depth import warn_of_units
@@ -85,7 +85,7 @@ def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
 
 def test_poses_to_start_from_may_be_an_array(taken):
     view, image = taken
-    labels = (silhouette(view)[..., 0] > 0.5).numpy().astype(np.int32)
+    labels = (coverage(view)[..., 0] > 0.5).numpy().astype(np.int32)
     (fit,) = fit_poses([bracket()], image, view, labels, **{**QUICK, "init": START[None].numpy()})
     assert fit.steps > 0
 
@@ -109,7 +109,7 @@ def test_one_picture_for_two_cameras(taken):
     view, image = taken
     with pytest.raises(ValueError, match=r"target: expected 2, one for each camera, got one of shape \(48, 48, 3\)"):
         fit_pose(bracket(), image, [view, view], **QUICK)
-    mask = silhouette(view)[..., 0]
+    mask = coverage(view)[..., 0]
     for given in (mask, [mask]):
         with pytest.raises(ValueError, match=r"mask.*: expected 2, one for each camera, got one of shape \(48, 48\)"):
             fit_poses([bracket()], [image] * 2, [view] * 2, given, **{**QUICK, "init": [START]})
@@ -173,3 +173,113 @@ def test_what_is_not_explained_is_not_blamed_on_steps(taken):
     fit = fit_pose(bracket(True), image, view, init=START, search=False, progress=False, steps=2)
     assert 0.6 < fit.explained < CONTOUR_SUPPORT and not fit.converged, fit.explained
     assert fit.reason.startswith("edges not explained"), fit.reason
+
+
+@pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_picture_from_the_bottom_up_is_named(masked):
+    view = camera(32)
+    target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
+    told = {"mask": mask} if masked else {"background": BACKGROUND}
+    with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
+        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=4, **told)
+    assert not fit.converged
+
+
+def test_masks_from_the_bottom_up_are_named():
+    views = [camera(32), camera(32, distance=5.0)]
+    masks = [silhouette(view).flip(0) for view in views]
+    sought = {"verts": 1e-4}
+    options = {"masks": masks, "steps": 2, "spp": 2, "progress": False}
+    with pytest.warns(UserWarning, match=r"^masks: expected the upper row first.*IoU of \d+%, as given at \d+%"):
+        fit_scene(bracket(), views, None, sought, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        fit_scene(bracket(), views, None, sought, **options | {"masks": [mask.flip(0) for mask in masks]})
+
+
+@pytest.mark.parametrize(
+    "change, error, message",
+    [
+        ({"camera": []}, ValueError, "camera: expected at least one"),
+        (
+            {"camera": [camera(8)] * 2},
+            ValueError,
+            "target: expected 2, one for each camera, got one of shape (8, 8, 3)",
+        ),
+        (
+            {"camera": [camera(8)], "target": [torch.zeros(8, 8, 3)], "mask": [torch.ones(4, 4)]},
+            ValueError,
+            "mask[0]: expected",
+        ),
+        (
+            {"target": "photo.png"},
+            TypeError,
+            "target: expected an image (H, W, C) of numbers, got the path 'photo.png'; read",
+        ),
+        (
+            {"target": None},
+            TypeError,
+            "target: expected an image (H, W, C) of numbers, got None; read one with read_image",
+        ),
+        ({"weight": -torch.ones(8, 8)}, ValueError, "weight: expected numbers from 0 up"),
+        ({"weight": torch.ones(8, 8, 3)}, ValueError, "weight: expected shape (8, 8) or (8, 8, 1)"),
+    ],
+)
+def test_errors_name_the_argument(change, error, message):
+    with pytest.raises(error) as caught:
+        fit_pose(
+            **{"mesh": bracket(), "target": torch.zeros(8, 8, 3), "camera": camera(8), "progress": False, **change}
+        )
+    assert message in str(caught.value)
+
+
+def test_pictures_and_masks_of_bytes_are_named():
+    view = camera(16)
+    image = picture(view)
+    bytes_ = (255 * image / image.max()).round()
+    with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
+        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, steps=1, search=False, progress=False)
+    resized = 40.0 + 0.7 * bytes_  # no whole numbers any more
+    with pytest.warns(
+        UserWarning, match=r"target: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
+    ):
+        fit_pose(bracket(), resized, view, silhouette(view), init=START, steps=1, search=False, progress=False)
+    with pytest.raises(
+        ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
+    ):
+        fit_pose(bracket(), image, view, 255.0 * torch.eye(16), progress=False)
+    with pytest.raises(ValueError, match=r"masks\[0\]: expected numbers from 0 to 1"):
+        masks = [255.0 * torch.eye(16)]
+        fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
+
+
+def test_alpha_is_no_colour_of_a_picture():
+    """It would show nothing of what surrounds the object, or more than a photograph knows."""
+    view = camera(16)
+    image = torch.cat([picture(view), silhouette(view)[..., None].reshape(16, 16, 1)], -1)
+    words = (
+        r"expected grey or colours, got 4 channels.*read_image\(path, channels=3\), or, .* x\[\.\.\., -1:\] as its mask"
+    )
+    with pytest.raises(ValueError, match="target: " + words):
+        fit_pose(bracket(plain=True), image, view, progress=False)
+    with pytest.raises(ValueError, match="images: " + words):
+        fit_scene(bracket(plain=True), view, image, {"verts": 0.01}, loss="region", progress=False)
+
+
+def test_faint_masks_are_named():
+    def stop(_):
+        raise KeyboardInterrupt
+
+    view, other = camera(16), camera(16, distance=2.6)
+    mask, options = silhouette(view), {"callback": stop, "progress": False}
+    with pytest.warns(
+        UserWarning, match=r"mask: expected 1 where the object covers .* got at most 0\.216; .* read_mask"
+    ):
+        fit_pose(bracket(), picture(view), view, 0.216 * mask, init=START, **options)
+    what = {"verts": 0.01}
+    with pytest.warns(UserWarning, match=r"masks: expected 1 where the object covers .* got at most 0\.00392"):
+        fit_scene(bracket(), view, None, what, masks=mask / 255, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # In one of two views the object is hardly seen.
+        fit_scene(bracket(), [view, other], None, what, masks=[mask, 0.1 * silhouette(other)], **options)
