@@ -20,7 +20,9 @@ class Shape(NamedTuple):
 
 
 EIGHTHS = st.integers(-64, 64).map(lambda n: n / 8)  # exact in any type of floating point, and as a decimal
-NAMES = st.sampled_from(["a", "Würfel", "solid part", "x#1", "vertex", "endsolid f", "o", "two  words", "é"])
+NAMES = st.sampled_from(
+    ["a", "Würfel", "solid part", "x#1", "vertex", "endsolid", "endsolid f", "facet", "o", "two  words", "é"]
+)
 COLORS = st.tuples(*[st.integers(0, 255)] * 3)
 COMMENTS = st.sampled_from(["", "# José", "#f 1 2 3", "#", "# mtllib no.mtl"])
 
@@ -86,7 +88,7 @@ def numbers(draw: Any, values: Any) -> str:
 
 def encoded(draw: Any, lines: list[str]) -> bytes:
     text = draw(st.sampled_from(["\n", "\r\n", "\r"])).join(lines) + draw(st.sampled_from(["", "\n", "\n\n"]))
-    return text.encode(draw(st.sampled_from(["utf-8", "latin-1"])))
+    return text.encode(draw(st.sampled_from(["utf-8", "latin-1", "utf-8-sig", "utf-16"])))
 
 
 @st.composite
@@ -221,8 +223,9 @@ def ply_files(draw: Any) -> DrawnFile:
     if on is not None:
         count = n if on == "vertex" else f
         rows = np.array(draw(st.lists(COLORS, min_size=count, max_size=count)))
-        kind, scale = draw(st.sampled_from([("uchar", 1), ("uint8", 1), ("int", 1), ("short", 1), ("ushort", 257),
-                                            ("float", 1 / 255), ("double", 1 / 255)]))  # fmt: skip
+        rows[0, 0] = max(rows[0, 0], 2)  # or numbers up to 255 would be 0 and 1 alone
+        kind, scale = draw(st.sampled_from([("uchar", 1), ("uint8", 1), ("int", 1), ("short", 1), ("ushort", 257), ("uint", 257),
+                                            ("float", 1 / 255), ("double", 1 / 255), ("double", 1)]))  # fmt: skip
         names = draw(st.sampled_from(COLOR_NAMES))
         (vertex if on == "vertex" else face).append(
             [(kind, name, (rows[:, i] * scale).tolist()) for i, name in enumerate(names)]

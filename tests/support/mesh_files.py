@@ -3,9 +3,11 @@
 import io
 import json
 import struct
+import warnings
 import zlib
 
 import numpy as np
+import pytest
 from PIL import Image
 
 import edgegrad as eg
@@ -38,10 +40,25 @@ def load(path):
     return eg.load_camera(path) if path.suffix == ".json" else eg.load_scene(path)
 
 
+def quietly(path, **options):
+    """Return the mesh of a file that causes no warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return eg.load_mesh(path, **options)
+
+
 def write(folder, name, content):
     path = folder / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return path
+
+
+def check_refused(path, fault, *loaders):
+    """Check that loaders, by default those of meshes and of scenes, refuse a file by an error that begins with its path."""
+    for function in loaders or (eg.load_mesh, eg.load_scene):
+        with pytest.raises((ValueError, FileNotFoundError), match=fault) as caught:
+            function(path)
+        assert str(caught.value).startswith(str(path))
 
 
 TEXTURED = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
@@ -166,3 +183,20 @@ OFF = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 STL = (
     "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
 )
+
+
+def ply_header(vertex="", face="property list uchar int vertex_indices\n", more=""):
+    """Return the header of a text PLY of three vertices and a face, with more properties and elements."""
+    return (
+        f"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n{vertex}"
+        f"element face 1\n{face}{more}end_header\n"
+    )
+
+
+CORNERS = [[SQUARE[i] for i in face] for face in TRIANGLES]
+
+
+def binary_stl(attribute=0, name=b"x"):
+    """Return the square as a binary STL."""
+    body = b"".join(struct.pack("<12fH", 0, 0, 1, *np.ravel(face), attribute) for face in CORNERS)
+    return name.ljust(80, b"\0") + struct.pack("<I", len(CORNERS)) + body
