@@ -10,8 +10,6 @@ import edgegrad as eg
 
 pytestmark = pytest.mark.unsanitized
 
-VERTS = "0 0 0\n1 0 0\n0 1 0\n"
-
 
 def test_obj_corners_of_every_kind_in_one_material(tmp_path):
     """Each face but the first has nine words, which trimesh would take for the same."""

@@ -12,13 +12,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import trimesh
-from brackets import START, bracket, camera, picture
+from bracket_files import write_bracket
 
 import edgegrad.fit
 from edgegrad import cli
-from edgegrad.files.cameras import save_camera
-from edgegrad.files.image import linear_to_srgb, write_image
 from edgegrad.fit import PoseFit
 
 pytestmark = pytest.mark.unsanitized
@@ -33,14 +30,7 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals
 
 @pytest.fixture
 def files(tmp_path):
-    """A folder with mesh.ply, target.png, camera.json and init.json."""
-    mesh, view = bracket(), camera(32)
-    colors = (linear_to_srgb(mesh.face_colors) * 255).round().byte().numpy()
-    trimesh.Trimesh(mesh.verts, mesh.faces, face_colors=colors, process=False).export(tmp_path / "mesh.ply")
-    write_image(tmp_path / "target.png", picture(view))
-    save_camera(tmp_path / "camera.json", view)
-    (tmp_path / "init.json").write_text(json.dumps({"mesh_to_world": START.tolist()}))
-    return tmp_path
+    return write_bracket(tmp_path, 32)
 
 
 def arguments(files, out="out", steps=None):
