@@ -1,9 +1,7 @@
 """fit_pose on a small coloured bracket finds poses, names wrong arguments, and keeps the best pose when interrupted."""
 
-import math
 import pickle
 
-import numpy as np
 import pytest
 import torch
 from brackets import BACKGROUND, CENTER, START, about_center, bracket, camera, errors, picture, rotation, silhouette
@@ -202,55 +200,4 @@ def test_json_round_trip():
 def test_faults_of_pose_json(text, message):
     with pytest.raises((ValueError, TypeError)) as caught:
         pose_from_json(text)
-    assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "change, error, message",
-    [
-        ({"mesh": "bracket.obj"}, TypeError, "mesh: expected a Mesh or a Scene, got str"),
-        ({"target": torch.zeros(32, 64, 3)}, ValueError, "target: expected shape (64, 64, C), got (32, 64, 3)"),
-        ({"target": torch.zeros(64, 64, 4)}, ValueError, "target: expected 3 channels"),
-        (
-            {"target": [torch.zeros(64, 64, 3)] * 2},
-            ValueError,
-            "target: expected one, for the one camera, got a list of 2",
-        ),
-        (
-            {"target": torch.zeros(64, 64, 3)},
-            ValueError,
-            "target: expected a picture of the object, got the same in every",
-        ),
-        (
-            {"mask": torch.ones(64, 64), "target": torch.zeros(64, 64, 3)},
-            ValueError,
-            "mask: expected a picture of the object",
-        ),
-        ({"target": torch.full((64, 64, 3), math.nan)}, ValueError, "target: expected finite"),
-        ({"camera": np.eye(4)}, TypeError, "camera: expected a Camera, got ndarray"),
-        ({"camera": eg.Camera.stack([camera(), camera()])}, ValueError, "camera: expected one camera, got 2"),
-        ({"mask": torch.ones(8, 8)}, ValueError, "mask: expected shape (64, 64) or (64, 64, 1), got (8, 8)"),
-        ({"mask": torch.ones(64, 64), "background": 0.0}, ValueError, "background: expected None with a mask"),
-        ({"background": torch.ones(2)}, ValueError, "background: expected shape (3,) or (64, 64, 3), got (2,)"),
-        ({"init": torch.eye(3)}, ValueError, "init: expected shape (4, 4), got (3, 3)"),
-        (
-            {"init": about_center(torch.eye(3).double(), (20.0, 0.0, -8.0))},
-            ValueError,
-            "init: expected a pose at which",
-        ),
-        (
-            {"init": about_center(torch.eye(3).double(), (3.0, 3.0, 9.0))},
-            ValueError,
-            "init: expected the object in front",
-        ),
-        ({"steps": 0}, ValueError, "steps: expected an int from 1"),
-        ({"spp": 1.5}, TypeError, "spp: expected an int"),
-        ({"tolerance": 0.0}, ValueError, "tolerance: expected a number above 0 and below 1, got 0"),
-    ],
-)
-def test_errors_name_the_argument(change, error, message):
-    something = torch.eye(64)[..., None].expand(-1, -1, 3)
-    arguments = {"mesh": bracket(), "target": something, "camera": camera(), **change}
-    with pytest.raises(error) as caught:
-        fit_pose(**arguments, progress=False)
     assert message in str(caught.value)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import numpy as np
 import pytest
 import torch
-from brackets import BACKGROUND, START, bracket, camera, picture, silhouette
+from brackets import BACKGROUND, START, about_center, bracket, camera, picture, silhouette
 from photographs import coverage, depth_of, photograph
 
 import edgegrad as eg
@@ -154,16 +155,9 @@ def test_a_film_begins_where_the_object_is_seen(taken, along, message):
 
 
 def test_more_steps_are_taken_where_they_are_asked_for():
-    assert [most_steps(40, *level) for level in ((False, True), (False, False), (True, False))] == [
-        12,
-        8,
-        20,
-    ]
-    assert [most_steps(5, *level) for level in ((False, True), (False, False), (True, False))] == [
-        5,
-        5,
-        5,
-    ]
+    levels = (False, True), (False, False), (True, False)
+    assert [most_steps(40, *level) for level in levels] == [12, 8, 20]
+    assert [most_steps(5, *level) for level in levels] == [5, 5, 5]
     assert most_steps(80, True, False) == 40 and most_steps(80, False, True) == 24
 
 
@@ -197,39 +191,42 @@ def test_masks_from_the_bottom_up_are_named():
         fit_scene(bracket(), views, None, sought, **options | {"masks": [mask.flip(0) for mask in masks]})
 
 
+BLANK = torch.zeros(64, 64, 3)
+
+
 @pytest.mark.parametrize(
     "change, error, message",
     [
+        ({"mesh": "bracket.obj"}, TypeError, "mesh: expected a Mesh or a Scene, got str"),
+        ({"target": torch.zeros(32, 64, 3)}, ValueError, "target: expected shape (64, 64, C), got (32, 64, 3)"),
+        ({"target": torch.zeros(64, 64, 4)}, ValueError, "target: expected 3 channels"),
+        ({"target": [BLANK] * 2}, ValueError, "target: expected one, for the one camera, got a list of 2"),
+        ({"target": BLANK}, ValueError, "target: expected a picture of the object, got the same in every"),
+        ({"target": BLANK, "mask": torch.ones(64, 64)}, ValueError, "mask: expected a picture of the object"),
+        ({"target": torch.full((64, 64, 3), math.nan)}, ValueError, "target: expected finite"),
+        ({"target": "photo.png"}, TypeError, "target: expected an image (H, W, C) of numbers, got the path 'photo.png'; read"),
+        ({"target": None}, TypeError, "target: expected an image (H, W, C) of numbers, got None; read one with read_image"),
+        ({"camera": np.eye(4)}, TypeError, "camera: expected a Camera, got ndarray"),
+        ({"camera": eg.Camera.stack([camera(), camera()])}, ValueError, "camera: expected one camera, got 2"),
         ({"camera": []}, ValueError, "camera: expected at least one"),
-        (
-            {"camera": [camera(8)] * 2},
-            ValueError,
-            "target: expected 2, one for each camera, got one of shape (8, 8, 3)",
-        ),
-        (
-            {"camera": [camera(8)], "target": [torch.zeros(8, 8, 3)], "mask": [torch.ones(4, 4)]},
-            ValueError,
-            "mask[0]: expected",
-        ),
-        (
-            {"target": "photo.png"},
-            TypeError,
-            "target: expected an image (H, W, C) of numbers, got the path 'photo.png'; read",
-        ),
-        (
-            {"target": None},
-            TypeError,
-            "target: expected an image (H, W, C) of numbers, got None; read one with read_image",
-        ),
-        ({"weight": -torch.ones(8, 8)}, ValueError, "weight: expected numbers from 0 up"),
-        ({"weight": torch.ones(8, 8, 3)}, ValueError, "weight: expected shape (8, 8) or (8, 8, 1)"),
+        ({"mask": torch.ones(8, 8)}, ValueError, "mask: expected shape (64, 64) or (64, 64, 1), got (8, 8)"),
+        ({"camera": [camera()], "target": [BLANK], "mask": [torch.ones(4, 4)]}, ValueError, "mask[0]: expected"),
+        ({"mask": torch.ones(64, 64), "background": 0.0}, ValueError, "background: expected None with a mask"),
+        ({"background": torch.ones(2)}, ValueError, "background: expected shape (3,) or (64, 64, 3), got (2,)"),
+        ({"weight": -torch.ones(64, 64)}, ValueError, "weight: expected numbers from 0 up"),
+        ({"weight": torch.ones(64, 64, 3)}, ValueError, "weight: expected shape (64, 64) or (64, 64, 1)"),
+        ({"init": torch.eye(3)}, ValueError, "init: expected shape (4, 4), got (3, 3)"),
+        ({"init": about_center(torch.eye(3).double(), (20.0, 0.0, -8.0))}, ValueError, "init: expected a pose at which"),
+        ({"init": about_center(torch.eye(3).double(), (3.0, 3.0, 9.0))}, ValueError, "init: expected the object in front"),
+        ({"steps": 0}, ValueError, "steps: expected an int from 1"),
+        ({"spp": 1.5}, TypeError, "spp: expected an int"),
+        ({"tolerance": 0.0}, ValueError, "tolerance: expected a number above 0 and below 1, got 0"),
     ],
-)
+)  # fmt: skip
 def test_errors_name_the_argument(change, error, message):
+    something = torch.eye(64)[..., None].expand(-1, -1, 3)
     with pytest.raises(error) as caught:
-        fit_pose(
-            **{"mesh": bracket(), "target": torch.zeros(8, 8, 3), "camera": camera(8), "progress": False, **change}
-        )
+        fit_pose(**{"mesh": bracket(), "target": something, "camera": camera(), "progress": False, **change})
     assert message in str(caught.value)
 
 
