@@ -216,7 +216,7 @@ QUICK = ("--steps", 12, "--unconverged")
 
 
 def pose_off(truth: torch.Tensor) -> torch.Tensor:
-    """Turn about the object's own origin, and shift."""
+    """Return a pose after a rotation about the object's own origin and a shift."""
     found = SHIFT @ truth
     found[:3, :3] = TURN[:3, :3] @ truth[:3, :3]
     return found

@@ -10,7 +10,7 @@ from edgegrad.files.image import srgb_to_linear, write_image
 
 @pytest.fixture
 def files(tmp_path):
-    """A folder with mesh.ply, camera.json, target.png, mask.png and init.json."""
+    """Return a folder with mesh.ply, camera.json, target.png, mask.png and init.json."""
     write_image(
         tmp_path / "mask.png", srgb_to_linear(silhouette(camera(48)))
     )  # a mask's greys are coverage as they are

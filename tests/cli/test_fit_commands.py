@@ -20,7 +20,7 @@ pytest_plugins = "cli_fixtures"
 
 @pytest.fixture
 def sphere(tmp_path):
-    """sphere.ply, and masks of it, a little larger, by three cameras."""
+    """Return a folder with sphere.ply, and masks of a larger sphere by three cameras."""
     shape = trimesh.creation.icosphere(subdivisions=2)
     shape.export(tmp_path / "sphere.ply")
     larger = eg.Mesh(1.2 * torch.tensor(shape.vertices).float(), torch.tensor(shape.faces))

@@ -65,7 +65,7 @@ def test_fit_pose_with(what, files, monkeypatch):
 
 
 def test_depth_reaches_the_fit(files, monkeypatch):
-    """In millimetres; of a mesh without colours, whose distance it tells."""
+    """It is in millimetres."""
     given = {}
 
     def fit_pose(*arguments, depth, **options):
@@ -179,7 +179,7 @@ def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
 
 
 def test_fit_pose_is_written_when_interrupted_and_resumes(files, capsys, monkeypatch):
-    """As if it had never been interrupted, to the last bit."""
+    """The result is that of an uninterrupted fit, to the last bit."""
 
     def found(folder):
         kept = json.loads((files / folder / "pose.json").read_text())

@@ -20,7 +20,8 @@ pytest_plugins = "cli_fixtures"
 
 
 def test_depth_files(tmp_path):
-    """Whole numbers of 16 bits with their scale, floating point as it is, NaN where nothing was measured."""
+    """They hold whole numbers of 16 bits with a scale, or floating-point numbers, with NaN where nothing was
+    measured."""
     whole = np.array([[0, 1, 65535], [1000, 2500, 40000]], np.uint16)
     Image.fromarray(whole).save(tmp_path / "mm.png")
     found = eg.read_depth(tmp_path / "mm.png", 0.001)
@@ -60,7 +61,7 @@ def test_a_bare_matrix_is_a_pose(tmp_path):
     ],
 )
 def test_the_focal_length_of_a_photograph(tags, pixels, tmp_path):
-    """Of 3 : 2, as 35 mm film is."""
+    """The photograph is 3 : 2, as 35 mm film is."""
     exif = Image.Exif()
     exif.get_ifd(0x8769).update(tags)
     Image.fromarray(np.full((40, 60, 3), 99, np.uint8)).save(tmp_path / "photo.jpg", exif=exif)

@@ -15,7 +15,7 @@ sys.path.append(str(FOLDER))  # where they find one another
 
 
 def example(name: str, size: int | None = None) -> ModuleType:
-    """The example's module, with pictures of `size` pixels in place of its own."""
+    """Return the example's module, with pictures of `size` pixels in place of its own."""
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -129,7 +129,7 @@ def test_a_material_under_a_known_sky() -> None:
 
 @pytest.mark.slow
 def test_a_pose_of_a_body_from_masks() -> None:
-    """From where a descent alone ends with a leg in the other's place."""
+    """A descent alone ends with a leg in the other's place."""
     body = example("body")
     rig, truth, _, fit = body.trial(0, progress=False)
     rotation, direction = body.Errors.of(rig, fit.values["rotations"], truth)

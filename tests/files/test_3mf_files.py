@@ -40,7 +40,7 @@ def model(resources="", build="", more="", space=SPACES):
 
 
 def save(folder, parts):
-    """A package of such files; one text is its root."""
+    """Write a package of such files; a single text is its root."""
     parts = {"3D/3dmodel.model": parts} if isinstance(parts, str) else parts
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
@@ -51,7 +51,7 @@ def save(folder, parts):
 
 
 def shown(path, **options):
-    """(F, 3, 3) corners of each mesh of a scene that is loaded without a word."""
+    """Return the corners (F, 3, 3) of each mesh of a scene that loads without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return [m.verts[m.faces].numpy() for m in eg.load_scene(path, **options).meshes]
@@ -64,7 +64,7 @@ def expect(found, *corners):
 
 
 def test_objects_that_share_an_id_in_different_parts(tmp_path):
-    """Components and items with a path, which names parts whatever its case."""
+    """Components and items have a path, which names parts whatever its case."""
     parts = {
         "3D/3dmodel.model": model(
             one('<components><component objectid="1" p:path="/3D/Objects/a.model"/><component objectid="1" '
@@ -90,7 +90,7 @@ def test_the_root_is_the_part_that_the_package_names(tmp_path):
 
 
 def test_units_are_the_file_s_own(tmp_path):
-    """Those of the root; parts in others are converted to them."""
+    """The root's units count. Parts in others are converted to them."""
     expect(shown(save(tmp_path, model(one(mesh()), '<item objectid="1"/>', 'unit="inch"'))), CORNERS)
     parts = {
         "3D/3dmodel.model": model(build='<item objectid="1" p:path="/b.model" transform="1 0 0 0 1 0 0 0 1 3 0 0"/>'),

@@ -1,4 +1,4 @@
-"""Calibrations of OpenCV, ROS and Kalibr: where points land by OpenCV, of files that the tests write."""
+"""Calibrations of OpenCV, ROS and Kalibr land points where OpenCV does, by files that the tests write."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ BENT = np.array([[0.05, -0.02, 0.01, -0.015, 0.002]])
 def lands(
     camera: eg.Camera, R: np.ndarray, t: np.ndarray, K: np.ndarray, bent: np.ndarray | None, fisheye=False
 ) -> None:
-    """Where OpenCV says."""
+    """Check that points land where OpenCV says."""
     project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
     points = (POINTS + SHIFT).numpy()[:, None]
     theirs, _ = project(points, cv2.Rodrigues(R)[0], np.asarray(t, np.float64).reshape(3, 1), K, bent)
@@ -80,7 +80,7 @@ def lands(
 
 
 def test_a_stereo_pair_of_opencv(tmp_path) -> None:
-    """As stereoCalibrate returns it, x₂ = R x₁ + T, in one file or in the two of OpenCV's example."""
+    """stereoCalibrate returns x₂ = R x₁ + T, in one file or in the two of OpenCV's example."""
     lenses = {"M1": K, "D1": BENT, "M2": SECOND, "D2": 0.5 * BENT}
     T = np.array([[-0.3], [0.02], [0.01]])
     place = {"R": R.numpy(), "T": T}
@@ -176,7 +176,7 @@ def test_camera_info_as_a_topic_prints_it(tmp_path) -> None:
 
 
 def chain(tmp_path: Path, **changes: object) -> Path:
-    """Three cameras, the last before the second in the file; the world is the first one's."""
+    """Write three cameras, the last before the second. The world is that of the first one."""
     step = np.eye(4)
     step[:3, :3], step[:3, 3] = R.numpy(), [-0.3, 0.02, 0.01]
     usual = {"camera_model": "pinhole", "resolution": [W, H], "rostopic": "/cam", "cam_overlaps": [1]}
@@ -232,7 +232,7 @@ def test_faults_of_kalibr_are_named(tmp_path, changes, fault) -> None:
 
 
 def test_yaml_of_python(tmp_path) -> None:
-    """Lists of rows, as tutorials write them; and what nobody reads."""
+    """Matrices are lists of rows, as tutorials write them. The rest is named."""
     file = tmp_path / "mine.yaml"
     fields = {"camera_matrix": K.tolist(), "dist_coeff": BENT.tolist(), "image_size": [W, H], "square_size": 0.02}
     file.write_text(yaml.safe_dump(fields))
@@ -318,7 +318,8 @@ for path in sys.argv[1:]:
 
 
 def test_what_opencv_does_not_survive_ends_no_process(tmp_path) -> None:
-    """Numbers that do not match are read past the end of its memory, deep files past that of its stack; so in a process apart."""
+    """OpenCV reads numbers that do not match past the end of its memory, and deep files past that of its stack. The
+    files are read in a process apart."""
     storage(tmp_path / "whole.yml", image_width=W, image_height=H, camera_matrix=K)
     storage(tmp_path / "whole.xml", image_width=W, image_height=H, camera_matrix=K)
     files = []

@@ -49,7 +49,7 @@ COUNTED = [name for name in WHOLE if name not in ("a.obj", "a.jpg", "a.tif")]
 
 @pytest.fixture
 def whole(tmp_path, name):
-    """The bytes of a good file."""
+    """Return the bytes of a good file."""
     if name == "a.exr":
         eg.write_image(tmp_path / name, WHOLE[name])
         return (tmp_path / name).read_bytes()
@@ -75,7 +75,7 @@ def test_a_beginning_of_a_file_is_refused_by_name_or_loads_as_the_whole(tmp_path
 
 @pytest.mark.parametrize("name", WHOLE)
 def test_changed_bytes_are_refused_by_name_or_load(tmp_path, name, whole):
-    """The names of the errors are all that a caller must know."""
+    """The types of the errors are all that a caller must know."""
     random, refused = np.random.default_rng(list(WHOLE).index(name)), 0
     for _ in range(75):
         content = bytearray(whole)

@@ -52,7 +52,7 @@ def png_with_alpha(alpha):
 
 
 def alpha_mask_glb(alpha, sampler=None, **material):
-    """The textured square with an alpha in its texture."""
+    """Return the textured square with an alpha in its texture."""
     base = {"baseColorTexture": {"index": 0}, **material.pop("base", {})}
     more = {} if sampler is None else {"samplers": [sampler]}
     return square_glb(
@@ -104,7 +104,7 @@ def test_gltf_masks_without_alpha_in_a_texture(tmp_path):
 
 @pytest.mark.parametrize("type_", ["<f4", "<u1", "<u2"])
 def test_gltf_masks_by_alpha_of_vertices(tmp_path, type_):
-    """Alpha rises from 0 to 1 from left to right; times 0.8 it is above a half right of 5/8."""
+    """Alpha rises from 0 to 1 from left to right. Times 0.8 it exceeds a half right of 5/8."""
     scale = 1 if type_ == "<f4" else np.iinfo(type_).max
     colors = (np.array([[1, 1, 1, x] for x, _, _ in SQUARE]) * scale).astype(type_)
     K = torch.tensor([[32.0, 0, 0], [0, 32, 0], [0, 0, 1]])
@@ -220,7 +220,7 @@ def test_gltf_with_files_beside_it(tmp_path):
 
 
 def test_gltf_vertex_colours_beside_a_texture(tmp_path):
-    """Multiplied where they are all one. Others need a lit mesh, or the texture left out."""
+    """They are multiplied where they are all equal. Others need a lit mesh, or no texture."""
     base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.5, 1.0, 0.2, 1.0]}
     given = dict(uv=True, extra=[saved("PNG")], textures=[{"source": 0}], images=[{"bufferView": 4}])
     file, colors = tmp_path / "t.glb", np.array([[0.5, 0.25, 1.0, 1.0]] * 4, "<f4")

@@ -157,7 +157,7 @@ def test_what_is_only_announced_takes_no_memory(tmp_path):
 
 
 def test_an_image_too_large_to_hold_is_refused_by_its_header(tmp_path, monkeypatch):
-    """A whole file, and a small one: 3 MB of zeros unpack to ten times 2³⁰ numbers."""
+    """The file may be whole and small: 3 MB of zeros unpack to ten times 2³⁰ numbers."""
     monkeypatch.setattr("edgegrad.files.image.MOST_NUMBERS", 1000)
     path = write(tmp_path, "a.png", png(40, 26, bytes(26 * (1 + 40)), 8, 0))
     with pytest.raises(ValueError, match=r"a\.png: expected at most 1000 pixels times channels, got 26 × 40 × 1"):
@@ -214,7 +214,7 @@ def test_nothing_outside_the_folder_is_read(tmp_path, monkeypatch, kind):
 
 
 def test_files_below_the_folder_and_in_the_uri_are_read(tmp_path):
-    """What may be read: so that the test above cannot pass by reading nothing."""
+    """The test above cannot pass by reading nothing."""
     (tmp_path / "sub").mkdir()
     write(tmp_path, "sub/skin one.png", saved("PNG"))
     material = {"images": [{"uri": "sub/skin%20one.png"}], "textures": [{"source": 0}]}
@@ -226,7 +226,7 @@ def test_files_below_the_folder_and_in_the_uri_are_read(tmp_path):
 
 
 class Touch:
-    """Unpickled, it makes a file."""
+    """An object that makes a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -287,7 +287,7 @@ def test_postscript_is_no_texture(tmp_path, monkeypatch, kind, gloss):
 
 
 def test_3mf_that_looks_odd_and_is_not(tmp_path):
-    """Components in components, and files next to the model with any name: none is written anywhere."""
+    """Components contain components, and files have any name. None is written anywhere."""
     path = write(tmp_path, "a.3mf", triangle_3mf(nested(2), {"../../evil.txt": "x", "/tmp/evil.txt": "x"}))
     depths = sorted(mesh.verts[0, 2].item() for mesh in eg.load_scene(path).meshes)
     assert depths == [0.0, 4.0, 8.0, 12.0]

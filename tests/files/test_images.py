@@ -1,4 +1,4 @@
-"""Images in and out: the sRGB curve, every kind of file, and faults by name."""
+"""Images are read and written by the sRGB curve, in every kind of file, and errors name the file."""
 
 import os
 
@@ -34,7 +34,7 @@ def test_srgb_curve_has_finite_gradients_at_zero():
 
 
 def test_webp_is_read(tmp_path):
-    """As it was stored, with its alpha; one that ends early is no image."""
+    """It has the stored values and their alpha. A file that ends early is no image."""
     pixels = np.random.default_rng(0).integers(40, 256, (20, 30, 4)).astype(np.uint8)
     file = tmp_path / "a.webp"
     Image.fromarray(pixels).save(file, lossless=True, exact=True)
@@ -94,7 +94,7 @@ def test_alpha_is_kept_apart(tmp_path):
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float16, np.float32])
 @pytest.mark.parametrize("planes", ["contig", "separate"])
 def test_colours_of_a_tiff_are_not_multiplied_by_alpha(tmp_path, dtype, planes):
-    """By the definition of associated alpha in TIFF 6.0: what is stored is the stored colour times alpha."""
+    """TIFF 6.0 defines associated alpha: a file holds the colour times alpha."""
     one = 1.0 if np.dtype(dtype).kind == "f" else float(np.iinfo(dtype).max)
     half = round(one / 2) / one if one > 1 else 0.5
     straight = np.array([[[1.0, 0, 0, half], [0.2, 0.6, 1, 0.8]], [[0, 0, 0, 0], [0.5, 0.25, 0.75, 1]]])
@@ -180,7 +180,7 @@ def test_write_image_takes_what_a_loop_has_at_hand(tmp_path):
 
 
 def test_curves_of_cameras(tmp_path):
-    """Exponents, tables for all channels or for each, and functions, against the formula for each value."""
+    """Exponents, tables and functions agree with the formula for each value."""
     codes = np.arange(256, dtype=np.uint8)
     stored = np.stack([codes, codes[::-1], np.full(256, 100, np.uint8)], -1)[None]
     path = tmp_path / "a.png"
@@ -316,7 +316,7 @@ STORED = np.random.default_rng(5).integers(0, 256, (4, 5, 4), dtype=np.uint8)
     [("1", 1), ("L", 1), ("LA", 2), ("P", 3), ("RGB", 3), ("RGBA", 4), ("I;16", 1)],
 )
 def test_modes_of_png_and_tiff(tmp_path, mode, channels):
-    """Also as textures, where alpha is dropped."""
+    """As textures they lose their alpha."""
     if mode == "I;16":
         image = Image.fromarray(np.random.default_rng(6).integers(0, 65536, (4, 5), dtype=np.uint16))
         values = np.asarray(image)[..., None] / 257.0

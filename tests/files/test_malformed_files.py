@@ -1,4 +1,4 @@
-"""Malformed files are refused with an error that names the file and the bad value, or load as they should."""
+"""Malformed files are refused with an error that names the file and the bad value."""
 
 import gzip
 import json

@@ -41,7 +41,7 @@ def test_vertices_stay_welded_at_a_texture_seam_and_a_crease(tmp_path):
 
 @pytest.mark.parametrize("bad", [None, "nan", "1e10"])
 def test_texture_coordinates_without_a_texture(tmp_path, bad):
-    """For a texture to come; and those that no texture can have are no fault of a file without one."""
+    """They are kept for a later texture. Unusable ones are no fault of a file without a texture."""
     path = write_obj(tmp_path)
     plain = path.read_text().replace("mtllib quad.mtl\n", "").replace("usemtl skin\n", "")
     path.write_text(plain if bad is None else re.sub(r"(?m)^vt \S+", f"vt {bad}", plain, count=1))

@@ -1,4 +1,4 @@
-"""save_mesh() into GLB: what load_scene(lit=True) reads is the same, in numbers and pictures; the rest is named."""
+"""save_mesh() writes a GLB from which load_scene(lit=True) reads the same numbers and pictures; the rest is named."""
 
 import warnings
 from functools import cache
@@ -20,12 +20,12 @@ OWN = {"uvs": torch.rand(36, 2, generator=random), "uv_faces": torch.arange(36).
 
 
 def data(channels=3, h=4, w=8, least=0):
-    """An image that 8 bits hold."""
+    """Return an image that 8 bits hold."""
     return torch.randint(least, 256, (h, w, channels), generator=random) / 255.0
 
 
 def color(channels=3, **size):
-    """One whose sRGB they hold."""
+    """Return an image whose sRGB values 8 bits hold."""
     image = srgb_to_linear(data(channels, **size).double()).float()
     image[0, 0] = 1.0
     return image
@@ -50,7 +50,7 @@ def saved(folder, mesh):
 
 
 def close(found, given):
-    """Numbers, or textures with how they lie on the mesh."""
+    """Check that numbers, or textures with their coordinates, are close."""
     if not isinstance(given, eg.Texture):
         torch.testing.assert_close(torch.as_tensor(found).double(), torch.as_tensor(given).double())
         return
@@ -233,7 +233,7 @@ def test_what_is_matt(tmp_path):
 
 @cache
 def schema():
-    """Checks a tree by the schema of the format, which trimesh has."""
+    """Return a validator of the schema of glTF, which trimesh has."""
     jsonschema = pytest.importorskip("jsonschema")
     return jsonschema.validators.validator_for(get_schema())(get_schema())
 

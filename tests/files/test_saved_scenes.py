@@ -1,4 +1,5 @@
-"""save_scene(): what load_scene(lit=True) and load_cameras() read is the same, in numbers and pictures; the rest is named."""
+"""save_scene() writes what load_scene(lit=True) and load_cameras() read as the same numbers and pictures; the rest is
+named."""
 
 import json
 import math
@@ -62,7 +63,7 @@ SCENES = {
 
 
 def saved(path, scene, cameras=None):
-    """What comes back, without a warning."""
+    """Save a scene, and return what is read, without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         eg.save_scene(path, scene, cameras)

@@ -1,4 +1,4 @@
-"""What a text format holds and nobody reads is named in one warning, and what is left out on purpose is not."""
+"""One warning names what a text format holds and nobody reads, but nothing that is left out on purpose."""
 
 import pytest
 from mesh_files import GOOD, OFF, SQUARE, STL, TRIANGLES, binary_stl, ply, ply_header, quietly, write, write_obj

@@ -10,7 +10,7 @@ import edgegrad as eg
 
 
 def arm(bones: int = 2, colored: bool = False) -> eg.Rig:
-    """A flat bar along y of some bones of length 1."""
+    """Return a flat bar along y with some bones of length 1."""
     n = 4 * bones
     y = torch.linspace(0.0, float(bones), n + 1, dtype=torch.float64)
     ring = [(0.22, 0.1), (-0.22, 0.1), (-0.22, -0.1), (0.22, -0.1)]

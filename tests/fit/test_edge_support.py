@@ -1,4 +1,4 @@
-"""Which share of a render's edges a picture shows: what tells a right fit from a wrong one."""
+"""The share of a render's edges that a picture shows distinguishes a right fit from a wrong one."""
 
 import pytest
 import torch

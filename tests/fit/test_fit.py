@@ -45,7 +45,7 @@ def test_a_start_that_is_the_answer_is_converged():
 
 @pytest.mark.parametrize("mode", [pytest.param(torch.no_grad, marks=pytest.mark.slow), torch.inference_mode])
 def test_where_gradients_are_off(mode):
-    """A fit takes gradients of its own, also of what was made there."""
+    """A fit takes gradients of its own, also of tensors that were made in inference mode."""
 
     def fit():
         view = camera(size=24).to(torch.float64)

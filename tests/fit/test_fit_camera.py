@@ -31,7 +31,7 @@ def test_a_camera_and_its_focal_length():
 
 
 def started_aside(true, zoom=1.0):
-    """A camera some degrees and some percent off."""
+    """Return a camera some degrees and some percent off."""
     off = torch.linalg.inv(about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05)))
     K = true.K.clone()
     K[:2, :2] *= zoom
@@ -39,7 +39,7 @@ def started_aside(true, zoom=1.0):
 
 
 def test_the_history_of_a_camera(tmp_path):
-    """Loss, gradient and cameras of each step; that of a fit that goes on is the same to the last bit."""
+    """A step has its loss, gradient and cameras. The history of a resumed fit is the same to the last bit."""
     true = camera(48)
     start = started_aside(true, 1.05)
 
@@ -73,7 +73,7 @@ def test_the_history_of_a_camera(tmp_path):
 
 @pytest.mark.parametrize("part", ["rotation", "shift"])
 def test_the_gradient_in_the_history(part):
-    """That of the loss, by finite differences of renders with the same samples, which leave some percent."""
+    """It is that of the loss, by finite differences of renders with the same samples, which leave some percent."""
     true = camera(48)
     fit = fit_camera(
         bracket(), picture(true), started_aside(true), background=BACKGROUND, focal=False, steps=1, spp=64, progress=False

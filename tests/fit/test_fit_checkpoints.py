@@ -23,7 +23,7 @@ def uninterrupted():
 
 
 def same(fit, other):
-    """To the last bit."""
+    """Check that two fits are equal to the last bit."""
     assert torch.equal(fit.matrix, other.matrix) and torch.equal(fit.camera.K, other.camera.K)
     assert (fit.loss, fit.explained, fit.converged) == (other.loss, other.explained, other.converged)
     told = [[(s.size, s.loss, s.best, dict(s.gradient)) for s in one.history] for one in (fit, other)]

@@ -73,7 +73,7 @@ def test_no_wrong_answer_is_converged(problem, method, seed):
 
 
 def monitored(gradient, steps, start=3.0, rate=0.1, noise=0.0):
-    """Monitor steps of gradient descent in three numbers, whose gradients have noise."""
+    """Return a monitor after steps of gradient descent in three numbers, whose gradients have noise."""
     x = torch.full((3,), start, dtype=torch.float64)
     monitor, generator = ConvergenceMonitor({"x": x}), torch.Generator().manual_seed(0)
     for _ in range(steps):

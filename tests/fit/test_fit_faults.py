@@ -1,4 +1,4 @@
-"""fit-pose when things go wrong around it: killed, no room or rights to write, nowhere to print."""
+"""fit-pose is killed, has no room or rights to write, or cannot print."""
 
 import errno
 import json
@@ -41,7 +41,8 @@ def arguments(files, out="out", steps=None):
 
 
 class Forked:
-    """A child that runs `work()`, which gives its exit code; `out` is what it writes to file descriptors 1 and 2."""
+    """A child process that runs `work()` and exits with its result; `out` is what it writes to file descriptors 1 and
+    2."""
 
     def __init__(self, work):
         read, write = os.pipe()
@@ -60,7 +61,7 @@ class Forked:
         self.out = os.fdopen(read)
 
     def wait(self):
-        """The exit code, or minus the signal that ended it."""
+        """Return the exit code, or minus the signal that ended the child."""
         with self.out:
             return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
 
@@ -69,7 +70,7 @@ class Forked:
 
 
 def told_fit(*args, callback, **options):
-    """fit_pose that prints which pose is the best before it may be written: the file is at most one step behind."""
+    """Run fit_pose and print the best pose before it may be written, so that the file is at most one step behind."""
 
     def tell(fit):
         print(fit.to_json().replace("\n", " "), flush=True)
@@ -126,7 +127,7 @@ def test_the_pose_on_disk_follows_the_search(files, monkeypatch):
 
 
 def is_a_result(printed):
-    """Whether a pose stands there: four rows of four numbers, the last 0 0 0 1."""
+    """Return whether a pose is printed: four rows of four numbers, the last 0 0 0 1."""
     lines = printed.splitlines()
     at = lines.index("mesh to world:")
     rows = [[float(number) for number in line.split()] for line in lines[at + 1 : at + 5]]
@@ -135,7 +136,7 @@ def is_a_result(printed):
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, pytest.param(errno.EACCES, marks=pytest.mark.slow)])
 def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsys):
-    """As on a full disk, where the rights are taken away meanwhile, and so on."""
+    """The disk is full, or the rights to write are taken away during the fit."""
 
     def replace(source, target):
         raise OSError(code, os.strerror(code), source, None, target)
@@ -174,7 +175,7 @@ def test_a_folder_that_cannot_be_made_is_named_before_the_fit(files, out, monkey
 
 
 def test_a_folder_without_permission_is_named_before_the_fit(files, monkeypatch, capsys):
-    """access() is what tells; root, as whom tests may run, may write anywhere."""
+    """The test replaces access(), since root, who may run tests, may write anywhere."""
     monkeypatch.setattr(edgegrad.fit, "fit_pose", lambda *_, **__: pytest.fail("no fit should begin"))
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != files / "out")
     assert cli.main(arguments(files)) == 2

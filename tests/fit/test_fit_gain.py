@@ -35,7 +35,7 @@ def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> N
 
 
 def test_a_broken_pixel_does_not_hold_a_fit() -> None:
-    """The range of the pictures, which the width of the robust loss follows, is that of what is not brighter than white."""
+    """The width of the robust loss follows the range of pixels that are not brighter than white."""
     view = camera(48)
     image = picture(view)
     image[3, 3] = 1e5
@@ -87,7 +87,7 @@ def test_noise_makes_no_edge_stronger(noise: float) -> None:
 
 @pytest.mark.parametrize("gain", [1.0, 2.5])
 def test_a_scene_whose_pictures_are_brighter_is_not_converged(gain: float) -> None:
-    """fit_scene() takes colours as they are: edges that are stronger than those of the scene are not explained by it."""
+    """fit_scene() takes colours as they are, so the scene does not explain stronger edges than its own."""
     view = camera(32)
     start = pose_from_matrix("", about_center(rotation(0.03, -0.1, 0.04), (0.04, 0.0, 0.0)))
     wanted = {"meshes.0.pose": PoseParameter(start, rotation=0.02, shift=0.01)}
@@ -98,7 +98,7 @@ def test_a_scene_whose_pictures_are_brighter_is_not_converged(gain: float) -> No
 
 
 def test_the_deviation_that_noise_leaves() -> None:
-    """Root mean square of errors in parts of the stated deviations; 1 where these are right."""
+    """The root mean square of errors over the stated deviations is 1 where these are right."""
     view, ratios = camera(32), []
     clean = picture(view)
     for seed in range(4):

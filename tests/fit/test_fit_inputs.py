@@ -251,7 +251,7 @@ def test_pictures_and_masks_of_bytes_are_named():
 
 
 def test_alpha_is_no_colour_of_a_picture():
-    """It would show nothing of what surrounds the object, or more than a photograph knows."""
+    """Alpha would show nothing of what surrounds the object, or more than a photograph knows."""
     view = camera(16)
     image = torch.cat([picture(view), silhouette(view)[..., None].reshape(16, 16, 1)], -1)
     words = (

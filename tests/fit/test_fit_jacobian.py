@@ -23,7 +23,7 @@ def smooth():
 
 
 def test_derivatives_by_a_rigid_motion():
-    """The same as torch.func's from the same samples, of all channels."""
+    """All channels have the derivatives of torch.func by the same samples."""
     view, scene = camera(24), eg.Scene([smooth()], BACKGROUND)
     axes = camera().world_to_camera[:3, :3]
     motion = about(CENTER, axes, size=2.0)
@@ -68,7 +68,7 @@ def test_other_channels_are_refused():
 @pytest.mark.parametrize("dofs", [range(7), [0, 1, 2, 3, 4, 5, 7], range(18), [0, 1, 2, 3, 4, 5, *range(8, 18)]])
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
 def test_the_motion_of_a_step(dofs, kind):
-    """That of where points are, and of the lens, by differences of PoseTask.moved() and lens()."""
+    """Points and lens move as by differences of PoseTask.moved() and lens()."""
     dofs = [
         entry for entry in dofs if entry < DISTORTION or kind == "perspective"
     ]  # a parallel projection has no distortion

@@ -22,7 +22,7 @@ from edgegrad.fit.region import smoothed
 
 
 def test_a_pose_that_looks_alike_may_be_elsewhere(taken):
-    """Not turned, but nearer: it is as good a reason for doubt."""
+    """A nearer pose is as good a reason for doubt as a rotated one."""
     view, image = taken
     task = task_of(image, view)
     pose = pose_from_matrix("pose", START)
@@ -112,7 +112,8 @@ def test_a_photograph_of_something_else_is_not_converged():
 
 @pytest.mark.parametrize(("step", "least", "most"), [(0.2, 0.95, 1.0), (0.05, 0.2, 0.6)])
 def test_a_faint_contour_proves_little(step, least, most):
-    """A plain mesh at its very place: but where colours hardly show it from what surrounds it, chance finds as much elsewhere."""
+    """A plain mesh is at its very place. Where colours hardly separate it from its surroundings, chance finds as much
+    elsewhere."""
     view, generator = camera(96), torch.Generator().manual_seed(0)
     texture = smoothed(torch.randn(3, 96, 96, generator=generator), 0.8).movedim(0, -1)
     display = 0.3 + 0.1 * texture + step * smoothed(coverage(view)[..., 0][None], 0.7)[0][..., None]

@@ -1,5 +1,4 @@
-"""fit_poses: several objects that cover one another in one photograph, with equations against oracles and poses end to end; and
-what covers an object that fit_pose looks for."""
+"""fit_poses finds several objects that cover one another in one photograph; its equations agree with oracles."""
 
 import json
 import math
@@ -37,7 +36,7 @@ def view_of(size=96, distance=6.0):
 
 
 def box(extents=(1.3, 1.0, 1.2), plain=False, seed=3):
-    """With two colours a side, so that no pose is ambiguous."""
+    """Return a box with two colours a side, so that no pose is ambiguous."""
     body = trimesh.creation.box(extents=extents)
     colors = torch.rand(12, 3, generator=torch.Generator().manual_seed(seed)) * 0.8 + 0.1
     verts, faces = torch.from_numpy(np.array(body.vertices)), torch.from_numpy(np.array(body.faces))
@@ -56,14 +55,14 @@ def centre(mesh):
 
 
 def beside(mesh, pose, turn, shift):
-    """Turned about the object's centre, and shifted."""
+    """Return a pose that is rotated about the object's centre and shifted."""
     R = rotation(*turn) @ pose[:3, :3]
     where = pose[:3, :3] @ centre(mesh) + pose[:3, 3] + torch.tensor(shift).double()
     return at(R, where - R @ centre(mesh))
 
 
 def errors(fit, mesh, truth):
-    """Degrees, and the way between the centres in % of the size."""
+    """Return degrees, and the distance of the centres in percent of the size."""
     low, high = mesh.verts.double().aminmax(dim=0)
     cosine = 0.5 * (float((fit.R.T @ truth[:3, :3]).trace()) - 1.0)
     way = (fit.R @ centre(mesh) + fit.t) - (truth[:3, :3] @ centre(mesh) + truth[:3, 3])
@@ -89,7 +88,7 @@ def scene_of(count):
 
 
 def shares_of(view, meshes, spp=32):
-    """(H, W, n), of each pixel what each mesh covers."""
+    """Return the shares (H, W, n) of each pixel that each mesh covers."""
     colours = torch.eye(len(meshes))
     painted = [
         eg.Mesh(mesh.verts, mesh.faces, colors=colour.expand(len(mesh.verts), -1))
@@ -99,7 +98,7 @@ def shares_of(view, meshes, spp=32):
 
 
 def labels_of(view, meshes):
-    """(H, W) of integers."""
+    """Return labels (H, W), whole numbers."""
     shares = shares_of(view, meshes)
     return torch.where(shares.sum(-1) > 0.5, shares.argmax(-1) + 1, 0)
 
@@ -114,7 +113,7 @@ def two():
 
 
 def test_the_region_terms_gradient_is_that_of_its_loss():
-    """Of two objects, of which one covers the other: against central differences of renders with many samples."""
+    """One of two objects covers the other. The reference is central differences of renders with many samples."""
     view, h, sigma = view_of(48), 0.004, 0.7
     meshes = scene_of(2)
     axes, colours = view.world_to_camera[:3, :3].double(), torch.eye(2, dtype=torch.float64)
@@ -220,7 +219,7 @@ def test_a_mesh_that_is_not_there_makes_no_other_wrong(two):
 
 @pytest.mark.slow
 def test_a_hidden_mesh_is_said_to_be_hidden(two):
-    """Behind the box as the camera sees it."""
+    """The mesh lies behind the box as the camera sees it."""
     view, image = two
     eye = torch.linalg.inv(view.world_to_camera.double())[:3, 3]
     away = torch.nn.functional.normalize(CENTER + BESIDE - eye, dim=0)
@@ -321,7 +320,7 @@ def test_from_the_shell(two, tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def covered():
-    """Another clutter before a quarter of the bracket."""
+    """Return a picture in which other clutter covers a quarter of the bracket."""
     view = view_of(160, 4.5)
     image = photograph(view, seed=2)
     alpha = eg.render_aovs(bracket(), view, ["alpha"], 16)["alpha"][..., 0]
@@ -332,7 +331,7 @@ def covered():
 
 @pytest.mark.parametrize("strength", [1.0, 0.3])
 def test_what_covers_an_object_is_told_by_its_light(covered, strength):
-    """Also a cover whose colours are nearly the object's: pixels around show what one alone does not."""
+    """The colours of a cover may be nearly the object's: neighbouring pixels show what one alone does not."""
     view, image, over, alpha = covered
     bare = photograph(view, seed=2)
     image = torch.lerp(bare, image, strength)
@@ -361,7 +360,7 @@ def test_a_quarter_covered(covered):
 
 
 def test_white_may_be_any_brighter_colour():
-    """The light of a surface that a sensor shows in part as white is that of the part that it does not."""
+    """The light is that of the channels that the sensor does not clip to white."""
     view = view_of(96, 4.5)
     mesh = bracket().replace(face_colors=bracket().face_colors * 0.0 + torch.tensor([0.9, 0.5, 0.2]))
     with torch.no_grad():
@@ -375,7 +374,7 @@ def test_white_may_be_any_brighter_colour():
 
 
 def test_two_meshes_that_end_in_one_place_have_not_converged():
-    """The picture shows one of them. Two steps leave both about where they start; where many take them depends on rounding."""
+    """The picture shows one of them. Two steps leave both near their starts; the end of many depends on rounding."""
     view = view_of(96)
     beside_it = beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
     image = photograph(view, *scene_of(1), seed=4)

@@ -45,7 +45,7 @@ def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
 
 
 def photographs(rig: eg.Rig, cameras: list[eg.Camera], seed: int) -> tuple[eg.Mesh, list[torch.Tensor]]:
-    """The true pose, before clutter, in colours that the rig does not know."""
+    """Return the true pose, and pictures of it before clutter, in colours that the rig does not know."""
     g = torch.Generator().manual_seed(seed)
     posed = rig.posed(TRUTH, translation=[0.05, 0.0, -0.1])
     warm = torch.tensor([0.8, 0.35, 0.15]) * (0.7 + 0.3 * torch.rand(len(posed.verts), 1, generator=g))
@@ -71,7 +71,7 @@ def test_a_pose_from_photographs_without_masks() -> None:
 
 @pytest.mark.slow
 def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
-    """In small pictures, where a descent alone stops with the upper bone across the clutter and the whole well explained."""
+    """In small pictures a descent alone stops with the upper bone across the clutter and the whole well explained."""
     rig, cameras = arm(), views(48)
     posed, photos = photographs(rig, cameras, 1)
     start = {"rotations": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.6]]).double()}
@@ -84,7 +84,7 @@ def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
 
 @pytest.mark.slow
 def test_keypoints_find_what_masks_do_not() -> None:
-    """A limb far from its mask, by its joints, of which one is wrong in one picture."""
+    """A limb is far from its mask. Its joints lead there, of which one is wrong in one picture."""
     rig, cameras = arm(3), views(count=4)
     truth = torch.tensor([[0.0, 0.0, 1.3], [0.0, 0.0, 0.9], [0.0, 0.0, 0.3]], dtype=torch.float64)
     joints = rig.shape({"rotations": truth}).joints
@@ -101,7 +101,7 @@ def test_keypoints_find_what_masks_do_not() -> None:
 
 @pytest.mark.slow
 def test_a_limb_that_is_drawn_anew() -> None:
-    """From where a descent alone does not lead: the limb is bent to the other side."""
+    """The limb is bent to the other side, from where a descent alone does not lead to the answer."""
     rig, cameras = arm(3), views(count=2)
     truth = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.4], [0.0, 0.0, 0.6]], dtype=torch.float64)
     masks = shown(rig.posed(truth), cameras)
@@ -140,7 +140,7 @@ def test_a_sequence() -> None:
 
 @pytest.mark.parametrize(("loss", "angles"), [(0.5, [0.0, 2.0, 3.0]), (2.0, [0.0, 1.0, 2.0])])
 def test_what_a_frame_misses_is_looked_for_once(monkeypatch, loss: float, angles: list[float]) -> None:
-    """What is found is kept where it is better, and a limb that is missed still is not looked for in the next frame."""
+    """A result is kept where it is better. A limb that is still missed is not searched again in the next frame."""
     calls: list[tuple[int | None, float]] = []
 
     def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **told: Any) -> Any:

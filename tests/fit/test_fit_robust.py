@@ -54,7 +54,7 @@ def test_a_quarter_covered(how, steps):
 
 @pytest.mark.parametrize("looks", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
-    """Where something covers the object, as a board does, turned poses are looked at."""
+    """Where a board covers the object, rotated poses are tried."""
     view = camera(64)
     image, _ = covered(view, picture(view))
     down, aside = color_search.ColorSearch._down, []
@@ -84,7 +84,7 @@ WORN = {
 
 @pytest.mark.parametrize("kind", ["sharp", "soft", pytest.param("compressed", marks=pytest.mark.slow), "both"])
 def test_blur_and_compression_cost_no_second_search(kind):
-    """One way down is enough, and ends as near."""
+    """One descent is enough and ends as near."""
     view = camera(80)
     fit = fit_pose(bracket(), WORN[kind](picture(view)), view, init=START, background=BACKGROUND, progress=False)
     degrees, percent = errors(fit)
@@ -106,7 +106,7 @@ def test_the_softness_of_a_picture():
 
 
 def lit():
-    """The bracket under a sun and a sky; for each face by its normal."""
+    """Return the bracket under a sun and a sky, which each face meets by its normal."""
     mesh = bracket()
     a, b, c = (mesh.verts[mesh.faces[:, corner]] for corner in range(3))
     normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
@@ -154,7 +154,7 @@ def test_a_border_of_many_colours_is_clutter():
     ],
 )
 def test_what_is_not_in_the_picture_is_not_found(size, steps, alike):
-    """A picture of something else: the fit ends somewhere, and says that the picture does not show it."""
+    """The picture shows something else. The fit ends somewhere and says that the picture does not show the object."""
     cells = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     image = torch.nn.functional.interpolate(cells, (size, size), mode="bicubic")[0].movedim(0, -1)
     with warnings.catch_warnings():
@@ -165,7 +165,7 @@ def test_what_is_not_in_the_picture_is_not_found(size, steps, alike):
 
 
 def test_several_pictures_share_the_pose():
-    """Two views show the scale from the distance, as one cannot."""
+    """Two views separate the scale from the distance; one cannot."""
     first = camera(48)
     second = eg.Camera.look_at(CENTER + torch.tensor([4.0, 1.0, 0.5]).double(), CENTER, fov_y=45.0, size=(36, 48))
     larger = bracket().transformed(torch.eye(3).double(), -0.08 * CENTER, 1.08)
@@ -193,8 +193,8 @@ def test_the_start_is_placed_where_the_picture_shows_the_object():
 
 @pytest.mark.parametrize("clutter", [False, True])
 def test_residuals_have_the_gradient_of_the_loss(clutter):
-    """Σ f ∂f is half the derivative of Σ ρ − (1 − (1 − α)²) c²/2 for weights at rest and gains that make it least; here by finite
-    differences of the loss, on renders that are functions of one number."""
+    """Σ f ∂f is half the derivative of Σ ρ − (1 − (1 − α)²) c²/2 with weights held fixed and optimal gains. Renders are
+    functions of one number, which finite differences change."""
     view = camera(16)
     background = None if clutter else BACKGROUND
     image = picture(

@@ -1,4 +1,4 @@
-"""Fits by descent on scenes of a few faces: they find, stop, stop claiming, resume and save."""
+"""fit_scene finds values of scenes of a few faces, ends, says whether it converged, resumes and saves."""
 
 import json
 import math
@@ -195,7 +195,7 @@ def test_an_interruption_keeps_the_best_values():
 
 
 def test_a_step_too_far_is_taken_back():
-    """A learning rate that throws the values out of float32: the fit goes back and on with shorter steps."""
+    """A learning rate throws the values out of float32. The fit goes back and continues with shorter steps."""
     cameras = views(1, 16)
     target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
 
@@ -299,7 +299,7 @@ def test_errors_name_the_argument(change, error, message):
 
 
 def test_the_best_values_are_not_those_of_the_easiest_views():
-    """Two views of which the first drawn has the smaller loss at the start than both have at the end."""
+    """The first of two views has a smaller loss at the start than both have at the end."""
     square = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     mesh = eg.Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.full((2, 1), 0.4))
     cameras = [eg.Camera.look_at((x, 0.0, 3.0), (0, 0, 0), size=(8, 8)) for x in (0.0, 0.1)]

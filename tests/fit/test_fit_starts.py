@@ -1,4 +1,5 @@
-"""Many starts of fit_pose, and none at all: rotations that cover what they should, matches with a picture, ends and refusals."""
+"""fit_pose from many starts and from none: rotations cover SO(3), matches find the object, and wrong counts are
+refused."""
 
 from __future__ import annotations
 
@@ -31,13 +32,13 @@ def camera() -> eg.Camera:
 
 
 def truth(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-    """A pose turned about the object's centre."""
+    """Return a pose that is rotated about the object's centre."""
     R = rotation(torch.tensor(turn))
     return R, CENTER + torch.tensor(shift) - R @ CENTER
 
 
 def pictured(R: Tensor, t: Tensor) -> tuple[eg.Mesh, Tensor, Tensor]:
-    """The mesh, its picture in light before clutter, and a mask."""
+    """Return the mesh, its picture in light before clutter, and a mask."""
     mesh = bracket().to(torch.float32)
     moved = mesh.transformed(R, t)
     generator = torch.Generator().manual_seed(3)
@@ -55,7 +56,7 @@ def pictured(R: Tensor, t: Tensor) -> tuple[eg.Mesh, Tensor, Tensor]:
 
 
 def farthest(rotations: Tensor, seed: int = 0) -> float:
-    """Radians from random rotations to the nearest of these, at most."""
+    """Return the largest angle from random rotations to the nearest of these, in radians."""
     q = torch.nn.functional.normalize(
         torch.randn(300, 4, generator=torch.Generator().manual_seed(seed)), dim=-1
     ).double()
@@ -104,13 +105,13 @@ def test_a_pose_off_the_axis_shows_the_object_where_it_should_and_turned_alike()
 
 
 def near(pose: Pose, R: Tensor, t: Tensor, task: PoseTask, turn: float, share: float) -> bool:
-    """Within an angle in radians and a share of the object's size."""
+    """Return whether a pose is within an angle in radians and a share of the object's size."""
     off = (pose.R @ task.center + pose.t) - (R.double() @ task.center + t.double())
     return angle(pose.R, R.double()) < turn and float(off.norm()) < share * task.size
 
 
 def test_matches_come_closer_than_views_are_apart() -> None:
-    """Views are 20° apart, and places a tenth of the object's size: the rounds after them bring matches nearer."""
+    """Views are 20° apart, and places a tenth of the object's size. The later rounds bring matches nearer."""
     R, t = truth((2.5, 0.3, 0.2), (0.3, -0.2, 0.4))
     mesh, picture, mask = pictured(R, t)
     task = task_of(picture, camera(), mesh, mask)
@@ -132,7 +133,7 @@ def test_matches_come_closer_than_views_are_apart() -> None:
 
 @pytest.mark.slow
 def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a quarter nothing is seen: one side has to be left out, and the right one."""
+    """A quarter of the object is covered, so the right side has to be left out."""
     monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.NEARBY_ROTATIONS", 24)
     case = photo_cases.rendered("pebble", pebble(), [photo_cases.clutter(k) for k in range(2)], "covered", 4)
     task = task_of(case.picture, case.camera, case.mesh)
@@ -182,7 +183,7 @@ def test_the_same_seed_gives_the_same_fit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("masked", [False, True])
 def test_nine_of_ten_are_found_without_a_start(masked: bool) -> None:
-    """A stone with patterns in any pose, in any light, before boards: 256², worn as photographs are."""
+    """A stone with patterns has any pose and any light before boards, in 256² that are worn as photographs are."""
     right, count = 0, 10
     for k in range(count):
         case = photo_cases.rendered("lit", pebble(), [photo_cases.clutter(seed) for seed in range(4)], "lit", 300 + k)

@@ -37,7 +37,7 @@ def moved(mesh, step, axes, center, size=1.0):
 
 
 def test_the_region_terms_gradient_is_that_of_its_loss():
-    """With the posterior held fixed, against central differences of renders with many samples."""
+    """The posterior is held fixed. The reference is central differences of renders with many samples."""
     view, mesh = camera(40), bracket(plain=True)
     axes, sigma, h = view.world_to_camera[:3, :3].double(), 0.7, 0.005
     p = torch.rand(1, 5, 5, generator=torch.Generator().manual_seed(3))
@@ -69,7 +69,8 @@ def test_the_region_terms_gradient_is_that_of_its_loss():
 
 
 def test_the_posterior_tells_colours_apart_near_the_contour_alone():
-    """Left red on green, right green on red: one pair of histograms for the whole picture would show nothing."""
+    """The left object is red on green, the right one green on red: one pair of histograms for the picture would show
+    nothing."""
     view = camera(60)
     alpha = torch.zeros(60, 60)
     alpha[20:40, 5:25] = alpha[20:40, 35:55] = 1.0
@@ -91,7 +92,7 @@ def test_the_posterior_tells_colours_apart_near_the_contour_alone():
 
 
 def ball(size=64, step=None, spp=64):
-    """A sphere with smooth colours, its surface as a camera sees it, and its size."""
+    """Return a camera, and the surface of a sphere with smooth colours as it sees it."""
     sphere = trimesh.creation.icosphere(subdivisions=4)
     verts = torch.tensor(sphere.vertices.copy())
     waves = torch.tensor([[5.0, 1.0, 2.0], [-1.0, 6.0, 2.0], [2.0, -3.0, 5.0]]).double()
@@ -114,7 +115,7 @@ LIGHT = torch.tensor([
 
 
 def under(surface, coefficients):
-    """(h, w, 3), the radiance of a surface in a light."""
+    """Return the radiance (h, w, 3) of a surface in a light."""
     Y = harmonics_of(surface.normals)[..., : coefficients.shape[1]]
     return surface.channels["image"].float() * torch.einsum("hwn,cn->hwc", Y, coefficients)
 
@@ -130,7 +131,7 @@ def test_an_exposure_is_found():
 
 @pytest.mark.parametrize("malformed", [False, True])
 def test_the_light_of_a_matte_ball_is_found(malformed, monkeypatch):
-    """With what the model lacks on a tenth of it, a shadow and a highlight, too."""
+    """A tenth of the ball may have a shadow and a highlight, which the model lacks."""
     view, surface = ball()
     image, inside = under(surface, LIGHT), surface.inside
     malformed_image = image.clone()
@@ -155,8 +156,8 @@ def test_the_light_of_a_matte_ball_is_found(malformed, monkeypatch):
 
 @pytest.mark.parametrize(("harmonics", "most"), [(1, 0.06), (9, 0.2)])
 def test_a_step_of_the_light_term_undoes_a_small_motion(harmonics, most):
-    """By half a pixel and less, in a light that is solved for. A ball's turns look like shifts, all but, so what counts is by how
-    much of the picture's change the step is off."""
+    """The motion is half a pixel and less, in a light that is solved for. Rotations of a ball look nearly like shifts,
+    so the error of the step counts by how much of the picture it changes."""
     step = torch.tensor([0.008, -0.01, 0.012, 0.006, -0.005, 0.02]).double()
     view, surface = ball()
     _, there = ball(step=step)
@@ -171,7 +172,7 @@ def test_a_step_of_the_light_term_undoes_a_small_motion(harmonics, most):
     [(0.0, (0.7, 0.4, 0.2), (0.3, 0.45, 0.5)), (0.5, (0.9, 0.6, 0.1), (0.1, 0.15, 0.2))],
 )
 def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle, front, behind):
-    """A straight blurred edge between two textures, from half a pixel off: radiances are mixed, not the values of a display, by
+    """A straight blurred edge between two textures is half a pixel off. Radiances are mixed, not display values, by
     which a bright contour before something dark would be found 0.2 pixels too far out."""
     view, n, shift = camera(48), 48, 0.5
     x, y = torch.meshgrid(torch.arange(n) + 0.0, torch.arange(n) + 0.0, indexing="xy")
@@ -197,7 +198,7 @@ def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle, front, behind):
 
 
 def test_the_noise_of_a_mask_is_that_of_its_pixels():
-    """Of a disc: what a mask of zeros and ones has where it is mixed, before it is reduced and after."""
+    """A mask of a disc holds zeros and ones also where a pixel is mixed; it is taken whole and reduced."""
     n, fine = 96, (torch.arange(960) + 0.5) / 10
     disc = (fine - 47.4).square() + (fine[:, None] - 48.3).square() < 37.3**2
     exact = area_mean(disc[..., None].float(), (n, n))[..., 0]
@@ -211,7 +212,7 @@ def test_the_noise_of_a_mask_is_that_of_its_pixels():
 
 @pytest.mark.parametrize("blur", CONTOUR_BLURS)
 def test_how_sharp_a_contour_is(blur):
-    """A disc before something dark, noisy: the blur that it was taken with leaves the least."""
+    """A noisy disc lies before something dark. The blur that it was taken with leaves the smallest residual."""
     view, n = camera(64), 64
     y, x = torch.meshgrid(torch.arange(n) + 0.5, torch.arange(n) + 0.5, indexing="ij")
     alpha = (17.3 - ((x - 31.6).square() + (y - 32.2).square()).sqrt()).add(0.5).clamp(0.0, 1.0)
@@ -226,7 +227,7 @@ def test_how_sharp_a_contour_is(blur):
 
 @pytest.mark.parametrize("malformed", [False, True])
 def test_a_shift_of_depth_is_found(malformed):
-    """Also where a third was not measured, and something stands before the object."""
+    """A third may not be measured, while something stands before the object."""
     view, mesh = camera(48).to(torch.float64), bracket()
     axes = view.world_to_camera[:3, :3].double()
     step = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.01]).double()

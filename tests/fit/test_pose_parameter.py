@@ -98,7 +98,7 @@ def test_turns_of_more_than_a_half_circle_are_rotations():
 
 
 def test_the_pose_of_a_mesh_and_what_else_is_sought_of_it():
-    """Its vertices are moved with it; a scene's second mesh moves alone."""
+    """The mesh's vertices move with its pose. A scene's second mesh moves alone."""
     mesh, view = bracket(), camera(16)
     pose = Pose(START.R, START.t)
     fit = fit_scene(mesh, view, target(view), {"pose": PoseParameter(pose), "verts": 1e-3}, steps=2, **QUIET)

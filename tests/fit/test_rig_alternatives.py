@@ -1,4 +1,5 @@
-"""Poses that outlines hardly separate from another one: two limbs exchanged, a twist shared in another way."""
+"""Poses that outlines hardly separate from another one: two exchanged limbs, or a rotation that two bones share
+differently."""
 
 import sys
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ F64 = torch.float64
 
 
 def legs(apart: float) -> eg.Joints:
-    """Two of three joints, whose own axes at rest are not alike."""
+    """Return two legs of three joints, whose own axes at rest are not alike."""
     one = torch.tensor([[0.5 * apart, 0.0, 0.0], [0.0, -0.4, 0.0], [0.0, -0.3, 0.1]], dtype=F64)
     turns = torch.tensor([[0.3, 0.0, 0.2], [0.0, 0.5, 0.0], [0.1, 0.0, 0.0]], dtype=F64)
     mirror = torch.tensor([-1.0, 1.0, 1.0], dtype=F64)
@@ -64,7 +65,7 @@ def test_limbs_that_hang_apart_point_to_where_the_other_one_was() -> None:
 
 
 def test_what_is_exchanged_hangs_alike() -> None:
-    """Arms and legs of a figure; not a leg with the spine, nor a limb with one that branches."""
+    """A figure's arms and legs are exchanged, but no leg with the spine, nor a limb with one that branches."""
     rig = figure.figure(fine=3)
     pairs = [limb.twins for limb in limbs(rig, range(20)) if limb.twins is not None]
     names = [[rig.joints.names[k].removeprefix("left ") for k in one] for one, _ in pairs]
@@ -73,7 +74,7 @@ def test_what_is_exchanged_hangs_alike() -> None:
 
 @pytest.mark.slow
 def test_crossed_legs_are_found() -> None:
-    """A descent from rest, and limbs drawn anew by themselves, end with each leg in the outline of the other one."""
+    """A descent from rest and a search of single limbs end with each leg in the outline of the other."""
     rig, truth, _, fit = body.trial(6, size=96, progress=False)
     legs = [rig.joints.names.index(name) for name in LEGS]
     assert fit.converged and float(body.Errors.of(rig, fit.values["rotations"], truth).direction[legs].max()) < 2.0
@@ -82,14 +83,14 @@ def test_crossed_legs_are_found() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", (4, 7))
 def test_twists_are_found(seed: int) -> None:
-    """Descents end with an arm and its elbow 20° to 45° twisted against each other, and the outlines less than a pixel off (7);
-    with a hand 86° across its true place, and a shoulder and its arm twisted by 15° (4)."""
+    """In pose 7, descents end with an arm and its elbow rotated by 20° to 45° against each other, with outlines less
+    than a pixel off. In pose 4, a hand ends 86° across its place, and a shoulder and its arm are rotated by 15°."""
     _, truth, _, fit = body.trial(seed, progress=False)
     assert fit.converged and float(body.Errors.of(fit.rig, fit.values["rotations"], truth).rotation.quantile(0.9)) < 3.0
 
 
 def arm_of(rig: eg.Rig) -> tuple[FreeParameters, Alternatives]:
-    """Of a figure, the joints of one arm, by whose rotations it is posed."""
+    """Return the rotations of one arm of a figure as free parameters, and their alternatives."""
     sought = FreeParameters.from_arguments(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
     return sought, Alternatives(rig, sought, "rotations")
 
@@ -116,7 +117,7 @@ def test_a_twist_keeps_what_hangs_below_in_place() -> None:
 
 
 def test_twists_are_found_by_the_loss_along_them() -> None:
-    """A hand turned across its true place, and an arm and its elbow twisted against each other; what is right stays."""
+    """A hand is rotated across its true place, and an arm against its elbow. What is right stays."""
     rig, cameras = figure.figure(fine=4), figure.cameras(64)[:3]
     sought, alternatives = arm_of(rig)
     parameter = sought.parameters["rotations"]
@@ -142,7 +143,7 @@ def test_twists_are_found_by_the_loss_along_them() -> None:
 
 @pytest.mark.parametrize(("nearly", "costs", "tries"), [(True, [1.0], 6), (False, [1.0], 20), (True, [0.9, 0.89], 7)])
 def test_tries_that_gain_nothing_end(nearly: bool, costs: list[float], tries: int) -> None:
-    """Where pictures are explained but for what a finer level tells, after six; else all of them."""
+    """They end after six where a finer level may explain the rest, and otherwise after all."""
 
     class Same:
         worse, gain = 2.0, 0.0

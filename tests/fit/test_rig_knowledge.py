@@ -39,7 +39,7 @@ def test_a_hand_in_a_wrong_place_is_told() -> None:
 
 
 def test_a_hand_that_hides_is_told() -> None:
-    """Folded back onto its arm it has hardly edges of its own, and the masks show what nothing covers."""
+    """A hand that is folded onto its arm has hardly edges of its own, and the masks show what nothing covers."""
     rig, cameras = arm(3), views(48, 2)
     hidden = TRUTH.clone()
     hidden[2, 2] = math.pi
@@ -50,7 +50,7 @@ def test_a_hand_that_hides_is_told() -> None:
 
 
 def test_uncertainty_is_that_of_noise() -> None:
-    """Of pictures with noise of a known deviation σ, the covariance is σ² (JᵀJ)⁻¹, with J of a derivative of its own."""
+    """For noise of a known deviation σ the covariance is σ² (JᵀJ)⁻¹, with J by a derivative of its own."""
     rig, cameras, sigma = arm(2, colored=True), views(32, 2), 0.1
     truth = TRUTH[:2]
     g = torch.Generator().manual_seed(2)
@@ -72,7 +72,7 @@ def test_uncertainty_is_that_of_noise() -> None:
 
 
 def test_curvature_of_views_in_one_call(monkeypatch) -> None:
-    """As of each by itself."""
+    """It is the sum of the curvatures of each view by itself."""
     rig, cameras = arm(2), views(32, 3)
     judged, values = objective(rig, cameras, masks=shown(rig.posed(TRUTH[:2]), cameras)), {"rotations": 0.9 * TRUTH[:2]}
     ((_, group, images, slopes),) = derivatives(judged, values, 0)
@@ -87,7 +87,7 @@ def test_curvature_of_views_in_one_call(monkeypatch) -> None:
 
 
 def test_what_no_picture_shows_is_unknown() -> None:
-    """A joint of a limb that lies out of sight."""
+    """A joint belongs to a limb that lies out of sight."""
     rig, cameras = arm(2), views(32, 1)
     camera = cameras[0].replace(world_to_camera=cameras[0].world_to_camera.clone())
     camera.world_to_camera[1, 3] += 2.2  # of the upper limb hardly anything is seen

@@ -10,7 +10,8 @@ from edgegrad.fit.views import over_black
 
 
 def of_object(kind, image, alpha):
-    """A picture whose pixels at the object's border hold its colour times alpha, as it is, or mixed with what lies behind."""
+    """Return a picture that holds, at the object's border, its colour times alpha, its colour, or a mixture with the
+    background."""
     if kind == "straight":
         return torch.where(alpha > 0.0, image / alpha.clamp(min=1e-6), 0.0)
     return image + (1.0 - alpha) * {"before black": 0.0, "photograph": 0.9}[kind]
@@ -41,7 +42,7 @@ def test_the_object_over_black():
 
 @pytest.mark.parametrize("kind", ["before black", "straight", "photograph"])
 def test_a_texture_under_a_soft_mask(kind):
-    """A square of one colour: at its border, the texture is that colour too."""
+    """A square has one colour, which the texture has at the border, too."""
     uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     square = eg.Mesh(torch.cat([2.0 * uvs - 1.0, torch.zeros(4, 1)], 1), torch.tensor([[0, 1, 2], [0, 2, 3]]))
     square = square.replace(uvs=uvs, uv_faces=square.faces)

@@ -1,4 +1,4 @@
-"""A vase, a solid of revolution by its radii."""
+"""A vase as a solid of revolution by its radii."""
 
 from __future__ import annotations
 

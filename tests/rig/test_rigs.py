@@ -21,7 +21,7 @@ def meshes_of(posed: Any) -> list[eg.Mesh]:
 
 
 def check(sample: Sample, rig: eg.Rig, posed: Any, animation: int | None, t: float) -> None:
-    """To 1e-6 of the size of what is shown."""
+    """Check vertices to 1e-6 of the size of what is shown."""
     expected = places(sample, animation, t)
     found = meshes_of(posed)
     assert len(found) == len(expected)
@@ -71,7 +71,7 @@ def test_plain_loaders_name_load_rig(tmp_path) -> None:
 
 
 def small(dtype: torch.dtype = torch.float64) -> eg.Rig:
-    """Three joints in a chain, one morph, normals."""
+    """Return three joints in a chain, one morph target, and normals."""
     g = torch.Generator().manual_seed(0)
     verts = torch.rand(7, 3, generator=g, dtype=dtype) * 3.0
     faces = torch.tensor([[0, 1, 2], [2, 3, 4], [4, 5, 6]])
@@ -307,7 +307,7 @@ def test_bad_arguments() -> None:
 
 
 def two_bars() -> eg.Rig:
-    """One rig of two bodies: coloured bars on joints of their own, the second across the first."""
+    """Return one rig of two coloured bars on joints of their own, the second across the first."""
     from arms import arm
 
     one, skin = arm(), arm().deformer.skins[0]
@@ -327,7 +327,8 @@ def two_bars() -> eg.Rig:
 
 @pytest.mark.parametrize("depth", [0.0, -0.35], ids=["in front", "through"])
 def test_gradients_of_bodies_that_occlude_each_other(depth: float) -> None:
-    """Of an image's loss by the joints of both, by finite differences; depth 0: one is before the other, −0.35: within it."""
+    """Finite differences give the derivatives of an image's loss by the joints of both. At depth 0 one is before the
+    other, at −0.35 within it."""
     rig = two_bars()
     camera = eg.Camera.look_at((0.8, 1.0, 5.0), (0, 1, 0), up=(0, 1, 0), fov_y=30, size=(32, 32))
     at = rig.joints.translations.clone()

@@ -1,4 +1,4 @@
-"""What a URDF and its mesh files say: mirrored meshes, units, materials, packages, limits; and odd trees of links."""
+"""URDF and its mesh files: mirrored meshes, units, materials, packages, limits, and malformed trees of links."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def volume(mesh: eg.Mesh) -> float:
 
 
 def write_obj(path: Path, materials: tuple[str, ...] = ()) -> None:
-    """A box with texture coordinates and normals; its faces have the materials in turn."""
+    """Write a box with texture coordinates and normals, whose faces have the materials in turn."""
     lines = [f"v {x} {y} {z}" for x, y, z in BOX] + [f"vt {(x + 1) / 2} {(y + 1) / 2}" for x, y, _ in BOX]
     lines += [f"vn {x} {y} {z}" for x, y, z in BOX]
     if materials:
@@ -77,7 +77,7 @@ def test_a_mirrored_mesh_keeps_its_outside(scale: str, tmp_path) -> None:
 
 
 def test_all_that_belongs_to_corners_is_reversed() -> None:
-    """A lit textured mesh that is mirrored and reversed: values at points are those of the mesh before, mirrored."""
+    """A lit textured mesh is mirrored. Values at its points are those of the mesh before, mirrored."""
     g = torch.Generator().manual_seed(0)
     faces = torch.tensor(TRIANGLES)
     own = torch.rand(3 * len(faces), 2, generator=g)

@@ -1,4 +1,4 @@
-"""Robots from URDF files: where their links are, and what is wrong with a file."""
+"""Links of robots from URDF files are in their places, and errors name what is wrong with a file."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def gripper(folder: Path, text: str = GRIPPER) -> Path:
 
 
 def check_links(path: Path, robot: eg.Rig, seed: int) -> None:
-    """Against yourdfpy's own kinematics."""
+    """Check links against yourdfpy's own kinematics."""
     control = robot.controls["angles"]
     random = torch.rand(len(control.rest), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     low, high = control.low.clamp(min=-3.0), control.high.clamp(max=3.0)
@@ -72,7 +72,7 @@ def test_links_are_where_another_library_has_them(tmp_path) -> None:
 
 
 def test_a_robot_of_a_package() -> None:
-    """With joints that mimic, colours, and meshes of OBJ files."""
+    """The robot has joints that mimic others, colours, and meshes of OBJ files."""
     models = pytest.importorskip("airo_models")
     path = Path(models.get_urdf_path("robotiq_2f_85"))
     robot = eg.load_robot(path)

@@ -18,13 +18,13 @@ TEXELS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [128, 64, 32]]], np
 
 
 def linear(value):
-    """The definition in IEC 61966-2-1, in float64."""
+    """Return linear values by the definition in IEC 61966-2-1, in float64."""
     s = np.asarray(value, np.float64) / 255.0
     return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
 
 
 def texel_at(mesh, face, corner):
-    """The texel of a small texture in whose cell a corner's texture coordinate lies, v running up."""
+    """Return the texel of a small texture in whose cell a corner's texture coordinate lies, with v upwards."""
     u, v = mesh.uvs[mesh.uv_faces[face, corner]].tolist()
     h, w, _ = mesh.texture.shape
     return mesh.texture[int((1.0 - v) * h), int(u * w)].numpy()
@@ -65,7 +65,8 @@ TEXTURED = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
 
 
 def write_obj(folder, name="quad.obj", mtl="newmtl skin\nmap_Kd skin.png\n", body=None):
-    """A square of two triangles whose corners lie in the middles of the four texels; indices of their own."""
+    """Write a square of two triangles whose corners lie in the middles of the four texels, with indices of their
+    own."""
     Image.fromarray(TEXELS).save(folder / "skin.png")
     (folder / "quad.mtl").write_text(mtl)
     body = body or (
@@ -77,7 +78,7 @@ def write_obj(folder, name="quad.obj", mtl="newmtl skin\nmap_Kd skin.png\n", bod
 
 
 def glb(tree, *arrays):
-    """A GLB file; accessors and buffer views follow from the arrays, bytes become buffer views only."""
+    """Return a GLB file whose accessors and buffer views follow from the arrays; bytes become buffer views only."""
     views, accessors, blob = [], [], b""
     for array in arrays:
         content = array if isinstance(array, bytes) else array.tobytes()
@@ -109,7 +110,7 @@ def glb(tree, *arrays):
 
 
 def square_glb(material=None, nodes=None, colors=None, uv=False, extra=(), **more):
-    """The square as a GLB file, with attributes and nodes as a test needs them."""
+    """Return the square as a GLB file, with attributes and nodes as a test needs them."""
     arrays = [np.array(SQUARE, "<f4"), np.array(TRIANGLES, "<u2").reshape(-1)]
     attributes = {"POSITION": 0}
     if uv:
