@@ -40,7 +40,7 @@ def test_a_network_and_the_shape_under_it() -> None:
 
 
 @pytest.mark.slow
-def test_steps() -> None:
+def test_declared_discontinuities() -> None:
     step = example("step", size=64)
     _, found = step.fit(steps=50)
     assert torch.allclose(found.centre, step.TRUTH.centre, atol=0.02)
@@ -230,7 +230,7 @@ def test_a_mesh_of_few_faces_with_a_texture() -> None:
 
 
 @pytest.mark.slow
-def test_colors_in_light_that_goes_to_and_fro() -> None:
+def test_colors_in_indirect_light() -> None:
     corner = example("corner")
     seen = corner.pictures(corner.TRUTH, 32, 8)
     direct, all_light = (max(corner.errors(corner.fit(seen, bounces)).values()) for bounces in (1, 4))

@@ -167,7 +167,7 @@ def test_colours_of_corners(tmp_path):
         ),
     ],
 )
-def test_one_thing_too_many_is_named(tmp_path, text, said):
+def test_one_unread_thing_is_named(tmp_path, text, said):
     path = save(tmp_path, text)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

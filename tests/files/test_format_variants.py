@@ -106,7 +106,7 @@ def test_float_colours_near_one(tmp_path, kind, red, expected):
     np.testing.assert_allclose(quietly(path).colors[0], linear([expected * 255, 127.5, 0]), atol=1e-6)
 
 
-def test_ushort_colours_of_eight_bits_are_said(tmp_path):
+def test_ushort_colours_of_eight_bits_are_named(tmp_path):
     properties = "".join(f"property ushort {name}\n" for name in RGB)
     path = write(tmp_path, "a.ply", ply_header(properties) + "0 0 0 255 128 0\n1 0 0 0 0 0\n0 1 0 3 3 3\n3 0 1 2\n")
     with pytest.warns(UserWarning, match=r"ushort colours of vertex up to 255 \(taken for 0 to 255, not 65535\)"):

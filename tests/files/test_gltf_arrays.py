@@ -313,7 +313,7 @@ def extended(kind):
         ),
     ],
 )  # fmt: skip
-def test_one_thing_too_many_is_named(tmp_path, change, said, also_unlit):
+def test_one_unread_thing_is_named(tmp_path, change, said, also_unlit):
     path = file(tmp_path, {"pbrMetallicRoughness": {}, "extensions": {}}, uvs=(CORNERS,), samplers=[{}])
     path.write_bytes(changed(change, path.read_bytes()))
     for lit in (True, False):

@@ -196,7 +196,7 @@ def test_merging_welds_across_parts(tmp_path):
     assert load_mesh(tmp_path / "boxes.glb").verts.shape == (12, 3)
 
 
-def test_gltf_with_files_beside_it(tmp_path):
+def test_gltf_with_separate_files(tmp_path):
     whole = square_glb(
         {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}},
         uv=True,
@@ -219,7 +219,7 @@ def test_gltf_with_files_beside_it(tmp_path):
         load_mesh(tmp_path / "s.gltf")
 
 
-def test_gltf_vertex_colours_beside_a_texture(tmp_path):
+def test_gltf_vertex_colours_with_a_texture(tmp_path):
     """They are multiplied where they are all equal. Others need a lit mesh, or no texture."""
     base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.5, 1.0, 0.2, 1.0]}
     given = dict(uv=True, extra=[saved("PNG")], textures=[{"source": 0}], images=[{"bufferView": 4}])
@@ -256,7 +256,7 @@ def test_glb_by_the_name_of_gltf_and_the_other_way_round(tmp_path):
         assert mesh.verts.tolist() == SQUARE and mesh.faces.tolist() == TRIANGLES
 
 
-def test_the_material_beside_specular_glossiness_is_shown(tmp_path):
+def test_metallic_roughness_is_shown_where_specular_glossiness_is_given_too(tmp_path):
     gloss = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0, 1, 0, 1]}}
     base = {"baseColorFactor": [1.0, 0.5, 0.25, 1.0]}
     used = {"extensionsUsed": list(gloss)}

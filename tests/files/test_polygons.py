@@ -112,7 +112,7 @@ def test_texture_coordinates_follow_their_corners(tmp_path):
         [[0, 0], [4, 0], [4, 4], [2, -2], [0, 4]],
     ],
 )
-def test_faces_that_cross_themselves_are_said(tmp_path, polygon):
+def test_faces_that_cross_themselves_are_named(tmp_path, polygon):
     path = written(tmp_path, "obj", [ARROW, polygon, polygon])
     with pytest.warns(UserWarning, match="2 faces that cross themselves, the first of them face 1, counted from 0"):
         assert len(eg.load_mesh(path).faces) >= 4

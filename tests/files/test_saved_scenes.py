@@ -7,8 +7,8 @@ import warnings
 
 import pytest
 import torch
+from boxes import APPEARANCES, FACES, OWN, VERTS, box, color, data, schema
 from scenes import cube, icosphere
-from test_saved_materials import FACES, LOOKS, OWN, VERTS, box, color, data, schema
 
 import edgegrad as eg
 from edgegrad.files.formats import gltf
@@ -33,7 +33,7 @@ def ground(**look):
 WOOD = eg.Material(eg.Texture(color(), filter="mipmap"), roughness=eg.Texture(data(1, least=60)), metallic=0.2)
 SCENES = {
     "plain": eg.Scene([eg.Mesh(VERTS, FACES)]),
-    "plain colours": eg.Scene([box(**LOOKS["colours"]), ball(face_colors=torch.rand(80, 3, generator=random))]),
+    "plain colours": eg.Scene([box(**APPEARANCES["colours"]), ball(face_colors=torch.rand(80, 3, generator=random))]),
     "plain textures": eg.Scene([box(texture=color(), wrap="clamp"), ball()]),
     "lights on a ball": eg.Scene([ball(material=eg.Material(0.8)), ground(material=eg.Material())], lights=[POINT, SPOT, SUN]),
     "a shared material": eg.Scene(

@@ -70,7 +70,7 @@ UNREAD = {
 
 
 @pytest.mark.parametrize("case", UNREAD)
-def test_what_nobody_reads_is_said_once(tmp_path, case):
+def test_what_nobody_reads_is_named_once(tmp_path, case):
     name, content, said = UNREAD[case]
     path = content(tmp_path) if callable(content) else write(tmp_path, name, content)
     with pytest.warns(UserWarning, match=rf"{name}: .*{said}") as caught:
@@ -89,11 +89,11 @@ SCANNED = "property float nx\nproperty float ny\nproperty float nz\nproperty uch
         ("quad.obj", textured("newmtl skin\nKa 1 1 1\nKd 1 1 1\nKs 1 1 1\nNs 9\nNi 1.5\nd 0.9\nTf 1 0 0\nmap_Bump b\n")),
     ],
 )  # fmt: skip
-def test_what_is_left_out_on_purpose_is_not_said(tmp_path, name, content):
+def test_what_is_left_out_on_purpose_is_not_named(tmp_path, name, content):
     quietly(content(tmp_path) if callable(content) else write(tmp_path, name, content))
 
 
-def test_what_a_lit_scene_leaves_out_is_said(tmp_path):
+def test_what_a_lit_scene_leaves_out_is_named(tmp_path):
     path = write(tmp_path, "a.obj", "s 1\n" + GOOD)
     with pytest.warns(UserWarning, match=r"s \(flat faces, for there are no normals"):
         eg.load_mesh(path, lit=True)

@@ -52,7 +52,7 @@ def scene() -> eg.Scene:
     return eg.Scene([bracket()], BACKGROUND)
 
 
-def test_noise_of_pixels_that_are_alike_nearby() -> None:
+def test_noise_of_correlated_neighbouring_pixels() -> None:
     """The covariance is S = Σ s_p s_qᵀ over pairs, with the weights (1 − |Δx|/8)(1 − |Δy|/8)."""
     s = torch.randn(2, 5, 11, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     y, x = (axis.flatten() for axis in torch.meshgrid(torch.arange(5), torch.arange(11), indexing="ij"))
@@ -105,7 +105,7 @@ def test_deviations_are_those_of_pictures_with_noise(blocks: int) -> None:
     assert 0.6 < sum(found) / len(found) < 1.7
 
 
-def test_a_lens_that_a_picture_does_not_tell() -> None:
+def test_a_lens_that_a_picture_does_not_show() -> None:
     """An object within a third of the image does not show k2. It shows k1 and the focal length roughly."""
     (true,) = taken(1, 96, distance=11.0)
     (start,) = guessed([true], 1.0)
@@ -121,7 +121,7 @@ def test_a_lens_that_a_picture_does_not_tell() -> None:
     assert 0.0 < known.focal < 0.05 and abs(float(fit.camera.K[0, 0] / true.K[0, 0]) - 1.0) < 4.0 * known.focal
 
 
-def test_a_near_object_tells_the_lens() -> None:
+def test_a_near_object_shows_the_lens() -> None:
     (true,) = taken(1, 64, distance=2.2, distortion=SIMPLE)
     (start,) = guessed([true])
     fit = fit_camera(
@@ -185,7 +185,7 @@ def test_a_lens_from_several_pictures(tmp_path) -> None:
     torch.testing.assert_close(eg.load_camera(tmp_path / "camera-1.json").K.double(), fit.cameras[1].K)
 
 
-def test_a_calibration_without_rest_names_what_is_not_known() -> None:
+def test_a_calibration_that_ran_out_of_steps_names_what_is_not_known() -> None:
     """No more steps can be had, so numbers that the pictures hardly show are the reason."""
     zeros = torch.zeros(2, dtype=torch.float64)
     known = CameraUncertainty(
@@ -196,7 +196,7 @@ def test_a_calibration_without_rest_names_what_is_not_known() -> None:
 
 
 @pytest.mark.slow
-def test_a_calibration_that_goes_on_ends_as_if_it_had_never_stopped(tmp_path) -> None:
+def test_a_resumed_calibration_ends_as_if_it_had_never_stopped(tmp_path) -> None:
     true = taken(2, 48, distortion=SIMPLE)
 
     def stop(now: Calibration) -> None:

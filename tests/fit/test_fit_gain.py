@@ -34,7 +34,7 @@ def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> N
     assert errors(expected)[0] < 0.1 and fit.loss == pytest.approx(expected.loss, rel=0.3)
 
 
-def test_a_broken_pixel_does_not_hold_a_fit() -> None:
+def test_a_broken_pixel_does_not_stop_a_fit() -> None:
     """The width of the robust loss follows the range of pixels that are not brighter than white."""
     view = camera(48)
     image = picture(view)
@@ -121,7 +121,7 @@ def test_the_uncertainty_is_saved(expected: PoseFit) -> None:
     assert '"reason": "converged"' in expected.to_json()
 
 
-def test_the_white_level_a_picture() -> None:
+def test_the_white_level_of_a_picture() -> None:
     levels = torch.randint(0, 40, (32, 32, 3), generator=torch.Generator().manual_seed(0))
     dark = srgb_to_linear(levels / 255.0)
     assert has_levels(dark) and not has_levels(0.5 * dark) and not has_levels(2.0 * picture(camera(32)))

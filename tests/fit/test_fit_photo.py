@@ -134,7 +134,7 @@ def test_noise_is_refused_without_following_other_starts():
     assert len(finest) <= photo_descent.LAST_STEPS + photo_descent.FINE_STEPS + 1  # of the given start alone
 
 
-def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, tmp_path):
+def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
     view, image = taken
     start, whole = about_center(rotation(0.05, -0.04, 0.03)), {"progress": False, "search": False, "spp": 8, "steps": 4}
     expected = fit_pose(bracket(), image, view, init=start, **whole)

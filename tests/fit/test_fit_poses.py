@@ -273,14 +273,14 @@ WITHIN = at(torch.eye(3).double(), CENTER + BESIDE)
         (MESHES[:2], {"init": STARTS[:2], "callback": 3}, TypeError, r"callback: expected a function of a list of PoseFits"),
     ],
 )  # fmt: skip
-def test_errors(two, meshes, given, error, message):
+def test_errors_name_the_argument(two, meshes, given, error, message):
     view, image = two
     with pytest.raises(error, match=message):
         fit_poses(meshes, image, view, progress=False, **given)
 
 
 @pytest.mark.slow
-def test_from_the_shell(two, tmp_path, capsys):
+def test_the_command_line(two, tmp_path, capsys):
     view, image = two
     eg.write_image(tmp_path / "photo.png", image)
     eg.save_camera(tmp_path / "camera.json", view)
@@ -330,7 +330,7 @@ def covered():
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.3])
-def test_what_covers_an_object_is_told_by_its_light(covered, strength):
+def test_what_covers_an_object_is_found_by_its_light(covered, strength):
     """The colours of a cover may be nearly the object's: neighbouring pixels show what one alone does not."""
     view, image, over, alpha = covered
     bare = photograph(view, seed=2)

@@ -190,7 +190,7 @@ def test_radiance_and_weights_of_any_unit(taken):
 
 
 @pytest.mark.parametrize("method", ["adam", "gauss-newton"])
-def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, method, tmp_path):
+def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, method, tmp_path):
     """It may stop between two counts of the colours."""
     given = {"pose": PoseParameter(Pose(torch.eye(3), torch.tensor([0.1, 0.0, 0.0])))}
     told = {"loss": "region", "method": method, "spp": 4, "steps": 8, "progress": False}

@@ -100,7 +100,7 @@ def test_keypoints_find_what_masks_do_not() -> None:
 
 
 @pytest.mark.slow
-def test_a_limb_that_is_drawn_anew() -> None:
+def test_a_limb_is_found_from_new_starts() -> None:
     """The limb is bent to the other side, from where a descent alone does not lead to the answer."""
     rig, cameras = arm(3), views(count=2)
     truth = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.4], [0.0, 0.0, 0.6]], dtype=torch.float64)
@@ -117,7 +117,7 @@ def test_a_limb_that_is_drawn_anew() -> None:
     assert helped.loss < 0.3 * alone.loss and not alone.converged
 
 
-def test_ctrl_c_while_limbs_are_drawn_anew_keeps_what_there_is(monkeypatch) -> None:
+def test_ctrl_c_in_the_search_of_limbs_keeps_the_descent(monkeypatch) -> None:
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -139,7 +139,7 @@ def test_a_sequence() -> None:
 
 
 @pytest.mark.parametrize(("loss", "angles"), [(0.5, [0.0, 2.0, 3.0]), (2.0, [0.0, 1.0, 2.0])])
-def test_what_a_frame_misses_is_looked_for_once(monkeypatch, loss: float, angles: list[float]) -> None:
+def test_what_a_frame_misses_is_searched_once(monkeypatch, loss: float, angles: list[float]) -> None:
     """A result is kept where it is better. A limb that is still missed is not searched again in the next frame."""
     calls: list[tuple[int | None, float]] = []
 
@@ -186,7 +186,7 @@ def test_a_start_within_limits_that_leave_out_rest() -> None:
     assert float(found.values["rotations"][1].min()) >= 0.1
 
 
-def test_it_goes_on_where_it_stopped(tmp_path) -> None:
+def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
     rig, cameras = arm(), views(32, 2)
     told = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
     whole = fit_rig(rig, cameras, **told)
@@ -242,7 +242,7 @@ def test_priors() -> None:
     assert torch.isclose(priors.near({"scale": torch.tensor(2.0)}, 3.0)(values).double(), torch.tensor(3.0).double())
 
 
-def test_bad_input() -> None:
+def test_errors_name_the_argument() -> None:
     rig, cameras = arm(), views(16, 2)
     masks = shown(rig.posed(), cameras)
     for error, message, told in (

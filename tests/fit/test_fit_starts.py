@@ -79,14 +79,14 @@ def test_rotations_are_rotations() -> None:
         assert torch.allclose(torch.linalg.det(found), torch.ones(len(found)).double())
 
 
-def test_a_ball_begins_with_no_turn_and_is_filled_evenly() -> None:
+def test_a_ball_of_rotations_begins_with_none_and_is_filled_evenly() -> None:
     angles = torch.tensor([angle(torch.eye(3).double(), R) for R in ball(200, 0.8)])
     assert float(angles[0]) < 1e-9 and float(angles.max()) <= 0.8
     # Half of a ball's volume is within 2^(-1/3) of its radius.
     assert float((angles < 0.8 * 0.5 ** (1.0 / 3.0)).double().mean()) == pytest.approx(0.5, abs=0.04)
 
 
-def test_a_pose_off_the_axis_shows_the_object_where_it_should_and_turned_alike() -> None:
+def test_a_pose_off_the_axis_shows_the_object_in_its_place_and_from_its_side() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     task = task_of(picture, camera(), mesh, mask)
     R = rotation(torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64))
@@ -198,7 +198,7 @@ def test_nine_of_ten_are_found_without_a_start(masked: bool) -> None:
     assert right >= 9
 
 
-def test_refused() -> None:
+def test_errors_name_the_argument() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     for starts, says in ((0, "starts"), ("all", 'or "global"'), (10**6, "starts")):
         with pytest.raises(ValueError, match=says):

@@ -93,7 +93,7 @@ def test_a_continuous_symmetry_makes_its_axis_known() -> None:
     assert Uncertainty.from_curvature(given, standing(), curvature, list(range(6)), other).unknown != ""
 
 
-def test_a_focal_length_that_is_not_known_is_said() -> None:
+def test_an_unknown_focal_length_is_named() -> None:
     """Where perspective hardly shows, the focal length has the curvature of the distance."""
     given = task()
     free = [*range(6), FOCAL_LENGTH]

@@ -88,7 +88,7 @@ def test_finds_a_pose_by_name():
     torch.testing.assert_close(fit.mesh.verts, bracket().transformed(pose.R, pose.t).verts)
 
 
-def test_turns_of_more_than_a_half_circle_are_rotations():
+def test_rotation_vectors_longer_than_pi_are_rotations():
     """Steps add up in a rotation vector of any length, which still makes a rotation."""
     placement = PoseParameter(START, bracket()).placed("pose")
     for turn in (3.5, 6.0, 20.0):
@@ -97,7 +97,7 @@ def test_turns_of_more_than_a_half_circle_are_rotations():
         torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=F64))
 
 
-def test_the_pose_of_a_mesh_and_what_else_is_sought_of_it():
+def test_a_mesh_has_a_pose_and_other_parameters():
     """The mesh's vertices move with its pose. A scene's second mesh moves alone."""
     mesh, view = bracket(), camera(16)
     pose = Pose(START.R, START.t)
@@ -218,7 +218,7 @@ def test_errors_name_the_argument(parameters, error, message):
         fit_scene(eg.Scene([bracket()], BACKGROUND), view, target(view), parameters, **QUIET)
 
 
-def test_a_function_must_be_told_of_what():
+def test_a_function_needs_the_mesh_that_is_moved():
     view = camera(16)
     with pytest.raises(
         TypeError, match=r"place: of: expected the Mesh or Scene that is moved, got none; give PoseParam"

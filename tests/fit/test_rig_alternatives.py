@@ -82,7 +82,7 @@ def test_crossed_legs_are_found() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", (4, 7))
-def test_twists_are_found(seed: int) -> None:
+def test_axial_rotations_are_found(seed: int) -> None:
     """In pose 7, descents end with an arm and its elbow rotated by 20° to 45° against each other, with outlines less
     than a pixel off. In pose 4, a hand ends 86° across its place, and a shoulder and its arm are rotated by 15°."""
     _, truth, _, fit = body.trial(seed, progress=False)
@@ -95,7 +95,7 @@ def arm_of(rig: eg.Rig) -> tuple[FreeParameters, Alternatives]:
     return sought, Alternatives(rig, sought, "rotations")
 
 
-def test_a_twist_keeps_what_hangs_below_in_place() -> None:
+def test_an_axial_rotation_keeps_what_hangs_below_in_place() -> None:
     rig = figure.figure(fine=3)
     sought, alternatives = arm_of(rig)
     values = {"rotations": figure.pose(7, 40.0)[[rig.joints.names.index(name) for name in ARM]]}
@@ -116,7 +116,7 @@ def test_a_twist_keeps_what_hangs_below_in_place() -> None:
         assert float(turned) == pytest.approx(0.7, abs=1e-6)
 
 
-def test_twists_are_found_by_the_loss_along_them() -> None:
+def test_axial_rotations_are_found_by_the_loss_along_them() -> None:
     """A hand is rotated across its true place, and an arm against its elbow. What is right stays."""
     rig, cameras = figure.figure(fine=4), figure.cameras(64)[:3]
     sought, alternatives = arm_of(rig)

@@ -27,7 +27,7 @@ def objective(rig: eg.Rig, cameras: list[eg.Camera], **pictures: list[torch.Tens
     return Objective(build, views_of(cameras, pictures.get("images"), pictures.get("masks"), None), Options(spp=64))
 
 
-def test_a_hand_in_a_wrong_place_is_told() -> None:
+def test_a_misplaced_hand_has_low_edge_support() -> None:
     rig, cameras = arm(3), views(48, 2)
     judged = objective(rig, cameras, masks=shown(rig.posed(TRUTH), cameras))
     names = {"rotations": rig.joints.names}
@@ -38,7 +38,7 @@ def test_a_hand_in_a_wrong_place_is_told() -> None:
     assert off["bone 2"] < 0.5 < 0.6 < off["bone 0"] and off["bone 2"] < off["bone 1"] < off["bone 0"]
 
 
-def test_a_hand_that_hides_is_told() -> None:
+def test_a_hidden_hand_leaves_pixels_uncovered() -> None:
     """A hand that is folded onto its arm has hardly edges of its own, and the masks show what nothing covers."""
     rig, cameras = arm(3), views(48, 2)
     hidden = TRUTH.clone()
@@ -105,7 +105,7 @@ def test_what_no_picture_shows_is_unknown() -> None:
     assert "bone 1 known to ±" in fit.uncertainty.unknown
 
 
-def test_light_is_sought_with_the_pose() -> None:
+def test_light_is_found_with_the_pose() -> None:
     rig, cameras = arm(2, colored=True), views(32, 2)
 
     def lit(posed: eg.Mesh, light: torch.Tensor) -> eg.Scene:

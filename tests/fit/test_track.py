@@ -21,7 +21,7 @@ pytest_plugins = "film_fixtures"
 SIZE, COUNT = 80, 7  # of its film
 
 
-def test_a_stone_that_turns(film, frames):
+def test_a_rotating_stone_is_followed(film, frames):
     read = []
 
     def one_by_one():
@@ -54,7 +54,7 @@ def test_lost_and_found_again(film):
 
 
 @pytest.mark.slow
-def test_found_again_elsewhere_and_turned(film):
+def test_found_again_elsewhere_and_rotated(film):
     """The mesh returns rotated by 30° and shifted by a quarter of the picture. Nothing else is taken for it meanwhile.
     The mesh has other units."""
     there = film.poses[0].clone()

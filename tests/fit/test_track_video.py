@@ -92,7 +92,7 @@ def test_frames_of_a_video_are_read_as_they_were_written(pictures, tmp_path):
         assert float(off.max()) < 10.0 and float(off.mean()) < 2.0
 
 
-def test_a_picture_is_turned_as_the_file_says():
+def test_frames_are_rotated_as_the_file_says():
     picture = torch.arange(6.0).reshape(2, 3, 1)
     assert torch.equal(upright(picture, 0), picture)
     assert upright(picture, 90)[..., 0].tolist() == [[2.0, 5.0], [1.0, 4.0], [0.0, 3.0]]  # counterclockwise

@@ -260,7 +260,7 @@ def test_what_is_no_robot_is_named(case: str, tmp_path) -> None:
         eg.load_robot(robot(tmp_path, *parts))
 
 
-def test_limits_that_are_not_said_are_zero(tmp_path) -> None:
+def test_missing_limits_are_zero(tmp_path) -> None:
     limit = '<limit effort="1" velocity="1"{}/><axis xyz="0 0 1"/>'
     path = robot(
         tmp_path, LINKS, joint("j", "a", "b", "revolute", limit.format("")),
