@@ -81,6 +81,11 @@ def result_of(checkpoint: str, killed: int = -1) -> Tensor:
         return many_views.fit(TASK, Path(checkpoint), every=2, callback=die)[0].verts
 
 
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Tensor:
+    return result_of(str(tmp_path_factory.mktemp("fit") / "one.pt"))
+
+
 def apart(a: Tensor, b: Tensor) -> float:
     return float((a - b).norm() / b.norm())
 
@@ -95,8 +100,7 @@ def test_gradients_are_those_of_one_process(count: int) -> None:
 
 @forks
 @pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_a_killed_worker_is_started_again(count: int, tmp_path: Path) -> None:
-    undisturbed = result_of(str(tmp_path / "one.pt"))
+def test_a_killed_worker_is_started_again(count: int, tmp_path: Path, undisturbed: Tensor) -> None:
     found = launched(count, result_of, str(tmp_path / "many.pt"), 4, restarts=1)
     assert apart(found, undisturbed) < 1e-6
     with pytest.raises(ChildFailedError):  # without restarts it ends there
@@ -104,7 +108,7 @@ def test_a_killed_worker_is_started_again(count: int, tmp_path: Path) -> None:
     assert torch.load(tmp_path / "none.pt")["state"]["step"] == 4
 
 
-def test_a_fit_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, undisturbed: Tensor) -> None:
     def stop(step: int, loss: float) -> None:
         if step == 4:
             raise KeyboardInterrupt
@@ -114,7 +118,7 @@ def test_a_fit_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     steps = []
     mesh, _ = many_views.fit(TASK, tmp_path / "fit.pt", every=2, callback=lambda step, _: steps.append(step))
     assert steps == [4, 5]
-    assert torch.equal(mesh.verts, result_of(str(tmp_path / "other.pt")))
+    assert torch.equal(mesh.verts, undisturbed)
 
 
 def test_a_checkpoint_of_another_task(tmp_path: Path) -> None:

@@ -52,7 +52,8 @@ def test_where_gradients_are_off(mode):
         mesh = bracket()
         mesh = mesh.replace(verts=1.0 * mesh.verts, faces=mesh.faces.int())
         return fit_pose(
-            mesh, picture(view), view, init=1.0 * START, background=1.0 * BACKGROUND, fit_focal=True, steps=2, progress=False
+            mesh, picture(view), view, init=1.0 * START, background=1.0 * BACKGROUND, fit_focal=True, steps=2,
+            search=False, progress=False,
         )  # fmt: skip
 
     expected = fit()
@@ -148,10 +149,8 @@ def test_a_picture_larger_than_max_size_is_reduced():
 
 def test_the_same_seed_gives_the_same_fit():
     view = camera(24)
-    fits = [
-        fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, seed=s, steps=2, progress=False)
-        for s in (3, 3, 4)
-    ]
+    given = {"init": START, "background": BACKGROUND, "steps": 2, "search": False, "progress": False}
+    fits = [fit_pose(bracket(), picture(view), view, seed=seed, **given) for seed in (3, 3, 4)]
     assert torch.equal(fits[0].matrix, fits[1].matrix)
     assert not torch.equal(fits[0].matrix, fits[2].matrix)
 
@@ -174,13 +173,17 @@ def test_interruption_keeps_the_best_pose():
 
 def test_json_round_trip():
     view = camera(24)
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, steps=1, progress=False)
+    fit = fit_pose(
+        bracket(), picture(view), view, init=START, background=BACKGROUND, steps=1, search=False, progress=False
+    )
     back = PoseFit.from_json(fit.to_json())
     torch.testing.assert_close(back.matrix, fit.matrix, rtol=0, atol=1e-12)
     assert torch.equal(back.camera.K, fit.camera.K) and back.camera.size == fit.camera.size
     assert (back.loss, back.steps, back.converged, back.interrupted) == (fit.loss, fit.steps, fit.converged, False)
     torch.testing.assert_close(pose_from_json(fit.to_json()).matrix, fit.matrix, rtol=0, atol=1e-12)
-    again = fit_pose(bracket(), picture(view), view, init=back, background=BACKGROUND, steps=1, progress=False)
+    again = fit_pose(
+        bracket(), picture(view), view, init=back, background=BACKGROUND, steps=1, search=False, progress=False
+    )
     assert torch.allclose(again.history[0].pose.matrix, fit.matrix)
 
 

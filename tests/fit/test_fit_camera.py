@@ -44,8 +44,8 @@ def test_the_history_of_a_camera(tmp_path):
     start = started_aside(true, 1.05)
 
     def fit(**options):
-        told = {"background": BACKGROUND, "steps": 4, "progress": False, **options}
-        return fit_camera(bracket(), picture(true), start, **told)
+        given = {"background": BACKGROUND, "steps": 4, "progress": False, **options}
+        return fit_camera(bracket(), picture(true), start, **given)
 
     whole = fit()
     history = whole.history
@@ -71,8 +71,7 @@ def test_the_history_of_a_camera(tmp_path):
         assert all(torch.equal(value, again.values[name]) for name, value in record.values.items())
 
 
-@pytest.mark.parametrize("part", ["rotation", "shift"])
-def test_the_gradient_in_the_history(part):
+def test_the_gradient_in_the_history():
     """It is that of the loss, by finite differences of renders with the same samples, which leave some percent."""
     true = camera(48)
     fit = fit_camera(
@@ -89,8 +88,9 @@ def test_the_gradient_in_the_history(part):
         return compared.loss(c or compared.scale())[0], compared.scale()
 
     c = loss(0, 0.0)[1]
-    slopes = [(loss(entry, h, c)[0] - loss(entry, -h, c)[0]) / (2 * h) for entry in STEP_PARTS[part]]
-    assert first.gradient[part] == pytest.approx(math.hypot(*slopes), rel=0.05)
+    for part in ("rotation", "shift"):
+        slopes = [(loss(entry, h, c)[0] - loss(entry, -h, c)[0]) / (2 * h) for entry in STEP_PARTS[part]]
+        assert first.gradient[part] == pytest.approx(math.hypot(*slopes), rel=0.05)
 
 
 def test_a_camera_is_saved(tmp_path):

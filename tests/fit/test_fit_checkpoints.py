@@ -26,8 +26,8 @@ def same(fit, other):
     """Check that two fits are equal to the last bit."""
     assert torch.equal(fit.matrix, other.matrix) and torch.equal(fit.camera.K, other.camera.K)
     assert (fit.loss, fit.explained, fit.converged) == (other.loss, other.explained, other.converged)
-    told = [[(s.size, s.loss, s.best, dict(s.gradient)) for s in one.history] for one in (fit, other)]
-    assert told[0] == told[1] and any(gradient for _, _, _, gradient in told[0])
+    histories = [[(s.size, s.loss, s.best, dict(s.gradient)) for s in one.history] for one in (fit, other)]
+    assert histories[0] == histories[1] and any(gradient for _, _, _, gradient in histories[0])
     for a, b in zip(fit.history, other.history, strict=True):
         assert all(torch.equal(x, y) for x, y in zip(a.pose, b.pose, strict=True))
 
@@ -82,7 +82,8 @@ def test_a_fit_that_was_killed_goes_on_from_its_last_checkpoint(uninterrupted, t
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     file = tmp_path / "fit.ckpt"
-    fit = small_fit(steps=1, checkpoint=file)
+    quick = {"steps": 1, "search": False}
+    fit = small_fit(**quick, checkpoint=file)
     view = camera(size=96)
     for name, value in {
         "mesh": bracket().transformed(scale=1.01),
@@ -97,11 +98,11 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
         "steps": 2,
     }.items():
         with pytest.raises(ValueError, match=rf"resume: expected .* with another {name}; give what it was made with"):
-            small_fit(**{"steps": 1, name: value}, checkpoint=file, resume=True)
+            small_fit(**{**quick, name: value}, checkpoint=file, resume=True)
     for other in ({"filter": "nearest"}, {"alpha_cutoff": 0.9}, {"wrap": "clamp"}):  # of no tensors
         with pytest.raises(ValueError, match="with another mesh; give what it was made with"):
-            small_fit(steps=1, mesh=bracket().replace(**other), checkpoint=file, resume=True)
-    same(small_fit(steps=1, mesh=bracket().replace(name="it"), checkpoint=file, resume=True), fit)
+            small_fit(**quick, mesh=bracket().replace(**other), checkpoint=file, resume=True)
+    same(small_fit(**quick, mesh=bracket().replace(name="it"), checkpoint=file, resume=True), fit)
     for damaged in ({"format": 2}, {"format": FORMAT}, {"format": FORMAT, "given": 3, "state": {}}):
         torch.save(damaged, tmp_path / "damaged.ckpt")
         expected = (

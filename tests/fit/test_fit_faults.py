@@ -69,15 +69,15 @@ class Forked:
 # -- killed -----------------------------------------------------------------------------------------------------------
 
 
-def told_fit(*args, callback, **options):
+def printing_fit(*args, callback, **options):
     """Run fit_pose and print the best pose before it may be written, so that the file is at most one step behind."""
 
-    def tell(fit):
+    def print_and_call(fit):
         print(fit.to_json().replace("\n", " "), flush=True)
         callback(fit)
 
     options["progress"] = False
-    return FIT_POSE(*args, callback=tell, **options)
+    return FIT_POSE(*args, callback=print_and_call, **options)
 
 
 FIT_POSE = edgegrad.fit.fit_pose
@@ -86,23 +86,23 @@ FIT_POSE = edgegrad.fit.fit_pose
 @linux
 @pytest.mark.parametrize("kills", [2, pytest.param(60, marks=pytest.mark.slow)])
 def test_a_killed_fit_leaves_the_best_pose_so_far(files, kills, monkeypatch):
-    monkeypatch.setattr(edgegrad.fit, "fit_pose", told_fit)
+    monkeypatch.setattr(edgegrad.fit, "fit_pose", printing_fit)
     chance = random.Random(kills)
     for kill in range(kills):
         out = f"out{kill}"
         run = Forked(lambda out=out: cli.main(arguments(files, out)))
         steps = chance.randint(0, 40) if kill else 0  # of about 60
-        told = [json.loads(run.out.readline()) for _ in range(steps)]
+        printed = [json.loads(run.out.readline()) for _ in range(steps)]
         # From the next step's beginning to its end; the first step comes after reading the files.
         time.sleep(chance.uniform(0.0, 0.02 if steps else 0.2))
         os.kill(run.pid, signal.SIGKILL)
-        told += [json.loads(line) for line in run.out if line.endswith("\n")]
+        printed += [json.loads(line) for line in run.out if line.endswith("\n")]
         assert run.wait() == -signal.SIGKILL
         file = files / out / "pose.json"
-        if len(told) > 1 or file.exists():
+        if len(printed) > 1 or file.exists():
             found = json.loads(file.read_text())
             PoseFit.from_json(file.read_text())  # nothing is missing
-            assert found in told[-2:], (steps, found, told[-2:])
+            assert found in printed[-2:], (steps, found, printed[-2:])
 
 
 def test_the_pose_on_disk_follows_the_search(files, monkeypatch):

@@ -24,7 +24,7 @@ def expected() -> PoseFit:
     return fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
 
 
-@pytest.mark.parametrize("gain", [1 / 256, 0.1, 2.0, pytest.param(16.0, marks=pytest.mark.slow), 256.0])
+@pytest.mark.parametrize("gain", [1 / 256, pytest.param(16.0, marks=pytest.mark.slow), 256.0])
 def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> None:
     """The background is given in the unit of the mesh's colours."""
     view = camera(48)

@@ -173,9 +173,9 @@ def test_what_is_not_explained_is_not_blamed_on_steps(taken):
 def test_a_picture_from_the_bottom_up_is_named(masked):
     view = camera(32)
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
-    told = {"mask": mask} if masked else {"background": BACKGROUND}
+    options = {"mask": mask} if masked else {"background": BACKGROUND}
     with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=4, **told)
+        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=4, **options)
     assert not fit.converged
 
 

@@ -347,7 +347,7 @@ def test_what_covers_an_object_is_found_by_its_light(covered, strength):
     rows, columns = slice(top, top + h), slice(left, left + w)
     inside = alpha[rows, columns] > 0.99
     wrong = ((weight < 0.5) != over[rows, columns])[inside].float().mean()
-    assert float(wrong) < 0.03, float(wrong)  # 0.25 where nothing is told
+    assert float(wrong) < 0.03, float(wrong)  # 0.25 where no cover is found
     assert visible_share(level.comparisons(pose, 0), [weight]) == pytest.approx(0.75, abs=0.02)
 
 

@@ -193,16 +193,16 @@ def test_radiance_and_weights_of_any_unit(taken):
 def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, method, tmp_path):
     """It may stop between two counts of the colours."""
     given = {"pose": PoseParameter(Pose(torch.eye(3), torch.tensor([0.1, 0.0, 0.0])))}
-    told = {"loss": "region", "method": method, "spp": 4, "steps": 8, "progress": False}
-    expected = fit_scene(vase(RADII), VIEW, taken, given, **told)
+    options = {"loss": "region", "method": method, "spp": 4, "steps": 8, "progress": False}
+    expected = fit_scene(vase(RADII), VIEW, taken, given, **options)
 
     def stop(record):
         if record.step == 4:
             raise KeyboardInterrupt
 
     file = tmp_path / "fit.pt"
-    fit_scene(vase(RADII), VIEW, taken, given, checkpoint=file, callback=stop, **told)
-    found = fit_scene(vase(RADII), VIEW, taken, given, checkpoint=file, resume=True, **told)
+    fit_scene(vase(RADII), VIEW, taken, given, checkpoint=file, callback=stop, **options)
+    found = fit_scene(vase(RADII), VIEW, taken, given, checkpoint=file, resume=True, **options)
     assert found.loss == expected.loss and torch.equal(found.values["pose"], expected.values["pose"])
 
 

@@ -35,8 +35,8 @@ def test_a_pose_from_masks() -> None:
 def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
     rig, cameras = arm(colored=True).with_limits(rotations={"bone 1": ([-0.2] * 3, [0.2] * 3)}), views()
     pictures = shown(rig.posed(TRUTH), cameras, "image")
-    told = {"seek": ["rotations"], "joints": ["bone 1"], "start": {"rotations": {"bone 0": TRUTH[0]}}, "tries": 0}
-    found = fit_rig(rig, cameras, pictures, progress=False, steps=5, **told)
+    options = {"seek": ["rotations"], "joints": ["bone 1"], "start": {"rotations": {"bone 0": TRUTH[0]}}, "tries": 0}
+    found = fit_rig(rig, cameras, pictures, progress=False, steps=5, **options)
     assert (
         torch.allclose(found.values["rotations"][0], TRUTH[0])
         and found.values["rotations"][1].abs().max() <= 0.2 + 1e-12
@@ -75,8 +75,8 @@ def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
     rig, cameras = arm(), views(48)
     posed, photos = photographs(rig, cameras, 1)
     start = {"rotations": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.6]]).double()}
-    told = {"loss": "region", "start": start, "progress": False}
-    alone, helped = (fit_rig(rig, cameras, photos, tries=n, **told) for n in (0, 40))
+    options = {"loss": "region", "start": start, "progress": False}
+    alone, helped = (fit_rig(rig, cameras, photos, tries=n, **options) for n in (0, 40))
     off = [float((fit.posed().verts - posed.verts).norm(dim=1).max()) for fit in (alone, helped)]
     assert off[0] > 0.5 and not alone.converged and "bone 1" in alone.reason
     assert off[1] < 0.1 and helped.converged
@@ -105,7 +105,7 @@ def test_a_limb_is_found_from_new_starts() -> None:
     rig, cameras = arm(3), views(count=2)
     truth = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.4], [0.0, 0.0, 0.6]], dtype=torch.float64)
     masks = shown(rig.posed(truth), cameras)
-    told = {
+    options = {
         "masks": masks,
         "start": {"rotations": -truth},
         "coarsest": 24,
@@ -113,7 +113,7 @@ def test_a_limb_is_found_from_new_starts() -> None:
         "seek": ["rotations"],
         "steps": 8,
     }
-    alone, helped = (fit_rig(rig, cameras, tries=tries, **told) for tries in (0, 6))
+    alone, helped = (fit_rig(rig, cameras, tries=tries, **options) for tries in (0, 6))
     assert helped.loss < 0.3 * alone.loss and not alone.converged
 
 
@@ -143,16 +143,16 @@ def test_what_a_frame_misses_is_searched_once(monkeypatch, loss: float, angles: 
     """A result is kept where it is better. A limb that is still missed is not searched again in the next frame."""
     calls: list[tuple[int | None, float]] = []
 
-    def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **told: Any) -> Any:
+    def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **options: Any) -> Any:
         angle = float(start["rotations"][0, 0]) + (1.0 if calls else 0.0)
-        calls.append((told.get("tries"), angle))
-        assert told["resume"] == (told["checkpoint"] is not None)
+        calls.append((options.get("tries"), angle))
+        assert options["resume"] == (options["checkpoint"] is not None)
         values = {"rotations": torch.full((2, 3), angle, dtype=torch.float64)}
         missed = ["bone 1"] if len(calls) > 1 else []
         return SimpleNamespace(
             values=values,
             missed=missed,
-            loss=loss if told.get("tries") else 1.0,
+            loss=loss if options.get("tries") else 1.0,
             fit=SimpleNamespace(interrupted=False),
         )
 
@@ -167,8 +167,8 @@ def test_what_a_frame_misses_is_searched_once(monkeypatch, loss: float, angles: 
 def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
     rig, cameras = arm(), views(16, 2)
     frames = [{"masks": shown(rig.posed(TRUTH * k), cameras)} for k in (0.1, 0.2)]
-    told = {"tries": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
-    first, again = (list(track_rig(rig, cameras, frames, start={}, resume=True, **told)) for _ in range(2))
+    options = {"tries": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
+    first, again = (list(track_rig(rig, cameras, frames, start={}, resume=True, **options)) for _ in range(2))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["walk-0001.ckpt", "walk-0002.ckpt"]
     for a, b in zip(first, again, strict=True):
         assert torch.equal(a.values["rotations"], b.values["rotations"])
@@ -188,8 +188,8 @@ def test_a_start_within_limits_that_leave_out_rest() -> None:
 
 def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
     rig, cameras = arm(), views(32, 2)
-    told = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
-    whole = fit_rig(rig, cameras, **told)
+    options = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
+    whole = fit_rig(rig, cameras, **options)
     count = 0
 
     def stop(record: object) -> None:
@@ -199,9 +199,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
             raise KeyboardInterrupt
 
     path = tmp_path / "checkpoint.pt"
-    half = fit_rig(rig, cameras, checkpoint=path, callback=stop, **told)
+    half = fit_rig(rig, cameras, checkpoint=path, callback=stop, **options)
     assert half.fit.interrupted and half.reason == "interrupted"
-    rest = fit_rig(rig, cameras, checkpoint=path, resume=True, **told)
+    rest = fit_rig(rig, cameras, checkpoint=path, resume=True, **options)
     assert torch.equal(rest.values["rotations"], whole.values["rotations"]) and len(rest.history) == len(whole.history)
     assert "pose.json" in rest.save(tmp_path / "out", figures=False)
 
@@ -216,7 +216,7 @@ def test_the_command_line(tmp_path, capsys) -> None:
     eg.save_camera(tmp_path / "camera.json", camera)
     (mask,) = shown(rig.posed({"upper": [0.0, 0.0, 0.4]}), [camera])
     eg.write_image(tmp_path / "mask.png", eg.image.srgb_to_linear(mask))
-    told = [
+    command = [
         "fit-rig",
         tmp_path / "a.gltf",
         tmp_path / "mask.png",
@@ -225,13 +225,13 @@ def test_the_command_line(tmp_path, capsys) -> None:
         "--joints",
         "upper",
     ]
-    told += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
-    assert cli.main([str(word) for word in told]) == 0
+    command += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
+    assert cli.main([str(word) for word in command]) == 0
     assert "wrote pose.json, joints.json, posed.glb" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "pose.json").read_text())["rotations"]
     assert abs(found[-1][2] - 0.4) < 0.15 and found[0] == [0.0, 0.0, 0.0]
-    told = json.loads((tmp_path / "out" / "joints.json").read_text())
-    assert list(told) == ["upper"] and told["upper"]["explained"] > 0.6 and told["upper"]["degrees"] > 0.0
+    joints = json.loads((tmp_path / "out" / "joints.json").read_text())
+    assert list(joints) == ["upper"] and joints["upper"]["explained"] > 0.6 and joints["upper"]["degrees"] > 0.0
 
 
 def test_priors() -> None:
@@ -245,7 +245,7 @@ def test_priors() -> None:
 def test_errors_name_the_argument() -> None:
     rig, cameras = arm(), views(16, 2)
     masks = shown(rig.posed(), cameras)
-    for error, message, told in (
+    for error, message, change in (
         (TypeError, "rig: expected a Rig", {"rig": rig.posed()}),
         (ValueError, "seek: expected names among .*got 'pose'", {"seek": ["pose"]}),
         (ValueError, "seek: expected a name or more", {"seek": []}),
@@ -275,6 +275,6 @@ def test_errors_name_the_argument() -> None:
         (TypeError, "expected options among", {"step": 3}),
         (ValueError, "images: expected pictures or masks", {"masks": None}),
     ):
-        given = {"rig": rig, "cameras": cameras, "masks": masks, "progress": False, **told}
+        given = {"rig": rig, "cameras": cameras, "masks": masks, "progress": False, **change}
         with pytest.raises(error, match=message):
             fit_rig(**given)

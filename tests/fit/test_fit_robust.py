@@ -43,10 +43,10 @@ def covered(view, image):
 def test_a_quarter_covered(how, steps):
     view = camera(64)
     image, free = covered(view, picture(view))
-    told = {"background": BACKGROUND}
+    options = {"background": BACKGROUND}
     if how == "weight":
-        told["weight"] = free
-    fit = fit_pose(bracket(), image, view, init=START, steps=steps, progress=False, **told)
+        options["weight"] = free
+    fit = fit_pose(bracket(), image, view, init=START, steps=steps, progress=False, **options)
     degrees, percent = errors(fit)
     assert degrees < 1.0 and percent < 1.0, (degrees, percent)
     assert fit.converged and fit.explained > 0.5

@@ -165,13 +165,19 @@ def test_tries_that_gain_nothing_end(nearly: bool, costs: list[float], tries: in
 
     class Few(LimbSearch):
         def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
-            return (dict(best[0]), costs[len(told)]) if len(told) < len(costs) and costs[len(told)] < 1.0 else best
+            return (
+                (dict(best[0]), costs[len(reports)])
+                if len(reports) < len(costs) and costs[len(reports)] < 1.0
+                else best
+            )
 
         def drawn(self, best: Values, limb: Limb) -> list[Values]:
             return []
 
-    told: list[None] = []
+    reports: list[None] = []
     nothing: Any = None
-    search = Few(nothing, Same(), "x", [Limb([0])], {}, torch.zeros(1), nothing, nothing, 0, lambda: told.append(None))
+    search = Few(
+        nothing, Same(), "x", [Limb([0])], {}, torch.zeros(1), nothing, nothing, 0, lambda: reports.append(None)
+    )
     search.run({"x": torch.zeros(1)}, 20)
-    assert len(told) == tries
+    assert len(reports) == tries

@@ -119,11 +119,11 @@ def test_light_is_found_with_the_pose() -> None:
     pictures = [eg.render(lit(rig.posed(truth), light), camera, 64, 9) for camera in cameras]
     start = torch.zeros_like(light)
     start[0] = 2.0
-    told = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
-    found = fit_rig(rig, cameras, pictures, parameters={"light": Parameter(0.2, start)}, **told)
+    options = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
+    found = fit_rig(rig, cameras, pictures, parameters={"light": Parameter(0.2, start)}, **options)
     assert math.degrees(float((found.values["rotations"] - truth).norm(dim=1).max())) < 5.0
     assert torch.allclose(found.fit.values["light"][:4], light[:4], atol=0.3) and "light" not in found.values
     with pytest.raises(ValueError, match="parameters: expected names that the rig does not have, got 'rotations'"):
-        fit_rig(rig, cameras, pictures, parameters={"rotations": Parameter(0.2, start)}, **told)
+        fit_rig(rig, cameras, pictures, parameters={"rotations": Parameter(0.2, start)}, **options)
     with pytest.raises(TypeError, match=r"parameters\['light'\]: expected a Parameter, got float"):
-        fit_rig(rig, cameras, pictures, parameters={"light": 0.2}, **told)
+        fit_rig(rig, cameras, pictures, parameters={"light": 0.2}, **options)

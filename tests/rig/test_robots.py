@@ -109,11 +109,11 @@ def test_only_the_joints_that_are_named_turn(tmp_path) -> None:
     truth = 0.2 * torch.ones(7, dtype=torch.float64)
     with torch.no_grad():
         mask = eg.render_aovs(robot.posed(angles=truth), camera, ["alpha"], spp=16)["alpha"]
-    told = {"masks": [mask], "tries": 0, "steps": 2, "coarsest": 24, "progress": False}
-    found = fit_rig(robot, [camera], joints=[names[1]], **told).values["angles"]
+    options = {"masks": [mask], "tries": 0, "steps": 2, "coarsest": 24, "progress": False}
+    found = fit_rig(robot, [camera], joints=[names[1]], **options).values["angles"]
     assert float(found[1]) != 0.0 and float(found.abs().sum()) == float(found[1].abs())
     with pytest.raises(ValueError, match="angles: expected names among"):
-        fit_rig(robot, [camera], joints=["nope"], **told)
+        fit_rig(robot, [camera], joints=["nope"], **options)
 
 
 BAD = {
