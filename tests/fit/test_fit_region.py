@@ -189,11 +189,10 @@ def test_radiance_and_weights_of_any_unit(taken):
     assert found[1] == pytest.approx(found[0], abs=0.05) and found[0] > 0.5
 
 
-@pytest.mark.parametrize("method", ["adam", "gauss-newton"])
-def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, method, tmp_path):
+def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
     """It may stop between two counts of the colours."""
     given = {"pose": PoseParameter(Pose(torch.eye(3), torch.tensor([0.1, 0.0, 0.0])))}
-    options = {"loss": "region", "method": method, "spp": 4, "steps": 8, "progress": False}
+    options = {"loss": "region", "method": "gauss-newton", "spp": 4, "steps": 8, "progress": False}
     expected = fit_scene(vase(RADII), VIEW, taken, given, **options)
 
     def stop(record):

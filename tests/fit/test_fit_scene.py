@@ -79,8 +79,7 @@ def test_finds_a_camera_by_name():
     assert float(fit.cameras[0].K[0, 2]) == pytest.approx(float(K[0, 2]), abs=0.2)
 
 
-@pytest.mark.parametrize("how", ["weights", "robust"])
-def test_weights_exclude_what_covers_the_object(how):
+def test_weights_and_a_robust_loss_exclude_what_covers_the_object():
     mesh, (view,) = bracket(), views(1)
     mesh = mesh.replace(face_colors=torch.tensor([[0.3, 0.6, 0.2]]).repeat(20, 1))
     (target,) = pictures(eg.Scene([mesh], BACKGROUND), [view])
@@ -88,16 +87,17 @@ def test_weights_exclude_what_covers_the_object(how):
     weight = torch.ones(32, 32)
     weight[:, :14] = 0.0
     start = eg.Scene([mesh.replace(face_colors=torch.full((20, 3), 0.45))], BACKGROUND)
-    more = {"weights": weight} if how == "weights" else {"loss": lambda a, b, w: losses.robust(a, b, w, scale=0.1)}
 
     def one_colour(values):
         return start.replace(meshes=[start.meshes[0].replace(face_colors=values["colour"].expand(20, 3))])
 
-    parameters = {"colour": Parameter(0.02, torch.full((3,), 0.45))}
-    fit = fit_scene(one_colour, view, target, parameters, steps=80, **more, **QUIET)
-    torch.testing.assert_close(fit.values["colour"], mesh.face_colors[0], atol=0.03, rtol=0)
-    plain = fit_scene(one_colour, view, target, parameters, steps=80, **QUIET)
-    assert float((plain.values["colour"] - mesh.face_colors[0]).abs().max()) > 0.05
+    def off(**options):
+        parameters = {"colour": Parameter(0.02, torch.full((3,), 0.45))}
+        fit = fit_scene(one_colour, view, target, parameters, steps=80, **options, **QUIET)
+        return float((fit.values["colour"] - mesh.face_colors[0]).abs().max())
+
+    assert off(weights=weight) < 0.03 and off(loss=lambda a, b, w: losses.robust(a, b, w, scale=0.1)) < 0.03
+    assert off() > 0.05
 
 
 def test_a_flat_loss_alone_is_no_convergence():
@@ -139,8 +139,7 @@ def colour_fit(cameras, target, **options):
     return fit_scene(start, cameras, target, {"meshes.0.face_colors": 0.03, "background": 0.02}, **QUIET, **options)
 
 
-@pytest.mark.parametrize("views_per_step", [None, 2])
-def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path, views_per_step):
+def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path):
     cameras = views()
     target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
 
@@ -148,9 +147,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path, views_per_step)
         if record.step == 13:
             raise KeyboardInterrupt
 
-    whole = colour_fit(cameras, target, steps=30, patience=5, views_per_step=views_per_step)
+    whole = colour_fit(cameras, target, steps=30, patience=5, views_per_step=2)
     file = tmp_path / "fit.ckpt"
-    options = {"steps": 30, "patience": 5, "checkpoint": file, "resume": True, "views_per_step": views_per_step}
+    options = {"steps": 30, "patience": 5, "checkpoint": file, "resume": True, "views_per_step": 2}
     half = colour_fit(cameras, target, callback=stop, **options)
     assert half.interrupted and not half.converged and half.steps == 14 and file.exists()
     again = colour_fit(cameras, target, **options)
