@@ -38,9 +38,9 @@ SECOND_OPINION = {"target": picture(camera(32)).flip(1), "steps": 21, "fit_focal
 @pytest.mark.parametrize(
     ("options", "stops"),
     [
-        # On the coarsest level, on the next, at the first step, between levels, and (−1) at the end of the last.
-        ({}, (4, 10)),
-        pytest.param({}, (1, 7, 14, -1), marks=pytest.mark.slow, id="other places"),
+        # On a finer level; on the coarsest, at the first step, between levels, and (−1) at the end of the last.
+        ({}, (10,)),
+        pytest.param({}, (4, 1, 7, 14, -1), marks=pytest.mark.slow, id="other places"),
         # Among other starts, on their ways to finer levels, on that of the best.
         pytest.param(SECOND_OPINION, (100, 210, 330), marks=pytest.mark.slow, id="second opinions"),
     ],

@@ -171,11 +171,11 @@ def test_what_is_not_explained_is_not_blamed_on_steps(taken):
 
 @pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_picture_from_the_bottom_up_is_named(masked):
-    view = camera(32)
+    view = camera(24)
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
     options = {"mask": mask} if masked else {"background": BACKGROUND}
     with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=4, **options)
+        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=3, **options)
     assert not fit.converged
 
 
