@@ -54,7 +54,7 @@ def test_finds_a_shape_and_its_translation():
 @pytest.mark.parametrize("method", [pytest.param("adam", marks=pytest.mark.slow), "gauss-newton"])
 def test_finds_a_pose(method):
     """A bracket without colours starts 12.3° and 8.4 % of its size off."""
-    view = camera(96)
+    view = camera(128)
     given = {"pose": PoseParameter(Pose(START[:3, :3], START[:3, 3]))}
     image = photograph(view, seed=2, light_samples=16)
     fit = fit_scene(bracket(plain=True), view, image, given, loss="region", method=method, spp=8, progress=False)

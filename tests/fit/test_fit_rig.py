@@ -58,7 +58,7 @@ def photographs(rig: eg.Rig, cameras: list[eg.Camera], seed: int) -> tuple[eg.Me
 
 
 def test_a_pose_from_photographs_without_masks() -> None:
-    rig, cameras = arm(), views(40, 2)
+    rig, cameras = arm(), views(48)
     _, photos = photographs(rig, cameras, 5)
     start = {"rotations": 0.5 * TRUTH}
     found = fit_rig(rig, cameras, photos, loss="region", start=start, coarsest=24, progress=False)

@@ -106,7 +106,7 @@ def test_what_no_picture_shows_is_unknown() -> None:
 
 
 def test_light_is_found_with_the_pose() -> None:
-    rig, cameras = arm(2, colored=True), views(24, 2)
+    rig, cameras = arm(2, colored=True), views(32, 2)
 
     def lit(posed: eg.Mesh, light: torch.Tensor) -> eg.Scene:
         normals = eg.vertex_normals(posed.verts, posed.faces)
@@ -119,7 +119,7 @@ def test_light_is_found_with_the_pose() -> None:
     pictures = [eg.render(lit(rig.posed(truth), light), camera, 64, 9) for camera in cameras]
     start = torch.zeros_like(light)
     start[0] = 2.0
-    options = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 24, "steps": 8, "progress": False}
+    options = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
     found = fit_rig(rig, cameras, pictures, parameters={"light": Parameter(0.2, start)}, **options)
     assert math.degrees(float((found.values["rotations"] - truth).norm(dim=1).max())) < 5.0
     assert torch.allclose(found.fit.values["light"][:4], light[:4], atol=0.3) and "light" not in found.values
