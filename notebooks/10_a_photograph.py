@@ -39,7 +39,7 @@ def outlined(alpha, image, color=(1.0, 0.8, 0.0)):
 
 
 # %% [markdown]
-# ## What is sought
+# ## What is unknown
 #
 # Profiles are rotated about the z axis. The saucer's radius is the unit of length, since a photograph does not show sizes.
 # Four numbers are free: how high the saucer's rim lies; the radius of the cup's rim, its height and its foot.

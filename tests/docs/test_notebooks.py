@@ -23,7 +23,7 @@ FOLDER = Path(__file__).parents[2] / "notebooks"
 NAMES = sorted(path.stem for path in FOLDER.glob("[0-9]*_*.py"))
 QUICK = "1_images_and_gradients"
 LARGEST = 300_000  # bytes
-# What tells on whose machine the outputs were made.
+# Such paths would show on whose machine the outputs were made.
 PLACES = re.compile(r"/(home|root|tmp|usr|opt|mnt|work|Users)/|site-packages|[A-Z]:\\")
 
 

@@ -59,7 +59,7 @@ class Storage:
         return self.accessor(rows, False, bufferView=self.view(rows.tobytes()))
 
     def attributes(self, given: dict[str, tuple[np.ndarray, bool]]) -> dict[str, int]:
-        """Add attributes, interleaved in one view or each in its own, in rows of whole fours of bytes; some are
+        """Add attributes, interleaved in one view or each in its own, in rows of multiples of four bytes; some are
         sparse."""
         groups = [list(given)] if one_of(self.random, False, True) else [[name] for name in given]
         found = {}

@@ -286,7 +286,7 @@ def test_postscript_is_no_texture(tmp_path, monkeypatch, kind, gloss):
         assert eg.load_scene(path).meshes[0].texture is not None
 
 
-def test_3mf_that_looks_odd_and_is_not(tmp_path):
+def test_3mf_that_is_unusual_and_harmless(tmp_path):
     """Components contain components, and files have any name. None is written anywhere."""
     path = write(tmp_path, "a.3mf", triangle_3mf(nested(2), {"../../evil.txt": "x", "/tmp/evil.txt": "x"}))
     depths = sorted(mesh.verts[0, 2].item() for mesh in eg.load_scene(path).meshes)

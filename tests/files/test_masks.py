@@ -255,7 +255,7 @@ def test_palettes(tmp_path: Path) -> None:
     palette(two, (0, 0, 0), (0, 0, 0), (128, 0, 0)).save(path)  # a second black is a label
     with pytest.raises(ValueError, match=r"got the labels 0, 1, 2; choose"):
         eg.read_mask(path)
-    palette(LABELS, *[(0, 0, 0)] * 8).save(path)  # labels that no colour tells apart
+    palette(LABELS, *[(0, 0, 0)] * 8).save(path)  # labels that no colour separates
     agree(path, LABELS == 3, 3)
     Image.fromarray(LABELS == 1).save(path)
     agree(path, LABELS == 1, 1)

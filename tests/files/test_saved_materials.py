@@ -109,7 +109,7 @@ ALPHAS = {
     "cut out of a texture": ({"alpha": data(1)[..., 0], "texture": color(), "filter": "nearest"}, {}),
     "cut out of a material": ({"alpha": data(1)[..., 0]}, {"base_color": eg.Texture(color(), filter="mipmap")}),
     "seen through": ({"alpha": data(1)[..., 0]}, {"alpha_mode": "BLEND"}),
-    "seen through beside colours": ({"alpha": data(1)[..., 0], **APPEARANCES["colours"]}, {"alpha_mode": "BLEND"}),
+    "seen through, with colours": ({"alpha": data(1)[..., 0], **APPEARANCES["colours"]}, {"alpha_mode": "BLEND"}),
     "evenly seen through": ({"alpha": torch.full((1, 1), 0.3)}, {"alpha_mode": "BLEND"}),
 }
 

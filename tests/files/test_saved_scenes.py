@@ -42,7 +42,7 @@ SCENES = {
     "a shared texture": eg.Scene(
         [box(WOOD), box(WOOD.replace(metallic=0.8, two_sided=False)).transformed(t=(2.0, 0.0, -1.0))], lights=[POINT, SUN]
     ),
-    "lit beside unlit": eg.Scene(
+    "lit and unlit": eg.Scene(
         [box(texture=color()), ball(material=eg.Material(0.5), colors=torch.rand(42, 3, generator=random)), ground()],
         lights=[POINT],
     ),

@@ -101,7 +101,7 @@ def test_deviations_are_those_of_pictures_with_noise(blocks: int) -> None:
         loss = ColorLoss(task, pose, 512, 16, seed).at(pose)
         step = torch.linalg.solve(loss.curvature, loss.gradient)
         found.append(float(loss.gradient @ torch.linalg.solve(loss.scores, loss.gradient)) / len(step))
-    # The mean over ten has a deviation of 0.13. Bartlett's weights leave out a part of what is alike: of blocks of 3, a ninth.
+    # The mean over ten has a deviation of 0.13. Bartlett's weights leave out a part of the correlation: of blocks of 3, a ninth.
     assert 0.6 < sum(found) / len(found) < 1.7
 
 

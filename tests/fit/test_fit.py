@@ -79,7 +79,7 @@ def test_finds_the_pose_with_a_mask(plain):
 def test_finds_the_scale():
     view = camera()
     start = START.clone()
-    # Larger and further away looks the same, so the depth is not sought: here it is right.
+    # A larger object further away looks the same, so the depth is not fitted. Here it is right.
     forward = view.world_to_camera[2, :3]
     off = forward @ (START[:3, :3] @ CENTER + START[:3, 3] - CENTER)
     start[:3, 3] -= off * forward

@@ -56,7 +56,7 @@ def test_the_history_of_a_camera(tmp_path):
         torch.testing.assert_close(record.values["cameras.0.K"], one.K.double())
         torch.testing.assert_close(record.values["cameras.0.world_to_camera"], one.world_to_camera.double())
     assert history[-1].loss == whole.loss < history[0].loss
-    # The focal length is not sought on blurred levels, and the last record is no step.
+    # The focal length is not fitted on blurred levels, and the last record is no step.
     assert set(history[0].gradient) == {"world_to_camera"} and not history[-1].gradient
     assert any(set(record.gradient) == {"world_to_camera", "K"} for record in history)
 

@@ -182,13 +182,13 @@ def test_a_picture_from_the_bottom_up_is_named(masked):
 def test_masks_from_the_bottom_up_are_named():
     views = [camera(32), camera(32, distance=5.0)]
     masks = [silhouette(view).flip(0) for view in views]
-    sought = {"verts": 1e-4}
+    parameters = {"verts": 1e-4}
     options = {"masks": masks, "steps": 2, "spp": 2, "progress": False}
     with pytest.warns(UserWarning, match=r"^masks: expected the upper row first.*IoU of \d+%, as given at \d+%"):
-        fit_scene(bracket(), views, None, sought, **options)
+        fit_scene(bracket(), views, None, parameters, **options)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        fit_scene(bracket(), views, None, sought, **options | {"masks": [mask.flip(0) for mask in masks]})
+        fit_scene(bracket(), views, None, parameters, **options | {"masks": [mask.flip(0) for mask in masks]})
 
 
 BLANK = torch.zeros(64, 64, 3)

@@ -21,7 +21,7 @@ from edgegrad.fit.pose.target_images import is_clutter
 from edgegrad.fit.region import smoothed
 
 
-def test_a_pose_that_looks_alike_may_be_elsewhere(taken):
+def test_an_ambiguous_pose_may_be_shifted(taken):
     """A nearer pose is as good a reason for doubt as a rotated one."""
     view, image = taken
     task = task_of(image, view)
@@ -170,9 +170,9 @@ def test_errors_of_depth(taken, depth, error, message):
 
 
 @pytest.mark.slow
-def test_what_looks_alike_in_unknown_light_is_not_converged():
+def test_an_ambiguous_pose_in_unknown_light_is_not_converged():
     """A box of one colour, before a camera without perspective: turned to the left and to the right it has nearly one contour,
-    and a light makes its faces as bright as they are. The way down from a start at the wrong one stays there."""
+    and a light makes its faces as bright as they are. The descent from a start at the wrong one stays there."""
     made = trimesh.creation.box((1.6, 0.9, 0.7))
     verts, faces = (torch.tensor(x.copy()) for x in (made.vertices, made.faces))
     box = eg.Mesh(verts, faces, colors=torch.full((len(verts), 3), 0.5))
@@ -189,7 +189,7 @@ def test_what_looks_alike_in_unknown_light_is_not_converged():
 
 
 @pytest.mark.slow
-def test_what_looks_alike_is_not_converged(monkeypatch):
+def test_an_ambiguous_pose_is_not_converged(monkeypatch):
     """A box before a camera without perspective has nearly one contour turned to the left and to the right."""
     made = trimesh.creation.box((1.6, 0.9, 0.7))
     verts = torch.tensor(made.vertices.copy())

@@ -27,7 +27,7 @@ from edgegrad.fit.pose.photo.surface_interior import AOVS, SurfaceInterior
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.region import OUTLIERS, smoothed
 
-BESIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which covers a part of the bracket
+ASIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which covers a part of the bracket
 
 
 def view_of(size=96, distance=6.0):
@@ -54,7 +54,7 @@ def centre(mesh):
     return 0.5 * (low + high)
 
 
-def beside(mesh, pose, turn, shift):
+def moved_by(mesh, pose, turn, shift):
     """Return a pose that is rotated about the object's centre and shifted."""
     R = rotation(*turn) @ pose[:3, :3]
     where = pose[:3, :3] @ centre(mesh) + pose[:3, 3] + torch.tensor(shift).double()
@@ -72,13 +72,13 @@ def errors(fit, mesh, truth):
 MESHES = [bracket(), box(), box((0.7, 0.9, 0.6), seed=8)]
 TRUTHS = [
     at(torch.eye(3).double(), torch.zeros(3).double()),
-    at(rotation(0.5, 0.7, 0.2), CENTER + BESIDE),
+    at(rotation(0.5, 0.7, 0.2), CENTER + ASIDE),
     at(rotation(-0.4, 0.3, 0.6), CENTER + torch.tensor([-1.15, 0.6, 0.5]).double()),
 ]
 STARTS = [
-    beside(MESHES[0], TRUTHS[0], (0.1, -0.12, 0.08), (0.08, -0.06, 0.08)),
-    beside(MESHES[1], TRUTHS[1], (-0.1, 0.08, 0.1), (-0.05, 0.05, 0.06)),
-    beside(MESHES[2], TRUTHS[2], (0.09, 0.1, -0.08), (0.03, 0.04, -0.04)),
+    moved_by(MESHES[0], TRUTHS[0], (0.1, -0.12, 0.08), (0.08, -0.06, 0.08)),
+    moved_by(MESHES[1], TRUTHS[1], (-0.1, 0.08, 0.1), (-0.05, 0.05, 0.06)),
+    moved_by(MESHES[2], TRUTHS[2], (0.09, 0.1, -0.08), (0.03, 0.04, -0.04)),
 ]
 
 
@@ -188,7 +188,7 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
         off = errors(fit, mesh, truth)
         assert off[0] < degrees and off[1] < percent, (kind, off, fit.explained)
         known = fit.uncertainty.degrees
-        if kind == "plain" and known > 2.0:  # the contour of the covered one tells its turn to about as much
+        if kind == "plain" and known > 2.0:  # the contour of the covered one shows its rotation to about as much
             assert fit.reason.startswith("directions unknown: ") and off[0] < known < 2.5, (off, known)
         elif kind == "plain":  # a plain box shows nearly the same contour in a pose that is turned by 10°
             assert fit.converged or fit.reason.startswith("ambiguous: "), (off, fit.reason)
@@ -222,9 +222,9 @@ def test_a_hidden_mesh_is_said_to_be_hidden(two):
     """The mesh lies behind the box as the camera sees it."""
     view, image = two
     eye = torch.linalg.inv(view.world_to_camera.double())[:3, 3]
-    away = torch.nn.functional.normalize(CENTER + BESIDE - eye, dim=0)
+    away = torch.nn.functional.normalize(CENTER + ASIDE - eye, dim=0)
     small = box((0.3, 0.3, 0.3), seed=5)
-    hidden = at(torch.eye(3).double(), CENTER + BESIDE + 1.3 * away)
+    hidden = at(torch.eye(3).double(), CENTER + ASIDE + 1.3 * away)
     fits = fit_poses([*MESHES[:2], small], image, view, init=[*STARTS[:2], hidden], search=False, progress=False)
     assert fits[0].converged and fits[1].converged and not fits[2].converged
     assert fits[2].visible < 0.1 and fits[2].reason.startswith("hidden: the other objects leave"), fits[2].reason
@@ -249,7 +249,7 @@ def test_a_stopped_fit_keeps_the_poses_so_far(two):
 BLANK = torch.zeros(160, 160, 3)
 FAR = at(torch.eye(3).double(), CENTER + 40.0 * view_of().world_to_camera[0, :3].double())
 BEHIND = at(torch.eye(3).double(), CENTER + 20.0 * torch.tensor([0.35, 0.3, 0.89]).double())
-WITHIN = at(torch.eye(3).double(), CENTER + BESIDE)
+WITHIN = at(torch.eye(3).double(), CENTER + ASIDE)
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_the_command_line(two, tmp_path, capsys):
         off = errors(fit, MESHES[k], TRUTHS[k])
         assert off[0] < 2.5 and off[1] < 1.4, off
     said = capsys.readouterr().out
-    # The contour of the first tells its rotation to about 2°, and what is less exact is unknown. That of a box in so few
+    # The contour of the first shows its rotation to about 2°, and what is less exact is unknown. That of a box in so few
     # pixels is nearly the same in a pose that is turned by 10°.
     assert f"{tmp_path}/0.ply: converged" in said or f"{tmp_path}/0.ply: directions unknown" in said, said
     assert f"{tmp_path}/1.ply: converged" in said or f"{tmp_path}/1.ply: ambiguous" in said, said
@@ -376,13 +376,13 @@ def test_white_may_be_any_brighter_colour():
 def test_two_meshes_that_end_in_one_place_have_not_converged():
     """The picture shows one of them. Two steps leave both near their starts; the end of many depends on rounding."""
     view = view_of(96)
-    beside_it = beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
+    neighbour = moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
     image = photograph(view, *scene_of(1), seed=4)
-    starts = [TRUTHS[0], beside_it]
+    starts = [TRUTHS[0], neighbour]
     fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, spp=8, steps=2, search=False, progress=False)
     for k, fit in enumerate(fits):
         assert not fit.converged and fit.reason.startswith(f"in one place: meshes[{k}] ends where")
-    apart = [TRUTHS[0], beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (2.5, 0.02, 0.02))]
+    apart = [TRUTHS[0], moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (2.5, 0.02, 0.02))]
     fits = fit_poses([MESHES[0]] * 2, image, view, init=apart, spp=8, steps=2, search=False, progress=False)
     assert not any(fit.reason.startswith("in one place") for fit in fits)
 

@@ -52,8 +52,8 @@ def test_a_quarter_covered(how, steps):
     assert fit.converged and fit.explained > 0.5
 
 
-@pytest.mark.parametrize("looks", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
+@pytest.mark.parametrize("searched", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_wrong_place_nearby_is_left_for_a_better_one(searched, monkeypatch):
     """Where a board covers the object, rotated poses are tried."""
     view = camera(64)
     image, _ = covered(view, picture(view))
@@ -67,10 +67,10 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
 
     monkeypatch.setattr(color_search.ColorSearch, "_down", ends_aside)
     monkeypatch.setattr(color_search, "MIN_EDGE_SUPPORT", 0.0)  # all ends are taken for right
-    if not looks:
+    if not searched:
         monkeypatch.setattr(color_search, "MIN_BLOCK_ERROR", math.inf)
     fit = fit_pose(bracket(), image, view, init=START, background=BACKGROUND, steps=24, progress=False)
-    assert (errors(fit)[0] < 1.0) == looks and fit.converged
+    assert (errors(fit)[0] < 1.0) == searched and fit.converged
     assert torch.equal([step for step in fit.history if step.best][-1].pose.matrix, fit.matrix)
 
 
@@ -146,23 +146,23 @@ def test_a_border_of_many_colours_is_clutter():
     assert is_clutter(picture(view, background=clutter)) and not is_clutter(picture(view))
 
 
-# On few pixels one of hundreds of places is alike by chance, but not known exactly; the last has other starts.
+# On few pixels one of hundreds of places matches by chance, but is not known exactly; the last row has other starts.
 @pytest.mark.parametrize(
-    ("size", "steps", "alike"),
+    ("size", "steps", "most"),
     [
         pytest.param(64, 4, 0.6, marks=pytest.mark.slow),
         pytest.param(32, 4, 0.8, marks=pytest.mark.slow),  # quick for photographs, in test_fit_photo.py
         pytest.param(32, 21, 0.8, marks=pytest.mark.slow),
     ],
 )
-def test_what_is_not_in_the_picture_is_not_found(size, steps, alike):
+def test_what_is_not_in_the_picture_is_not_found(size, steps, most):
     """The picture shows something else. The fit ends somewhere and says that the picture does not show the object."""
     cells = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     image = torch.nn.functional.interpolate(cells, (size, size), mode="bicubic")[0].movedim(0, -1)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # nor turned over
         fit = fit_pose(bracket(), image, camera(size), background=BACKGROUND, steps=steps, progress=False)
-    assert not fit.converged and fit.explained < alike
+    assert not fit.converged and fit.explained < most
     assert fit.reason.startswith(("edges not explained: the pictures show", "directions unknown: rotation about"))
 
 

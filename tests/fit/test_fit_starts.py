@@ -143,7 +143,7 @@ def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch)
     assert comparable(task, start) and not comparable(task, start._replace(scale=2.0 * start.scale))
     R, t = case.truth.R, case.truth.t
     pose, side = nearby(task, start, 0)[0]
-    assert near(pose, R, t, task, 0.1, 0.06) and side != EVERYWHERE  # its distance is found on the way down
+    assert near(pose, R, t, task, 0.1, 0.06) and side != EVERYWHERE  # the descent finds its distance
     assert not near(start, R, t, task, 0.2, 0.03)
 
 

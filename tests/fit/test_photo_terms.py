@@ -68,7 +68,7 @@ def test_the_region_terms_gradient_is_that_of_its_loss():
     torch.testing.assert_close(normal.curvature, torch.einsum("ahw,bhw->ab", J, J), rtol=1e-4, atol=1e-6)
 
 
-def test_the_posterior_tells_colours_apart_near_the_contour_alone():
+def test_the_posterior_separates_colours_near_the_contour_alone():
     """The left object is red on green, the right one green on red: one pair of histograms for the picture would show
     nothing."""
     view = camera(60)
@@ -150,7 +150,7 @@ def test_the_light_of_a_matte_ball_is_found(malformed, monkeypatch):
     monkeypatch.setattr(light, "LIGHT_RIDGE", 0.0)
     lit = FittedLight.from_picture(picture_of(view, malformed_image), surface, 9)
     assert off(lit) < (0.02 if malformed else 3e-4)
-    # Half of a ball tells the harmonics of z apart hardly, and float32 solves for them: rounding differs by processor.
+    # Half of a ball hardly separates the harmonics of z, and float32 solves for them: rounding differs by processor.
     assert float((lit.coefficients - LIGHT).norm() / LIGHT.norm()) < (0.2 if malformed else 0.08)
 
 

@@ -64,7 +64,7 @@ def test_limbs_that_hang_apart_point_to_where_the_other_one_was() -> None:
         torch.testing.assert_close(along, wanted)
 
 
-def test_what_is_exchanged_hangs_alike() -> None:
+def test_exchanged_limbs_hang_on_joints_alike() -> None:
     """A figure's arms and legs are exchanged, but no leg with the spine, nor a limb with one that branches."""
     rig = figure.figure(fine=3)
     pairs = [limb.twins for limb in limbs(rig, range(20)) if limb.twins is not None]
@@ -91,22 +91,24 @@ def test_axial_rotations_are_found(seed: int) -> None:
 
 def arm_of(rig: eg.Rig) -> tuple[FreeParameters, Alternatives]:
     """Return the rotations of one arm of a figure as free parameters, and their alternatives."""
-    sought = FreeParameters.from_arguments(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
-    return sought, Alternatives(rig, sought, "rotations")
+    free = FreeParameters.from_arguments(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
+    return free, Alternatives(rig, free, "rotations")
 
 
 def test_an_axial_rotation_keeps_what_hangs_below_in_place() -> None:
     rig = figure.figure(fine=3)
-    sought, alternatives = arm_of(rig)
+    free, alternatives = arm_of(rig)
     values = {"rotations": figure.pose(7, 40.0)[[rig.joints.names.index(name) for name in ARM]]}
-    twists = {(ARM[t.row], None if t.child is None else ARM[t.child]): t for t in alternatives.axial_rotations(values)}
-    assert list(twists) == [("left arm", "left elbow"), ("left elbow", "left hand"), ("left hand", None)]
+    rotations = {
+        (ARM[t.row], None if t.child is None else ARM[t.child]): t for t in alternatives.axial_rotations(values)
+    }
+    assert list(rotations) == [("left arm", "left elbow"), ("left elbow", "left hand"), ("left hand", None)]
     # The hand's own axis points to the middle of its ellipsoid.
     along = torch.tensor(figure.BONES_ALONG[8], dtype=F64)
-    assert float(twists["left hand", None].axis @ along / along.norm()) > 0.99
-    before = rig.joints.world(roma.rotvec_to_rotmat(sought.all(values)["rotations"]))
-    for (name, _), twist in twists.items():
-        found = sought.all({"rotations": alternatives.with_rotation(values, twist, 0.7)})["rotations"]
+    assert float(rotations["left hand", None].axis @ along / along.norm()) > 0.99
+    before = rig.joints.world(roma.rotvec_to_rotmat(free.all(values)["rotations"]))
+    for (name, _), rotation in rotations.items():
+        found = free.all({"rotations": alternatives.with_rotation(values, rotation, 0.7)})["rotations"]
         after = rig.joints.world(roma.rotvec_to_rotmat(found))
         at = rig.joints.names.index(name)
         others = [k for k in range(20) if k != at]
@@ -119,16 +121,14 @@ def test_an_axial_rotation_keeps_what_hangs_below_in_place() -> None:
 def test_axial_rotations_are_found_by_the_loss_along_them() -> None:
     """A hand is rotated across its true place, and an arm against its elbow. What is right stays."""
     rig, cameras = figure.figure(fine=4), figure.cameras(64)[:3]
-    sought, alternatives = arm_of(rig)
-    parameter = sought.parameters["rotations"]
+    free, alternatives = arm_of(rig)
+    parameter = free.parameters["rotations"]
     assert parameter.value is not None
     truth = {"rotations": parameter.value}
-    masks = [
-        eg.render_aovs(rig.posed(sought.fixed["rotations"]), c, ["alpha"], spp=64, seed=5)["alpha"] for c in cameras
-    ]
+    masks = [eg.render_aovs(rig.posed(free.fixed["rotations"]), c, ["alpha"], spp=64, seed=5)["alpha"] for c in cameras]
     views = views_of(cameras, None, masks, None)
     objective = Objective(
-        lambda values: (eg.Scene([rig.posed(**sought.all(values))]), cameras),
+        lambda values: (eg.Scene([rig.posed(**free.all(values))]), cameras),
         views,
         Options(spp=32),
     )

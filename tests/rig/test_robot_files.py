@@ -102,7 +102,7 @@ def test_all_that_belongs_to_corners_is_reversed() -> None:
     assert bool((outwards > 0).all())
 
 
-# -- looks ------------------------------------------------------------------------------------------------------------
+# -- appearance ------------------------------------------------------------------------------------------------------------
 
 DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -214,7 +214,7 @@ def test_meshes_of_packages(tmp_path) -> None:
         eg.load_robot(path, package_dirs=tmp_path / "nowhere")
     with pytest.raises(TypeError, match="package_dirs: expected folders, got int"):
         eg.load_robot(path, package_dirs=[3])  # type: ignore[list-item]
-    # Beside the robot's own folder, without an argument.
+    # Next to the robot's own folder, without an argument.
     shutil.move(tmp_path / "other" / "arm_meshes", tmp_path / "arm_meshes")
     assert volume(eg.load_robot(path).posed()) == pytest.approx(8.0)
 
