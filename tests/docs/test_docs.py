@@ -20,6 +20,7 @@ from typing import get_args, get_type_hints
 import matplotlib
 import pytest
 import torch
+from doc_pages import FENCE, FOLDER
 from torch import Tensor
 
 import edgegrad
@@ -29,10 +30,8 @@ import edgegrad.raster
 
 pytestmark = pytest.mark.unsanitized
 
-FOLDER = Path(__file__).parents[2] / "docs"
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
 LONG = ("how-to/shape-from-depth.md", "how-to/bop.md", "how-to/training-loop.md")
-FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-−+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 TOLERANCE = 0.2
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_docs import FENCE, FOLDER
+from doc_pages import FENCE, FOLDER
 from torch import Tensor
 
 import edgegrad as eg

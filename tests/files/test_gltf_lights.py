@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from lit_gltf import TURN, file, loaded
+from lit_gltf import CAMERAS, TURN, file, loaded
 from mesh_files import SQUARE, TRIANGLES, changed, glb
 
 import edgegrad as eg
@@ -117,12 +117,6 @@ def test_what_lies_below_a_camera_is_read(tmp_path):
     nodes = [{"camera": 0, "translation": [0, 0, 5], "children": [1]}, {"mesh": 0}]
     scene = eg.load_scene(file(tmp_path, nodes=nodes, roots=[0], cameras=cameras))
     np.testing.assert_allclose(scene.meshes[0].verts[:, 2], 5.0)
-
-
-CAMERAS = [
-    {"type": "perspective", "perspective": {"yfov": 0.8, "aspectRatio": 3.0, "znear": 0.1}},
-    {"type": "orthographic", "orthographic": {"xmag": 1.0, "ymag": 2.0, "znear": 0.1, "zfar": 10.0}},
-]
 
 
 def test_cameras(tmp_path):

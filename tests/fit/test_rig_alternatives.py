@@ -1,9 +1,7 @@
 """Poses that outlines hardly separate from another one: two exchanged limbs, or a rotation that two bones share
 differently."""
 
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,7 +17,6 @@ from edgegrad.fit.rig.limbs import Limb, LimbSearch, Values, limbs
 from edgegrad.fit.views import views_of
 
 roma = pytest.importorskip("roma")
-sys.path.append(str(Path(__file__).parents[2] / "examples"))
 import body  # noqa: E402
 import figure  # noqa: E402
 

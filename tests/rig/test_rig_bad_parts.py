@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lit_gltf import file
+from lit_gltf import CAMERAS, file
+from rig_checks import check, malformed, primitive
 from rig_files import Sample, quaternion_matrix, simple_morph, simple_skin
 from scipy.spatial.transform import Rotation, Slerp
-from test_gltf_lights import CAMERAS
-from test_rigs import check, malformed, primitive
 
 import edgegrad as eg
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from edgegrad.fit import fit_rig
 
 yourdfpy = pytest.importorskip("yourdfpy")
 pytest.importorskip("pytorch_kinematics")
-sys.path.append(str(Path(__file__).parents[2] / "examples"))
 import arm  # noqa: E402
 
 GRIPPER = """<?xml version="1.0"?>

@@ -65,3 +65,9 @@ def places(tree):
     for key in keys:
         yield tree, key
         yield from places(tree[key])
+
+
+CAMERAS = [
+    {"type": "perspective", "perspective": {"yfov": 0.8, "aspectRatio": 3.0, "znear": 0.1}},
+    {"type": "orthographic", "orthographic": {"xmag": 1.0, "ymag": 2.0, "znear": 0.1, "zfar": 10.0}},
+]
