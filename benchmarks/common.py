@@ -12,7 +12,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.files.paths import replacing
-from edgegrad.kernel.operators import Hits, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
+from edgegrad.kernel.operators import HitBuffers, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad.kernel.request import make_request
 from edgegrad.library import core, load
 
@@ -47,7 +47,7 @@ class Kernel:
         self.adjoint = adjoint.to(flat.colors.dtype).contiguous()
         self.image = torch.empty_like(self.adjoint)
         self.interior = request.gradient.channels_vary
-        self.hits = kernel_hits(Hits.empty(request))
+        self.hits = kernel_hits(HitBuffers.empty(request))
         appearance = ("uvs", "texels") if len(flat.textures) else ("colors",)
         self.grads = {
             name: torch.zeros_like(request.slot(name), dtype=torch.float64) for name in ("verts", *appearance)

@@ -16,7 +16,7 @@ import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.library import core
 from edgegrad.light.radiance import Lighting
-from edgegrad.points.frame import Frame
+from edgegrad.points.image_context import ImageContext
 from edgegrad.shader import ShadingTraits, UserShader, _Image
 
 from .common import Kernel, parts
@@ -116,7 +116,7 @@ def shadow_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, 
     moved = scene.moved(verts)
     request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
     image = ShadowBoundaries(
-        Frame(moved, request, 0),
+        ImageContext(moved, request, 0),
         UserShader(Lighting(True, 1)),
         False,
         False,

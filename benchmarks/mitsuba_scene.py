@@ -13,7 +13,7 @@ from edgegrad.camera.camera import Camera
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import PointLight
 from edgegrad.scene.material import Material, Texture
-from edgegrad.scene.mesh import PLAIN, Mesh
+from edgegrad.scene.mesh import DEFAULT_RADIANCE, Mesh
 from edgegrad.scene.scene import Scene
 
 # Radius of a scene in Mitsuba, which steps off silhouettes by lengths in world units: too long for an object of 0.1.
@@ -114,7 +114,7 @@ def _shape(mi: Any, dr: Any, mesh: Mesh, name: str, lit: bool) -> Any:
     that both its faces run along in one direction, for two open borders."""
     verts, faces = mesh.verts.detach().cpu().double(), mesh.faces.cpu().long()
     attributes: dict[str, Tensor] = {}
-    uvs, radiance = None, _rgb(torch.full((3,), PLAIN))
+    uvs, radiance = None, _rgb(torch.full((3,), DEFAULT_RADIANCE))
     if mesh.texture is not None:
         assert mesh.uvs is not None and mesh.uv_faces is not None
         radiance = {

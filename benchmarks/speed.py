@@ -31,7 +31,7 @@ from .glossy import glossy
 from .glossy_gradients import glossy_gradients
 from .light import light
 from .material_grid import material_grid
-from .processes import memory, order, start
+from .processes import busy, memory, start
 from .table import HEAD, Bench, Row, Skipped, line
 
 ROWS: dict[str, Callable[[Bench], list[Row]]] = {
@@ -46,7 +46,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "threads": threads,
     "memory": memory,
     "start": start,
-    "order": order,
+    "busy": busy,
     "bits": bits,
     "textures": textures,
     "aovs": aovs,

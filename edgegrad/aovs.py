@@ -16,9 +16,9 @@ from .camera.camera import Camera
 from .kernel.autograd import faces_at_centers, render_image
 from .kernel.flat import image_dtype
 from .kernel.request import Channels, Request, make_request
+from .light.lit_operator import lit_image
 from .light.radiance import Lighting
 from .light.unused_options import warn_of_unused
-from .light.whole import lit_image
 from .scene.mesh import Mesh
 from .scene.rows import areas, rows_of, unit
 from .scene.scene import Scene, as_scene

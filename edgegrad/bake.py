@@ -19,16 +19,16 @@ from .points.rays import trace
 from .scene.appearance import OnMesh, coordinates
 from .scene.mesh import Mesh
 from .scene.mikktspace import Fans
-from .scene.nearest import Places, SurfaceIndex
+from .scene.nearest import NearestPoints, SurfaceIndex
 from .scene.scene import Scene, as_scene
 from .warnings import warn
 
-WHAT = ("color", "normal", "normal_map", "visibility")
-FLAT = (0.5, 0.5, 1.0)  # of a normal map that bends nothing
-AT_ONCE = 1 << 20  # rays
+BAKED = ("color", "normal", "normal_map", "visibility")
+FLAT_NORMAL = (0.5, 0.5, 1.0)  # of a normal map that bends nothing
+RAYS_AT_ONCE = 1 << 20  # rays
 REACH = 0.05  # of the diagonal of a mesh's box: how far rays look for the other surface
-SLACK = 1e-4  # of texture coordinates beyond the unit square, by rounding
-NEAR = 1e-4  # of a distance: what lies so close is the surface itself
+UV_ROUNDING = 1e-4  # of texture coordinates beyond the unit square, by rounding
+CONTACT = 1e-4  # of a distance: what lies so close is the surface itself
 
 
 class SurfacePoints(NamedTuple):
@@ -98,20 +98,20 @@ def bake(
     """
     _check_mesh(mesh)
     shape = _shape(size)
-    check_choice("what", what, WHAT)
+    check_choice("what", what, BAKED)
     if by not in ("rays", "nearest"):
         raise ValueError(f"by: expected 'rays' or 'nearest', got {by!r}")
     check_int("rays", rays, 1, 1 << 16)
     mesh = mesh.detach().to("cpu")
     texels = _Texels.of(mesh, shape)
-    empty = FLAT if what == "normal_map" else 0.0
+    empty = FLAT_NORMAL if what == "normal_map" else 0.0
     if isinstance(source, (Mesh, Scene)):
         scene = as_scene(source).detach().to("cpu")
         low, high = mesh.verts.double().aminmax(dim=0)
         diagonal = float((high - low).norm())
         reach = REACH * diagonal if reach is None else check_positive("reach", reach, least=1e-30, most=1e30)
         if what == "visibility":
-            values = _visibility(texels.points, scene, NEAR * diagonal, rays, seed, progress)
+            values = _visibility(texels.points, scene, CONTACT * diagonal, rays, seed, progress)
         else:
             values = _of_surface(scene, _matched(texels.points, scene, by, reach), what)
             if what == "normal_map":
@@ -205,7 +205,7 @@ class _Texels(NamedTuple):
     def of(cls, mesh: Mesh, shape: tuple[int, int]) -> _Texels:
         assert mesh.uvs is not None and mesh.uv_faces is not None
         used = mesh.uvs.double()[mesh.uv_faces.long()]
-        if bool(((used < -SLACK) | (used > 1 + SLACK)).any()):
+        if bool(((used < -UV_ROUNDING) | (used > 1 + UV_ROUNDING)).any()):
             low, high = (round(float(x), 3) for x in used.aminmax())
             raise ValueError(
                 f"mesh: expected texture coordinates in the unit square, got some from {low} to {high}; use unwrap(mesh)"
@@ -267,7 +267,7 @@ def points_of(mesh: Mesh, face: Tensor, b: Tensor) -> SurfacePoints:
     return SurfacePoints(at(mesh.verts, mesh.faces), F.normalize(flat, dim=1), face, b, uv)
 
 
-def _matched(points: SurfacePoints, scene: Scene, by: str, reach: float) -> Places:
+def _matched(points: SurfacePoints, scene: Scene, by: str, reach: float) -> NearestPoints:
     """Return the source's points that belong to points of the mesh."""
     count = len(points.face)
     face, b = np.full(count, -1), np.zeros((count, 3))
@@ -280,10 +280,10 @@ def _matched(points: SurfacePoints, scene: Scene, by: str, reach: float) -> Plac
     if lost.any():
         found = SurfaceIndex(scene).nearest(points.position[torch.from_numpy(lost)].numpy())
         face[lost], b[lost] = found.face, found.b
-    return Places(np.zeros((count, 3)), face, b)
+    return NearestPoints(np.zeros((count, 3)), face, b)
 
 
-def _of_surface(scene: Scene, places: Places, what: str) -> Tensor:
+def _of_surface(scene: Scene, places: NearestPoints, what: str) -> Tensor:
     if what == "color":
         colors = SurfaceIndex(scene).colors(places)
         if colors is None:
@@ -334,7 +334,7 @@ def _visibility(points: SurfacePoints, scene: Scene, aside: float, rays: int, se
     seen = torch.zeros(count, 1, dtype=torch.float64)
     normal, origin = points.normal, points.position + aside * points.normal
     # A point drawn on the unit sphere around the normal's end is a direction with this density (Shirley et al. 2019).
-    parts = max(1, -(-count * rays // AT_ONCE))
+    parts = max(1, -(-count * rays // RAYS_AT_ONCE))
     for k in tqdm(range(parts), desc="visibility", disable=not progress):
         first, end = k * count // parts, (k + 1) * count // parts
         on_sphere = F.normalize(torch.randn(end - first, rays, 3, dtype=torch.float64, generator=generator), dim=2)
@@ -359,7 +359,7 @@ def _seen(mesh: Mesh, points: SurfacePoints, camera: Camera) -> Tensor:
     hits = trace(mesh, points.position - along, along)
     first = torch.full((len(points.face),), torch.inf, dtype=torch.float64)
     first[hits.ray] = hits.depth.detach().double()
-    visible = first >= 1 - NEAR
+    visible = first >= 1 - CONTACT
     if camera.projection == "perspective":  # others see behind themselves too, or have no place
         visible &= (points.position @ ahead + pose[2, 3]) > 0
     cosine = -(points.normal * F.normalize(along, dim=1)).sum(1)

@@ -26,7 +26,7 @@ from .scene.scene import Scene
 SIZE = 256  # pixels
 TARGET_SPP = 256
 MOST_TURN, MOST_SHIFT = 20.0, 15.0  # degrees, percent of the object's size: how far a start is from the truth
-GOOD = 0.5  # degrees and percent: what counts as found
+FOUND_WITHIN = 0.5  # degrees and percent: what counts as found
 
 
 class Errors(NamedTuple):

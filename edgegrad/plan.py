@@ -15,14 +15,14 @@ from .kernel import memory as memory
 from .kernel.counts import COUNTS, table
 from .kernel.derivatives import moves
 from .kernel.flat import Flat
-from .kernel.operators import Hits, backward_kernel, image_memory, pass_size
-from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
+from .kernel.operators import HitBuffers, backward_kernel, image_memory, pass_size
+from .kernel.request import DISCONTINUITY_SLOTS, MOVING, SLOTS, Request, WantedTerms, label, make_request, required
 from .library import core
 from .light.bounces import check_bounces
 from .light.radiance import LIGHTING, Lighting
 from .light.sampling import MOST_SETS, SETS, how_drawn
 from .light.unused_options import warn_of_unused
-from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, without_colors
+from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, with_attributes
 from .points.shadows import ShadowLight
 from .points.surfaces import every_face
 from .render import SHADING, check_options
@@ -30,7 +30,7 @@ from .scene.lights import Light
 from .scene.mesh import Mesh
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene, as_scene
-from .shader import AT_ONCE
+from .shader import POINTS_AT_ONCE
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | 
     """Return the terms with a shader, of which nothing is asked before it runs: neither what it needs nor at which edges it may
     jump."""
     attributes = every_face(len(request.scene.faces)) if creases is True else None
-    request = request._replace(scene=without_colors(request.scene, attributes))
+    request = request._replace(scene=with_attributes(request.scene, attributes))
     moving = [name for name in required(request) if name in MOVING]
     # It is not known either whether a tensor of the shader's own requires a gradient.
     wanted = [*moving, "colors"] if torch.is_grad_enabled() else []
@@ -121,7 +121,7 @@ def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | 
     rows = CURVE_BYTES * terms["boundary"].samples + SURFACE_BYTES * terms["interior"].samples
     terms["textures"] = Term(False, "left to the shader")
     terms["shader"] = Term(
-        True, f"asked for at most {AT_ONCE:,} points at a time; what it keeps of them is not counted here"
+        True, f"asked for at most {POINTS_AT_ONCE:,} points at a time; what it keeps of them is not counted here"
     )
     terms["samples"] = Term(rows > 0, "handed to the shader" if rows else "no gradients", bytes=rows)
     terms["interior"] = replace(
@@ -150,7 +150,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     )
     terms["lights"] = Term(
         lights > 0,
-        f"{lights} points of lights for each point{how_drawn(scene)}{more}; at most {AT_ONCE:,} points at a time",
+        f"{lights} points of lights for each point{how_drawn(scene)}{more}; at most {POINTS_AT_ONCE:,} points at a time",
     )
     why = (
         f"{inside} rays for each point of the gradient inside faces, {lights} for others and for each face in a pixel"
@@ -164,11 +164,11 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     slides = request.gradient.visibility and any(name in MOVING for name in required(request))
     interior, boundary = terms["interior"].samples, terms["boundary"].samples
     terms["bounces"] = _bounces(scene, interior + boundary, 4 * interior if slides else 0, lighting)
-    terms["shadow edges"] = _shadow_edges(scene, request, lighting)
-    terms["indirect shadow edges"] = _indirect_shadow_edges(scene, request, lighting)
-    terms["bounce edges"] = _bounce_edges(scene, request, lighting)
-    terms["surface borders"] = _secondary_borders(scene, request, lighting)
-    terms["texels of lights"] = _texels_of_lights(scene, lighting)
+    terms["shadow boundaries"] = _shadow_boundaries(scene, request, lighting)
+    terms["indirect shadow boundaries"] = _indirect_shadow_boundaries(scene, request, lighting)
+    terms["secondary edges"] = _secondary_edges(scene, request, lighting)
+    terms["surface edges"] = _surface_edges(scene, request, lighting)
+    terms["texel edges of lights"] = _texel_edges_of_lights(scene, lighting)
     return terms
 
 
@@ -190,19 +190,19 @@ def _bounces(scene: Scene, points: int, near_field: int, lighting: Lighting) -> 
     )
 
 
-def _texels_of_lights(scene: Scene, lighting: Lighting) -> Term:
-    emitters = [light for light in scene.casting if isinstance(light, MeshLight) and light.has_borders]
+def _texel_edges_of_lights(scene: Scene, lighting: Lighting) -> Term:
+    emitters = [light for light in scene.casting if isinstance(light, MeshLight) and light.has_texel_edges]
     moving = sum(moves(light.coordinates) for light in emitters)
     if not moving:
         return Term(False, "nothing that moves them" if emitters else "no emission is that of the nearest texel")
     count = moving * lighting.samples
-    return Term(True, f"{count} point{'s' * (count > 1)} of their borders for each point of the interior")
+    return Term(True, f"{count} point{'s' * (count > 1)} of their texel edges for each point of the interior")
 
 
 def _lights_with_moving_shadows(
     scene: Scene, request: Request, lighting: Lighting, names: Collection[str]
 ) -> tuple[list[Light], str]:
-    """Return the lights whose shadows have borders that move, as they do with slots of these names; else why there are none."""
+    """Return the lights whose shadow boundaries move, as they do with slots of these names; else why there are none."""
     if not scene.casting or not lighting.shadows:
         return [], "shadows=False" if scene.casting else "no lights"
     if not request.gradient.visibility:
@@ -211,21 +211,23 @@ def _lights_with_moving_shadows(
     return [light for light in scene.casting if moving or ShadowLight.moves(light)], ""
 
 
-def _shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
-    lights, why = _lights_with_moving_shadows(scene, request, lighting, STEPPING if _has_alpha(scene) else MOVING)
+def _shadow_boundaries(scene: Scene, request: Request, lighting: Lighting) -> Term:
+    lights, why = _lights_with_moving_shadows(
+        scene, request, lighting, DISCONTINUITY_SLOTS if _has_alpha(scene) else MOVING
+    )
     if not lights:
         return Term(False, why or "nothing that casts, receives or gives light moves, nor the camera")
     many = sum(not light.punctual for light in lights)
     samples = request.cameras * many * _most_shadow_samples(request)
-    why = f"of {len(lights)} light{'s' * (len(lights) > 1)}: 24 samples a pixel of border"
+    why = f"of {len(lights)} light{'s' * (len(lights) > 1)}: 24 samples a pixel of boundary"
     why += ", not counted here" + "; of those with an extent by the rays of the image" * (many > 0)
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
 
 
-def _indirect_shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+def _indirect_shadow_boundaries(scene: Scene, request: Request, lighting: Lighting) -> Term:
     if lighting.bounces == 1:
         return Term(False, "bounces=1: no surface lights another")
-    # How borders lie on surfaces does not depend on the camera.
+    # How boundaries lie on surfaces does not depend on the camera.
     names = ("verts", *(("uvs", "alphas") if _has_alpha(scene) else ()))
     lights, why = _lights_with_moving_shadows(scene, request, lighting, names)
     if not lights:
@@ -239,15 +241,15 @@ def _indirect_shadow_edges(scene: Scene, request: Request, lighting: Lighting) -
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
 
 
-def _bounce_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+def _secondary_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
     if why := _why_no_secondary_edges(request, lighting):
         return Term(False, why)
     moving, cut = required(request), _moving_alpha_edges(scene, request)
     if not cut and not any(name in MOVING for name in moving):
         return Term(False, "neither surfaces nor the camera move")
-    # The camera alone moves only borders that it sees.
+    # The camera alone moves only edges that it sees.
     kinds = lighting.bounces - 1 if cut or "verts" in moving else 1
-    samples = request.cameras * kinds * _most_bounce_samples(request)
+    samples = request.cameras * kinds * _most_secondary_samples(request)
     past = "edges and alpha edges" if _has_alpha(scene) else "edges"
     why = f"what surfaces see of one another: lines past {past}, each two rays, one to the camera and a path at its other end"
     if kinds > 1:
@@ -255,7 +257,7 @@ def _bounce_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
 
 
-def _secondary_borders(scene: Scene, request: Request, lighting: Lighting) -> Term:
+def _surface_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
     if why := _why_no_secondary_edges(request, lighting):
         return Term(False, why)
     crossings = "verts" in required(request) and has_intersections(request.scene)
@@ -265,7 +267,7 @@ def _secondary_borders(scene: Scene, request: Request, lighting: Lighting) -> Te
             False, "no faces that move pass through each other" + ", no alpha edges move on theirs" * _has_alpha(scene)
         )
     kinds = lighting.bounces - 1
-    samples = request.cameras * kinds * max(_most_bounce_samples(request) // 4, 256)
+    samples = request.cameras * kinds * max(_most_secondary_samples(request) // 4, 256)
     where = " and ".join(["where faces pass through each other"] * crossings + ["at alpha edges"] * cut)
     why = f"light that surfaces send next to curves {where}: up to 8 rays for each place, each with a path and one to the camera"
     return Term(True, why, samples=samples, bytes=8 * samples * CURVE_BYTES)
@@ -281,7 +283,7 @@ def _moving_alpha_edges(scene: Scene, request: Request) -> bool:
     return _has_alpha(scene) and any(name in ("uvs", "alphas") for name in required(request))
 
 
-def _most_bounce_samples(request: Request) -> int:
+def _most_secondary_samples(request: Request) -> int:
     each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
     return each if each >= 0 else core.default_secondary_samples(*size, request.image.spp)
 
@@ -323,13 +325,13 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
 
 def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None = None) -> dict[str, Term]:
     flat, camera, B = request.scene, request.camera, request.cameras
-    work = Work.of(request, wanted)
+    work = WantedTerms.from_request(request, wanted)
     moves = any(name in wanted for name in MOVING)
 
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
     with image_memory(request):
         ones = flat.colors.new_ones((B, camera.height, camera.width, request.channels))
-    hits = Hits(
+    hits = HitBuffers(
         ones[..., 0].contiguous(),
         ones.new_full(ones.shape[:-1], math.inf, dtype=torch.float32),
         flat.faces.new_zeros((*ones.shape[:-1], 2), dtype=torch.int32),
@@ -342,9 +344,9 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
         for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "lens_boundary")
     )
     needs = core.gradient_bytes(
-        pass_size(request), motion=work.motion, boundary=work.boundary, steps=work.steps, wanted=list(wanted),
+        pass_size(request), motion=work.motion, boundary=work.boundary, discontinuities=work.discontinuities, wanted=list(wanted),
         surface_samples=surface, edge_samples=edge, curves=silhouettes + creases,
-        intersections=intersections, step_lines=counts["step_lines"],
+        intersections=intersections, discontinuity_lines=counts["discontinuity_lines"],
     )  # fmt: skip
 
     needs = {**needs, "view": needs.get("view", 0) + ones.nbytes}
@@ -363,10 +365,10 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     reasons = [label(name) for name in ("colors", "uvs", "texels") if name in wanted]
     reasons += ["radiance varies over faces that move"] if work.motion else []
 
-    has_steps, lines, unseen = flat.has_steps, counts["step_lines"], "none in view"
-    no_steps = "" if work.steps else "no face is cut out, and no nearest texels"
-    if not work.steps and has_steps:
-        no_steps = "nothing that moves them" if request.gradient.visibility else "visibility=False"
+    has_discontinuities, lines, unseen = flat.has_discontinuities, counts["discontinuity_lines"], "none in view"
+    no_discontinuities = "" if work.discontinuities else "no alpha edge, and no nearest texels"
+    if not work.discontinuities and has_discontinuities:
+        no_discontinuities = "nothing that moves them" if request.gradient.visibility else "visibility=False"
     topology = "edges, found once for a set of faces"
     inside = ", ".join(reasons) + _bound(surface, counts["surface_wanted"])
     jumps = "what moves shows where radiance jumps" + _bound(edge, counts["edge_wanted"])
@@ -381,7 +383,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
         "creases": term(creases, no_boundary, f"{creases:,} in view", "nothing jumps between neighbours", "creases"),
         "intersections": term(intersections, no_boundary, f"{intersections:,} in view", unseen, "intersections"),
         "lens boundary": term(lens_boundary, no_boundary or no_lens_boundary, lens, "no lens ends in view"),
-        "steps": term(lines, no_steps, f"on {lines:,} lines over faces", unseen, "steps"),
+        "discontinuities": term(lines, no_discontinuities, f"on {lines:,} lines over faces", unseen, "discontinuities"),
     }
     for name in SLOTS:
         why = "required; summed in double" if name in wanted else "not required"

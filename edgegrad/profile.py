@@ -27,10 +27,10 @@ from .scene.tree import map_tensors, tensors_in
 # The kernel measures these parts, in the order of a step.
 _PARTS = (
     "update", "forward", "view", "surface measure", "surface rays", "surface scatter", "curves", "edge rays",
-    "edge scatter", "step rays", "step scatter", "world",
+    "edge scatter", "discontinuity rays", "discontinuity scatter", "world",
 )  # fmt: skip
 # These are the parts where points are shaded: in lit scenes, and around mipmaps.
-_SHADED = ("image", "samples", "surface shading", "edge shading", "steps", "shadows", "backward")
+_SHADED = ("image", "samples", "surface shading", "edge shading", "discontinuities", "shadows", "backward")
 _BAR = 24  # characters of a bar of 100 %
 
 
@@ -42,7 +42,7 @@ class Profile(Mapping[str, float]):
         view             vertices in the image, the importance map of the loss, and the background's gradient
         surface …        triangles laid end to end; samples and their rays; adding what they found
         curves, edge …   the same at edges
-        step …           the same at discontinuities within faces
+        discontinuity …  the same at discontinuities within faces
         world            from camera coordinates to the user's arrays
         python           all the rest: checks and copies of tensors
 
@@ -52,7 +52,8 @@ class Profile(Mapping[str, float]):
         samples            of the gradient, inside faces and at edges, and their rays
         surface shading    inside faces
         edge shading       on both sides of edges
-        steps, shadows     finding, and shading on both sides of, borders of nearest texels and of shadows
+        discontinuities    finding, and shading on both sides of, texel edges
+        shadows            the same of shadow boundaries
         backward           what autograd runs
         python             all the rest
     """
@@ -142,7 +143,7 @@ def profile(
     seconds = {part: statistics.median(run[part] for run in runs) for part in (*_PARTS, "python")}
     samples = {
         "image_samples": adjoint.shape[:-1].numel() * request.image.spp,
-        **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "step_lines", *CURVES)},
+        **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "discontinuity_lines", *CURVES)},
     }
     return Profile(seconds, samples)
 

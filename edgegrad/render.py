@@ -22,9 +22,9 @@ from .kernel.autograd import render_image
 from .kernel.batch import render_images
 from .kernel.operators import forward_kernel, screen_gradient_kernel
 from .kernel.request import Request, make_request
+from .light.lit_operator import lit_image
 from .light.radiance import LIGHTING, Lighting, check_unlit
 from .light.unused_options import warn_of_unused
-from .light.whole import lit_image
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
 from .scene.tree import map_tensors, savable, tensors_in
@@ -86,7 +86,7 @@ def render(
                      edges if it asked for `face` or `barycentrics`); True, at all; False, at none
     check_shader     asks the shader twice, the second time with half of the points in another order, and compares
     step_spacing     px between the lines along which steps within faces are looked for: those that a shader declares, of which
-                     two borders that lie closer may be missed; alpha_edges of what alpha cuts out, and borders of nearest texels.
+                     two borders that lie closer may be missed; alpha edges, and borders of nearest texels.
                      Closer lines cost more and err less
     shadows          of lit scenes: False lets light pass through everything
     light_samples    of lit scenes: points drawn of each light that has an extent, for each point that is shaded. Of a face in a
@@ -127,7 +127,7 @@ def render(
     return image.to(scene.meshes[0].verts.device)
 
 
-SMALL = 1 << 22  # samples of an image, up to which one thread an image is better than all of them
+SAMPLES_OF_SMALL_IMAGE = 1 << 22  # samples of an image, up to which one thread an image is better than all of them
 
 
 def render_batch(
@@ -205,7 +205,7 @@ def _is_small(camera: Camera, spp: int) -> bool:
     """And without a lens that may fold, of which a warning would have to find the caller's line."""
     height, width = camera.size
     known = values_visible(camera.coefficients)
-    return height * width * spp <= SMALL and known and not bool(camera.coefficients.any())
+    return height * width * spp <= SAMPLES_OF_SMALL_IMAGE and known and not bool(camera.coefficients.any())
 
 
 @overload

@@ -1,11 +1,11 @@
-"""Images of shaders written in PyTorch, with gradients of what moves at silhouettes and at declared steps.
+"""Images of shaders written in PyTorch, with gradients of what moves at silhouettes and at declared discontinuities.
 
 The value of the image and its gradient come from different samples. Those of the image are shaded without a graph, several of a
-face where borders of steps run through a pixel. Terms are attached to it of which only the derivatives count (points/splat.py):
+face where discontinuities run through a pixel. Terms are attached to it of which only the derivatives count (points/splat.py):
 
 - samples inside faces, shaded with a graph, at points that move with the scene while their pixel stays;
 - samples on curves, shaded without a graph on both sides; the jump multiplies the curve's velocity;
-- samples on the steps that the shader declares.
+- samples on the discontinuities that the shader declares.
 
 All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
 """
@@ -28,16 +28,16 @@ from .kernel.derivatives import differentiates, moves, transformed
 from .kernel.request import LEAST_SPACING, Request, derived_seed
 from .points.background import environments
 from .points.blend import Blended, let_through, transparent
-from .points.borders import Borders
 from .points.discontinuities import UNEQUAL
 from .points.discontinuity_terms import DiscontinuityTerms
-from .points.frame import Frame
+from .points.discontinuous_pixels import DiscontinuousPixels
 from .points.hits import Hits
-from .points.records import PixelRecords, without_colors
+from .points.image_context import ImageContext
+from .points.records import PixelRecords, with_attributes
 from .points.sampler import shaded_memory
 from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
-from .points.splat import Term, boundary
+from .points.splat import SplatTerm, boundary
 from .points.surfaces import every_face
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene
@@ -46,7 +46,7 @@ from .warnings import warn
 Shader = Callable[[Hits], Tensor]
 
 # Points that a shader is given at once: with three layers of 64 numbers each takes some kilobytes.
-AT_ONCE = 1 << 17
+POINTS_AT_ONCE = 1 << 17
 # So many samples of a pixel on one face are shaded at one of them: a face once at the usual number, and more often the more
 # there are, so that what shading leaves of noise falls with them too.
 SAMPLES_A_POINT = 16
@@ -68,14 +68,16 @@ class ShadingTraits(NamedTuple):
     glossy: bool = False
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
-    closer: float = 1.0  # by which lines that look for steps lie closer, for what is shaded next to them is noisy
+    closer: float = (
+        1.0  # by which lines that look for discontinuities lie closer, for what is shaded next to them is noisy
+    )
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     discontinuity_margin: float = 0.0  # how far from a discontinuity its sides are shaded
 
     @property
     def at_once(self) -> int:
         """Return points of the image that are shaded together."""
-        return 2 * AT_ONCE if self.keeps_little else AT_ONCE
+        return 2 * POINTS_AT_ONCE if self.keeps_little else POINTS_AT_ONCE
 
 
 class Radiance:
@@ -87,18 +89,18 @@ class Radiance:
         """Return the radiance (N, C)."""
         raise NotImplementedError
 
-    def image(self, frame: Frame) -> Tensor | None:
+    def image(self, context: ImageContext) -> Tensor | None:
         """Return the image (H · W, C) before black by one call of the kernel, or None: then points are shaded one by one."""
         return None
 
     def declare(self, hits: Hits) -> None:
         """Declare the discontinuities without shading."""
 
-    def near_field(self, frame: Frame, hits: Hits) -> tuple[float, Tensor] | None:
+    def near_field(self, context: ImageContext, hits: Hits) -> tuple[float, Tensor] | None:
         """Return how near light changes as samples slide on faces, and that change (N, C); see light/near_field.py."""
         return None
 
-    def indirect(self, frame: Frame, watch: Watch) -> list[Term]:
+    def indirect(self, context: ImageContext, watch: Watch) -> list[SplatTerm]:
         """Return the terms of samples on the borders of light that surfaces scatter to one another."""
         return []
 
@@ -133,7 +135,7 @@ def render_shaded(
     traits = traits or ShadingTraits(shaded_points(request.image.spp), blended=scene.blends)
     with shaded_memory(request, textured=traits.lit and scene.textured_faces is not None):
         images = [
-            _Image(Frame(scene, request, k), radiance, creases, check, traits, watch).render()
+            _Image(ImageContext(scene, request, k), radiance, creases, check, traits, watch).render()
             for k in range(request.cameras)
         ]
     return images[0] if camera.batch is None else torch.stack(images)
@@ -157,25 +159,25 @@ class _Image:
 
     def __init__(
         self,
-        frame: Frame,
+        context: ImageContext,
         radiance: Radiance,
         creases: bool | str,
         check: bool,
         traits: ShadingTraits,
         watch: Watch = Watch(),  # noqa: B008  it keeps nothing
     ) -> None:
-        self._frame, self._creases, self._check, self._traits, self._watch = frame, creases, check, traits, watch
+        self._context, self._creases, self._check, self._traits, self._watch = context, creases, check, traits, watch
         self._radiance = radiance
         # (C,) or (H, W, C): the scene's background, or the environments that it shows. Found here, where derivatives are
         # enabled if they are asked for; the values of an image are found without.
-        background = frame.surfaces.scene.background
-        self._behind_all = environments(frame) if background is None else background
+        background = context.surfaces.scene.background
+        self._behind_all = environments(context) if background is None else background
         self._shader: Shader = radiance
         if traits.blended:
-            self._shader = Blended(frame, radiance, self._behind_all)
-            frame.sampler.transparent = transparent(frame.surfaces)
+            self._shader = Blended(context, radiance, self._behind_all)
+            context.sampler.transparent = transparent(context.surfaces)
         self._channels: int | None = None
-        self._kinds: list[str] | None = None  # of the steps that the shader declares
+        self._kinds: list[str] | None = None  # of the discontinuities that the shader declares
         self.discontinuities_move = radiance.declares_discontinuities  # whether one of their functions has a derivative
 
     def render(self) -> Tensor:
@@ -185,85 +187,85 @@ class _Image:
         if not differentiates():
             return image
         if self._radiance.declares_discontinuities:
-            none = self._frame.no_hits
+            none = self._context.no_hits
             self._radiance.declare(none)
             self._kinds = list(none._discontinuities.kinds)
-        frame = self._frame
-        visibility = frame.request.gradient.visibility
-        moving = visibility and moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
-        flat = frame.request.scene
-        cut = visibility and flat.has_steps and (moving or moves(flat.uvs, flat.alphas))
+        context = self._context
+        visibility = context.request.gradient.visibility
+        moving = visibility and moves(context.surfaces.verts, context.view.world_to_camera, context.intrinsics)
+        flat = context.request.scene
+        cut = visibility and flat.has_discontinuities and (moving or moves(flat.uvs, flat.alphas))
         with watch.part("samples"):
-            surface, curves = frame.sampler.samples(
+            surface, curves = context.sampler.samples(
                 self._with_creases(),
                 interior=True,
                 boundary=moving,
-                intrinsics=moves(frame.intrinsics),
-                steps=cut,
-                lit=frame.surfaces.scene if self._traits.lit else None,
+                intrinsics=moves(context.intrinsics),
+                discontinuities=cut,
+                lit=context.surfaces.scene if self._traits.lit else None,
                 importance=_where_bright(image) if self._traits.glossy else None,
             )
         watch.count("surface_samples", len(surface.x))
         with watch.part("surface shading"):
-            terms = self._interior(SurfaceSamples(frame, surface))
+            terms = self._interior(SurfaceSamples(context, surface))
         if moving or cut:
             watch.count("edge_samples", len(curves.x))
             with watch.part("edge shading"):
-                terms += self._boundary(EdgeSamples(frame, curves))
+                terms += self._boundary(EdgeSamples(context, curves))
         if visibility and self._kinds and self.discontinuities_move:
-            with watch.part("steps"):
+            with watch.part("discontinuities"):
                 declare = self._radiance.declare if self._radiance.declares_discontinuities else self._shade
                 margin = self._traits.discontinuity_margin
                 found = DiscontinuityTerms(
-                    frame, self._kinds, self._shade, declare, AT_ONCE, self._step_spacing, margin
+                    context, self._kinds, self._shade, declare, POINTS_AT_ONCE, self._step_spacing, margin
                 )
                 terms += found.found(watch)
         if visibility:
             with watch.part("shadows"):
                 terms += self._shadows()
-            terms += self._radiance.indirect(frame, watch)
-        return frame.attached(image, terms)
+            terms += self._radiance.indirect(context, watch)
+        return context.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
 
     def _values(self) -> Tensor:
         """Return the image, without a graph of its surfaces."""
-        frame = self._frame
+        context = self._context
         with torch.no_grad():
-            image = self._radiance.image(frame)
+            image = self._radiance.image(context)
             if image is None:
                 image = self._point_by_point()
             self._channels = image.shape[1]
-        return frame.composed(image, self._background)
+        return context.composed(image, self._background)
 
     def _point_by_point(self) -> Tensor:
         """Return (H · W, C) what surfaces add to the image."""
-        frame = self._frame
+        context = self._context
         points = self._traits.points
-        borders = Borders((frame.height, frame.width), points)
+        discontinuous = DiscontinuousPixels((context.height, context.width), points)
         parts: list[Tensor] = []
-        for pixels, found in frame.sampler.pixel_hits(self._traits.at_once, points):
-            seeds = frame.seeds_of_pixels("image", found.pixel, points)
+        for pixels, found in context.sampler.pixel_hits(self._traits.at_once, points):
+            seeds = context.seeds_of_pixels("image", found.pixel, points)
             sums, hits = self._shaded(found, pixels, seeds)
             parts.append(sums)
-            borders.add(found.pixel, hits)
+            discontinuous.add(found.pixel, hits)
         image = torch.cat(parts)
-        again, most = borders.found() if frame.request.image.spp > 1 else (None, 1)
+        again, most = discontinuous.found() if context.request.image.spp > 1 else (None, 1)
         if again is None or not bool(again.any()):
             return image
         parts = []
-        for pixels, found in frame.sampler.pixel_hits(self._traits.at_once, most, again):
-            seeds = frame.seeds_of_pixels("image again", found.pixel, most)
+        for pixels, found in context.sampler.pixel_hits(self._traits.at_once, most, again):
+            seeds = context.seeds_of_pixels("image again", found.pixel, most)
             parts.append(self._shaded(found, pixels, seeds)[0])
-        return torch.where(frame.here(again).reshape(-1, 1), torch.cat(parts), image)
+        return torch.where(context.here(again).reshape(-1, 1), torch.cat(parts), image)
 
     def _shaded(self, found: PixelRecords, pixels: range, seeds: Tensor) -> tuple[Tensor, Hits]:
         """Return (pixels, C) what hits add to the image, and the hits."""
-        frame = self._frame
-        hits = frame.fixed_hits(found.face, found.b, found.x, seeds)
+        context = self._context
+        hits = context.fixed_hits(found.face, found.b, found.x, seeds)
         radiance = self._shade(hits).detach()
-        weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
-        return frame.image(found.pixel, weighted, pixels), hits
+        weighted = radiance * context.here(found.weight).to(radiance.dtype)[:, None]
+        return context.image(found.pixel, weighted, pixels), hits
 
     @cached_property
     def _background(self) -> Tensor | None:
@@ -273,13 +275,13 @@ class _Image:
             raise ValueError(
                 f"shader: expected as many channels as the background has, {background.shape[-1]}, got {self._channels}"
             )
-        return None if background is None else background.to(self._frame.dtype)
+        return None if background is None else background.to(self._context.dtype)
 
     # -- what its derivatives are those of ----------------------------------------------------------------------------
 
-    def _interior(self, samples: SurfaceSamples) -> list[Term]:
+    def _interior(self, samples: SurfaceSamples) -> list[SplatTerm]:
         """Return the terms Σ k(x − c) L px² over samples inside faces."""
-        terms: list[Term] = []
+        terms: list[SplatTerm] = []
         at_once = self._traits.at_once
         # Once at least, so that an image with nothing in view has a graph too, of zeros.
         for first in range(0, max(len(samples), 1), at_once):
@@ -289,7 +291,7 @@ class _Image:
                 # Hits of its own each time, for these keep what was computed from them.
                 hits = samples.part(first, first + at_once).hits
                 hits._needs_values = not self._traits.gives_derivatives
-                if (change := self._radiance.near_field(self._frame, hits)) is None:
+                if (change := self._radiance.near_field(self._context, hits)) is None:
                     return self._shade(hits)
                 hits._near, term = change
                 return self._shade(hits) + term
@@ -301,31 +303,33 @@ class _Image:
             terms.append(some._term(L))
         return terms
 
-    def _shadows(self) -> list[Term]:
+    def _shadows(self) -> list[SplatTerm]:
         """Return the terms of samples on the boundaries of the shadows that the shader asked for."""
-        frame = self._frame
-        terms: list[Term] = []
-        count, flat = frame.request.gradient.edge_samples, frame.surfaces.casters
-        moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
+        context = self._context
+        terms: list[SplatTerm] = []
+        count, flat = context.request.gradient.edge_samples, context.surfaces.casters
+        moving = moves(context.surfaces.verts, context.view.world_to_camera, context.intrinsics)
         if len(flat.alpha_masks) and moves(flat.alphas, flat.uvs):
             moving = True
-            _warn_of_lights(frame)
-        for index in sorted(frame.surfaces.shadowing):
-            seed = derived_seed(frame.sampler.grad_seed, index + 2)
-            light = ShadowLight.from_surfaces(frame.surfaces, index, seed)
+            _warn_of_lights(context)
+        for index in sorted(context.surfaces.shadowing):
+            seed = derived_seed(context.sampler.grad_seed, index + 2)
+            light = ShadowLight.from_surfaces(context.surfaces, index, seed)
             if moving or ShadowLight.moves(light.light):
                 one = self._traits.additive
-                casters = frame.fixed.casters if frame.surfaces.scene.blends else None
-                records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one, casters)
+                casters = context.fixed.casters if context.surfaces.scene.blends else None
+                records = context.sampler.shadow_samples(
+                    light.parts, seed, count, moves(context.intrinsics), one, casters
+                )
                 self._watch.count("shadow_samples", len(records.x))
                 if len(records.x):
-                    terms += self._boundary(EdgeSamples(frame, records, light, one))
+                    terms += self._boundary(EdgeSamples(context, records, light, one))
         return terms
 
-    def _boundary(self, samples: EdgeSamples) -> list[Term]:
+    def _boundary(self, samples: EdgeSamples) -> list[SplatTerm]:
         """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
         at_once = self._traits.at_once
-        parts = [self._frame.fixed.verts.new_zeros((0, self._channels or 1))]
+        parts = [self._context.fixed.verts.new_zeros((0, self._channels or 1))]
         with torch.no_grad():
             for first in range(0, len(samples.hits), at_once):
                 points = samples.hits
@@ -334,24 +338,24 @@ class _Image:
                 parts.append(self._shade(points).detach())
             jump, to_background = samples.sum(torch.cat(parts[1:] or parts)), samples.to_background
             if self._traits.blended:
-                through = let_through(self._frame, samples._records)
+                through = let_through(self._context, samples._records)
                 jump, to_background = through[:, None].to(jump) * jump, through * to_background
         return boundary(samples.x, samples.velocity, jump, to_background, self._background)
 
     @property
     def _step_spacing(self) -> float:
-        return max(self._frame.request.gradient.step_spacing / self._traits.closer, LEAST_SPACING)
+        return max(self._context.request.gradient.step_spacing / self._traits.closer, LEAST_SPACING)
 
     def _with_creases(self) -> Request:
         """Return the request for samples on curves, with colours that jump where the shader may."""
-        frame = self._frame
+        context = self._context
         with torch.no_grad():
             if self._creases is True:
-                attributes = every_face(len(frame.fixed.faces))
+                attributes = every_face(len(context.fixed.faces))
             else:
-                attributes = frame.fixed.crease_attributes().cpu() if self._creases else None
-        gradient = frame.request.gradient._replace(step_spacing=self._step_spacing)
-        return frame.request._replace(scene=without_colors(frame.request.scene, attributes), gradient=gradient)
+                attributes = context.fixed.crease_attributes().cpu() if self._creases else None
+        gradient = context.request.gradient._replace(step_spacing=self._step_spacing)
+        return context.request._replace(scene=with_attributes(context.request.scene, attributes), gradient=gradient)
 
     # -- the shader ----------------------------------------------------------------------------------------------------
 
@@ -403,12 +407,12 @@ class _Image:
             raise ValueError(
                 f"{name}: expected finite numbers, got {radiance.detach()[row].tolist()} at one of {count} hits; look for {hint}"
             )
-        return radiance.to(self._frame.dtype)
+        return radiance.to(self._context.dtype)
 
 
-def _warn_of_lights(frame: Frame) -> None:
+def _warn_of_lights(context: ImageContext) -> None:
     """Warn of emissive meshes of which alpha cuts out some faces or parts, not all or nothing."""
-    lights = (light.mesh for light in frame.surfaces.scene.casting if isinstance(light, MeshLight))
+    lights = (light.mesh for light in context.surfaces.scene.casting if isinstance(light, MeshLight))
     for mesh in lights:
         if mesh.alpha is None or mesh.uvs is None or not moves(mesh.alpha, mesh.uvs) or not values_visible(mesh.alpha):
             continue

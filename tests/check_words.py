@@ -42,15 +42,15 @@ EXCEPTIONS = {
     "floor": """
         csrc/boundary/curve.h csrc/boundary/discontinuity_finder.h csrc/camera/sub_cameras.cpp
         csrc/camera/wide_fisheye.cpp csrc/estimator/view.h csrc/film/film.h csrc/film/importance.h
-        csrc/interior/surface_measure.cpp csrc/primary/coincident_segments.h csrc/primary/crease_control.cpp
+        csrc/interior/pixel_mask.h csrc/primary/coincident_segments.h csrc/primary/crease_control.cpp
         csrc/raster/rasterize.cpp csrc/raster/sample_texture.cpp csrc/raster/texels.h csrc/scene/topology.cpp
         csrc/secondary/alpha_edges.h csrc/secondary/lune.h csrc/shading/lit/environment.h csrc/texture/texture.cpp
         csrc/texture/texture.h edgegrad/bop/depth.py edgegrad/bop/refine.py edgegrad/files/curve.py
         edgegrad/files/formats/off.py edgegrad/files/formats/ply_elements.py edgegrad/fit/plots.py
         edgegrad/fit/pose/photo/level.py edgegrad/fit/pose/photo/match.py edgegrad/light/near_field.py
-        edgegrad/points/blend.py edgegrad/points/borders.py edgegrad/points/hits.py edgegrad/points/pyramid.py
+        edgegrad/points/blend.py edgegrad/points/discontinuous_pixels.py edgegrad/points/hits.py edgegrad/points/pyramid.py
         edgegrad/points/discontinuity_terms.py edgegrad/points/discontinuities.py edgegrad/raster/exact.py edgegrad/render.py
-        edgegrad/scene/environment.py edgegrad/scene/texel_borders.py edgegrad/scene/textures.py
+        edgegrad/scene/environment.py edgegrad/scene/texel_edges.py edgegrad/scene/textures.py
         """,
     "looks": """
         edgegrad/camera/convention_warnings.py edgegrad/fit/row_order.py

@@ -13,14 +13,14 @@ namespace edgegrad {
 
 namespace {
 
-// InImage holds what all sub-cameras share of the image and its adjoint.
+// WholeImage holds what all sub-cameras share of the image and its adjoint.
 template <class T>
-struct InImage {
+struct WholeImage {
     FilteredAdjoint<T> filtered;
     Importance importance;
     OcclusionHint occlusion;
 
-    InImage(const BackwardInput<T>& input, ThreadTeam& team)
+    WholeImage(const BackwardInput<T>& input, ThreadTeam& team)
         : filtered(input.adjoint, input.scene, input.image.filter, input.camera.width, input.camera.height),
           importance(input.importance_map ? input.importance_map : input.adjoint, input.camera.width,
                      input.camera.height, input.importance_map ? 1 : input.scene.channels, margin_of(input.image), team,
@@ -33,11 +33,11 @@ struct InImage {
 
 // Calls body(view) with what all terms share for one sub-camera.
 template <class T>
-void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
+void with_view(const BackwardInput<T>& input, const Camera& camera, const WholeImage<T>& whole_image,
                const GradientOptions& o, const Terms& terms, ThreadTeam& team, const ViewBody<T>& body) {
     const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed, transparent, importance_map] = input;
-    const auto& [filtered, importance, occlusion] = in_image;
-    const ViewVolume volume(camera, InImage<T>::margin_of(image));
+    const auto& [filtered, importance, occlusion] = whole_image;
+    const ViewVolume volume(camera, WholeImage<T>::margin_of(image));
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
     std::optional<AlphaMasks<T>> alpha_masks;
     if (scene.alpha_masks.face) alpha_masks.emplace(scene, camera, vertices.q.data());
@@ -79,8 +79,9 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
 // sub-camera that wants any gets some, because it alone shows its part.
 template <class T>
 std::vector<GradientOptions> options_of_sub_cameras(const BackwardInput<T>& input,
-                                                    const std::vector<Camera>& sub_cameras, const InImage<T>& in_image,
-                                                    const GradientOptions& o, const Terms& terms, ThreadTeam& team) {
+                                                    const std::vector<Camera>& sub_cameras,
+                                                    const WholeImage<T>& whole_image, const GradientOptions& o,
+                                                    const Terms& terms, ThreadTeam& team) {
     std::vector<GradientOptions> options(sub_cameras.size(), o);
     for (size_t k = 1; k < sub_cameras.size(); ++k) options[k].seed = hash(o.seed, k, gradient_stream + 1);
     if (sub_cameras.size() == 1 || o.pixel_spp) return options;
@@ -89,7 +90,7 @@ std::vector<GradientOptions> options_of_sub_cameras(const BackwardInput<T>& inpu
     std::vector<SampleCounts> wanted(sub_cameras.size());
     SampleCounts all;
     for (size_t k = 0; k < sub_cameras.size(); ++k)
-        with_view<T>(input, sub_cameras[k], in_image, counted, terms, team, [&](const BackwardView<T>& view) {
+        with_view<T>(input, sub_cameras[k], whole_image, counted, terms, team, [&](const BackwardView<T>& view) {
             wanted[k] = wanted_samples(view, terms);
             all.surface += wanted[k].surface, all.edge += wanted[k].edge;
         });
@@ -111,18 +112,19 @@ std::vector<GradientOptions> options_of_sub_cameras(const BackwardInput<T>& inpu
 template <class T>
 void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, ThreadTeam& team,
                const std::type_identity_t<ViewBody<T>>& body) {
-    const std::vector<Camera> sub_cameras = sub_cameras_for_points(input.camera, InImage<T>::margin_of(input.image));
-    const InImage<T> in_image(input, team);
-    const std::vector<GradientOptions> options = options_of_sub_cameras(input, sub_cameras, in_image, o, terms, team);
+    const std::vector<Camera> sub_cameras = sub_cameras_for_points(input.camera, WholeImage<T>::margin_of(input.image));
+    const WholeImage<T> whole_image(input, team);
+    const std::vector<GradientOptions> options =
+        options_of_sub_cameras(input, sub_cameras, whole_image, o, terms, team);
     for (size_t k = 0; k < sub_cameras.size(); ++k)
-        with_view(input, sub_cameras[k], in_image, options[k], terms, team, body);
+        with_view(input, sub_cameras[k], whole_image, options[k], terms, team, body);
 }
 
 template <class T>
 void with_any_sub_camera(const BackwardInput<T>& input, const GradientOptions& o, ThreadTeam& team,
                          const std::type_identity_t<ViewBody<T>>& body) {
-    const Camera sub_camera = sub_cameras_for_points(input.camera, InImage<T>::margin_of(input.image)).front();
-    with_view<T>(input, sub_camera, InImage<T>(input, team), o, Terms{}, team, body);
+    const Camera sub_camera = sub_cameras_for_points(input.camera, WholeImage<T>::margin_of(input.image)).front();
+    with_view<T>(input, sub_camera, WholeImage<T>(input, team), o, Terms{}, team, body);
 }
 
 #define EDGEGRAD_INSTANTIATE(T)                                                                         \

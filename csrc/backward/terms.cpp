@@ -16,19 +16,20 @@ namespace edgegrad {
 
 namespace {
 
-// Measured holds where the terms sample, and how often.
+// TermMeasures holds where the terms sample, and how often.
 template <class T>
-struct Measured {
+struct TermMeasures {
     std::optional<SurfaceMeasure<T>> surface;
     std::optional<Curves<T>> curves;
     SampleCounts wanted;
 };
 
 template <class T>
-Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, GradientSink& to, BackwardProfile& profile) {
+TermMeasures<T> measure_terms(const BackwardView<T>& view, const Terms& terms, GradientSink& to,
+                              BackwardProfile& profile) {
     const GradientOptions& o = view.options;
     Stopwatch watch;
-    Measured<T> out;
+    TermMeasures<T> out;
     Array<int8_t> facing(terms.boundary ? view.scene.n_faces : 0);
     if (terms.interior()) {
         out.surface.emplace(measure_surface(view, terms.motion, facing, to));
@@ -79,7 +80,7 @@ void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const
         return;
     }
     // Both terms are measured before samples are drawn, since they share a budget.
-    Measured<T> measured = measure_terms(view, terms, to, profile);
+    TermMeasures<T> measured = measure_terms(view, terms, to, profile);
     const SampleCounts n = within_budget(input, o, measured.wanted, view.team);
     if (measured.surface) add_interior(view, *measured.surface, n.surface, accumulation, to, profile);
     if (Curves<T>* curves = measured.curves ? &*measured.curves : nullptr) {

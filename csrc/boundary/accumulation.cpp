@@ -53,7 +53,7 @@ class ReverseBoundary final : public CurveAccumulation {
     bool wants(int i, Vec2 x) override { return radiance_.wants(i, x); }
 
    private:
-    void contract(int i, MovingSample& sample) override { sample.add_motion(radiance_.jumps(i, sample), grad_); }
+    void accumulate(int i, MovingSample& sample) override { sample.add_motion(radiance_.jumps(i, sample), grad_); }
 
     AdjointRadiance<N, T> radiance_;
     LocalGradients& grad_;
@@ -74,7 +74,7 @@ class ForwardBoundary final : public CurveAccumulation {
     bool wants(int, Vec2) override { return true; }
 
    private:
-    void contract(int, MovingSample& sample) override {
+    void accumulate(int, MovingSample& sample) override {
         const SampleSurfaces surfaces = sample.surfaces();
         for (int k = 0; k < surfaces.count; ++k)
             if (const SurfacePoint& p = surfaces.at[k]; p.face >= 0)
@@ -115,7 +115,7 @@ class ScreenBoundary final : public CurveAccumulation {
     bool wants(int i, Vec2 x) override { return radiance_.wants(i, x); }
 
    private:
-    void contract(int i, MovingSample& sample) override {
+    void accumulate(int i, MovingSample& sample) override {
         const CurveJumps jumps = radiance_.jumps(i, sample);
         const Vec2 moved = (jumps.first + jumps.second) * sample.normal();
         grad_.pixels.template add<2>(view_.pixel(sample.x()), &moved.x);
@@ -140,7 +140,7 @@ class BoundaryRecorder final : public CurveAccumulation {
    private:
     static_assert(CurveRecords::surfaces == SampleSurfaces::most);
 
-    void contract(int, MovingSample& sample) override {
+    void accumulate(int, MovingSample& sample) override {
         const SampleSurfaces surfaces = sample.surfaces();
         double first[CurveRecords::surfaces] = {}, second[CurveRecords::surfaces] = {};
         for (int k = 0; k < surfaces.count; ++k) {

@@ -64,11 +64,11 @@ class CurveAccumulation {
     template <MovingCurve Source>
     void add(int i, Source& source, typename Source::Sample& sample) {
         SampleOf<Source> moving(source, sample);
-        contract(i, moving);
+        accumulate(i, moving);
     }
 
    private:
-    virtual void contract(int i, MovingSample& sample) = 0;
+    virtual void accumulate(int i, MovingSample& sample) = 0;
 };
 
 // Makes the accumulation of one chunk of samples.

@@ -99,7 +99,7 @@ bool attributes_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdg
            rows_differ(a.vertex, a.vertex_width, vertex(scene, m, m.second()), vertex(scene, p, p.second()));
 }
 
-// Returns whether an edge runs exactly along a border of nearest texels. Other borders are discontinuities.
+// Returns whether an edge runs exactly along a texel edge. Other texel edges are discontinuities.
 template <class T>
 bool lies_between_texels(const SceneView<T>& scene, const HalfEdge& h) {
     if (!takes_nearest(scene, h.face)) return false;
@@ -223,7 +223,8 @@ class CurveFinder {
         const int32_t* const end =
             last < topology.n_edges() ? topology.faces(last).data() : topology.faces(last - 1).data();
         for (int64_t e = first; e < last; ++e) {
-            if (face + 2 * far < end) early_out.prefetch(face[2 * far]), early_out.prefetch(face[2 * far + 1]);
+            if (face + 2 * ahead_far < end)
+                early_out.prefetch(face[2 * ahead_far]), early_out.prefetch(face[2 * ahead_far + 1]);
             if (topology.joins_two(e)) [[likely]] {
                 const int32_t one = face[0], other = face[1];
                 face += 2;
@@ -241,22 +242,22 @@ class CurveFinder {
         if (!joins.empty()) {
             const size_t others = edges.size();
             for (size_t i = 0; i < joins.size(); ++i) {
-                if (i + 2 * far < joins.size()) prefetch_corners(joins[i + 2 * far]);
-                if (i + far < joins.size()) prefetch_values(joins[i + far]);
+                if (i + 2 * ahead_far < joins.size()) prefetch_corners(joins[i + 2 * ahead_far]);
+                if (i + ahead_far < joins.size()) prefetch_values(joins[i + ahead_far]);
                 if (carries_jump(joins[i])) edges.push_back(joins[i]);
             }
             std::inplace_merge(edges.begin(), edges.begin() + others, edges.end());
         }
         for (size_t i = 0; i < edges.size(); ++i) {
-            if (i + 2 * near < edges.size()) {
-                prefetch_faces(edges[i + 2 * near]);
-                if (jumps_) prefetch_corners(edges[i + 2 * near]);
+            if (i + 2 * ahead_near < edges.size()) {
+                prefetch_faces(edges[i + 2 * ahead_near]);
+                if (jumps_) prefetch_corners(edges[i + 2 * ahead_near]);
             }
-            if (i + near < edges.size()) {
-                prefetch_vertices(edges[i + near]);
-                if (jumps_) prefetch_values(edges[i + near]);
+            if (i + ahead_near < edges.size()) {
+                prefetch_vertices(edges[i + ahead_near]);
+                if (jumps_) prefetch_values(edges[i + ahead_near]);
             }
-            if (i + near / 2 < edges.size()) prefetch_place(edges[i + near / 2]);
+            if (i + ahead_near / 2 < edges.size()) prefetch_place(edges[i + ahead_near / 2]);
             body(edges[i]);
         }
     }
@@ -349,8 +350,9 @@ class CurveFinder {
     }
 
    private:
-    // Memory is prefetched this many edges ahead: `far` where little is done for each edge, `near` where more is.
-    static constexpr size_t far = 24, near = 4;
+    // Memory is prefetched this many edges ahead: `ahead_far` where little is done for each edge, `ahead_near` where
+    // more is.
+    static constexpr size_t ahead_far = 24, ahead_near = 4;
 
     void prefetch_corners(int64_t edge) const {
         for (const int32_t f : view_.geometry.topology().faces(edge)) {

@@ -54,7 +54,7 @@ class CurveSamples {
    private:
     // Returns the face that occludes the point; −1: none. `face` is what the cast found.
     int32_t hiding(typename Source::Sample& sample, int32_t face) const {
-        const int32_t hit = visibility_.beyond_float(sample, face);
+        const int32_t hit = visibility_.exact_hit(sample, face);
         return hit < 0 || visibility_.lies_behind(hit, source_.faces_of(sample), sample) ? -1 : hit;
     }
 

@@ -22,11 +22,11 @@ namespace edgegrad {
 // is affine in the texture coordinates near there. An alpha-tested face is opaque where F > 0.
 struct DiscontinuityCrossing {
     int32_t face = -1;
-    bool is_alpha_edge = false;  // whether it is an alpha edge; else a border of texels
+    bool is_alpha_edge = false;  // whether it is an alpha edge; else a texel edge
     bool vertical = false;       // whether the line is vertical
     Vec2 u;
     Vec2 slope;            // ∂F/∂uv
-    double side = 0;       // F on the two sides of a border of texels, ±; 0: F is α minus the cutoff
+    double side = 0;       // F on the two sides of a texel edge, ±; 0: F is α minus the cutoff
     Footprint alpha = {};  // texels and weights of F, where it is bilinear
 };
 
@@ -114,10 +114,10 @@ class DiscontinuityFinder {
                 return m != n && !std::equal(p, p + C, q);
             };
             if (texture.sampler.filter == TextureFilter::nearest)
-                each_border(texture, s, most, hash(random, 1), [&](const Border& border) {
-                    if (!differ(border.low, border.high)) return;
-                    at(border.tau), crossing.slope = border.slope, crossing.side = border.side;
-                    visit(crossing, border.weight);
+                each_texel_edge(texture, s, most, hash(random, 1), [&](const TexelEdgeCrossing& edge) {
+                    if (!differ(edge.low, edge.high)) return;
+                    at(edge.tau), crossing.slope = edge.slope, crossing.side = edge.side;
+                    visit(crossing, edge.weight);
                 });
         }
         if (!scene.alpha_masks.on(face_)) return;
@@ -125,11 +125,11 @@ class DiscontinuityFinder {
         const Texture<T> alpha = alpha_of(scene, face_);
         const double cutoff = cutoff_of(scene, face_);
         if (alpha.sampler.filter == TextureFilter::nearest) {
-            each_border(alpha, s, most, hash(random, 2), [&](const Border& border) {
-                const bool low = alpha.texels[border.low] >= cutoff, high = alpha.texels[border.high] >= cutoff;
+            each_texel_edge(alpha, s, most, hash(random, 2), [&](const TexelEdgeCrossing& edge) {
+                const bool low = alpha.texels[edge.low] >= cutoff, high = alpha.texels[edge.high] >= cutoff;
                 if (low == high) return;
-                at(border.tau), crossing.slope = (high ? 1.0 : -1.0) * border.slope, crossing.side = border.side;
-                visit(crossing, border.weight);
+                at(edge.tau), crossing.slope = (high ? 1.0 : -1.0) * edge.slope, crossing.side = edge.side;
+                visit(crossing, edge.weight);
             });
             return;
         }
@@ -200,15 +200,15 @@ class DiscontinuityFinder {
         return walk;
     }
 
-    // A Border is where the segment crosses a border between texels.
-    struct Border {
+    // A TexelEdgeCrossing is where the segment crosses a texel edge.
+    struct TexelEdgeCrossing {
         double tau, weight;
         int64_t low, high;  // texels on the side of the lower and higher coordinate
         Vec2 slope;         // derivative of that coordinate minus the border's, by uv
         double side;        // motion that is needed to be well within a texel
     };
     template <class Visit>
-    void each_border(const Texture<T>& texture, const Segment& s, int most, uint64_t random, Visit visit) const {
+    void each_texel_edge(const Texture<T>& texture, const Segment& s, int most, uint64_t random, Visit visit) const {
         const Walk walk = walk_of(texture, s, {}, most, random);
         double last_i = 0, last_j = 0;
         bool begun = false;
@@ -220,12 +220,13 @@ class DiscontinuityFinder {
                 const int64_t here = texel_at(texture, i, j).texel[0],
                               before = texel_at(texture, last_i, last_j).texel[0];
                 const double place = std::fabs(across ? i : j);
-                visit(Border{.tau = from,
-                             .weight = walk.weight,
-                             .low = up ? before : here,
-                             .high = up ? here : before,
-                             .slope = across ? Vec2{double(texture.width), 0} : Vec2{0, -double(texture.height)},
-                             .side = 0x1p-20 + 0x1p-44 * place});
+                visit(TexelEdgeCrossing{
+                    .tau = from,
+                    .weight = walk.weight,
+                    .low = up ? before : here,
+                    .high = up ? here : before,
+                    .slope = across ? Vec2{double(texture.width), 0} : Vec2{0, -double(texture.height)},
+                    .side = 0x1p-20 + 0x1p-44 * place});
             }
             begun = true, last_i = i, last_j = j;
         });

@@ -36,7 +36,7 @@ class Visibility {
     // repeatedly. An example is the diagonal of a box's front before an edge of its back. A ray that ignores the
     // refused face then misses the neighbour in single precision. Further rays are therefore moved off that face, by
     // the error of floats and by less, because the neighbour may be narrower than that.
-    int32_t beyond_float(const CurveSample& sample, int32_t face) const {
+    int32_t exact_hit(const CurveSample& sample, int32_t face) const {
         const Vec2 n = sample.sight;
         const auto decide = [&](int32_t f) {
             return lies_far_before(view_, f, sample.point.z) ? is_there(view_, f, n) : meets(view_, f, n);
@@ -48,7 +48,7 @@ class Visibility {
         for (int refused = 0; face >= 0 && !decide(face); ++refused) {
             // One ray decides on all faces where floats see hundreds of them in one place.
             if (refused == most_refused) {
-                face = view_.frame.beyond_float(n, face, ignored, decide);
+                face = view_.frame.exact_hit(n, face, ignored, decide);
                 break;
             }
             const Vec2 error = out_of(face, n);

@@ -13,19 +13,19 @@ Vec3 direction_of(Vec2 angles) {
 
 }  // namespace
 
-Equirectangular::Equirectangular(const double* K, const CubeFace& cube_face, const Place& place)
-    : cube_face_(cube_face), place_(place) {
+Equirectangular::Equirectangular(const double* K, const CubeFace& cube_face, const Branch& branch)
+    : cube_face_(cube_face), branch_(branch) {
     std::copy(K, K + 6, k_);
     const double det = k_[0] * k_[4] - k_[1] * k_[3], size = std::sqrt(std::fabs(det));
     inverse_[0] = k_[4] / det, inverse_[1] = -k_[1] / det, inverse_[2] = -k_[3] / det, inverse_[3] = k_[0] / det;
     // The image is mirrored over a pole.
-    scale_ = {size, (det < 0) != (place.over % 2 != 0) ? -size : size};
+    scale_ = {size, (det < 0) != (branch.over % 2 != 0) ? -size : size};
 }
 
 Vec2 Equirectangular::angles_at(Vec3 d) const {
     const double latitude = std::atan2(d.y, std::sqrt(d.x * d.x + d.z * d.z));
-    return {std::atan2(d.x, d.z) + M_PI * place_.across,
-            place_.over % 2 ? M_PI * place_.over - latitude : M_PI * place_.over + latitude};
+    return {std::atan2(d.x, d.z) + M_PI * branch_.across,
+            branch_.over % 2 ? M_PI * branch_.over - latitude : M_PI * branch_.over + latitude};
 }
 
 Vec2 Equirectangular::angles_of_pixel(Vec2 x) const {
@@ -44,7 +44,7 @@ Mat2 Equirectangular::jacobian(Vec2 n) const {
     const Vec3 d = cube_face_.direction(n);
     const double h2 = d.x * d.x + d.z * d.z, h = std::sqrt(h2), all = h2 + d.y * d.y;
     if (!(h2 > 0)) return {0, 0, 0, 0};
-    const double sign = place_.over % 2 ? -1 : 1;
+    const double sign = branch_.over % 2 ? -1 : 1;
     const Vec3 longitude = (1 / h2) * Vec3{d.z, 0, -d.x},
                latitude = (sign / all) * Vec3{-d.y * d.x / h, h, -d.y * d.z / h};
     const Vec3 along[2] = {cube_face_.rotation.row[0], cube_face_.rotation.row[1]};  // It is ∂d/∂n.
@@ -63,7 +63,7 @@ void Equirectangular::distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* k_bar) 
 }
 
 std::optional<Vec2> Equirectangular::undistort(Vec2 m) const {
-    const Vec2 a = angles_of_pixel({scale_.x * m.x, scale_.y * m.y}), from = place_.from, to = place_.to;
+    const Vec2 a = angles_of_pixel({scale_.x * m.x, scale_.y * m.y}), from = branch_.from, to = branch_.to;
     if (!(a.x >= from.x && a.x < to.x && a.y >= from.y && a.y < to.y)) return {};
     return cube_face_.place(direction_of(a));
 }
@@ -73,8 +73,8 @@ namespace {
 // Bounds the steps from a pixel's centre to its samples; larger ones would lose digits in the series below.
 constexpr double small_step = 0.06;
 
-// Holds what all samples of a pixel share.
-struct Near {
+// Holds the direction at a pixel's centre, around which the samples' directions are expanded in series.
+struct PixelExpansion {
     double to_angles[4];    // It maps m − m0 to angles.
     Vec2 m0, sine, cosine;  // They belong to both angles at m0.
     Vec2 from, to;          // They bound this position's angles, relative to those at m0.
@@ -91,8 +91,8 @@ struct Near {
     return 1 - s * 0.5 * (1 - s * (1.0 / 12) * (1 - s * (1.0 / 30) * (1 - s * (1.0 / 56))));
 }
 
-EDGEGRAD_VECTORIZED void undistort_samples(const Near& p, int k, double* x, double* y) {
-    const Near l = p;
+EDGEGRAD_VECTORIZED void undistort_samples(const PixelExpansion& p, int k, double* x, double* y) {
+    const PixelExpansion l = p;
     const Mat3 rotation = l.cube_face.rotation;
     const double open = l.cube_face.closed ? 0 : 1;
     constexpr double nan = std::numeric_limits<double>::quiet_NaN();
@@ -119,14 +119,15 @@ EDGEGRAD_VECTORIZED void undistort_samples(const Near& p, int k, double* x, doub
 }  // namespace
 
 void Equirectangular::undistort_near(Vec2 m0, int k, double* x, double* y) const {
-    Near near{{inverse_[0] * scale_.x, inverse_[1] * scale_.y, inverse_[2] * scale_.x, inverse_[3] * scale_.y},
-              m0,
-              {},
-              {},
-              {},
-              {},
-              cube_face_};
-    const double* A = near.to_angles;
+    PixelExpansion expansion{
+        {inverse_[0] * scale_.x, inverse_[1] * scale_.y, inverse_[2] * scale_.x, inverse_[3] * scale_.y},
+        m0,
+        {},
+        {},
+        {},
+        {},
+        cube_face_};
+    const double* A = expansion.to_angles;
     double farthest = 0;
     for (int i = 0; i < k; ++i) farthest = std::max({farthest, std::fabs(x[i] - m0.x), std::fabs(y[i] - m0.y)});
     const double step = farthest * std::max(std::fabs(A[0]) + std::fabs(A[1]), std::fabs(A[2]) + std::fabs(A[3]));
@@ -139,14 +140,14 @@ void Equirectangular::undistort_near(Vec2 m0, int k, double* x, double* y) const
         return;
     }
     const Vec2 a = angles_of_pixel({scale_.x * m0.x, scale_.y * m0.y});
-    near.sine = {std::sin(a.x), std::sin(a.y)}, near.cosine = {std::cos(a.x), std::cos(a.y)};
-    near.from = place_.from - a, near.to = place_.to - a;
-    undistort_samples(near, k, x, y);
+    expansion.sine = {std::sin(a.x), std::sin(a.y)}, expansion.cosine = {std::cos(a.x), std::cos(a.y)};
+    expansion.from = branch_.from - a, expansion.to = branch_.to - a;
+    undistort_samples(expansion, k, x, y);
 }
 
 // A step in the angles rotates a direction by at most its length.
 bool Equirectangular::may_show(Vec2 x, double reach) const {
-    const Vec2 a = angles_of_pixel(x), from = place_.from, to = place_.to;
+    const Vec2 a = angles_of_pixel(x), from = branch_.from, to = branch_.to;
     const Vec2 step{(std::fabs(inverse_[0]) + std::fabs(inverse_[1])) * reach,
                     (std::fabs(inverse_[2]) + std::fabs(inverse_[3])) * reach};
     if (a.x + step.x < from.x || a.x - step.x > to.x || a.y + step.y < from.y || a.y - step.y > to.y) return false;
@@ -155,9 +156,9 @@ bool Equirectangular::may_show(Vec2 x, double reach) const {
 
 Box2 Equirectangular::image_box(Box2 n) const {
     Box2 a = cube_face_.angles(n);
-    a.low.x += M_PI * place_.across, a.high.x += M_PI * place_.across;
-    const double shift = M_PI * place_.over;
-    const Vec2 y = place_.over % 2 ? Vec2{shift - a.high.y, shift - a.low.y} : Vec2{shift + a.low.y, shift + a.high.y};
+    a.low.x += M_PI * branch_.across, a.high.x += M_PI * branch_.across;
+    const double shift = M_PI * branch_.over;
+    const Vec2 y = branch_.over % 2 ? Vec2{shift - a.high.y, shift - a.low.y} : Vec2{shift + a.low.y, shift + a.high.y};
     Box2 out = Box2::empty();
     for (const double longitude : {a.low.x, a.high.x})
         for (const double latitude : {y.x, y.y})
@@ -180,9 +181,9 @@ std::optional<Box2> Equirectangular::cube_face_box(Box2 x) const {
     constexpr double rounding = 1e-12;  // It is a generous bound for angles.
     const Box2 seen = angles(k_, x);
     // These are λ and φ of what is seen.
-    Vec2 from{std::max(seen.low.x - M_PI * place_.across, -M_PI), seen.low.y - M_PI * place_.over};
-    Vec2 to{std::min(seen.high.x - M_PI * place_.across, M_PI), seen.high.y - M_PI * place_.over};
-    if (place_.over % 2) std::swap(from.y, to.y), from.y = -from.y, to.y = -to.y;
+    Vec2 from{std::max(seen.low.x - M_PI * branch_.across, -M_PI), seen.low.y - M_PI * branch_.over};
+    Vec2 to{std::min(seen.high.x - M_PI * branch_.across, M_PI), seen.high.y - M_PI * branch_.over};
+    if (branch_.over % 2) std::swap(from.y, to.y), from.y = -from.y, to.y = -to.y;
     from = {from.x - rounding, std::max(from.y, -0.5 * M_PI) - rounding};
     to = {to.x + rounding, std::min(to.y, 0.5 * M_PI) + rounding};
     if (!(from.x < to.x && from.y < to.y)) return {};

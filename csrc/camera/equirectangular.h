@@ -19,19 +19,20 @@ namespace edgegrad {
 //
 // A panorama may reach around more than once, or over a pole, where it continues along the opposite meridian. A
 // direction therefore has many positions: for integers i and j of one parity, λ' = λ + j π and φ' = i π + (−1)ⁱ φ. A
-// lens has one of these.
+// lens has one of these branches.
 //
 // K takes the place of coefficients. The camera's own K only scales the undistorted image, so that m = x / scale.
 class Equirectangular {
    public:
     static constexpr int coefficients = 6;  // These are the upper two rows of K.
-    // Selects one position (i, j), and the angles (λ', φ') that this lens serves: below `to`, and not below `from`.
-    struct Place {
+    // Selects one of these positions by (i, j), and the angles (λ', φ') that this lens serves: below `to`, and not
+    // below `from`.
+    struct Branch {
         int across = 0, over = 0;  // They are j and i.
         Vec2 from{-infinite, -infinite}, to{infinite, infinite};
     };
 
-    Equirectangular(const double* K, const CubeFace& cube_face, const Place& place);
+    Equirectangular(const double* K, const CubeFace& cube_face, const Branch& branch);
 
     // Returns the focal lengths of the undistorted image, px; they keep positive areas positive.
     Vec2 scale() const { return scale_; }
@@ -74,7 +75,7 @@ class Equirectangular {
 
     double k_[6], inverse_[4];
     CubeFace cube_face_;
-    Place place_;
+    Branch branch_;
     Vec2 scale_;
 };
 

@@ -35,10 +35,10 @@ Camera sub_camera(const Camera& camera, const L& lens, Box2 n) {
 
 // Returns the integers k whose intervals [π (k − half), π (k + half)] meet [low, high] in more than a millionth of a
 // pixel; at least one.
-struct Range {
+struct IntegerRange {
     int first, last;
 };
-Range covering(double low, double high, double half, double least) {
+IntegerRange covering(double low, double high, double half, double least) {
     const int first = int(std::floor((low + least) / M_PI - half)) + 1,
               last = int(std::ceil((high - least) / M_PI + half)) - 1;
     return {std::min(first, last), std::max(first, last)};
@@ -88,14 +88,14 @@ std::vector<Camera> sub_cameras_for_points(const Camera& camera, double reach) {
         if ((last - over) % 2) --last;
         if (last < first) --first, last = first;
         for (int across = first; across <= last; across += 2) {
-            const Equirectangular::Place place{
+            const Equirectangular::Branch branch{
                 across,
                 over,
                 {across == first ? -infinite : M_PI * (across - 1),
                  over == over_first ? -infinite : M_PI * (over - 0.5)},
                 {across == last ? infinite : M_PI * (across + 1), over == over_last ? infinite : M_PI * (over + 0.5)}};
             for (const auto& cube_face : cube_faces) {
-                const Equirectangular of_cube_face(lens->K(), cube_face, place);
+                const Equirectangular of_cube_face(lens->K(), cube_face, branch);
                 if (const auto box = of_cube_face.cube_face_box(image))
                     out.push_back(sub_camera(camera, of_cube_face, *box));
             }

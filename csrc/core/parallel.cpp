@@ -23,8 +23,8 @@ void ThreadTeam::check() {
     if (failed_.load(std::memory_order_relaxed)) throw Interrupted();
     if (!interrupted_ || omp_get_thread_num() != 0) return;
     const auto now = std::chrono::steady_clock::now();
-    if (now - asked_ < std::chrono::milliseconds(50)) return;
-    asked_ = now;
+    if (now - last_check_ < std::chrono::milliseconds(50)) return;
+    last_check_ = now;
     if (interrupted_()) throw Interrupted();
 }
 

@@ -71,7 +71,7 @@ class ThreadTeam {
 
     const int threads_;
     bool (*const interrupted_)();
-    std::chrono::steady_clock::time_point asked_ = std::chrono::steady_clock::now();
+    std::chrono::steady_clock::time_point last_check_ = std::chrono::steady_clock::now();
     std::atomic<bool> failed_{false};
     std::exception_ptr failure_;
 };

@@ -20,7 +20,7 @@ namespace edgegrad {
 namespace {
 
 // A face behind the hits gets this fraction of its lines; see curve_measure.cpp.
-constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
+constexpr OcclusionHint::HiddenFactor occluded_face_lines{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
 
 // A Family is the lines at (k + shift) · spacing, k = first … end − 1.
 struct Family {
@@ -99,7 +99,7 @@ class DiscontinuityLines {
         if (!(view_.importance.mean(low, high) > 0)) return;
         double spacing = view_.options.discontinuity_spacing / view_.camera.stretch(polygon.low, polygon.high);
         if (const int64_t hiding = view_.occlusion.hiding_pixels(low, high, polygon.nearest))
-            spacing /= view_.occlusion.factor(occluded, hiding, view_.image.spp);
+            spacing /= view_.occlusion.factor(occluded_face_lines, hiding, view_.image.spp);
         LinedFace lined{.face = face,
                         .spacing = spacing,
                         .low = polygon.low,

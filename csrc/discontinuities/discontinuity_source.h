@@ -1,4 +1,4 @@
-// This file holds the curve source of discontinuities within faces: alpha edges, and borders of nearest texels.
+// This file holds the curve source of discontinuities within faces: alpha edges, and texel edges of nearest lookups.
 //
 // Lines at a spacing Δ, horizontal and vertical, meet the curve F = 0 in points (Crofton). Each family has one random
 // shift. With n = ∇F / |∇F|, the sum

@@ -36,8 +36,8 @@ class SampleBudget {
         const double fair = rays_ * std::sqrt(edge) / (std::sqrt(edge) + std::sqrt(surface));
         const double of_edges = std::clamp(fair, rays_ - surface, std::max(edge, rays_ - surface));
         const double of_surfaces = rays_ - std::min(edge, of_edges);
-        return {std::max(std::min(wanted.surface, least), int64_t(of_surfaces / cost_.surface)),
-                std::max(std::min(wanted.edge, least), int64_t(of_edges / cost_.edge))};
+        return {std::max(std::min(wanted.surface, least_samples), int64_t(of_surfaces / cost_.surface)),
+                std::max(std::min(wanted.edge, least_samples), int64_t(of_edges / cost_.edge))};
     }
 
    private:
@@ -48,7 +48,7 @@ class SampleBudget {
     };
     static constexpr Cost plain{3.9, 7.0}, shaded{9, 18};
     static constexpr double share_of_image = 1;
-    static constexpr int64_t least =
+    static constexpr int64_t least_samples =
         1 << 14;  // takes some milliseconds, so that small images and few rays lose nothing
     const Cost cost_;
     double rays_ = 0;

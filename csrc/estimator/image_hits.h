@@ -23,7 +23,7 @@ class ImageHits {
     // For `seen` (F,) see HitBuffers.
     template <class T>
     ImageHits(const SceneView<T>& scene, const Camera& camera, const VertexView& vertices,
-              const OcclusionHint& occlusion, const Parts& parts, const uint8_t* seen, ThreadTeam& team)
+              const OcclusionHint& occlusion, const ConnectedParts& parts, const uint8_t* seen, ThreadTeam& team)
         : parts_(parts), at_(scene.n_verts), share_(2 * parts.size()) {
         team.parallel_for_blocks(scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t v = first; v < last; ++v)
@@ -79,12 +79,12 @@ class ImageHits {
     // Returns whether a face with this vertex was hit.
     bool at(int64_t vertex) const { return at_[vertex] & hit; }
 
-    // Face combines the corners of a face. `missed`: none belongs to a hit face. `partly`: one belongs to a hit face or
-    // to its neighbour. `whole`: all belong to hit faces. `clear`: no adjacent face has other corners.
-    struct Face {
+    // FaceHits combines the corners of a face. `missed`: none belongs to a hit face. `partly`: one belongs to a hit
+    // face or to its neighbour. `whole`: all belong to hit faces. `clear`: no adjacent face has other corners.
+    struct FaceHits {
         bool missed, partly, whole, clear;
     };
-    Face of(const int32_t* v) const {
+    FaceHits of(const int32_t* v) const {
         const uint8_t a = at_[v[0]], b = at_[v[1]], c = at_[v[2]];
         return {((a | b | c) & hit) == 0, ((a | b | c) & (hit | border)) != 0, (a & b & c & hit) != 0,
                 !((a | b | c) & border)};
@@ -99,18 +99,18 @@ class ImageHits {
     // where_missed() returns the factor on the sample density of a face with this vertex that was not hit, nor a
     // neighbour. It is smaller if all hits on its part were from the other side, as on a closed mesh. `side`, 1 or 2,
     // is that from which the face would be visible. It is never zero, because the face may still be visible. A side
-    // with the fraction `some` of the part's hits counts in full.
+    // with the fraction `enough_of_part` of the part's hits counts in full.
     static constexpr double missed = 1.0 / 8;
     double where_missed(int32_t vertex, int side) const {
         const int64_t part = parts_.size() > 1 ? parts_.of(vertex) : 0;
-        return std::clamp(share_[2 * part + side - 1] / some * missed, turned_away, missed);
+        return std::clamp(share_[2 * part + side - 1] / enough_of_part * missed, turned_away, missed);
     }
 
     // Returns whether that factor is minimal.
     bool is_turned_away(int32_t vertex, int side) const { return where_missed(vertex, side) <= turned_away; }
     static constexpr double turned_away = 1.0 / 64;
 
-    // This includes Parts, which may be as many as vertices.
+    // This includes ConnectedParts, which may be as many as vertices.
     static constexpr int64_t bytes_per_vertex = sizeof(uint8_t) + 4 * sizeof(float);
 
     void prefetch(int32_t vertex) const { edgegrad::prefetch(&at_[vertex]); }
@@ -119,9 +119,9 @@ class ImageHits {
     // A `hit` vertex belongs to a hit face. A `border` vertex belongs to a face with such vertices and others. A
     // `behind` vertex lies behind all hits around it.
     static constexpr uint8_t hit = 1, border = 2, behind = 4;
-    static constexpr double some = 1.0 / 16;
+    static constexpr double enough_of_part = 1.0 / 16;
     static constexpr int enough = 64;  // number of hit faces that tells which sides of a part are visible
-    const Parts& parts_;
+    const ConnectedParts& parts_;
     Array<uint8_t> at_;
     std::vector<float> share_;  // fraction of a part's hits, by part and side; 1 where too few were hit
 };

@@ -22,7 +22,7 @@ class OcclusionHint {
         if (!depth) return;
         levels_.push_back({depth, width, height});
         while (levels_.back().width > 1 || levels_.back().height > 1) {
-            const Level below = levels_.back();
+            const DepthLevel below = levels_.back();
             const int w = (below.width + 1) / 2, h = (below.height + 1) / 2;
             storage_.emplace_back(size_t(w) * h);
             float* out = storage_.back().data();
@@ -36,7 +36,7 @@ class OcclusionHint {
             levels_.push_back({out, w, h});
         }
         if (int(levels_.size()) <= tile_level) return;
-        const Level& tiles = levels_[tile_level];
+        const DepthLevel& tiles = levels_[tile_level];
         around_tile_.resize(size_t(tiles.width) * tiles.height);
         team.parallel_for(tiles.height, [&](int64_t j) {
             for (int i = 0; i < tiles.width; ++i)
@@ -75,24 +75,24 @@ class OcclusionHint {
     int rows() const { return (height_ + tile - 1) / tile; }
     int tile_of(Vec2 x) const { return pixel(x.y, height_) / tile * columns() + pixel(x.x, width_) / tile; }
 
-    // Few sets the factor on the density of samples where something is hidden, by the number of rays that say so. Let
-    // gaps show V of the R px² in which it is hidden. All n = spp · R rays miss them with probability exp(−spp V). At
-    // 1/D of the density, the visible part has D V/R of the variance that it would have were all of it visible. On
-    // average over what rays find, D V/R exp(−spp V) ≤ D / (e n). D may therefore grow with n; D = n / rays bounds this
-    // by 1 / (e rays). One sample stands for at most `share` of the image. In a small image, where that is less, D is
-    // at most 1 / least instead.
-    struct Few {
+    // HiddenFactor sets the factor on the density of samples where something is hidden, by the number of rays that say
+    // so. Let gaps show V of the R px² in which it is hidden. All n = spp · R rays miss them with probability exp(−spp
+    // V). At 1/D of the density, the visible part has D V/R of the variance that it would have were all of it visible.
+    // On average over what rays find, D V/R exp(−spp V) ≤ D / (e n). D may therefore grow with n; D = n / rays bounds
+    // this by 1 / (e rays). One sample stands for at most `share` of the image. In a small image, where that is less, D
+    // is at most 1 / least instead.
+    struct HiddenFactor {
         double rays, share, least;
     };
     // factor() takes the value `least` at 16 samples per pixel. Fewer samples miss more of what shows through a gap.
     static double factor(double least, int spp) { return std::min(1.0, least * std::max(1.0, 16.0 / spp)); }
-    double factor(Few few, double pixels, int spp) const {
-        const double most = std::max(1 / few.least, few.share * width_ * height_);
-        return 1 / std::clamp(spp * pixels / few.rays, 1.0, most);
+    double factor(HiddenFactor hidden, double pixels, int spp) const {
+        const double most = std::max(1 / hidden.least, hidden.share * width_ * height_);
+        return 1 / std::clamp(spp * pixels / hidden.rays, 1.0, most);
     }
 
    private:
-    struct Level {
+    struct DepthLevel {
         const float* depth;
         int width, height;
 
@@ -116,7 +116,7 @@ class OcclusionHint {
     static_assert(tile == 1 << tile_level);
     int width_, height_;
     std::vector<std::vector<float>> storage_;
-    std::vector<Level> levels_;
+    std::vector<DepthLevel> levels_;
     std::vector<float> around_tile_;  // largest depth of a tile and its neighbours
 };
 

@@ -83,7 +83,7 @@ uint16_t cell_of(const BackwardView<T>& view, int32_t vertex) {
 // eighth: a visible strip may be too narrow for rays to find.
 template <class T>
 double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
-    constexpr OcclusionHint::Few unhit{.rays = 16, .share = 0, .least = 1.0 / 8};
+    constexpr OcclusionHint::HiddenFactor unhit{.rays = 16, .share = 0, .least = 1.0 / 8};
     return view.seen[face] || view.transparent ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
 }
 

@@ -4,7 +4,7 @@
 //
 // A pixel is marked where the pixels around it are on both sides. The pixel's own result is not used: whether it is
 // shaded again, at other points, must not depend on the points that this discards. Otherwise the mean over seeds would
-// be biased. edgegrad/points/borders.py has the same rule for shaders.
+// be biased. edgegrad/points/discontinuous_pixels.py has the same rule for shaders.
 #pragma once
 
 #include <algorithm>
@@ -53,7 +53,7 @@ class LightVisibility {
     void add(int x, int y, const int8_t* seen) {
         uint8_t* here = seen_.at(x, y);
         for (size_t l = 0; l < columns_.size(); ++l)
-            if (const int8_t s = seen[columns_[l]]; s != not_asked) here[l] |= s ? visible : hidden;
+            if (const int8_t s = seen[columns_[l]]; s != not_sampled) here[l] |= s ? visible : hidden;
     }
 
     // Marks such pixels in a row.
@@ -191,9 +191,9 @@ class SeenEmitters {
     PaddedImage<uint8_t> seen_;
 };
 
-class ImageBorders {
+class DiscontinuousPixels {
    public:
-    ImageBorders(int width, int height, const LitScene& lit, const LitOptions& options)
+    DiscontinuousPixels(int width, int height, const LitScene& lit, const LitOptions& options)
         : width_(width),
           height_(height),
           paths_(options.bounces > 1),

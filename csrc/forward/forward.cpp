@@ -95,7 +95,7 @@ class PixelRow {
     }
 
     // Does the same where no ray can hit anything.
-    void leave_out(int x0, int x1, int y) {
+    void fill_background(int x0, int x1, int y) {
         for (int x = x0; x < x1; ++x) {
             const int64_t pixel = pixel_at(x, y);
             const T* behind = scene_.background_at(pixel);
@@ -132,7 +132,7 @@ class PixelRow {
             for (int done = 0; done < spp_;) {
                 const int n = std::min(spp_ - done, RayBatch::size - rays_.count);
                 sub_camera.pixel_rays.append(x, y_, done, n, rays_);
-                part_[parts_++] = {x - x0, n};
+                runs_[n_runs_++] = {x - x0, n};
                 done += n;
                 if (rays_.count == RayBatch::size) trace();
             }
@@ -146,10 +146,10 @@ class PixelRow {
         sub_camera_->frame.cast(rays_);
         if (scene_.n_faces > in_cache) prefetch_faces();
         int i = 0;
-        for (int p = 0; p < parts_; ++p) {
+        for (int p = 0; p < n_runs_; ++p) {
             typename AffineRadiance<N>::Sum sum(C_);
             int hits = 0;
-            const int end = i + part_[p].n;
+            const int end = i + runs_[p].n;
             for (; i + lanes <= end; i += lanes)
                 for (unsigned left = (1u << lanes) - 1 - on_face(rays_.face + i, -1); left;) {
                     const int first = std::countr_zero(left);
@@ -171,21 +171,21 @@ class PixelRow {
                             for (unsigned one = same; one; one &= one - 1)
                                 add_direction(s, barycentrics_of_hit(s.map, rays_.n(i + std::countr_zero(one))), sum);
                         hits += n;
-                        note_hit(s, part_[p].column);
+                        note_hit(s, runs_[p].column);
                     } else {
                         for (unsigned one = same; one; one &= one - 1)
-                            hits += add(i + std::countr_zero(one), part_[p].column, sum);
+                            hits += add(i + std::countr_zero(one), runs_[p].column, sum);
                     }
                 }
             for (; i < end; ++i) {
                 if (rays_.face[i] >= 0 && shaded(rays_.face[i]).edge_on) [[unlikely]]
                     cast_beyond();
-                if (rays_.face[i] >= 0) hits += add(i, part_[p].column, sum);
+                if (rays_.face[i] >= 0) hits += add(i, runs_[p].column, sum);
             }
-            hits_[part_[p].column] += hits;
-            for (int c = 0; c < C_; ++c) sum_[part_[p].column * C_ + c] += sum[c];
+            hits_[runs_[p].column] += hits;
+            for (int c = 0; c < C_; ++c) sum_[runs_[p].column * C_ + c] += sum[c];
         }
-        rays_.count = parts_ = 0;
+        rays_.count = n_runs_ = 0;
     }
 
     // Records that a pixel hits a face, and its depth.
@@ -281,12 +281,12 @@ class PixelRow {
     const int C_;
     const int direction_;  // A direction begins at this channel; −1: there is none.
 
-    struct Part {
+    struct PixelRun {
         int column, n;
     };
     CameraRays rays_;
-    Part part_[RayBatch::size];  // They map rays to pixels.
-    int parts_ = 0;
+    PixelRun runs_[RayBatch::size];  // They map rays to pixels.
+    int n_runs_ = 0;
     unsigned traced_ = 0;
     Shaded kept_[n_kept];
     int x0_ = 0, y_ = 0;  // They are the first pixel of the row.
@@ -316,7 +316,7 @@ void render_pixels(const SceneView<T>& scene, const std::deque<SubCameraRays>& s
                 const auto [first, end] = reachable.row(y);
                 const int from = x0 + (std::clamp(first, x0, x1) - x0) / unit * unit;
                 const int to = std::min(x1, x0 + (std::clamp(end, from, x1) - x0 + unit - 1) / unit * unit);
-                row.leave_out(x0, from, y), row.render(from, to, y), row.leave_out(to, x1, y);
+                row.fill_background(x0, from, y), row.render(from, to, y), row.fill_background(to, x1, y);
             }
         });
 }

@@ -24,10 +24,10 @@ Vec2 through(const Camera& sub_camera, Vec2 x) {
 }  // namespace
 
 template <class T>
-PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry, const Places& places,
-                  ThreadTeam& team) {
-    PlaceHits out;
-    out.face.assign(places.size, -1), out.part.assign(places.size, -1), out.b.assign(2 * places.size, 0.0);
+ImagePointHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
+                       const ImagePoints& points, ThreadTeam& team) {
+    ImagePointHits out;
+    out.face.assign(points.size, -1), out.part.assign(points.size, -1), out.b.assign(2 * points.size, 0.0);
     for (const Camera& sub_camera : sub_cameras_for_rays(camera)) {
         const Array<Vec3> q = camera_vertices(sub_camera, scene.verts, scene.n_verts, team);
         const AlphaMasks<T> alpha_masks(scene, sub_camera, q.data());
@@ -38,27 +38,27 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
         };
         // A face whose plane contains the eye is invisible; the image shows what is behind it, too.
         const auto is_seen = [&](int32_t face) { return !sub_camera.passes_through_eye(corners(face).data()); };
-        team.parallel_for_blocks(places.size, [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(points.size, [&](int64_t, int64_t first, int64_t last) {
             team.check();
             CameraRays rays(frame);
-            int64_t place[RayBatch::size];
+            int64_t index[RayBatch::size];
             const auto cast = [&] {
                 rays.prepare();
                 frame.cast(rays);
                 for (int i = 0; i < rays.count; ++i) {
-                    const int32_t face = frame.beyond_float(rays.n(i), rays.face[i], {}, is_seen);
+                    const int32_t face = frame.exact_hit(rays.n(i), rays.face[i], {}, is_seen);
                     if (face < 0) continue;
                     const Barycentrics b = barycentrics_of_hit(face_map(sub_camera, corners(face).data()), rays.n(i));
-                    out.face[place[i]] = face;
-                    out.part[place[i]] = geometry.parts().of(scene.faces[3 * int64_t(face)]);
-                    out.b[2 * place[i]] = b.u, out.b[2 * place[i] + 1] = b.v;
+                    out.face[index[i]] = face;
+                    out.part[index[i]] = geometry.parts().of(scene.faces[3 * int64_t(face)]);
+                    out.b[2 * index[i]] = b.u, out.b[2 * index[i] + 1] = b.v;
                 }
                 rays.count = 0;
             };
             for (int64_t k = first; k < last; ++k) {
-                const Vec2 n = through(sub_camera, places[k]);
+                const Vec2 n = through(sub_camera, points[k]);
                 if (!std::isfinite(n.x + n.y)) continue;
-                place[rays.count] = k;
+                index[rays.count] = k;
                 rays.n_x[rays.count] = n.x, rays.n_y[rays.count] = n.y;
                 if (++rays.count == RayBatch::size) cast();
             }
@@ -68,16 +68,16 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
     return out;
 }
 
-RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, ThreadTeam& team) {
+RayRecords rays_at(const Camera& camera, const ImagePoints& points, bool intrinsics, ThreadTeam& team) {
     const std::vector<Camera> sub_cameras = sub_cameras_for_rays(camera);
-    std::vector<RayRecords> blocks(ThreadTeam::blocks(places.size));
-    team.parallel_for_blocks(places.size, [&](int64_t block, int64_t first, int64_t last) {
+    std::vector<RayRecords> blocks(ThreadTeam::blocks(points.size));
+    team.parallel_for_blocks(points.size, [&](int64_t block, int64_t first, int64_t last) {
         RayRecords& to = blocks[block];
         for (int64_t k = first; k < last; ++k) {
             const Camera* shown_by = &sub_cameras.front();
             Vec2 n = nowhere;
             for (const Camera& sub_camera : sub_cameras)
-                if (const Vec2 here = through(sub_camera, places[k]); std::isfinite(here.x + here.y))
+                if (const Vec2 here = through(sub_camera, points[k]); std::isfinite(here.x + here.y))
                     shown_by = &sub_camera, n = here;
             append_ray(*shown_by, n, to.along, intrinsics ? &to.along_by_k : nullptr, &to.along_by_x);
         }
@@ -89,7 +89,9 @@ RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, 
     return all;
 }
 
-template PlaceHits hits_at(const SceneView<float>&, const Camera&, const Geometry&, const Places&, ThreadTeam&);
-template PlaceHits hits_at(const SceneView<double>&, const Camera&, const Geometry&, const Places&, ThreadTeam&);
+template ImagePointHits hits_at(const SceneView<float>&, const Camera&, const Geometry&, const ImagePoints&,
+                                ThreadTeam&);
+template ImagePointHits hits_at(const SceneView<double>&, const Camera&, const Geometry&, const ImagePoints&,
+                                ThreadTeam&);
 
 }  // namespace edgegrad

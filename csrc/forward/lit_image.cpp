@@ -7,8 +7,8 @@
 
 #include "core/sobol.h"
 #include "forward/discontinuous_pixels.h"
+#include "forward/environment_guide.h"
 #include "forward/pixel_hits.h"
-#include "forward/sky_guide.h"
 #include "shading/lit/indirect.h"
 
 namespace edgegrad {
@@ -26,8 +26,8 @@ struct RowInput {
     uint64_t seed;
     const uint8_t* only;  // It selects pixels; null: all.
     LitImage<T>& to;
-    ImageBorders* borders;  // Null means not wanted.
-    SkyGuide* guide;        // Null means not wanted.
+    DiscontinuousPixels* discontinuous;  // Null means not wanted.
+    EnvironmentGuide* guide;             // Null means not wanted.
     ThreadTeam& team;
 };
 
@@ -76,7 +76,7 @@ class LitRow : public RowVisitor {
         const double* spread = filtered_ ? spread_.data() : nullptr;
         const LitPoints points{int64_t(n), face_.data(), b_.data(), seed_.data(), {}, spread};
         if (paths_ && in_.options.samples == 1) {
-            shade_whole(in_.lit, in_.scene, in_.caster, points, *paths_, radiance_.data(), seen_.data());
+            shade_by_paths(in_.lit, in_.scene, in_.caster, points, *paths_, radiance_.data(), seen_.data());
             if (in_.guide) in_.guide->add(*paths_, paths_of_point * int64_t(n));
         } else {
             shade_some(in_.lit, in_.scene, in_.caster, points, in_.options, *buffers_, radiance_.data(), seen_.data());
@@ -87,10 +87,10 @@ class LitRow : public RowVisitor {
             double* sum = &sums_[int64_t(hit.pixel % in_.width) * C];
             for (int c = 0; c < C; ++c) sum[c] += hit.weight * radiance_[i * C + c];
             const int8_t* seen = seen_.data() + i * K;
-            if (in_.borders) in_.borders->add(hit.pixel, hit.face, &b_[3 * i], seen);
+            if (in_.discontinuous) in_.discontinuous->add(hit.pixel, hit.face, &b_[3 * i], seen);
             for (size_t k = 0; k < K; ++k)
-                if (seen[k] != not_asked)
-                    std::atomic_ref(in_.to.asked[lights_[k].light]).store(1, std::memory_order_relaxed);
+                if (seen[k] != not_sampled)
+                    std::atomic_ref(in_.to.shadow_needed[lights_[k].light]).store(1, std::memory_order_relaxed);
         }
     }
 
@@ -106,12 +106,12 @@ class LitRow : public RowVisitor {
     std::vector<int8_t> seen_;
 };
 
-constexpr uint64_t pilot = 0x70696c6f74;  // It separates the pilot's random numbers.
+constexpr uint64_t pilot_stream = 0x70696c6f74;  // It separates the pilot's random numbers.
 
 // Selects every second pixel of every second row, or fewer in large images.
 std::vector<uint8_t> sparse_pixels(const Camera& camera) {
-    constexpr double enough = 4096;
-    const int step = std::max(2, int(std::sqrt(double(camera.width) * camera.height / enough)));
+    constexpr double pilot_pixels = 4096;
+    const int step = std::max(2, int(std::sqrt(double(camera.width) * camera.height / pilot_pixels)));
     std::vector<uint8_t> out(size_t(camera.width) * camera.height, 0);
     for (int y = step / 2; y < camera.height; y += step)
         for (int x = step / 2; x < camera.width; x += step) out[size_t(y) * camera.width + x] = 1;
@@ -126,33 +126,35 @@ LitImage<T> render_lit(const LitScene& given, const SceneView<T>& scene, const C
                        ThreadTeam& team, const HitBuffers<T>& hits) {
     LitImage<T> out{Array<T>(int64_t(camera.width) * camera.height * given.channels),
                     std::vector<uint8_t>(given.lights.size(), 0)};
-    std::unique_ptr<ImageBorders> borders;
-    if (image.spp > 1) borders = std::make_unique<ImageBorders>(camera.width, camera.height, given, options);
+    std::unique_ptr<DiscontinuousPixels> discontinuous;
+    if (image.spp > 1)
+        discontinuous = std::make_unique<DiscontinuousPixels>(camera.width, camera.height, given, options);
     const auto shade_pixels = [&](const LitScene& lit, const ImageOptions& image, const PixelChoice& choice,
-                                  uint64_t seed, SkyGuide* guide = nullptr) {
+                                  uint64_t seed, EnvironmentGuide* guide = nullptr) {
         const RowInput<T> rows{lit,         scene, caster,      options, camera.width,
-                               choice.most, seed,  choice.only, out,     choice.only ? nullptr : borders.get(),
+                               choice.most, seed,  choice.only, out,     choice.only ? nullptr : discontinuous.get(),
                                guide,       team};
         visit_pixel_hits(scene, camera, caster, image, choice, team, hits,
                          [&] { return std::make_unique<LitRow<T>>(rows); });
     };
     const bool spread = given.is_filtered();
-    SkyGuide guide(given);
-    const bool guides = options.bounces > 1 && options.samples == 1 && options.shadows && guide.has_sky();
+    EnvironmentGuide guide(given);
+    const bool guides = options.bounces > 1 && options.samples == 1 && options.shadows && guide.has_environment();
     if (guides) {
         // The pilot's random numbers differ from the image's, or its results would correlate with the guided samples.
         const std::vector<uint8_t> pixels = sparse_pixels(camera);
-        const ImageOptions few{1, image.filter, hash(image.seed, pilot)};
-        shade_pixels(given, few, {0, camera.height, 1, pixels.data(), spread}, hash(sampling.again, pilot), &guide);
+        const ImageOptions few{1, image.filter, hash(image.seed, pilot_stream)};
+        shade_pixels(given, few, {0, camera.height, 1, pixels.data(), spread}, hash(sampling.again, pilot_stream),
+                     &guide);
     }
     const std::optional<LitScene> guided = guides ? std::optional(guide.guided()) : std::nullopt;
     const LitScene& lit = guided ? *guided : given;
     shade_pixels(lit, image, {0, camera.height, sampling.points, nullptr, spread}, sampling.seed);
-    if (!borders) return out;
+    if (!discontinuous) return out;
     std::vector<uint8_t> pixels;
     ImageOptions finer = image;
     if (options.bounces > 1) finer.spp *= rays_again;
-    if (const int times = borders->find(pixels, team))
+    if (const int times = discontinuous->find(pixels, team))
         shade_pixels(lit, finer, {0, camera.height, times * sampling.points, pixels.data(), spread}, sampling.again);
     return out;
 }

@@ -17,11 +17,11 @@ struct LitSampling {
     uint64_t seed, again;  // They serve the first pass, and pixels that are shaded again.
 };
 
-// Holds the radiance (H · W, C) without the background, and whether some point asked for each light's shadow.
+// Holds the radiance (H · W, C) without the background, and whether some point needs each light's shadow.
 template <class T>
 struct LitImage {
     Array<T> radiance;
-    std::vector<uint8_t> asked;
+    std::vector<uint8_t> shadow_needed;
 };
 
 // Shades pixels with shadow boundaries or texel edges again, at several points (discontinuous_pixels.h).

@@ -39,11 +39,11 @@ struct Pose {
 
 // Intersects a ray and a face in camera coordinates (Möller and Trumbore 1997).
 template <class S>
-struct Crossing {
+struct PlaneIntersection {
     Vector<S> e1, e2, s, d, p, q;
     S scale, u, v;
 
-    Crossing(const Vector<S>* corner, Vector<S> along, bool perspective) {
+    PlaneIntersection(const Vector<S>* corner, Vector<S> along, bool perspective) {
         e1 = corner[1] - corner[0], e2 = corner[2] - corner[0];
         s = perspective ? -1.0 * corner[0] : along - corner[0];
         d = perspective ? along : Vector<S>(Vec3{0, 0, 1});
@@ -54,7 +54,8 @@ struct Crossing {
     bool exists() const { return std::isfinite(plain(u) + plain(v)); }
 };
 // Adds to the cotangents of the corners, and returns the cotangent of `along`.
-Vec3 crossing_vjp(const Crossing<double>& c, bool perspective, const double* b_bar, Vec3* corner_bar) {
+Vec3 plane_intersection_vjp(const PlaneIntersection<double>& c, bool perspective, const double* b_bar,
+                            Vec3* corner_bar) {
     const double u_bar = b_bar[1] - b_bar[0], v_bar = b_bar[2] - b_bar[0];
     Vec3 e1_bar, e2_bar, s_bar, d_bar, p_bar, q_bar;
     dot_vjp(c.s, c.p, u_bar * c.scale, s_bar, p_bar);
@@ -68,24 +69,24 @@ Vec3 crossing_vjp(const Crossing<double>& c, bool perspective, const double* b_b
 
 // Holds a face in world and in camera coordinates.
 template <class S>
-struct Corners {
+struct FaceCorners {
     Vector<S> world[3], corner[3];
 
-    Corners(const MovingHits& hits, const Pose<S>& pose, const MovingArrays<const double>& at,
-            const MovingArrays<const double>& tangents, int64_t i) {
+    FaceCorners(const MovingHits& hits, const Pose<S>& pose, const MovingArrays<const double>& at,
+                const MovingArrays<const double>& tangents, int64_t i) {
         const int32_t* v = hits.faces + 3 * hits.face[i];
         for (int k = 0; k < 3; ++k)
             world[k] = row<S>(at.verts, tangents.verts, v[k]), corner[k] = pose.in_camera(world[k]);
     }
 };
-// Calls body(index of the ray, crossing) for all rays of hits.
+// Calls body(index of the ray, intersection) for all rays of hits.
 template <class S, class Body>
-void each_crossing(const MovingHits& hits, const Pose<S>& pose, const MovingArrays<const double>& at,
-                   const MovingArrays<const double>& tangents, int64_t first, int64_t last, Body body) {
+void each_intersection(const MovingHits& hits, const Pose<S>& pose, const MovingArrays<const double>& at,
+                       const MovingArrays<const double>& tangents, int64_t first, int64_t last, Body body) {
     for (int64_t i = first; i < last; ++i) {
-        const Corners<S> face(hits, pose, at, tangents, i);
+        const FaceCorners<S> face(hits, pose, at, tangents, i);
         for (int64_t r = i * hits.rays; r < (i + 1) * hits.rays; ++r)
-            body(r, Crossing<S>(face.corner, row<S>(at.along, tangents.along, r), hits.perspective));
+            body(r, PlaneIntersection<S>(face.corner, row<S>(at.along, tangents.along, r), hits.perspective));
     }
 }
 
@@ -97,18 +98,18 @@ struct ChunkOfHits {
 
 }  // namespace
 
-void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team) {
+void intersect_planes(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team) {
     const Pose<double> pose(at.world_to_camera, nullptr);
     team.parallel_for_blocks(hits.size, [&](int64_t, int64_t first, int64_t last) {
-        each_crossing<double>(hits, pose, at, {}, first, last, [&](int64_t r, const Crossing<double>& c) {
+        each_intersection<double>(hits, pose, at, {}, first, last, [&](int64_t r, const PlaneIntersection<double>& c) {
             const bool there = c.exists();
             b[3 * r] = there ? 1 - c.u - c.v : 1, b[3 * r + 1] = there ? c.u : 0, b[3 * r + 2] = there ? c.v : 0;
         });
     });
 }
 
-void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
-                    const MovingArrays<double>& to, ThreadTeam& team) {
+void intersect_planes_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
+                          const MovingArrays<double>& to, ThreadTeam& team) {
     const Pose<double> pose(at.world_to_camera, nullptr);
     std::vector<ChunkOfHits> chunks;
     double seconds[2] = {};
@@ -121,14 +122,14 @@ void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at
         },
         [&](int64_t first, int64_t last, ChunkOfHits& chunk) {
             for (int64_t i = first; i < last; ++i) {
-                const Corners<double> face(hits, pose, at, {}, i);
+                const FaceCorners<double> face(hits, pose, at, {}, i);
                 Vec3 corner_bar[3];
                 bool met = false;
                 for (int64_t r = i * hits.rays; r < (i + 1) * hits.rays; ++r) {
-                    const Crossing<double> c(face.corner, row<double>(at.along, nullptr, r), hits.perspective);
+                    const PlaneIntersection<double> c(face.corner, row<double>(at.along, nullptr, r), hits.perspective);
                     if (!c.exists()) continue;
                     met = true;
-                    const Vec3 along = crossing_vjp(c, hits.perspective, b_bar + 3 * r, corner_bar);
+                    const Vec3 along = plane_intersection_vjp(c, hits.perspective, b_bar + 3 * r, corner_bar);
                     if (to.along)
                         to.along[3 * r] = along.x, to.along[3 * r + 1] = along.y, to.along[3 * r + 2] = along.z;
                 }
@@ -159,14 +160,15 @@ void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at
         seconds);
 }
 
-void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
-                    const MovingArrays<const double>& tangents, double* b_dot, ThreadTeam& team) {
+void intersect_planes_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
+                          const MovingArrays<const double>& tangents, double* b_dot, ThreadTeam& team) {
     const Pose<Dual> pose(at.world_to_camera, tangents.world_to_camera);
     team.parallel_for_blocks(hits.size, [&](int64_t, int64_t first, int64_t last) {
-        each_crossing<Dual>(hits, pose, at, tangents, first, last, [&](int64_t r, const Crossing<Dual>& c) {
-            const double u = c.exists() ? c.u.dot : 0, v = c.exists() ? c.v.dot : 0;
-            b_dot[3 * r] = -u - v, b_dot[3 * r + 1] = u, b_dot[3 * r + 2] = v;
-        });
+        each_intersection<Dual>(hits, pose, at, tangents, first, last,
+                                [&](int64_t r, const PlaneIntersection<Dual>& c) {
+                                    const double u = c.exists() ? c.u.dot : 0, v = c.exists() ? c.v.dot : 0;
+                                    b_dot[3 * r] = -u - v, b_dot[3 * r + 1] = u, b_dot[3 * r + 2] = v;
+                                });
     });
 }
 

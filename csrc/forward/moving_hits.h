@@ -26,12 +26,12 @@ struct MovingHits {
 };
 
 // Writes barycentrics (N, rays, 3). Degenerate or edge-on faces get those of the first corner, without derivatives.
-void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team);
+void intersect_planes(const MovingHits& hits, const MovingArrays<const double>& at, double* b, ThreadTeam& team);
 // Adds to the cotangents of vertices and camera, and writes those of `along`.
-void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
-                    const MovingArrays<double>& to, ThreadTeam& team);
-void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
-                    const MovingArrays<const double>& tangents, double* b_dot, ThreadTeam& team);
+void intersect_planes_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
+                          const MovingArrays<double>& to, ThreadTeam& team);
+void intersect_planes_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
+                          const MovingArrays<const double>& tangents, double* b_dot, ThreadTeam& team);
 
 // Describes how numbers of samples move with rows of a table: each is the sum over its rows of by · moved row.
 struct LinearForm {

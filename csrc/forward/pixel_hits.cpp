@@ -56,7 +56,7 @@ class HitRow {
                 for (int done = 0; done < options_.spp;) {
                     const int n = std::min(options_.spp - done, RayBatch::size - rays_.count);
                     sub_camera.pixel_rays.append(x, y, done, n, rays_);
-                    part_[parts_++] = {x, n};
+                    runs_[n_runs_++] = {x, n};
                     done += n;
                     if (rays_.count == RayBatch::size) cast(to);
                 }
@@ -76,7 +76,7 @@ class HitRow {
     }
 
    private:
-    struct Drawn {
+    struct KeyedSample {
         uint64_t key;
         Vec2 n;
     };
@@ -84,11 +84,11 @@ class HitRow {
     struct Group {
         int32_t face;
         int count;
-        std::vector<Drawn> drawn;
+        std::vector<KeyedSample> drawn;
     };
-    static bool is_less(const Drawn& a, const Drawn& b) { return a.key < b.key; }
+    static bool is_less(const KeyedSample& a, const KeyedSample& b) { return a.key < b.key; }
     // Holds what pixels on one face share. Some faces are kept, because they recur in the next pixel.
-    struct Kept {
+    struct KeptFace {
         int32_t face = -1;
         bool edge_on = false;
         FaceMap map;
@@ -103,7 +103,7 @@ class HitRow {
 
     void look_through(const SubCameraRays& sub_camera) {
         sub_camera_ = &sub_camera, rays_.look_through(sub_camera.frame);
-        for (Kept& kept : kept_) kept.face = -1;
+        for (KeptFace& kept : kept_) kept.face = -1;
     }
 
     void cast(std::vector<PixelHit>& to) {
@@ -111,9 +111,9 @@ class HitRow {
         rays_.prepare();
         sub_camera_->frame.cast(rays_);
         int i = 0;
-        for (int p = 0; p < parts_; ++p) {
-            if (part_[p].x != x_) begin(part_[p].x);
-            const int end = i + part_[p].n;
+        for (int p = 0; p < n_runs_; ++p) {
+            if (runs_[p].x != x_) begin(runs_[p].x);
+            const int end = i + runs_[p].n;
             for (int k = i; k < end; ++k) {
                 if (rays_.face[k] < 0) continue;
                 // A face whose plane contains the eye shows nothing.
@@ -125,10 +125,10 @@ class HitRow {
                 }
                 add(rays_.face[k], samples_ + k - i, rays_.n(k));
             }
-            samples_ += part_[p].n, i = end;
+            samples_ += runs_[p].n, i = end;
             if (samples_ == options_.spp) finish(to);
         }
-        rays_.count = parts_ = 0;
+        rays_.count = n_runs_ = 0;
     }
 
     void begin(int x) {
@@ -148,7 +148,7 @@ class HitRow {
         }
         ++groups_[g].count;
         const uint64_t key = key_(sample);
-        std::vector<Drawn>& drawn = groups_[g].drawn;
+        std::vector<KeyedSample>& drawn = groups_[g].drawn;
         if (int(drawn.size()) == choice_.most) {
             if (drawn.front().key <= key) return;
             std::pop_heap(drawn.begin(), drawn.end(), is_less);
@@ -165,8 +165,8 @@ class HitRow {
         Pixel& pixel = row_[x_];
         for (int i = 0; i < count_; ++i) {
             const Group& g = groups_[i];
-            const Kept& face = kept(g.face);
-            for (const Drawn& drawn : g.drawn) {
+            const KeptFace& face = kept(g.face);
+            for (const KeyedSample& drawn : g.drawn) {
                 const Barycentrics b = barycentrics_of_hit(face.map, drawn.n);
                 const Vec2 x = distort(camera, to_pixels(camera, drawn.n)).x;
                 const double weight = double(g.count) / (double(options_.spp) * g.drawn.size());
@@ -180,12 +180,12 @@ class HitRow {
         x_ = -1;
     }
 
-    const Kept& kept(int32_t face) {
-        Kept& found = kept_[unsigned(face) % n_kept];
+    const KeptFace& kept(int32_t face) {
+        KeptFace& found = kept_[unsigned(face) % n_kept];
         if (found.face != face) keep(found, face);
         return found;
     }
-    void keep(Kept& kept, int32_t face) {
+    void keep(KeptFace& kept, int32_t face) {
         const Camera& camera = sub_camera_->camera;
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Vec3 corner[3] = {sub_camera_->q[v[0]], sub_camera_->q[v[1]], sub_camera_->q[v[2]]};
@@ -207,16 +207,16 @@ class HitRow {
     const HitBuffers<T>& out_;
     ThreadTeam& team_;
 
-    struct Part {
+    struct PixelRun {
         int x, n;
     };
     CameraRays rays_;
-    Part part_[RayBatch::size];  // They map rays to pixels.
-    int parts_ = 0;
+    PixelRun runs_[RayBatch::size];  // They map rays to pixels.
+    int n_runs_ = 0;
     std::vector<Pixel> row_;
     int y_ = 0;
     size_t expected_ = 0;  // It estimates the hits in the next row.
-    Kept kept_[n_kept];
+    KeptFace kept_[n_kept];
     std::vector<Group> groups_;
     int count_ = 0;             // It counts the groups in use.
     int x_ = -1, samples_ = 0;  // They are the current pixel, and the number of its samples so far.
@@ -244,7 +244,7 @@ void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const Ray
     const int width = camera.width, unit = pixels_of_batches(options.spp);
     const ReachablePixels reachable(sub_cameras.front().camera, caster, sub_cameras.front().q,
                                     options.filter.radius() - 0.5, team);
-    struct State {
+    struct ThreadState {
         HitRow<T> row;
         std::unique_ptr<RowVisitor> visitor;
         std::vector<PixelHit> hits;
@@ -252,10 +252,10 @@ void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const Ray
     team.parallel_for_with_state(
         choice.end - choice.first,
         [&] {
-            return std::unique_ptr<State>(
-                new State{HitRow<T>(scene, sub_cameras, options, choice, out, team), make(), {}});
+            return std::unique_ptr<ThreadState>(
+                new ThreadState{HitRow<T>(scene, sub_cameras, options, choice, out, team), make(), {}});
         },
-        [&](State& state, int64_t k) {
+        [&](ThreadState& state, int64_t k) {
             const int y = choice.first + int(k);
             const auto [first, end] = reachable.row(y);
             const int from = first / unit * unit;

@@ -63,12 +63,12 @@ class InteriorChunk {
     bool is_visible(int i) const {
         const int32_t own = sample_[i].face;
         const Vec2 n = rays_.n(i);
-        if (rays_.face[i] == own) return !is_hidden_by_a_hair(i);
+        if (rays_.face[i] == own) return !is_narrowly_occluded(i);
         if (!is_there(view_, own, n)) return false;
         const double depth = depth_of(view_, own, n);
         const auto far_before = [&](int32_t face) { return lies_far_before(view_, face, depth); };
         const auto decide = [&](int32_t face) { return face == own || far_before(face) || meets(view_, face, n); };
-        const int32_t met = view_.frame.beyond_float(n, rays_.face[i], {}, decide);
+        const int32_t met = view_.frame.exact_hit(n, rays_.face[i], {}, decide);
         if (met < 0 || met == own) return true;
         if (far_before(met)) return false;
         const double* p = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(own)]);
@@ -77,7 +77,7 @@ class InteriorChunk {
 
     // Returns whether a narrow face is occluded although its ray found it. The occluder's border runs so near that
     // floats take the ray for one next to it.
-    bool is_hidden_by_a_hair(int i) const {
+    bool is_narrowly_occluded(int i) const {
         const SurfaceSample& sample = sample_[i];
         if (sample.across.x == 0 && sample.across.y == 0) return false;
         const int32_t own = sample.face;
@@ -103,15 +103,15 @@ class InteriorChunk {
 // Returns the vector across a face narrower than some errors of rays, as long as that error, px; 0: the face is wide.
 template <class T>
 Vec2 across_narrow(const BackwardView<T>& view, int64_t face, const VisiblePolygon& polygon) {
-    constexpr double narrow = 4;
-    if (polygon.starred || !(2 * polygon.area < narrow * float_reach * polygon.longest)) return {};
+    constexpr double errors_across = 4;
+    if (polygon.starred || !(2 * polygon.area < errors_across * float_reach * polygon.longest)) return {};
     double error = 0;
     for (int i = 0; i < 3; ++i) {
         const double* p = view.scene.verts + 3 * int64_t(view.scene.faces[3 * face + i]);
         error = std::max(error, view.frame.error({p[0], p[1], p[2]}));
     }
     error = std::min(error / view.camera.pixel_at_depth(polygon.nearest), float_reach);
-    if (!(2 * polygon.area < narrow * error * polygon.longest)) return {};
+    if (!(2 * polygon.area < errors_across * error * polygon.longest)) return {};
     Vec2 along;
     for (int i = 0; i < polygon.n; ++i) {
         const Vec2 side = polygon.corner[(i + 1) % polygon.n] - polygon.corner[i];

@@ -1,7 +1,6 @@
 #include "interior/surface_measure.h"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <optional>
 
@@ -10,6 +9,7 @@
 #include "estimator/vertex_image.h"
 #include "interior/control.h"
 #include "interior/face_lanes.h"
+#include "interior/pixel_mask.h"
 #include "shading/shade.h"
 
 namespace edgegrad {
@@ -18,7 +18,7 @@ namespace {
 
 // These factors apply to the density of a triangle behind the hits (occlusion.h): without hit neighbours, and next to a
 // hit face. They are never zero, because the triangle may still be visible.
-constexpr OcclusionHint::Few occluded{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
+constexpr OcclusionHint::HiddenFactor occluded_face{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
 constexpr double occluded_near_hits = 1.0 / 8;
 
 // Default samples are per unit of (area + longest side · 1 px), for interpolated colours and for textures. They are
@@ -33,18 +33,18 @@ constexpr double lit_pixel = 1, least_lit_area = 2,
 
 // An adjoint as rough as noise changes from pixel to pixel within a face. Up to this factor more samples are taken, on
 // faces several pixels long.
-constexpr double most = 4;
+constexpr double most_for_noise = 4;
 double more_if_rough(double rough, double longest) {
-    return std::clamp(rough, 1.0, std::clamp(longest / 2, 1.0, most));
+    return std::clamp(rough, 1.0, std::clamp(longest / 2, 1.0, most_for_noise));
 }
 
 // From this area in the image on, px², a triangle with a texture, or under a rough adjoint, is left to pixel samples.
 // Each triangle's integral is estimated in exactly one way, chosen before any sample, so the sum is unbiased.
-constexpr double large = 256;
+constexpr double least_area_by_pixels = 256;
 
 // A face with a control gets fewer samples where the control is likely good: the adjoint changes little, and the face
-// is not wide, px. From `widest` on its corners predict little.
-constexpr double least = 1.0 / 16, wide = 32, widest = 64;
+// is not wide, px. From `widest_controlled` on its corners predict little.
+constexpr double least_controlled = 1.0 / 16, wide_controlled = 32, widest_controlled = 64;
 
 // Hit neighbours imply that a face is visible, unless this many rays should have hit it and none did. Samples would
 // have to cancel all that the control of a hidden face adds.
@@ -52,57 +52,8 @@ constexpr double most_unhit = 4;
 
 // A face this long, px, has each of its points within OcclusionHint::reach of a corner. A point of a triangle is at
 // most two thirds of the longest side away from the nearest corner.
-constexpr double small = 1.5 * OcclusionHint::reach;
-static_assert(small < 2 * OcclusionHint::tile);
-
-// PixelMask holds the pixels that large triangles may touch, by tiles.
-class PixelMask {
-   public:
-    // Covers the image and `beyond` pixels beyond each of its sides.
-    PixelMask(const Camera& camera, double radius, int beyond)
-        : width_(camera.width + 2 * beyond),
-          height_(camera.height + 2 * beyond),
-          radius_(radius),
-          beyond_(beyond),
-          columns_((width_ + tile - 1) / tile),
-          marked_(size_t(columns_) * ((height_ + tile - 1) / tile), 0) {}
-
-    // Marks a box in the image.
-    void mark(Vec2 low, Vec2 high) {
-        low += Vec2{double(beyond_), double(beyond_)}, high += Vec2{double(beyond_), double(beyond_)};
-        const auto index = [](double x, int most) {
-            return int(std::clamp(std::floor(x), 0.0, double(most - 1))) / tile;
-        };
-        const int i0 = index(low.x - radius_, width_), i1 = index(high.x + radius_, width_);
-        const int j0 = index(low.y - radius_, height_), j1 = index(high.y + radius_, height_);
-        for (int j = j0; j <= j1; ++j)
-            for (int i = i0; i <= i1; ++i)
-                std::atomic_ref(marked_[size_t(j) * columns_ + i]).store(1, std::memory_order_relaxed);
-    }
-
-    // Returns the pixels square by square, because nearby rays are cast faster together.
-    std::vector<int64_t> pixels() const {
-        std::vector<int64_t> out;
-        for (size_t t = 0; t < marked_.size(); ++t) {
-            if (!marked_[t]) continue;
-            const int left = int(t) % columns_ * tile, top = int(t) / columns_ * tile;
-            for (int k = 0; k < tile * tile; ++k) {
-                const int square = k / (near * near), i = k % (near * near);
-                const int x = left + square % (tile / near) * near + i % near;
-                const int y = top + square / (tile / near) * near + i / near;
-                if (x < width_ && y < height_) out.push_back(int64_t(y) * width_ + x);
-            }
-        }
-        return out;
-    }
-
-   private:
-    static constexpr int tile = 16, near = 4;  // px
-    int width_, height_;
-    double radius_;
-    int beyond_, columns_;
-    std::vector<uint8_t> marked_;
-};
+constexpr double longest_near_corners = 1.5 * OcclusionHint::reach;
+static_assert(longest_near_corners < 2 * OcclusionHint::tile);
 
 // MeasuredChunk measures the faces of one chunk.
 template <class T>
@@ -169,7 +120,7 @@ class MeasuredChunk {
         int8_t* facing = facing_.data();
         for (int i = 0; i < count; ++i) {
             const int64_t f = l.face[i];
-            if (!(l.side[i] <= small)) {
+            if (!(l.side[i] <= longest_near_corners)) {
                 others_[n_others_++] = f;
                 continue;
             }
@@ -228,7 +179,7 @@ class MeasuredChunk {
     bool is_detailed(int64_t f) const { return view_.detailed && view_.detailed[f]; }
 
     // Returns the factor on the measure of a face that lies behind the hits in `pixels` pixels.
-    double hidden(int64_t pixels) const { return view_.occlusion.factor(occluded, pixels, view_.image.spp); }
+    double hidden(int64_t pixels) const { return view_.occlusion.factor(occluded_face, pixels, view_.image.spp); }
 
     // Extent describes the image of a face.
     struct Extent {
@@ -239,7 +190,7 @@ class MeasuredChunk {
 
     // Returns the default samples of a face. side() returns the side from which the face would be visible.
     template <class Side>
-    double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
+    double default_samples(int64_t f, const Extent& e, ImageHits::FaceHits hits, Side side) const {
         const double m = (e.area + e.longest) * rate(f), unhit = where_unhit(view_, f, e.area);
         const int64_t hiding = view_.seen[f] ? 0 : view_.occlusion.hiding_pixels(e.low, e.high, e.nearest);
         if (hits.partly)
@@ -254,7 +205,7 @@ class MeasuredChunk {
         const bool textured = is_textured(view_.scene, f);
         if (!textured) m *= more_if_rough(rough_, e.longest);
         const bool by_pixels = is_detailed(f) ? e.area >= least_lit_area && e.area >= sliver * e.longest * e.longest
-                                              : (textured || rough_ > 1) && e.area >= large;
+                                              : (textured || rough_ > 1) && e.area >= least_area_by_pixels;
         if (by_pixels) {
             out_.by_pixels[f] = 1;
             mask_.mark(e.low, e.high);
@@ -279,7 +230,7 @@ class MeasuredChunk {
             controlled_[i] = false;
             set_facing(f, l.wedge[i], l.longest[i]);
             if (!(area > 0) || !(importance_[i] > 0)) continue;
-            const ImageHits::Face seen = view_.hits->of(view_.scene.faces + 3 * f);
+            const ImageHits::FaceHits seen = view_.hits->of(view_.scene.faces + 3 * f);
             const auto [x0, x1] = std::minmax({l.x[0][i], l.x[1][i], l.x[2][i]});
             const auto [y0, y1] = std::minmax({l.y[0][i], l.y[1][i], l.y[2][i]});
             const Extent extent{area, l.longest[i], {x0, y0}, {x1, y1}, std::min({l.z[0][i], l.z[1][i], l.z[2][i]})};
@@ -288,7 +239,7 @@ class MeasuredChunk {
             // The face gets a control if it has no texture and is so small that its corners predict its inside. A face
             // near the eye is not affine in the image.
             const bool is_hit = view_.seen[f] || view_.image.spp * area < most_unhit;
-            if (is_hit && seen.whole && l.longest[i] <= widest && view_.options.controls &&
+            if (is_hit && seen.whole && l.longest[i] <= widest_controlled && view_.options.controls &&
                 !is_textured(view_.scene, f) && view_.camera.is_nearly_affine(l.depths[i])) {
                 controlled_[i] = any = true;
                 clear_[i] = seen.clear;
@@ -348,7 +299,8 @@ class MeasuredChunk {
             double m = samples_[i];
             const double rough = 2 * variation(i);
             if (rough > 1) m *= more_if_rough(rough * rough, l.longest[i]);
-            else if (clear_[i] && l.longest[i] < wide) m *= std::max({rough, l.longest[i] / wide, least});
+            else if (clear_[i] && l.longest[i] < wide_controlled)
+                m *= std::max({rough, l.longest[i] / wide_controlled, least_controlled});
             out_.is_controlled[f] = 1, out_.of_face[f] = m * importance_[i];
             total_ += m;
         }
@@ -389,20 +341,6 @@ class MeasuredChunk {
     const bool want_values_;
     CornerGrad rows_;
 };
-
-}  // namespace
-
-namespace {
-
-// Keeps the fraction `share` of the pixels, evenly spread, each with the same probability.
-void thin_out(std::vector<int64_t>& pixels, double share, double offset) {
-    if (share >= 1) return;
-    size_t kept = 0;
-    for (size_t i = 0; i < pixels.size(); ++i)
-        if (std::floor(double(i + 1) * share + offset) > std::floor(double(i) * share + offset))
-            pixels[kept++] = pixels[i];
-    pixels.resize(kept);
-}
 
 }  // namespace
 

@@ -115,7 +115,7 @@ class Coincidence {
 
     // Adds another curve that passes through x. Returns false once the gradient goes to others, whatever follows.
     bool add(const CoincidentCurve& other, double t) {
-        const Place place{&other, t, (1 - t) * other.curve.a + t * other.curve.b};
+        const CurveAtPoint place{&other, t, (1 - t) * other.curve.a + t * other.curve.b};
         for (int k = 0; k < 2; ++k) {
             if (other.side[k].face < 0) continue;
             several_[k] |= first_[k].curve != nullptr;
@@ -131,13 +131,13 @@ class Coincidence {
         if (!before_[0] && !before_[1]) return false;
         share = {};
         for (int k = 0; k < 2; ++k) {
-            const Place& p = before_[k] ? own_ : first_[k];
+            const CurveAtPoint& p = before_[k] ? own_ : first_[k];
             share.side[k].face = -1;
             if (p.curve) share.side[k] = p.side(k), share.side_t[k] = p.t;
         }
         if (before_[0] && before_[1]) return true;
         const int near = share.front = before_[0] ? 0 : 1, far = 1 - near;
-        const Place& opposite = first_[far];
+        const CurveAtPoint& opposite = first_[far];
         if (opposite.curve) {
             share.far_depth = opposite.point.z;
             if (touch(own_, opposite)) share.weight = 0.5;
@@ -145,7 +145,7 @@ class Coincidence {
         }
         if (own_.side(far).face >= 0) return true;
 
-        const Place& next = first_[near];
+        const CurveAtPoint& next = first_[near];
         bool recedes = false;
         for (const HalfEdge& h : own_.curve->edge_on) {
             EdgePoint end;
@@ -177,8 +177,8 @@ class Coincidence {
     }
 
    private:
-    // A Place is a curve at the point where it passes through x.
-    struct Place {
+    // A CurveAtPoint is a curve at the point where it passes through x.
+    struct CurveAtPoint {
         const CoincidentCurve* curve = nullptr;
         double t = 0;
         Vec3 point;
@@ -203,16 +203,18 @@ class Coincidence {
         return std::fabs(wedge(along, {o.x - o.z * c.x0.x, o.y - o.z * c.x0.y})) <= c.rounding * length(along) * o.z;
     }
 
-    double tolerance(const Place& p, const Place& q) const {
+    double tolerance(const CurveAtPoint& p, const CurveAtPoint& q) const {
         return contact(std::max(p.curve->spacing, q.curve->spacing), std::max(p.curve->coordinate, q.curve->coordinate),
                        std::max(length(p.point), length(q.point)));
     }
 
-    bool touch(const Place& p, const Place& q) const { return std::fabs(p.point.z - q.point.z) <= tolerance(p, q); }
+    bool touch(const CurveAtPoint& p, const CurveAtPoint& q) const {
+        return std::fabs(p.point.z - q.point.z) <= tolerance(p, q);
+    }
 
     // Returns which of two faces that end on the same side lies in front. This is a strict order, the same for all
     // callers. Where they touch, the plane of the one in front separates the other from the viewer.
-    bool lies_before(const Place& p, const Place& q, int k) const {
+    bool lies_before(const CurveAtPoint& p, const CurveAtPoint& q, int k) const {
         const double gap = q.point.z - p.point.z;
         if (!touch(p, q)) return gap > 0;
         const Curve& line = (p.curve->curve.edge < q.curve->curve.edge ? p : q).curve->curve;
@@ -224,7 +226,7 @@ class Coincidence {
         return p.curve->curve.edge < q.curve->curve.edge;
     }
 
-    EdgePoint point_of(const Place& p, int k) const {
+    EdgePoint point_of(const CurveAtPoint& p, int k) const {
         const HalfEdge& h = p.side(k);
         return {{vertex(view_.scene, h, h.first()), vertex(view_.scene, h, h.second())}, p.t, p.point};
     }
@@ -254,7 +256,7 @@ class Coincidence {
 
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
-    Place own_, first_[2];  // front-most of the others, on either side
+    CurveAtPoint own_, first_[2];  // front-most of the others, on either side
     bool several_[2] = {};
     bool before_[2] = {};  // whether the curve's own face lies before that one
     Vec2 x_;

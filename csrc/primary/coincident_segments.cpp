@@ -32,34 +32,35 @@ class Occupancy {
 };
 
 // Calls body(k, first, last) for parts of n segments. Parts are small, so that all threads get some.
-constexpr int64_t few = 256;
+constexpr int64_t segments_of_part = 256;
 template <class Body>
-void each_few(int64_t n, ThreadTeam& team, Body body) {
-    team.parallel_for((n + few - 1) / few, [&](int64_t k) { body(k, k * few, std::min(n, (k + 1) * few)); });
+void each_part(int64_t n, ThreadTeam& team, Body body) {
+    team.parallel_for((n + segments_of_part - 1) / segments_of_part,
+                      [&](int64_t k) { body(k, k * segments_of_part, std::min(n, (k + 1) * segments_of_part)); });
 }
 
 // Returns how s meets o, over the part of s that lies next to o.
-CoincidentCurves::Meeting meeting_within(const ImageSegment& s, const ImageSegment& o) {
+CoincidentCurves::Overlap overlap_within(const ImageSegment& s, const ImageSegment& o) {
     const Vec2 along = s.b - s.a, other = o.b - o.a;
     const double squared = along.x * along.x + along.y * along.y;
     const auto parameter = [&](Vec2 x) { return ((x.x - s.a.x) * along.x + (x.y - s.a.y) * along.y) / squared; };
     const double t0 = parameter(o.a), t1 = parameter(o.b);
     // Segments that merely touch end to end do not meet. Neglecting a millionth of the length loses nothing.
     const double first = std::max(0.0, std::min(t0, t1)), last = std::min(1.0, std::max(t0, t1));
-    using Meeting = CoincidentCurves::Meeting;
-    if (!(last - first > 1e-6)) return Meeting::none;
+    using Overlap = CoincidentCurves::Overlap;
+    if (!(last - first > 1e-6)) return Overlap::none;
     const double reach = std::max(s.reach, o.reach) * length(other);
     const auto aside = [&](double t) { return wedge(other, s.a + t * along - o.a); };  // px times the length of o
     const double d0 = aside(first), d1 = aside(last);
     const bool near0 = std::fabs(d0) <= reach, near1 = std::fabs(d1) <= reach;
-    if (near0 && near1) return Meeting::along;
-    return near0 || near1 || (d0 > 0) != (d1 > 0) ? Meeting::across : Meeting::none;
+    if (near0 && near1) return Overlap::along;
+    return near0 || near1 || (d0 > 0) != (d1 > 0) ? Overlap::across : Overlap::none;
 }
 
 }  // namespace
 
-CoincidentCurves::Meeting CoincidentCurves::meeting(const ImageSegment& s, const ImageSegment& o) {
-    return std::max(meeting_within(s, o), meeting_within(o, s));
+CoincidentCurves::Overlap CoincidentCurves::overlap(const ImageSegment& s, const ImageSegment& o) {
+    return std::max(overlap_within(s, o), overlap_within(o, s));
 }
 
 CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples,
@@ -151,7 +152,7 @@ void CoincidentCurves::fill(ThreadTeam& team) {
     mask_ = uint64_t(buckets - 1);
     std::vector<std::atomic<uint32_t>> end(buckets);
     const auto each_entry = [&](auto entry) {
-        each_few(n, team, [&](int64_t, int64_t first, int64_t last) {
+        each_part(n, team, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t i = first; i < last; ++i)
                 lines_.each_cell(segments_[i], [&](const LineBuckets::Line& l) { entry(i, l); });
         });
@@ -167,15 +168,15 @@ void CoincidentCurves::fill(ThreadTeam& team) {
     }
     if (sum > std::numeric_limits<uint32_t>::max()) throw std::bad_alloc();  // 64 GB
     begin_[buckets] = uint32_t(sum);
-    entries_ = Array<Entry>(int64_t(sum));
+    entries_ = Array<BucketEntry>(int64_t(sum));
     each_entry([&](int64_t i, const LineBuckets::Line& l) {
         const ImageSegment& s = segments_[i];
         const bool x = LineBuckets::runs_along_x(l);
         const double a = x ? s.a.x : s.a.y, b = x ? s.b.x : s.b.y;
-        constexpr float far = std::numeric_limits<float>::infinity();
+        constexpr float infinity = std::numeric_limits<float>::infinity();
         entries_[end[LineBuckets::key(l) & mask_].fetch_add(1, std::memory_order_relaxed)] = {
-            .low = std::nextafter(float(std::min(a, b) - margin_), -far),
-            .high = std::nextafter(float(std::max(a, b) + margin_), far),
+            .low = std::nextafter(float(std::min(a, b) - margin_), -infinity),
+            .high = std::nextafter(float(std::max(a, b) + margin_), infinity),
             .depth = float(s.depth),
             .segment = uint32_t(i)};
     });
@@ -183,7 +184,7 @@ void CoincidentCurves::fill(ThreadTeam& team) {
     team.parallel_for_blocks(buckets, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t k = first; k < last; ++k)
             std::sort(entries_.begin() + begin_[k], entries_.begin() + begin_[k + 1],
-                      [](const Entry& e, const Entry& o) {
+                      [](const BucketEntry& e, const BucketEntry& o) {
                           return e.depth != o.depth ? e.depth < o.depth : e.segment < o.segment;
                       });
     });
@@ -191,7 +192,7 @@ void CoincidentCurves::fill(ThreadTeam& team) {
 
 // Buckets also hold segments that follow end to end along a line. In a bucket with many, all are kept untested.
 void CoincidentCurves::find_coincident(const Systematic& samples, ThreadTeam& team) {
-    constexpr uint32_t many = 64;
+    constexpr uint32_t most_tested = 64;
     const auto any_adjacent = [&](const ImageSegment& s, const LineBuckets::Line& l) {
         uint64_t keys[4];
         LineBuckets::keys_around(l, keys);
@@ -200,17 +201,17 @@ void CoincidentCurves::find_coincident(const Systematic& samples, ThreadTeam& te
                     high = float(std::max(x ? s.a.x : s.a.y, x ? s.b.x : s.b.y));
         for (const uint64_t key : keys) {
             const uint32_t first = begin_[key & mask_], last = begin_[(key & mask_) + 1];
-            if (last - first > many) return true;
+            if (last - first > most_tested) return true;
             for (uint32_t i = first; i < last; ++i) {
-                const Entry& e = entries_[i];
+                const BucketEntry& e = entries_[i];
                 const ImageSegment& o = segments_[e.segment];
-                if (e.low <= high && low <= e.high && &o != &s && meeting(s, o) != Meeting::none) return true;
+                if (e.low <= high && low <= e.high && &o != &s && overlap(s, o) != Overlap::none) return true;
             }
         }
         return false;
     };
-    std::vector<std::vector<CoincidentSegment>> parts((segments_.size() + few - 1) / few);
-    each_few(segments_.size(), team, [&](int64_t k, int64_t first, int64_t last) {
+    std::vector<std::vector<CoincidentSegment>> parts((segments_.size() + segments_of_part - 1) / segments_of_part);
+    each_part(segments_.size(), team, [&](int64_t k, int64_t first, int64_t last) {
         std::vector<CoincidentSegment> part;
         for (int64_t i = first; i < last; ++i) {
             if (!samples.may_draw(segments_[i].curve)) continue;
@@ -232,15 +233,15 @@ const ImageSegment* CoincidentCurves::find(int64_t edge) const {
     return at != coincident_.end() && at->edge == edge ? &segments_[at->segment] : nullptr;
 }
 
-CoincidentCurves::Meeting CoincidentCurves::at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x) {
+CoincidentCurves::Overlap CoincidentCurves::at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x) {
     const Vec2 along = other.b - other.a, from = x - other.a;
     const double far = length(along), reach = std::max(own.reach, other.reach);
     const double t = from.x * along.x + from.y * along.y;
-    if (!(t >= -reach * far && t <= (far + reach) * far)) return Meeting::none;
+    if (!(t >= -reach * far && t <= (far + reach) * far)) return Overlap::none;
     const double aside = std::fabs(wedge(along, from));
-    if (!(aside <= 2 * reach * far)) return Meeting::none;  // This test spares most of what follows.
-    const Meeting found = meeting(own, other);
-    return found == Meeting::across && !(aside <= reach * far) ? Meeting::none : found;
+    if (!(aside <= 2 * reach * far)) return Overlap::none;  // This test spares most of what follows.
+    const Overlap found = overlap(own, other);
+    return found == Overlap::across && !(aside <= reach * far) ? Overlap::none : found;
 }
 
 }  // namespace edgegrad

@@ -44,7 +44,7 @@ class LineBuckets {
     // Calls found(line) for every cell that the segment passes at less than the margin.
     template <class Found>
     void each_cell(const ImageSegment& s, Found found) const {
-        const Direction direction(s.b - s.a);
+        const LineDirection direction(s.b - s.a);
         const int parts = 1 + int(std::min(direction.length * per_cell_, 0x1p20));
         int64_t last_i0 = INT64_MAX, last_j0 = 0, last_i1 = 0, last_j1 = 0;
         for (int k = 0; k < parts; ++k) {
@@ -62,7 +62,7 @@ class LineBuckets {
 
     // Returns the line of a segment in the cell of its point x.
     Line line_at(const ImageSegment& s, Vec2 x) const {
-        return line(Direction(s.b - s.a), s.a, index(x.x), index(x.y));
+        return line(LineDirection(s.b - s.a), s.a, index(x.x), index(x.y));
     }
 
     // Returns random bits that stand for a line's own bucket.
@@ -81,10 +81,11 @@ class LineBuckets {
     // Directions are measured by 1 − x / (|x| + y), y ≥ 0, which grows from 0 to 2, by ½ to 1 per radian.
     static constexpr int64_t directions = 400;
     static constexpr double distance_step = 0.05;  // px
-    struct Direction {
+    struct LineDirection {
         Vec2 along;
         double length, direction, per_distance;
-        explicit Direction(Vec2 d) : along(d.y < 0 || (d.y == 0 && d.x < 0) ? -1 * d : d), length(edgegrad::length(d)) {
+        explicit LineDirection(Vec2 d)
+            : along(d.y < 0 || (d.y == 0 && d.x < 0) ? -1 * d : d), length(edgegrad::length(d)) {
             direction = (1 - along.x / (std::fabs(along.x) + along.y)) * (directions / 2.0);
             per_distance = 1 / (length * distance_step);
         }
@@ -96,7 +97,7 @@ class LineBuckets {
     }
     int64_t index(double x) const { return floor(x * per_cell_); }
 
-    Line line(const Direction& d, Vec2 a, int64_t i, int64_t j) const {
+    Line line(const LineDirection& d, Vec2 a, int64_t i, int64_t j) const {
         const Vec2 middle{(double(i) + 0.5) * cell_, (double(j) + 0.5) * cell_};
         return {uint64_t(i) << 32 ^ uint64_t(j), d.direction, wedge(d.along, a - middle) * d.per_distance};
     }
@@ -120,17 +121,17 @@ class CoincidentCurves {
     // others lie on its line. It adds two tables, up to 7 cell entries, and its CoincidentSegment, twice. Most curves
     // pass one or two cells, and are alone.
     static constexpr int64_t bytes_per_curve() {
-        return sizeof(ImageSegment) + 2 * 16 + 7 * sizeof(Entry) + 2 * sizeof(CoincidentSegment);
+        return sizeof(ImageSegment) + 2 * 16 + 7 * sizeof(BucketEntry) + 2 * sizeof(CoincidentSegment);
     }
 
     // Returns the segment of an edge that has samples; null if no other segment lies on it anywhere.
     const ImageSegment* find(int64_t edge) const;
 
-    // Meeting tells how two segments meet that come closer in the image than the error of rays. `along` ones are so
+    // Overlap tells how two segments lie that come closer in the image than the error of rays. `along` ones are so
     // close wherever both exist. `across` ones meet at a small angle, where more than a point of one is close.
-    enum class Meeting { none, across, along };
+    enum class Overlap { none, across, along };
 
-    // Calls found(other, meeting) for segments that pass so close to the point x of `own`, until it returns false.
+    // Calls found(other, overlap) for segments that pass so close to the point x of `own`, until it returns false.
     template <class Found>
     void at(const ImageSegment& own, Vec2 x, Found found) const {
         const LineBuckets::Line line = lines_.line_at(own, x);
@@ -141,19 +142,19 @@ class CoincidentCurves {
             bucket[k] &= mask_;
             if (std::find(bucket, bucket + k, bucket[k]) != bucket + k) continue;
             for (uint32_t i = begin_[bucket[k]]; i < begin_[bucket[k] + 1]; ++i) {
-                const Entry& e = entries_[i];
+                const BucketEntry& e = entries_[i];
                 if (!(e.low <= place && place <= e.high)) continue;
                 const ImageSegment& other = segments_[e.segment];
                 if (&other == &own) continue;
-                const Meeting meeting = at_point(other, own, x);
-                if (meeting != Meeting::none && !found(other, meeting)) return;
+                const Overlap overlap = at_point(other, own, x);
+                if (overlap != Overlap::none && !found(other, overlap)) return;
             }
         }
     }
 
    private:
-    // An Entry is a segment in a bucket, with its interval along the longer of x and y.
-    struct Entry {
+    // A BucketEntry is a segment in a bucket, with its interval along the longer of x and y.
+    struct BucketEntry {
         float low, high, depth;
         uint32_t segment;
     };
@@ -162,8 +163,8 @@ class CoincidentCurves {
                               ThreadTeam& team) const;
     void fill(ThreadTeam& team);
     void find_coincident(const Systematic& samples, ThreadTeam& team);
-    static Meeting meeting(const ImageSegment& s, const ImageSegment& o);
-    static Meeting at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x);
+    static Overlap overlap(const ImageSegment& s, const ImageSegment& o);
+    static Overlap at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x);
 
     LineBuckets lines_;
     // A CoincidentSegment is a segment that others lie on.
@@ -176,7 +177,7 @@ class CoincidentCurves {
     std::vector<CoincidentSegment> coincident_;  // in ascending order of edges
     uint64_t mask_ = 0;
     std::vector<uint32_t> begin_;  // first index of each bucket in entries_
-    Array<Entry> entries_{0};
+    Array<BucketEntry> entries_{0};
     double margin_ = 0;  // px
 };
 

@@ -34,12 +34,12 @@ class CreaseJumps {
         for (int c = 0; c < C_; ++c) sum += weights[first_ + c] * (std::fabs(value_[c]) + std::fabs(value_[C_ + c]));
         return 0.5 * sum;
     }
-    // Ends holds Σ_c A_c jump_c at both ends, given A of all channels.
-    struct Ends {
+    // WeightedJumps holds Σ_c A_c jump_c at both ends, given A of all channels.
+    struct WeightedJumps {
         double a = 0, b = 0;
     };
-    Ends times(const T* A) const {
-        Ends sum;
+    WeightedJumps times(const T* A) const {
+        WeightedJumps sum;
         for (int c = 0; c < C_; ++c) {
             const double own = A[first_ + c];
             sum.a += own * value_[c], sum.b += own * value_[C_ + c];
@@ -89,7 +89,7 @@ class ControlOfChannels final : public CreaseControl {
     }
 
     double density(double least) const override {
-        return std::clamp(std::max(curve_->length / wide, distort_), least, 1.0);
+        return std::clamp(std::max(curve_->length / least_length, distort_), least, 1.0);
     }
 
     void add_integral() override {
@@ -143,12 +143,12 @@ class ControlOfChannels final : public CreaseControl {
         double middle_, half_, a_[3] = {}, b_[3] = {};  // Ã times the jump at either end of the curve
     };
 
-    // Passed walks the pixels that a curve passes along one axis. It leaves a pixel at `next`, then every `step`.
-    struct Passed {
+    // PixelWalk walks the pixels that a curve passes along one axis. It leaves a pixel at `next`, then every `step`.
+    struct PixelWalk {
         int64_t pixel;
         int by;
         double next, step;
-        Passed(double origin, double along, double per)
+        PixelWalk(double origin, double along, double per)
             : pixel(int64_t(along < 0 ? std::ceil(origin) - 1 : std::floor(origin))),
               by(along < 0 ? -1 : 1),
               next(along == 0 ? std::numeric_limits<double>::infinity()
@@ -162,14 +162,14 @@ class ControlOfChannels final : public CreaseControl {
     // Adds ∫ φ_k (φ_a a + φ_b b) ds over each pixel passed, where Ã is constant. a, b are Ã times the jump at the ends.
     void add_integral_of_box() {
         const int width = view_.camera.width, height = view_.camera.height;
-        Passed columns(curve_->x0.x, tangent_.x, per_[0]), rows(curve_->x0.y, tangent_.y, per_[1]);
-        struct Powers {
+        PixelWalk columns(curve_->x0.x, tangent_.x, per_[0]), rows(curve_->x0.y, tangent_.y, per_[1]);
+        struct Moments {
             double s, s2, s3;  // ∫ ds, ∫ s ds, ∫ s² ds from 0 on
         } low{};
         double at_a = 0, at_b = 0;
         for (double begin = 0; begin < 1;) {
             const double end = std::min({columns.next, rows.next, 1.0});
-            const Powers high{end, end * end / 2, end * end * end / 3};
+            const Moments high{end, end * end / 2, end * end * end / 3};
             const int64_t i = columns.pixel, j = rows.pixel;
             columns.pass(end), rows.pass(end);
             if (i >= 0 && j >= 0 && i < width && j < height) {
@@ -210,7 +210,7 @@ class ControlOfChannels final : public CreaseControl {
         return std::max(end, s + 1e-6);
     }
 
-    static constexpr double wide = 1024;  // px, length from which a crease gets all samples
+    static constexpr double least_length = 1024;  // px, length from which a crease gets all samples
 
     const BackwardView<T>& view_;
     const Curve* curve_ = nullptr;

@@ -11,8 +11,8 @@
 #include "boundary/curve.h"
 #include "estimator/view.h"
 #include "primary/crease_visibility.h"
-#include "primary/crossings.h"
-#include "primary/meeting_parts.h"
+#include "primary/overlapping_parts.h"
+#include "primary/silhouette_grid.h"
 #include "scene/contact.h"
 
 namespace edgegrad {
@@ -33,12 +33,12 @@ struct CreaseFace {
 template <class T>
 class CreaseFaces {
    public:
-    CreaseFaces(const BackwardView<T>& view, const CurveFinder<T>& finder, const Crossings& crossings,
-                const MeetingParts& meeting)
+    CreaseFaces(const BackwardView<T>& view, const CurveFinder<T>& finder, const SilhouetteGrid& silhouette_grid,
+                const OverlappingParts& overlapping_parts)
         : view_(view),
           finder_(finder),
-          crossings_(crossings),
-          meeting_(meeting),
+          silhouette_grid_(silhouette_grid),
+          overlapping_parts_(overlapping_parts),
           faces_(view.scene.n_faces),
           density_of_hidden_(
               view.occlusion.factor(CreaseSamples::hidden, OcclusionHint::pixels_around, view.image.spp)) {
@@ -66,7 +66,7 @@ class CreaseFaces {
         if ((p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) || is_textured(view_.scene, f)) return out;
         const ImageHits& hits = *view_.hits;
         const bool behind = hits.are_behind(v);
-        const ImageHits::Face hit = hits.of(v);
+        const ImageHits::FaceHits hit = hits.of(v);
         if (!behind && hit.partly && !hit.clear && !hit.missed) return out;
 
         const Vec2 a = p.x[v[0]], b = p.x[v[1]], c = p.x[v[2]];
@@ -75,9 +75,9 @@ class CreaseFaces {
         const auto [nearest, farthest] = std::minmax({p.q[v[0]].z, p.q[v[1]].z, p.q[v[2]].z});
         const double touching = contact(spacing_, largest_, std::max(std::fabs(nearest), std::fabs(farthest)));
         if ((view_.camera.perspective ? nearest : 1) < least_weight_) return out;
-        const bool crossed = crossings_.in(low, high, farthest + touching);
+        const bool crossed = silhouette_grid_.in(low, high, farthest + touching);
         if (!crossed && hit.clear && !hit.missed) {
-            if (!meeting_.in(low, high)) out.state = view_.seen[f] ? CreaseFace::seen : CreaseFace::clear;
+            if (!overlapping_parts_.in(low, high)) out.state = view_.seen[f] ? CreaseFace::seen : CreaseFace::clear;
             return out;
         }
         if (!hit.missed) return out;
@@ -142,8 +142,8 @@ class CreaseFaces {
 
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
-    const Crossings& crossings_;
-    const MeetingParts& meeting_;
+    const SilhouetteGrid& silhouette_grid_;
+    const OverlappingParts& overlapping_parts_;
     Array<CreaseFace> faces_;
     double largest_ = 0, spacing_ = 0;
     double least_weight_ = 1;  // a power of two: depth weight from which the rounding of positions does not matter

@@ -14,13 +14,13 @@
 #include "boundary/curve.h"
 #include "estimator/view.h"
 #include "primary/coincidence.h"
-#include "primary/crossings.h"
-#include "primary/meeting_parts.h"
+#include "primary/overlapping_parts.h"
+#include "primary/silhouette_grid.h"
 
 namespace edgegrad {
 
-// Expected is the predicted visibility of a crease, and the fraction of its samples drawn to verify it.
-struct Expected {
+// PredictedVisibility is the predicted visibility of a crease, and the fraction of its samples drawn to verify it.
+struct PredictedVisibility {
     bool visible;
     double samples;
 };
@@ -29,7 +29,7 @@ struct Expected {
 // `hidden_in_part` ones. `turned_away` creases are on the back of a closed mesh. `visible` ones have nothing that
 // divides them, and at least 16 rays per pixel.
 struct CreaseSamples {
-    static constexpr OcclusionHint::Few hidden{.rays = 0.5, .share = 1.0 / 64, .least = 1.0 / 256},
+    static constexpr OcclusionHint::HiddenFactor hidden{.rays = 0.5, .share = 1.0 / 64, .least = 1.0 / 256},
         hidden_in_part{.rays = 2, .share = 1.0 / 128, .least = 1.0 / 256};
     static constexpr double turned_away = 1.0 / 16 * ImageHits::turned_away, visible = 1.0 / 512;
 };
@@ -37,39 +37,41 @@ struct CreaseSamples {
 template <class T>
 class CreaseVisibility {
    public:
-    using Relation = Crossings::Relation;
+    using Relation = SilhouetteGrid::Relation;
 
-    CreaseVisibility(const BackwardView<T>& view, const Crossings& crossings, const MeetingParts& meeting)
-        : view_(view), crossings_(crossings), meeting_(meeting), rays_(view.frame) {}
+    CreaseVisibility(const BackwardView<T>& view, const SilhouetteGrid& silhouette_grid,
+                     const OverlappingParts& overlapping_parts)
+        : view_(view), silhouette_grid_(silhouette_grid), overlapping_parts_(overlapping_parts), rays_(view.frame) {}
 
-    Relation relation(const Curve& c) const { return crossings_.relation(c, touching(c)); }
+    Relation relation(const Curve& c) const { return silhouette_grid_.relation(c, touching(c)); }
 
     // Predicts a crease that lies behind the hits in `pixels` pixels (occlusion.h). If all of it is visible or none,
     // rays cannot have missed a part in a gap.
-    Expected hidden(Relation relation, int64_t pixels) const {
+    PredictedVisibility hidden(Relation relation, int64_t pixels) const {
         const bool whole = relation == Relation::apart;
         return {false, view_.occlusion.factor(whole ? CreaseSamples::hidden : CreaseSamples::hidden_in_part, pixels,
                                               view_.image.spp)};
     }
 
     // Predicts any other crease; returns nothing where rays must decide.
-    std::optional<Expected> without_rays(const Curve& c, Relation relation) const {
+    std::optional<PredictedVisibility> without_rays(const Curve& c, Relation relation) const {
         const double missed = where_missed(c);
-        if (relation == Relation::across) return Expected{hits(c.minus).whole && hits(c.plus).whole, missed};
+        if (relation == Relation::across) return PredictedVisibility{hits(c.minus).whole && hits(c.plus).whole, missed};
         // This crease is on the back of a closed mesh.
-        if (missed < ImageHits::missed) return Expected{false, relation == Relation::apart ? missed / 16 : missed};
+        if (missed < ImageHits::missed)
+            return PredictedVisibility{false, relation == Relation::apart ? missed / 16 : missed};
         // Rays may slip past an own face seen edge-on, whose other sides are silhouettes then.
-        if (is_thin(c, c.minus) || is_thin(c, c.plus)) return Expected{false, missed};
+        if (is_thin(c, c.minus) || is_thin(c, c.plus)) return PredictedVisibility{false, missed};
         if (fewest(c, relation) != few || !(view_.seen[c.minus.face] || view_.seen[c.plus.face])) return std::nullopt;
-        return Expected{true, by_evidence(few)};
+        return PredictedVisibility{true, by_evidence(few)};
     }
 
     // Adds rays to some points of a crease to the batch. Returns its index there.
     int ask(const Curve& c, Relation relation) {
         const int n = points(c);
-        asked_[size_] = {c, n, by_evidence(std::max(fewest(c, relation), near_silhouettes)), where_missed(c)};
+        tested_[size_] = {c, n, by_evidence(std::max(fewest(c, relation), near_silhouettes)), where_missed(c)};
         for (int i = 0; i < n; ++i) {
-            const Vec2 at = normalised(view_.camera, c.position(asked_at[i]));
+            const Vec2 at = normalised(view_.camera, c.position(ray_positions[i]));
             rays_.n_x[rays_.count] = at.x, rays_.n_y[rays_.count++] = at.y;
         }
         return size_++;
@@ -82,15 +84,15 @@ class CreaseVisibility {
         rays_.prepare();
         view_.frame.cast(rays_);
         for (int k = 0, ray = 0; k < size_; ++k) {
-            const auto& [c, points, fewest, missed] = asked_[k];
+            const auto& [c, points, fewest, missed] = tested_[k];
             int visible = 0, hidden = 0;
             for (int i = 0; i < points; ++i) {
-                const Answer a = at(c, asked_at[i], ray++);
-                visible += a == Answer::visible, hidden += a == Answer::hidden;
+                const RayAnswer a = at(c, ray_positions[i], ray++);
+                visible += a == RayAnswer::visible, hidden += a == RayAnswer::hidden;
             }
             // Next to a hit, a crease that rays find hidden may be visible between them, as at a limb.
             const bool agreed = visible == points || (hidden == points && missed < 1);
-            body(k, c, Expected{visible > hidden, agreed ? std::min(fewest, missed) : missed});
+            body(k, c, PredictedVisibility{visible > hidden, agreed ? std::min(fewest, missed) : missed});
         }
         rays_.count = size_ = 0;
     }
@@ -99,8 +101,8 @@ class CreaseVisibility {
 
    private:
     // Rays go to the ends of a crease. One longer than some pixels has more samples itself, and gets two points more.
-    static constexpr double asked_at[] = {0.05, 0.95, 0.35, 0.65};
-    static constexpr int most_points = int(std::size(asked_at));
+    static constexpr double ray_positions[] = {0.05, 0.95, 0.35, 0.65};
+    static constexpr int most_points = int(std::size(ray_positions));
     static int points(const Curve& c) { return c.length < 4 ? few_points : most_points; }
 
     // These least fractions of samples hold where nothing may divide a crease, or something may but rays miss it.
@@ -127,7 +129,9 @@ class CreaseVisibility {
                 farthest = std::max(farthest, view_.vertices.q[v].z);
             }
         if (!hits(c.minus).clear || !hits(c.plus).clear) return near_missed;
-        return meeting_.in(low, high) ? near_other_parts : crossings_.in(low, high, farthest) ? near_silhouettes : few;
+        return overlapping_parts_.in(low, high)           ? near_other_parts
+               : silhouette_grid_.in(low, high, farthest) ? near_silhouettes
+                                                          : few;
     }
 
     // Returns whether an own face is no wider in the image than the error of rays. Their positions are rounded to
@@ -140,17 +144,17 @@ class CreaseVisibility {
         return std::fabs(wedge(c.tangent(), view_.vertices.x[opposite] - c.x0)) < error * c.length;
     }
 
-    // Answer is what a ray says of the point s of a crease. It is `unknown` where the hit is nearer by less than a part
-    // of a pixel. On faces seen nearly edge-on it may be a neighbour that the ray should have missed. Contact with the
-    // crease is decided in double precision.
-    enum class Answer { visible, hidden, unknown };
-    Answer at(const Curve& c, double s, int ray) const {
+    // RayAnswer is what a ray says of the point s of a crease. It is `unknown` where the hit is nearer by less than a
+    // part of a pixel. On faces seen nearly edge-on it may be a neighbour that the ray should have missed. Contact with
+    // the crease is decided in double precision.
+    enum class RayAnswer { visible, hidden, unknown };
+    RayAnswer at(const Curve& c, double s, int ray) const {
         const int32_t hit = rays_.face[ray];
-        if (hit < 0 || hit == c.minus.face || hit == c.plus.face) return Answer::visible;
+        if (hit < 0 || hit == c.minus.face || hit == c.plus.face) return RayAnswer::visible;
         const double t = c.parameter(s), depth = (1 - t) * c.a.z + t * c.b.z;
         const double pixel = view_.camera.pixel_at_depth(depth);
         const double behind = depth_of(view_, hit, rays_.n(ray)) - depth;
-        return behind > touching(c) ? Answer::visible : behind < -pixel / 4 ? Answer::hidden : Answer::unknown;
+        return behind > touching(c) ? RayAnswer::visible : behind < -pixel / 4 ? RayAnswer::hidden : RayAnswer::unknown;
     }
 
     // Returns the world units by which a touching surface may lie behind a crease.
@@ -159,7 +163,9 @@ class CreaseVisibility {
                        largest_coordinate(view_.scene, c.minus), std::max(std::fabs(c.a.z), std::fabs(c.b.z)));
     }
 
-    ImageHits::Face hits(const HalfEdge& h) const { return view_.hits->of(view_.scene.faces + 3 * int64_t(h.face)); }
+    ImageHits::FaceHits hits(const HalfEdge& h) const {
+        return view_.hits->of(view_.scene.faces + 3 * int64_t(h.face));
+    }
 
     // Returns less than 1 where rays hit neither the crease nor its neighbours.
     double where_missed(const Curve& c) const {
@@ -168,17 +174,17 @@ class CreaseVisibility {
         return view_.hits->where_missed(view_.scene.faces[3 * int64_t(c.minus.face)], side_of(view_, c.minus.face));
     }
 
-    struct Asked {
+    struct TestedCrease {
         Curve curve;
         int points;
         double fewest, missed;
     };
 
     const BackwardView<T>& view_;
-    const Crossings& crossings_;
-    const MeetingParts& meeting_;
+    const SilhouetteGrid& silhouette_grid_;
+    const OverlappingParts& overlapping_parts_;
     CameraRays rays_;
-    Asked asked_[most];
+    TestedCrease tested_[most];
     int size_ = 0;
 };
 

@@ -53,23 +53,24 @@ ImageSegment image_segment(const BackwardView<T>& view, const Curve& c, int64_t 
 // CreaseHints holds what tells the visibility of creases without a sample.
 template <class T>
 struct CreaseHints {
-    const Crossings crossings;
-    const MeetingParts meeting;
+    const SilhouetteGrid silhouette_grid;
+    const OverlappingParts overlapping_parts;
     std::optional<CreaseFaces<T>>
         faces;  // none where faces are alpha-tested: it does not treat their alpha edges as silhouettes
 
     CreaseHints(const BackwardView<T>& view, const CurveFinder<T>& finder,
                 const std::vector<std::vector<ImageSegment>>& silhouettes)
-        : crossings(silhouettes, view.camera.width, view.camera.height, view.team),
-          meeting(view.hit, view.scene.faces, view.geometry.parts(), view.camera.width, view.camera.height, view.team) {
-        if (!view.scene.alpha_masks.face) faces.emplace(view, finder, crossings, meeting);
+        : silhouette_grid(silhouettes, view.camera.width, view.camera.height, view.team),
+          overlapping_parts(view.hit, view.scene.faces, view.geometry.parts(), view.camera.width, view.camera.height,
+                            view.team) {
+        if (!view.scene.alpha_masks.face) faces.emplace(view, finder, silhouette_grid, overlapping_parts);
     }
 };
 
 // MeasuredEdges measures the curves of one chunk of edges.
 template <class T>
 class MeasuredEdges {
-    using Relation = Crossings::Relation;
+    using Relation = SilhouetteGrid::Relation;
 
    public:
     // `hints`, and `x`, to which controls are added, are null if there are no controls.
@@ -81,7 +82,7 @@ class MeasuredEdges {
           faces_(hints && hints->faces ? &*hints->faces : nullptr),
           x_(x),
           control_(make_crease_control(view)) {
-        if (hints) visibility_.emplace(view, hints->crossings, hints->meeting);
+        if (hints) visibility_.emplace(view, hints->silhouette_grid, hints->overlapping_parts);
     }
 
     CurvesFound found;
@@ -185,7 +186,7 @@ class MeasuredEdges {
         } else {
             segments.push_back(image_segment(view_, c, jump.curve));
             measure(c, jump,
-                    std::min(hiding ? view_.occlusion.factor(occluded, double(hiding), view_.image.spp) : 1,
+                    std::min(hiding ? view_.occlusion.factor(occluded_curve, double(hiding), view_.image.spp) : 1,
                              next_to_unhit(view_, c.minus.face >= 0 ? c.minus.face : c.plus.face)));
         }
     }
@@ -209,19 +210,19 @@ class MeasuredEdges {
             else measure(c, jump, expected->samples);
             return;
         }
-        asked_[visibility_->ask(c, relation)] = jump;
+        tested_[visibility_->ask(c, relation)] = jump;
         if (visibility_->full()) answer();
     }
 
     void answer() {
         if (!visibility_) return;
-        visibility_->answer([&](int k, const Curve& c, Expected expected) {
+        visibility_->answer([&](int k, const Curve& c, PredictedVisibility expected) {
             control_->set(c);
-            expect(c, asked_[k], expected);
+            expect(c, tested_[k], expected);
         });
     }
 
-    void expect(const Curve& c, const Jump& jump, Expected expected) {
+    void expect(const Curve& c, const Jump& jump, PredictedVisibility expected) {
         if (expected.visible) {
             curves[jump.curve].controlled = true;
             control_->add_integral();
@@ -237,13 +238,13 @@ class MeasuredEdges {
     }
     double relative(double jump) const {
         const double size = jump / scale_.unknown;
-        return size > 0 && !visibility_ ? std::clamp(size, least, largest) : std::min(size, largest);
+        return size > 0 && !visibility_ ? std::clamp(size, least_jump, largest_jump) : std::min(size, largest_jump);
     }
 
-    static constexpr double largest = 2;  // keeps a bright face among dark ones from taking all samples
+    static constexpr double largest_jump = 2;  // keeps a bright face among dark ones from taking all samples
     // This bound holds where samples alone find the jump. They look slightly aside of the curve (accumulation.cpp),
     // where a texture may differ across a nearly coplanar crease. Such a sample must not have a large weight.
-    static constexpr double least = 1.0 / 1024;
+    static constexpr double least_jump = 1.0 / 1024;
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
     const JumpScale& scale_;
@@ -251,7 +252,7 @@ class MeasuredEdges {
     RowBuffer* x_;
     const std::unique_ptr<CreaseControl> control_;
     std::optional<CreaseVisibility<T>> visibility_;
-    Jump asked_[CreaseVisibility<T>::most];
+    Jump tested_[CreaseVisibility<T>::most];
 };
 
 // Measures the lens boundary, where the adjoint is not zero. The jump is unknown.

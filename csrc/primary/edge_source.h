@@ -31,7 +31,7 @@ class EdgeSource {
 
     // A Sample is the point t of an edge.
     struct Sample : CurveSample {
-        int place = 0;
+        int pending_curve = 0;
         double t = 0;
         CoincidentShare share = {};
     };
@@ -42,32 +42,32 @@ class EdgeSource {
     Vec2 position(const Curve& curve, double s) const { return curve.position(s); }
 
     bool place(const Curve& curve, double s, Sample& sample) {
-        if (places_ == 0 || place_[places_ - 1].own.curve.edge != curve.edge) {
-            // A place is free again if all of its samples were hidden, so there are never more places than lanes.
-            if (places_ > 0 && pending_ != places_ - 1) --places_;
-            start(place_[places_++], curve);
+        if (n_pending_ == 0 || pending_[n_pending_ - 1].own.curve.edge != curve.edge) {
+            // A curve without a pending sample is replaced, so there are never more curves than lanes.
+            if (n_pending_ > 0 && latest_ != n_pending_ - 1) --n_pending_;
+            start(pending_[n_pending_++], curve);
         }
-        Place& place = place_[places_ - 1];
+        PendingCurve& pending = pending_[n_pending_ - 1];
         const double t = curve.parameter(s);
-        sample.place = places_ - 1;
+        sample.pending_curve = n_pending_ - 1;
         sample.point = (1 - t) * curve.a + t * curve.b;
         sample.t = t;
         sample.behind = {};
         sample.share = {.side = {curve.minus, curve.plus}, .side_t = {t, t}};
         if (view_.alpha_masks && !show(curve, t, sample.share)) return false;
-        const std::span<const int32_t> own = place.faces.faces;
+        const std::span<const int32_t> own = pending.faces.faces;
         sample.gathered.clear();
-        if ((place.segment || place.edge_on) && !share(place, sample)) return false;
+        if ((pending.segment || pending.edge_on) && !share(pending, sample)) return false;
         if (!sample.gathered.empty()) {
             sample.gathered.insert(sample.gathered.end(), own.begin(), own.end());
             std::sort(sample.gathered.begin(), sample.gathered.end());
         }
         sample.ignored = sample.gathered.empty() ? own : std::span<const int32_t>(sample.gathered);
-        pending_ = sample.place;
+        latest_ = sample.pending_curve;
         return true;
     }
 
-    const CurveFaces& faces_of(const Sample& sample) const { return place_[sample.place].faces; }
+    const CurveFaces& faces_of(const Sample& sample) const { return pending_[sample.pending_curve].faces; }
 
     SampleSurfaces surfaces(Sample& sample) const {
         CoincidentShare& share = sample.share;
@@ -104,7 +104,7 @@ class EdgeSource {
     // Returns δx ∧ τ of the point. The vertices of the faces on either side have equal parts, as in flush().
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
         if (!direction.moves()) return {};
-        const Curve& curve = place_[sample.place].own.curve;
+        const Curve& curve = pending_[sample.pending_curve].own.curve;
         const Vec2 tangent = distorted_tangent(sample);
         const auto velocity = [&](Vec3 point, Vec3 point_dot) {
             return wedge(project_jvp(view_.camera, point, point_dot, direction.intrinsics), tangent);
@@ -125,7 +125,7 @@ class EdgeSource {
     }
 
     void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) {
-        const Curve& curve = place_[sample.place].own.curve;
+        const Curve& curve = pending_[sample.pending_curve].own.curve;
         const CoincidentShare& share = sample.share;
         const Vec2 tangent = distorted_tangent(sample);
         const auto move = [&](Vec3 point, double jump) {
@@ -148,7 +148,7 @@ class EdgeSource {
         second_bar_[1] += second.t * second_bar;
     }
 
-    void cast() { places_ = 0, pending_ = -1; }
+    void cast() { n_pending_ = 0, latest_ = -1; }
 
     void finish(LocalGradients& grad) {
         flush(grad);
@@ -156,25 +156,25 @@ class EdgeSource {
     }
 
    private:
-    // A Place is a curve with pending samples.
-    struct Place {
+    // A PendingCurve is a curve with pending samples.
+    struct PendingCurve {
         CoincidentCurve own;          // without its faces until they are needed
         const ImageSegment* segment;  // segment, if others lie on it somewhere; else null
         bool edge_on, with_faces;     // whether a face of it is seen edge-on; whether `own` has its faces
         CurveFaces faces;
     };
 
-    void start(Place& place, const Curve& curve) {
+    void start(PendingCurve& pending, const Curve& curve) {
         const Topology& topology = view_.geometry.topology();
-        place.own.curve = curve;
-        place.segment = coincident_.find(curve.edge);
+        pending.own.curve = curve;
+        pending.segment = coincident_.find(curve.edge);
         const auto halves = topology.half_edges(curve.edge);
-        place.edge_on =
+        pending.edge_on =
             std::any_of(halves.begin(), halves.end(), [&](const HalfEdge& h) { return finder_.facing_of(h) == 0; });
-        place.with_faces = false;
+        pending.with_faces = false;
         const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
-        place.faces = {topology.faces(curve.edge), largest_coordinate(view_.scene, h),
-                       view_.scene.spacing->of(vertex(view_.scene, h, h.first()))};
+        pending.faces = {topology.faces(curve.edge), largest_coordinate(view_.scene, h),
+                         view_.scene.spacing->of(vertex(view_.scene, h, h.first()))};
         other_edges_.clear();
     }
 
@@ -203,21 +203,21 @@ class EdgeSource {
 
     // Returns dx/ds at the pixel position.
     Vec2 distorted_tangent(const Sample& sample) const {
-        return distort_jvp(view_.camera, sample.n, place_[sample.place].own.curve.tangent());
+        return distort_jvp(view_.camera, sample.n, pending_[sample.pending_curve].own.curve.tangent());
     }
 
     // Computes what coincident curves leave to a sample, and gathers their faces. Returns false if it is nothing.
-    bool share(Place& place, Sample& sample) {
-        const Curve curve = place.own.curve;
+    bool share(PendingCurve& pending, Sample& sample) {
+        const Curve curve = pending.own.curve;
         const Topology& topology = view_.geometry.topology();
         std::vector<int32_t>& ignored = sample.gathered;
         const auto begin = [&] {
-            if (!place.with_faces) place.own = coincidence_.on_line(curve, curve), place.with_faces = true;
-            coincidence_.start(place.own, sample.u, sample.t);
+            if (!pending.with_faces) pending.own = coincidence_.on_line(curve, curve), pending.with_faces = true;
+            coincidence_.start(pending.own, sample.u, sample.t);
         };
         bool alone = true, visible = true;
-        const auto add = [&](const ImageSegment& o, CoincidentCurves::Meeting meeting) {
-            const bool on_line = meeting == CoincidentCurves::Meeting::along;
+        const auto add = [&](const ImageSegment& o, CoincidentCurves::Overlap overlap) {
+            const bool on_line = overlap == CoincidentCurves::Overlap::along;
             if (alone && on_line) begin(), alone = false;
             const auto faces = topology.faces(o.edge);
             const Vec2 along = o.b - o.a, from = sample.u - o.a;
@@ -234,19 +234,19 @@ class EdgeSource {
             }
             for (const int32_t f : faces) {
                 // A face that the ray misses is not ignored. If single precision confuses it with a neighbour, the ray
-                // finds that one as well (Visibility::beyond_float).
-                if (!asked_.insert(f) || !meets(view_, f, sample.n)) continue;
+                // finds that one as well (Visibility::exact_hit).
+                if (!tested_.insert(f) || !meets(view_, f, sample.n)) continue;
                 ignored.push_back(f);
-                if (!visibility_.lies_behind(f, place.faces, sample)) return visible = false;
+                if (!visibility_.lies_behind(f, pending.faces, sample)) return visible = false;
             }
             return true;
         };
-        asked_.clear();
-        for (const int32_t f : place.faces.faces) asked_.insert(f);
-        if (place.segment) coincident_.at(*place.segment, sample.u, add);
+        tested_.clear();
+        for (const int32_t f : pending.faces.faces) tested_.insert(f);
+        if (pending.segment) coincident_.at(*pending.segment, sample.u, add);
         if (!visible) return false;
         if (alone) {
-            if (!place.edge_on) return true;
+            if (!pending.edge_on) return true;
             begin();
         }
         return coincidence_.finish(sample.share);
@@ -285,11 +285,11 @@ class EdgeSource {
     const CoincidentCurves& coincident_;
     Coincidence<T> coincidence_;
 
-    Place place_[RayBatch::size];         // places of the pending samples
-    int places_ = 0, pending_ = -1;       // number of places; place of the latest pending sample
-    std::vector<int64_t> other_edges_;    // edges of the curves on the line of the latest curve
-    std::deque<CoincidentCurve> others_;  // their curves; entries beyond are kept for reuse
-    FaceSet asked_;                       // faces that were tested against the latest sample's ray
+    PendingCurve pending_[RayBatch::size];  // curves of the pending samples
+    int n_pending_ = 0, latest_ = -1;       // their number; index of the latest sample's
+    std::vector<int64_t> other_edges_;      // edges of the curves on the line of the latest curve
+    std::deque<CoincidentCurve> others_;    // their curves; entries beyond are kept for reuse
+    FaceSet tested_;                        // faces that were tested against the latest sample's ray
 
     // The members below sum over the latest curve, and over the latest second curve.
     Curve current_;

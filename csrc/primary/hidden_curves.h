@@ -15,7 +15,7 @@ namespace edgegrad {
 // silhouette may still be visible: a gap may run along it, which fewer rays than elsewhere find. A face that rays
 // merely missed counts in full. At the limb of a fine mesh the faces next to a silhouette are a hundredth of a pixel
 // wide and hit by chance. crease_visibility.h knows more of creases.
-constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
+constexpr OcclusionHint::HiddenFactor occluded_curve{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
 
 // Returns the fraction for a curve next to a face without a hit, if that face is visible wherever the curve is.
 template <class T>

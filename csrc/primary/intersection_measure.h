@@ -110,7 +110,7 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
             if (!(importance > 0)) continue;
             const int64_t hiding = hiding_pixels(view.occlusion, low, high, c.nearest_depth());
             const double samples =
-                std::min(hiding ? view.occlusion.factor(occluded, double(hiding), view.image.spp) : 1,
+                std::min(hiding ? view.occlusion.factor(occluded_curve, double(hiding), view.image.spp) : 1,
                          std::max(next_to_unhit(view, all[i].face[0]), next_to_unhit(view, all[i].face[1])));
             const double pixels = c.length * view.camera.stretch(c.low(), c.high()) * samples;
             const double size = size_of(c);

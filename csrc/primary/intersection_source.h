@@ -95,7 +95,7 @@ class IntersectionSource {
     using Curve = IntersectionCurve;
 
     struct Sample : CurveSample {
-        int place = 0;
+        int pending_curve = 0;
         SurfacePoint side[2];
     };
 
@@ -104,26 +104,27 @@ class IntersectionSource {
     Vec2 position(const Curve& curve, double s) const { return curve.x0 + s * (curve.x1 - curve.x0); }
 
     bool place(const Curve& curve, double s, Sample& sample) {
-        const bool another = places_ == 0 || place_[places_ - 1].curve.faces != curve.faces;
-        if (another) start(place_[places_++], curve);
-        Place& place = place_[places_ - 1];
+        const bool another = n_pending_ == 0 || pending_[n_pending_ - 1].curve.faces != curve.faces;
+        if (another) start(pending_[n_pending_++], curve);
+        PendingCurve& pending = pending_[n_pending_ - 1];
         const double t = s * curve.w0 / ((1 - s) * curve.w1 + s * curve.w0);
-        sample.place = places_ - 1;
+        sample.pending_curve = n_pending_ - 1;
         sample.point = (1 - t) * curve.a + t * curve.b;
         sample.behind = {};
-        sample.ignored = place.faces.faces;
+        sample.ignored = pending.faces.faces;
         for (int k = 0; k < 2; ++k) {
-            sample.side[k] = {curve.faces->face[k], barycentrics_of_hit(place.planes.map[k], sample.n), sample.point.z};
+            sample.side[k] = {curve.faces->face[k], barycentrics_of_hit(pending.planes.map[k], sample.n),
+                              sample.point.z};
         }
         // A face seen edge-on has no image.
-        bool visible = std::isfinite(place.planes.scale);
-        for (const Vec3 N : place.planes.normal) visible &= view_.camera.along_ray(N, sample.n) != 0;
+        bool visible = std::isfinite(pending.planes.scale);
+        for (const Vec3 N : pending.planes.normal) visible &= view_.camera.along_ray(N, sample.n) != 0;
         for (const SurfacePoint& p : sample.side) visible &= shows(view_.scene, p.face, p.b);
-        if (!visible) places_ -= another;
+        if (!visible) n_pending_ -= another;
         return visible;
     }
 
-    const CurveFaces& faces_of(const Sample& sample) const { return place_[sample.place].faces; }
+    const CurveFaces& faces_of(const Sample& sample) const { return pending_[sample.pending_curve].faces; }
 
     SampleSurfaces surfaces(const Sample& sample) const { return {{sample.side[0], sample.side[1]}}; }
 
@@ -133,34 +134,34 @@ class IntersectionSource {
 
     // The curve moves with δx as F does with −δx.
     Vec2 normal(const Sample& sample) const {
-        const Place& place = place_[sample.place];
-        return (-place.planes.scale * sample.area_scale) * pixel_vjp(view_.camera, sample.n, place.planes.slope);
+        const PendingCurve& pending = pending_[sample.pending_curve];
+        return (-pending.planes.scale * sample.area_scale) * pixel_vjp(view_.camera, sample.n, pending.planes.slope);
     }
 
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
         if (!direction.moves()) return {};
-        const Place& place = place_[sample.place];
+        const PendingCurve& pending = pending_[sample.pending_curve];
         const double z = sample.point.z;
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
         double F_dot = 0;
         for (int k = 0; k < 2; ++k) {
-            const Vec3 N = place.planes.normal[k];
+            const Vec3 N = pending.planes.normal[k];
             double moved = -view_.camera.unit_at_depth(z) * (N.x * n_dot.x + N.y * n_dot.y);
             for (int i = 0; i < 3; ++i)
                 moved += sample.side[k].b[i] *
-                         dot(N, direction.q[view_.scene.faces[3 * int64_t(place.curve.faces->face[k]) + i]]);
+                         dot(N, direction.q[view_.scene.faces[3 * int64_t(pending.curve.faces->face[k]) + i]]);
             F_dot += (k ? -1 : 1) * view_.camera.affine_depth_slope(z) * moved / view_.camera.along_ray(N, sample.n);
         }
-        return {place.planes.scale * sample.area_scale * F_dot, 0};
+        return {pending.planes.scale * sample.area_scale * F_dot, 0};
     }
 
     void add_motion(const Sample& sample, CurveJumps jumps, LocalGradients& grad) {
-        const Place& place = place_[sample.place];
-        if (current_ != place.curve.faces) finish(grad), current_ = place.curve.faces;
-        const double z = sample.point.z, F_bar = place.planes.scale * sample.area_scale * jumps.first;
+        const PendingCurve& pending = pending_[sample.pending_curve];
+        if (current_ != pending.curve.faces) finish(grad), current_ = pending.curve.faces;
+        const double z = sample.point.z, F_bar = pending.planes.scale * sample.area_scale * jumps.first;
         Vec2 n_bar;
         for (int k = 0; k < 2; ++k) {
-            const Vec3 N = place.planes.normal[k];
+            const Vec3 N = pending.planes.normal[k];
             const double z_bar =
                 (k ? -F_bar : F_bar) * view_.camera.affine_depth_slope(z) / view_.camera.along_ray(N, sample.n);
             for (int i = 0; i < 3; ++i) q_bar_[k][i] += z_bar * sample.side[k].b[i] * N;
@@ -169,7 +170,7 @@ class IntersectionSource {
         normalised_vjp(view_.camera, sample.n, n_bar, grad.k);
     }
 
-    void cast() { places_ = 0; }
+    void cast() { n_pending_ = 0; }
 
     // Adds the sums of the latest curve.
     void finish(LocalGradients& grad) {
@@ -183,31 +184,31 @@ class IntersectionSource {
     }
 
    private:
-    // A Place is a curve with pending samples.
-    struct Place {
+    // A PendingCurve is a curve with pending samples.
+    struct PendingCurve {
         Curve curve;
         IntersectionPlanes planes;
         CurveFaces faces;
     };
 
-    void start(Place& place, const Curve& curve) {
-        place.curve = curve;
-        place.planes.set(view_, curve);
+    void start(PendingCurve& pending, const Curve& curve) {
+        pending.curve = curve;
+        pending.planes.set(view_, curve);
         const int32_t (&face)[2] = curve.faces->face;
-        place.faces = {face, 0, 0};
+        pending.faces = {face, 0, 0};
         for (const int32_t f : face)
             for (int i = 0; i < 3; ++i) {
                 const int32_t v = view_.scene.faces[3 * int64_t(f) + i];
-                place.faces.spacing = std::max(place.faces.spacing, view_.scene.spacing->of(v));
+                pending.faces.spacing = std::max(pending.faces.spacing, view_.scene.spacing->of(v));
                 for (int axis = 0; axis < 3; ++axis)
-                    place.faces.coordinate =
-                        std::max(place.faces.coordinate, std::fabs(view_.scene.verts[3 * int64_t(v) + axis]));
+                    pending.faces.coordinate =
+                        std::max(pending.faces.coordinate, std::fabs(view_.scene.verts[3 * int64_t(v) + axis]));
             }
     }
 
     const BackwardView<T>& view_;
-    Place place_[RayBatch::size];  // places of the pending samples
-    int places_ = 0;
+    PendingCurve pending_[RayBatch::size];  // curves of the pending samples
+    int n_pending_ = 0;
 
     // The members below sum over the latest curve, by the corners of both faces.
     const Intersection* current_ = nullptr;

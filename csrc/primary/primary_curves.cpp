@@ -12,11 +12,11 @@
 #include "core/sampler.h"
 #include "core/systematic.h"
 #include "primary/crease_control.h"
-#include "primary/crossings.h"
 #include "primary/curve_measure.h"
 #include "primary/edge_source.h"
 #include "primary/intersection_source.h"
 #include "primary/lens_boundary_source.h"
+#include "primary/silhouette_grid.h"
 
 namespace edgegrad {
 
@@ -30,11 +30,11 @@ class VisibilityQuery final : public CurveAccumulation {
     bool wants(int, Vec2) override { return true; }
 
    private:
-    void contract(int, MovingSample&) override { visible = true; }
+    void accumulate(int, MovingSample&) override { visible = true; }
 };
 
 // Edges, intersections and the lens boundary are numbered as primitives in this order.
-enum Kind { on_edges, on_intersections, on_lens_boundary };
+enum CurveKind { on_edges, on_intersections, on_lens_boundary };
 
 template <class T>
 OrderedDraws ordered(const BackwardView<T>& view, const Curves<T>& curves, const Systematic& systematic, int64_t n) {
@@ -51,8 +51,8 @@ OrderedDraws ordered(const BackwardView<T>& view, const Curves<T>& curves, const
     return {systematic, n, {edges, lines, lines + curves.arcs()}, cell, view.team};
 }
 
-// Drawn is a range of the samples.
-struct Drawn {
+// SampleRange is a range of the samples.
+struct SampleRange {
     const OrderedDraws& draws;
     int64_t first, last;
 
@@ -94,7 +94,7 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
         EdgeSource<T> source(view, curves.finder, alone);
         CurveSamples samples(view, source, accumulation);
         Curve curve;
-        const Drawn drawn{draws, chunk * scatter_chunk, std::min(n, (chunk + 1) * scatter_chunk)};
+        const SampleRange drawn{draws, chunk * scatter_chunk, std::min(n, (chunk + 1) * scatter_chunk)};
         drawn.each([&](int64_t k, double s, double weight) {
             if (!curves.curve[k].hidden) return;
             if (!find(curves, curves.curve[k], curve)) return;
@@ -108,7 +108,7 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
 
 template <class T>
 void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const CoincidentCurves& coincident, bool hidden,
-               const Drawn& drawn, CurveAccumulation& accumulation, LocalGradients& grad) {
+               const SampleRange& drawn, CurveAccumulation& accumulation, LocalGradients& grad) {
     EdgeSource<T> source(view, curves.finder, coincident);
     CurveSamples samples(view, source, accumulation);
     const std::unique_ptr<CreaseControl> control = make_crease_control(view);
@@ -132,7 +132,7 @@ void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const Coinc
 }
 
 template <class T>
-void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn,
+void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, const SampleRange& drawn,
                        CurveAccumulation& accumulation, LocalGradients& grad) {
     const Array<Intersection>& all = curves.lines(view.geometry);
     IntersectionSource<T> source(view);
@@ -147,7 +147,7 @@ void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, con
 }
 
 template <class T>
-void add_lens_boundary(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn,
+void add_lens_boundary(const BackwardView<T>& view, const Curves<T>& curves, const SampleRange& drawn,
                        CurveAccumulation& accumulation, LocalGradients& grad) {
     LensBoundarySamples samples(view, curves.lens_boundary_curve->lens_boundary, accumulation);
     const auto before = int64_t(curves.curve.size() + curves.intersection.size());
@@ -176,15 +176,15 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, LocalGradients& grad) {
         const std::unique_ptr<CurveAccumulation> to_chunk = accumulate_curves(view, accumulation, grad);
-        const auto part = [&](Kind kind) {
+        const auto part = [&](CurveKind kind) {
             const int64_t begin = kind ? draws.end_of_kind(kind - 1) : 0;
-            return Drawn{draws, std::max(first, begin), std::min(last, draws.end_of_kind(kind))};
+            return SampleRange{draws, std::max(first, begin), std::min(last, draws.end_of_kind(kind))};
         };
-        if (const Drawn d = part(on_edges); d.first < d.last)
+        if (const SampleRange d = part(on_edges); d.first < d.last)
             add_edges(view, curves, coincident, hidden, d, *to_chunk, grad);
-        if (const Drawn d = part(on_intersections); d.first < d.last)
+        if (const SampleRange d = part(on_intersections); d.first < d.last)
             add_intersections(view, curves, d, *to_chunk, grad);
-        if (const Drawn d = part(on_lens_boundary); d.first < d.last)
+        if (const SampleRange d = part(on_lens_boundary); d.first < d.last)
             add_lens_boundary(view, curves, d, *to_chunk, grad);
     });
     to.x = nullptr;

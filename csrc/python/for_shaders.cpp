@@ -82,7 +82,7 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
 }
 
 // Holds a light for which edges cast shadows.
-struct LightArrays {
+struct ShadowLightArrays {
     In<double, 3> corner;
     In<double, 1> chance;
     In<int32_t, 1> face;
@@ -108,7 +108,7 @@ struct LightArrays {
 // surfaces that the camera sees; otherwise they lie on all surfaces.
 template <class T>
 nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const Camera& camera,
-                        const ImageOptions& image, const GradientOptions& options, const LightArrays& light,
+                        const ImageOptions& image, const GradientOptions& options, const ShadowLightArrays& light,
                         int64_t samples, double least, bool one, bool seen, int threads, const HitArrays<T>& hits,
                         const std::optional<In<uint8_t, 1>>& transparent) {
     hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
@@ -139,14 +139,14 @@ bool has_intersections(const SceneArrays<T>& arrays, int threads) {
     return found;
 }
 
-Places places_of(const In<double, 2>& x) {
+ImagePoints image_points(const In<double, 2>& x) {
     if (x.shape(1) != 2) refuse("x: expected rows of two numbers");
     return {x.data(), int64_t(x.shape(0))};
 }
 
 // Returns Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c: (H · W, C).
 nb::object splat(In<double, 2> x, In<double, 2> values, const std::string& filter, int width, int height) {
-    const size_t n = places_of(x).size, C = values.shape(1);
+    const size_t n = image_points(x).size, C = values.shape(1);
     if (values.shape(0) != n) refuse("values: expected a row for each point");
     const FilteredPixels pixels(make_filter(filter), width, height);
     std::vector<double> out(size_t(width) * size_t(height) * C, 0.0);
@@ -162,18 +162,18 @@ nb::object splat(In<double, 2> x, In<double, 2> values, const std::string& filte
 template <class T>
 nb::object splat_vjp(In<double, 2> x, In<T, 2> image, const std::string& filter, int width, int height, int threads,
                      const std::optional<In<double, 1>>& weight) {
-    const Places places = places_of(x);
+    const ImagePoints points = image_points(x);
     const size_t C = image.shape(1);
     if (image.shape(0) != size_t(width) * size_t(height)) refuse("image: expected a row for each pixel");
-    if (weight && int64_t(weight->size()) != places.size) refuse("weight: expected a number for each point");
+    if (weight && int64_t(weight->size()) != points.size) refuse("weight: expected a number for each point");
     const FilteredPixels pixels(make_filter(filter), width, height);
-    Array<T> out(places.size * int64_t(C));
+    Array<T> out(points.size * int64_t(C));
     unlocked(threads, [&](ThreadTeam& team) {
-        team.parallel_for_blocks(places.size, [&](int64_t, int64_t first, int64_t last) {
+        team.parallel_for_blocks(points.size, [&](int64_t, int64_t first, int64_t last) {
             std::vector<double> sum(C);
             for (int64_t i = first; i < last; ++i) {
                 std::fill(sum.begin(), sum.end(), 0.0);
-                pixels.around(places[i], [&](int64_t p, double w) {
+                pixels.around(points[i], [&](int64_t p, double w) {
                     for (size_t c = 0; c < C; ++c) sum[c] += w * double(image.data()[size_t(p) * C + c]);
                 });
                 for (size_t c = 0; c < C; ++c)
@@ -181,17 +181,17 @@ nb::object splat_vjp(In<double, 2> x, In<T, 2> image, const std::string& filter,
             }
         });
     });
-    return shaped(std::move(out), {size_t(places.size), C});
+    return shaped(std::move(out), {size_t(points.size), C});
 }
 
 template <class T>
 nb::dict seen_at(const SceneArrays<T>& arrays, const Camera& camera, In<double, 2> x, int threads) {
-    PlaceHits found;
-    const Places places = places_of(x);
+    ImagePointHits found;
+    const ImagePoints points = image_points(x);
     unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({.parts = true}, team, work);
-        found = hits_at(arrays.view(), camera, *geometry, places, team);
+        found = hits_at(arrays.view(), camera, *geometry, points, team);
     });
     nb::dict out;
     out["face"] = rows(std::move(found.face)), out["part"] = rows(std::move(found.part));
@@ -201,8 +201,8 @@ nb::dict seen_at(const SceneArrays<T>& arrays, const Camera& camera, In<double, 
 
 nb::dict rays_of(const Camera& camera, In<double, 2> x, bool intrinsics, int threads) {
     RayRecords found;
-    const Places places = places_of(x);
-    unlocked(threads, [&](ThreadTeam& team) { found = rays_at(camera, places, intrinsics, team); });
+    const ImagePoints points = image_points(x);
+    unlocked(threads, [&](ThreadTeam& team) { found = rays_at(camera, points, intrinsics, team); });
     nb::dict out;
     out["along"] = rows(std::move(found.along), {3}), out["along_by_x"] = rows(std::move(found.along_by_x), {3, 2});
     out["along_by_k"] = rows(std::move(found.along_by_k), {3, intrinsics_width});
@@ -299,9 +299,10 @@ template void bind_scene_for_shaders(nb::class_<SceneArrays<float>>&);
 template void bind_scene_for_shaders(nb::class_<SceneArrays<double>>&);
 
 void bind_for_shaders(nb::module_& m) {
-    nb::class_<LightArrays>(m, "LightParts")
-        .def(nb::new_([](In<double, 3> corner, In<double, 1> chance, In<int32_t, 1> face, bool infinite, bool extended,
-                         bool two_sided) { return LightArrays{corner, chance, face, infinite, extended, two_sided}; }),
+    nb::class_<ShadowLightArrays>(m, "LightParts")
+        .def(nb::new_(
+                 [](In<double, 3> corner, In<double, 1> chance, In<int32_t, 1> face, bool infinite, bool extended,
+                    bool two_sided) { return ShadowLightArrays{corner, chance, face, infinite, extended, two_sided}; }),
              "corner"_a.noconvert(), "chance"_a.noconvert(), "face"_a.noconvert(), "infinite"_a, "extended"_a,
              "two_sided"_a);
     m.def("splat", &splat, "x"_a.noconvert(), "values"_a.noconvert(), "filter"_a, "width"_a, "height"_a);

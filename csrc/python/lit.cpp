@@ -79,9 +79,9 @@ nb::tuple lit_image(const SceneArrays<T>& arrays, const LitArrays& lit, const Ca
                            LitSampling{points, seed, again}, team, hits.view());
     });
     const size_t channels = size_t(lit.scene.channels), pixels = size_t(found.radiance.size()) / channels;
-    const size_t lights = found.asked.size();
+    const size_t lights = found.shadow_needed.size();
     return nb::make_tuple(shaped(std::move(found.radiance), {pixels, channels}),
-                          shaped(std::move(found.asked), {lights, 1}));
+                          shaped(std::move(found.shadow_needed), {lights, 1}));
 }
 
 void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions& options, const In<int8_t, 2>& seen) {
@@ -97,7 +97,7 @@ class Cotangent {
     Cotangent(const Table& table, bool wanted, ThreadTeam& team) : table_(table) {
         if (!wanted) return;
         const int64_t n = table.rows * table.width;
-        if (table.wide || n < large) wide_ = zeros(n, team);
+        if (table.wide || n < least_summed_in_float) wide_ = zeros(n, team);
         else narrow_ = zeros<float>(n, team);
     }
     TableBar bar() { return {wide_.empty() ? nullptr : wide_.data(), narrow_.empty() ? nullptr : narrow_.data()}; }
@@ -110,7 +110,7 @@ class Cotangent {
     }
 
    private:
-    static constexpr int64_t large = 1 << 16;
+    static constexpr int64_t least_summed_in_float = 1 << 16;
     const Table& table_;
     Array<double> wide_{0};
     Array<float> narrow_{0};
@@ -146,9 +146,10 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, cons
                            In<int8_t, 2> seen, In<double, 2> bar, const std::vector<bool>& wanted, int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     check_seen(lit, view, options, seen);
-    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, ThreadTeam& team) {
-        shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, places, team);
-    });
+    return cotangents(lit, view, bar, wanted, threads,
+                      [&](const auto& to, LitPositions<double> places, ThreadTeam& team) {
+                          shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, places, team);
+                      });
 }
 
 // Does the same for functions that cast rays in the scene: compute(geometry's caster, points, to, places, team).
@@ -157,11 +158,12 @@ nb::tuple traced_cotangents(const SceneArrays<T>& arrays, const LitArrays& lit, 
                             const In<double, 2>& bar, const std::vector<bool>& wanted, int threads, Compute compute) {
     check_faces(arrays, lit);
     const LitPoints view = points.view(lit.scene, faces_of(lit));
-    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, ThreadTeam& team) {
-        GeometryWork work;
-        const auto geometry = arrays.geometry({}, team, work);
-        compute(geometry->caster(), view, to, places, team);
-    });
+    return cotangents(lit, view, bar, wanted, threads,
+                      [&](const auto& to, LitPositions<double> places, ThreadTeam& team) {
+                          GeometryWork work;
+                          const auto geometry = arrays.geometry({}, team, work);
+                          compute(geometry->caster(), view, to, places, team);
+                      });
 }
 
 template <class T>
@@ -190,8 +192,8 @@ LitScene with_tangents(const LitScene& scene, const std::vector<Tangents2>& tang
     }
     return moving;
 }
-LitPlaces<const double> tangents_of_places(const LitPoints& points, const Tangents2& b_dot,
-                                           const Tangents3& spread_dot) {
+LitPositions<const double> tangents_of_places(const LitPoints& points, const Tangents2& b_dot,
+                                              const Tangents3& spread_dot) {
     if (b_dot && (int64_t(b_dot->shape(0)) != points.size || b_dot->shape(1) != 3))
         refuse("b_dot: expected a row a point");
     if (spread_dot && (!points.spread || int64_t(spread_dot->shape(0)) != points.size || spread_dot->shape(1) != 2 ||
@@ -206,7 +208,7 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     check_seen(lit, view, options, seen);
     const LitScene moving = with_tangents(lit.scene, tangents);
-    const LitPlaces<const double> dot = tangents_of_places(view, b_dot, spread_dot);
+    const LitPositions<const double> dot = tangents_of_places(view, b_dot, spread_dot);
     std::vector<double> out(size_t(view.size) * size_t(moving.channels));
     unlocked(threads, [&](ThreadTeam& team) { shade_jvp(moving, view, options, seen.data(), dot, out.data(), team); });
     return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
@@ -245,7 +247,7 @@ nb::object indirect_points_jvp(const SceneArrays<T>& arrays, const LitArrays& li
     check_faces(arrays, lit);
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     const LitScene moving = with_tangents(lit.scene, tangents);
-    const LitPlaces<const double> dot = tangents_of_places(view, b_dot, spread_dot);
+    const LitPositions<const double> dot = tangents_of_places(view, b_dot, spread_dot);
     std::vector<double> out(size_t(view.size) * size_t(moving.channels));
     unlocked(threads, [&](ThreadTeam& team) {
         GeometryWork work;

@@ -111,11 +111,10 @@ nb::tuple crossings(const EmissiveFaceTree& tree, In<double, 2> origins, In<doub
     std::vector<double> where;
     for (size_t i = 0; i < n; ++i) {
         const double *o = origins.data() + 3 * i, *d = directions.data() + 3 * i;
-        tree.each_crossing(
-            {o[0], o[1], o[2]}, {d[0], d[1], d[2]}, start(i), end(i), [&](const EmissiveFaceTree::Crossing& c) {
-                which.insert(which.end(), {int64_t(i), c.face}), where.insert(where.end(), {c.u, c.v, c.t});
-                return end(i);
-            });
+        tree.each_hit({o[0], o[1], o[2]}, {d[0], d[1], d[2]}, start(i), end(i), [&](const EmissiveFaceTree::Hit& c) {
+            which.insert(which.end(), {int64_t(i), c.face}), where.insert(where.end(), {c.u, c.v, c.t});
+            return end(i);
+        });
     }
     const size_t m = which.size() / 2;
     return nb::make_tuple(shaped(std::move(which), {m, 2}), shaped(std::move(where), {m, 3}));

@@ -18,7 +18,7 @@
 #include "estimator/image_hits.h"
 #include "primary/crease_faces.h"
 #include "primary/curve_measure.h"
-#include "primary/meeting_parts.h"
+#include "primary/overlapping_parts.h"
 #include "rays/geometry.h"
 
 namespace nb = nanobind;
@@ -57,8 +57,8 @@ Bytes image_bytes(const PassSize& s, int64_t cameras) {
 
 // Selects the wanted parts of the gradient: what moves inside faces and at edges, and the arrays of colours.
 struct GradientWork {
-    bool motion, boundary, steps, colors, uvs, texels, alphas, vertex_attributes, face_attributes;
-    int64_t surface_samples, edge_samples, curves, intersections, step_lines;  // −1 means unknown.
+    bool motion, boundary, discontinuities, colors, uvs, texels, alphas, vertex_attributes, face_attributes;
+    int64_t surface_samples, edge_samples, curves, intersections, discontinuity_lines;  // −1 means unknown.
 };
 
 Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
@@ -69,7 +69,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         return RowBuffer::bytes({samples, primitives, each, destinations, width}, s.threads);
     };
     Bytes bytes;
-    if (interior || w.boundary || w.steps) {
+    if (interior || w.boundary || w.discontinuities) {
         bytes["view"] = word * s.pixels + s.verts * (VertexView::bytes_per_vertex + 3 * word * moves);
         bytes["ray structure"] = RayCaster::bytes(s.faces, s.verts);
     }
@@ -89,23 +89,23 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         if (w.vertex_attributes) samples += rows(n, s.faces, 3, s.vertex_attributes, s.verts);
         if (w.face_attributes) samples += rows(n, s.faces, 1, s.face_attributes, s.faces);
     }
-    if (w.steps) {
+    if (w.discontinuities) {
         // A line crosses a discontinuity at few points. Each moves three vertices, three texture coordinates and four
         // alphas.
         constexpr int64_t points = 4;
-        const int64_t lines = w.step_lines < 0 ? many / points : w.step_lines;
-        int64_t& steps = bytes["steps"];
-        steps = s.faces * lined_face_bytes;
-        if (moves) steps += points * rows(lines, s.faces, 3, 3, s.verts);
-        if (w.uvs) steps += points * rows(lines, s.faces, 3, 2, s.uvs);
-        if (w.alphas) steps += points * rows(lines, -1, 4, 1, s.alphas);
+        const int64_t lines = w.discontinuity_lines < 0 ? many / points : w.discontinuity_lines;
+        int64_t& discontinuities = bytes["discontinuities"];
+        discontinuities = s.faces * lined_face_bytes;
+        if (moves) discontinuities += points * rows(lines, s.faces, 3, 3, s.verts);
+        if (w.uvs) discontinuities += points * rows(lines, s.faces, 3, 2, s.uvs);
+        if (w.alphas) discontinuities += points * rows(lines, -1, 4, 1, s.alphas);
     }
     if (w.boundary) {
         // If all attributes are indexed like vertices, curves are silhouettes: a quarter of a tangled mesh's edges.
         const int64_t curves = w.curves < 0 ? s.edges() / (s.jumps ? 1 : 4) : w.curves;
         bytes["edges in view"] = s.faces + curves * bytes_per_curve();
         bytes["creases"] = s.jumps ? 2 * word * s.verts + int64_t(sizeof(CreaseFace)) * s.faces +
-                                         (MeetingParts::bytes_per_pixel + CellMarks::bytes_per_pixel) * s.pixels
+                                         (OverlappingParts::bytes_per_pixel + CellMarks::bytes_per_pixel) * s.pixels
                                    : 0;
         const int64_t lines = w.curves < 0 ? s.edges() : w.curves + w.intersections;
         bytes["edge samples"] = OrderedDraws::bytes(w.edge_samples < 0 ? lines : w.edge_samples, lines) +
@@ -133,17 +133,18 @@ void bind_memory(nb::module_& m) {
     m.def("image_bytes", &image_bytes, "size"_a, "cameras"_a);
     m.def(
         "gradient_bytes",
-        [](const PassSize& size, bool motion, bool boundary, bool steps, const std::vector<std::string>& wanted,
-           int64_t surface_samples, int64_t edge_samples, int64_t curves, int64_t intersections, int64_t step_lines) {
+        [](const PassSize& size, bool motion, bool boundary, bool discontinuities,
+           const std::vector<std::string>& wanted, int64_t surface_samples, int64_t edge_samples, int64_t curves,
+           int64_t intersections, int64_t discontinuity_lines) {
             const auto is = [&](const char* name) {
                 return std::find(wanted.begin(), wanted.end(), name) != wanted.end();
             };
-            return gradient_bytes(size, {motion, boundary, steps, is("colors"), is("uvs"), is("texels"), is("alphas"),
-                                         is("vertex_attributes"), is("face_attributes"), surface_samples, edge_samples,
-                                         curves, intersections, step_lines});
+            return gradient_bytes(size, {motion, boundary, discontinuities, is("colors"), is("uvs"), is("texels"),
+                                         is("alphas"), is("vertex_attributes"), is("face_attributes"), surface_samples,
+                                         edge_samples, curves, intersections, discontinuity_lines});
         },
-        "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "steps"_a, "wanted"_a, "surface_samples"_a = -1,
-        "edge_samples"_a = -1, "curves"_a = -1, "intersections"_a = -1, "step_lines"_a = -1);
+        "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "discontinuities"_a, "wanted"_a, "surface_samples"_a = -1,
+        "edge_samples"_a = -1, "curves"_a = -1, "intersections"_a = -1, "discontinuity_lines"_a = -1);
     // Bounds the rows that samples add to the pixels around them: at most nine, for a Gaussian.
     m.def(
         "pixel_row_bytes",

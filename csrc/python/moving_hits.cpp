@@ -47,18 +47,19 @@ void check(const HitFaces& hits, const Doubles& verts, const Doubles& world_to_c
         refuse("along: expected a row a ray, as many for each hit");
 }
 
-nb::object meet(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, int threads) {
+nb::object barycentrics_of_rays(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along,
+                                int threads) {
     check(hits, verts, world_to_camera, along);
     std::vector<double> b(3 * along.shape(0));
     unlocked(threads, [&](ThreadTeam& team) {
-        meet_faces(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, b.data(), team);
+        intersect_planes(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, b.data(), team);
     });
     return rows(std::move(b), {3});
 }
 
 // Returns the wanted cotangents of verts, world_to_camera and along, and None for the others.
-nb::tuple meet_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, Doubles bar,
-                   std::array<bool, 3> wanted, int threads) {
+nb::tuple barycentrics_of_rays_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along,
+                                   Doubles bar, std::array<bool, 3> wanted, int threads) {
     check(hits, verts, world_to_camera, along);
     if (bar.shape(0) != along.shape(0) || bar.shape(1) != 3) refuse("bar: expected a row a ray");
     const auto [of_verts, of_pose, of_along] = wanted;
@@ -66,16 +67,16 @@ nb::tuple meet_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera,
         along_bar(of_along ? along.size() : 0);
     const auto to = [](std::vector<double>& bar) { return bar.empty() ? nullptr : bar.data(); };
     unlocked(threads, [&](ThreadTeam& team) {
-        meet_faces_vjp(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, bar.data(),
-                       {to(verts_bar), to(pose_bar), to(along_bar)}, team);
+        intersect_planes_vjp(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, bar.data(),
+                             {to(verts_bar), to(pose_bar), to(along_bar)}, team);
     });
     return nb::make_tuple(rows(std::move(verts_bar), {3}), rows(std::move(pose_bar), {4}),
                           rows(std::move(along_bar), {3}));
 }
 
-nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along,
-                    std::optional<Doubles> verts_dot, std::optional<Doubles> pose_dot, std::optional<Doubles> along_dot,
-                    int threads) {
+nb::object barycentrics_of_rays_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along,
+                                    std::optional<Doubles> verts_dot, std::optional<Doubles> pose_dot,
+                                    std::optional<Doubles> along_dot, int threads) {
     check(hits, verts, world_to_camera, along);
     const auto tangent = [](const char* name, const std::optional<Doubles>& dot, const Doubles& of) {
         if (!dot) return static_cast<const double*>(nullptr);
@@ -88,8 +89,8 @@ nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera
                                               tangent("along_dot", along_dot, along)};
     std::vector<double> b_dot(3 * along.shape(0));
     unlocked(threads, [&](ThreadTeam& team) {
-        meet_faces_jvp(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, tangents, b_dot.data(),
-                       team);
+        intersect_planes_jvp(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, tangents,
+                             b_dot.data(), team);
     });
     return rows(std::move(b_dot), {3});
 }
@@ -115,14 +116,15 @@ nb::object form_vjp_by_rows(In<int64_t, 1> sample, In<int64_t, 1> row, Doubles b
 void bind_moving_hits(nb::module_& m) {
     nb::class_<HitFaces>(m, "MovingHits")
         .def(nb::new_(&make_hits), "faces"_a.noconvert(), "face"_a.noconvert(), "perspective"_a);
-    m.def("meet", &meet, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(), "along"_a.noconvert(),
-          "threads"_a);
-    m.def("meet_vjp", &meet_vjp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
-          "along"_a.noconvert(), "bar"_a.noconvert(), "wanted"_a, "threads"_a);
+    m.def("barycentrics_of_rays", &barycentrics_of_rays, "hits"_a, "verts"_a.noconvert(),
+          "world_to_camera"_a.noconvert(), "along"_a.noconvert(), "threads"_a);
+    m.def("barycentrics_of_rays_vjp", &barycentrics_of_rays_vjp, "hits"_a, "verts"_a.noconvert(),
+          "world_to_camera"_a.noconvert(), "along"_a.noconvert(), "bar"_a.noconvert(), "wanted"_a, "threads"_a);
     m.def("form_vjp", &form_vjp_by_rows, "sample"_a.noconvert(), "row"_a.noconvert(), "by"_a.noconvert(),
           "bar"_a.noconvert(), "table"_a, "threads"_a);
-    m.def("meet_jvp", &meet_jvp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
-          "along"_a.noconvert(), "verts_dot"_a.none(), "pose_dot"_a.none(), "along_dot"_a.none(), "threads"_a);
+    m.def("barycentrics_of_rays_jvp", &barycentrics_of_rays_jvp, "hits"_a, "verts"_a.noconvert(),
+          "world_to_camera"_a.noconvert(), "along"_a.noconvert(), "verts_dot"_a.none(), "pose_dot"_a.none(),
+          "along_dot"_a.none(), "threads"_a);
 }
 
 }  // namespace edgegrad

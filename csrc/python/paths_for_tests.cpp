@@ -30,7 +30,7 @@ nb::dict find_paths(const SceneArrays<T>& arrays, const LitArrays& lit, const Po
     const size_t n = size_t(view.size), B = size_t(options.bounces), K = paths.lights().size();
     std::vector<int64_t> points(n), face(n * B), index(n * B * K);
     std::vector<double> b(3 * n * B), pdf(n * B), uv(2 * n * B * K), light_pdf(n * B * K);
-    std::vector<int8_t> seen(n * B * K, not_asked);
+    std::vector<int8_t> seen(n * B * K, not_sampled);
     for (size_t i = 0; i < n; ++i) {
         const Path path = paths.path(int64_t(i));
         points[i] = path.points;

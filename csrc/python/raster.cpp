@@ -239,7 +239,7 @@ TextureOptions make_texture_options(std::array<int64_t, 5> shape, const std::str
     for (const int64_t n : shape)
         if (n < 1) refuse("tex: expected texels");
     return {{shape[0], shape[1], shape[2], int(shape[3]), int(shape[4]),
-             Border(index_of("boundary_mode", border_names, border))},
+             BoundaryMode(index_of("boundary_mode", border_names, border))},
             LookUp(index_of("filter_mode", look_up_names, filter))};
 }
 
@@ -306,8 +306,8 @@ struct EdgeArrays {
     }
 };
 
-struct Crossings {
-    std::vector<Crossing> all;
+struct SilhouetteCrossings {
+    std::vector<SilhouetteCrossing> all;
 };
 
 template <class T>
@@ -322,13 +322,13 @@ void bind_antialias(nb::module_& m) {
             check_finite("pos", pos.data(), pos.size(), 4, threads);
             check_triangles(rast, [&](int64_t i) { return std::pair(view.first(i), view.end(i)); }, threads);
             const EdgeGroups groups = edges.view(tri.shape(0));
-            return Crossings{unlocked(
+            return SilhouetteCrossings{unlocked(
                 threads, [&](ThreadTeam& team) { return find_crossings(view, frames, groups, rast.data(), team); })};
         },
         "pos"_a.noconvert(), "tri"_a.noconvert(), "edges"_a, "rast"_a.noconvert(), "threads"_a);
     m.def(
         "antialias",
-        [](const Crossings& crossings, In<T, 4> color, int threads) {
+        [](const SilhouetteCrossings& crossings, In<T, 4> color, int threads) {
             const Frames frames = frames_of(color);
             return image_of(unlocked(threads,
                                      [&](ThreadTeam& team) {
@@ -340,7 +340,7 @@ void bind_antialias(nb::module_& m) {
         "crossings"_a, "color"_a.noconvert(), "threads"_a);
     m.def(
         "antialias_vjp",
-        [](const Crossings& crossings, In<T, 3> pos, In<int32_t, 2> tri, In<T, 4> color, In<T, 4> bar,
+        [](const SilhouetteCrossings& crossings, In<T, 3> pos, In<int32_t, 2> tri, In<T, 4> color, In<T, 4> bar,
            std::array<bool, 2> wanted, int threads) {
             const ClipMesh<T> mesh(pos, tri, std::nullopt, threads);
             const Frames frames = frames_of(color);
@@ -369,7 +369,9 @@ void bind_raster(nb::module_& m) {
     nb::class_<EdgeArrays>(m, "EdgeGroups")
         .def(nb::init<In<int32_t, 1>, In<int32_t, 1>, In<int32_t, 1>>(), "group"_a.noconvert(), "start"_a.noconvert(),
              "member"_a.noconvert());
-    nb::class_<Crossings>(m, "Crossings").def("__len__", [](const Crossings& c) { return c.all.size(); });
+    nb::class_<SilhouetteCrossings>(m, "Crossings").def("__len__", [](const SilhouetteCrossings& c) {
+        return c.all.size();
+    });
     bind_all<float>(m), bind_all<double>(m);
 }
 

@@ -79,13 +79,14 @@ std::optional<double> share_at(const SideLine& side, const Neighbours& at, const
 }
 
 template <class T>
-class PairFinder {
+class SilhouetteFinder {
    public:
-    PairFinder(const Triangles<T>& mesh, const Frames& frames, const uint8_t* silhouette, int64_t item, const T* rast)
+    SilhouetteFinder(const Triangles<T>& mesh, const Frames& frames, const uint8_t* silhouette, int64_t item,
+                     const T* rast)
         : mesh_(mesh), frames_(frames), silhouette_(silhouette), item_(item), rast_(rast) {}
 
     // Handles the pixel and its neighbour to the right or above.
-    void visit(int64_t column, int64_t row, int axis, std::vector<Crossing>& out) const {
+    void visit(int64_t column, int64_t row, int axis, std::vector<SilhouetteCrossing>& out) const {
         const int64_t here = (item_ * frames_.height + row) * frames_.width + column,
                       there = here + (axis == 0 ? 1 : frames_.width);
         const RasterPixel<T> p(rast_ + 4 * here), q(rast_ + 4 * there);
@@ -119,7 +120,7 @@ struct Blend {
     int64_t to, from;
     double weight;
 
-    explicit Blend(const Crossing& c) {
+    explicit Blend(const SilhouetteCrossing& c) {
         if (c.share > 0.5) to = c.far, from = c.near, weight = c.share - 0.5;
         else to = c.near, from = c.far, weight = 0.5 - c.share;
     }
@@ -127,11 +128,11 @@ struct Blend {
 
 // Calls body(image, crossing) for the crossings of each image.
 template <class Body>
-void each_image(const std::vector<Crossing>& crossings, const Frames& frames, ThreadTeam& team, Body body) {
+void each_image(const std::vector<SilhouetteCrossing>& crossings, const Frames& frames, ThreadTeam& team, Body body) {
     const int64_t pixels = frames.height * frames.width;
     const auto begin = [&](int64_t image) {
         return std::partition_point(crossings.begin(), crossings.end(),
-                                    [&](const Crossing& c) { return c.near < image * pixels; });
+                                    [&](const SilhouetteCrossing& c) { return c.near < image * pixels; });
     };
     team.parallel_for(frames.count, [&](int64_t image) {
         const auto end = begin(image + 1);
@@ -150,19 +151,20 @@ Array<T> copy_of(const T* values, int64_t n, ThreadTeam& team) {
 }  // namespace
 
 template <class T>
-std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& frames, const EdgeGroups& edges,
-                                     const T* rast, ThreadTeam& team) {
+std::vector<SilhouetteCrossing> find_crossings(const Triangles<T>& mesh, const Frames& frames, const EdgeGroups& edges,
+                                               const T* rast, ThreadTeam& team) {
     const std::vector<uint8_t> sides =
         silhouettes(mesh, edges, mesh.shared ? std::min<int64_t>(1, frames.count) : frames.count, team);
     // Bands of rows let threads end at the same time, and keep crossings in order.
     constexpr int64_t rows = 32;
     const int64_t H = frames.height, bands = (H + rows - 1) / rows;
-    std::vector<std::vector<Crossing>> found(frames.count * bands);
+    std::vector<std::vector<SilhouetteCrossing>> found(frames.count * bands);
     team.parallel_for(frames.count * bands, [&](int64_t k) {
         const int64_t item = k / bands, band = k % bands;
-        const PairFinder<T> pairs(mesh, frames, sides.data() + (mesh.shared ? 0 : item * mesh.triangles), item, rast);
+        const SilhouetteFinder<T> pairs(mesh, frames, sides.data() + (mesh.shared ? 0 : item * mesh.triangles), item,
+                                        rast);
         // A local vector avoids cache conflicts between threads that write close to each other.
-        std::vector<Crossing> own;
+        std::vector<SilhouetteCrossing> own;
         for (int64_t y = band * rows; y < std::min(H, (band + 1) * rows); ++y)
             for (int64_t x = 0; x < frames.width; ++x) {
                 if (x + 1 < frames.width) pairs.visit(x, y, 0, own);
@@ -170,16 +172,16 @@ std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& fra
             }
         found[k] = std::move(own);
     });
-    std::vector<Crossing> out;
+    std::vector<SilhouetteCrossing> out;
     for (const auto& own : found) out.insert(out.end(), own.begin(), own.end());
     return out;
 }
 
 template <class T>
-Array<T> antialias(const std::vector<Crossing>& crossings, const Frames& frames, int channels, const T* color,
+Array<T> antialias(const std::vector<SilhouetteCrossing>& crossings, const Frames& frames, int channels, const T* color,
                    ThreadTeam& team) {
     Array<T> out = copy_of(color, frames.pixels() * channels, team);
-    each_image(crossings, frames, team, [&](int64_t, const Crossing& c) {
+    each_image(crossings, frames, team, [&](int64_t, const SilhouetteCrossing& c) {
         const Blend blend(c);
         const T *to = color + blend.to * channels, *from = color + blend.from * channels;
         for (int k = 0; k < channels; ++k)
@@ -189,12 +191,13 @@ Array<T> antialias(const std::vector<Crossing>& crossings, const Frames& frames,
 }
 
 template <class T>
-AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Triangles<T>& mesh, const Frames& frames,
-                               int channels, const T* color, const T* bar, AntialiasWanted wanted, ThreadTeam& team) {
+AntialiasGrad<T> antialias_vjp(const std::vector<SilhouetteCrossing>& crossings, const Triangles<T>& mesh,
+                               const Frames& frames, int channels, const T* color, const T* bar, AntialiasWanted wanted,
+                               ThreadTeam& team) {
     AntialiasGrad<T> out;
     if (wanted.color) {
         out.color = copy_of(bar, frames.pixels() * channels, team);
-        each_image(crossings, frames, team, [&](int64_t, const Crossing& c) {
+        each_image(crossings, frames, team, [&](int64_t, const SilhouetteCrossing& c) {
             const Blend blend(c);
             for (int k = 0; k < channels; ++k) {
                 const T g = T(blend.weight * double(bar[blend.to * channels + k]));
@@ -209,7 +212,7 @@ AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Tri
     const int64_t pixels = frames.height * frames.width;
     out.pos = sums_over<T>(shares, frames, to, team, [&](const Share& share, double* sums) {
         auto c = std::partition_point(crossings.begin(), crossings.end(),
-                                      [&](const Crossing& k) { return k.near < share.item * pixels; });
+                                      [&](const SilhouetteCrossing& k) { return k.near < share.item * pixels; });
         for (; c != crossings.end() && c->near < share.end_item * pixels; ++c) {
             // Both blends change by (near − far) for a change of the share.
             const int64_t blended = Blend(*c).to;
@@ -240,12 +243,12 @@ AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Tri
     return out;
 }
 
-#define EDGEGRAD_OF(T)                                                                                             \
-    template std::vector<Crossing> find_crossings(const Triangles<T>&, const Frames&, const EdgeGroups&, const T*, \
-                                                  ThreadTeam&);                                                    \
-    template Array<T> antialias(const std::vector<Crossing>&, const Frames&, int, const T*, ThreadTeam&);          \
-    template AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>&, const Triangles<T>&, const Frames&, int, \
-                                            const T*, const T*, AntialiasWanted, ThreadTeam&);
+#define EDGEGRAD_OF(T)                                                                                              \
+    template std::vector<SilhouetteCrossing> find_crossings(const Triangles<T>&, const Frames&, const EdgeGroups&,  \
+                                                            const T*, ThreadTeam&);                                 \
+    template Array<T> antialias(const std::vector<SilhouetteCrossing>&, const Frames&, int, const T*, ThreadTeam&); \
+    template AntialiasGrad<T> antialias_vjp(const std::vector<SilhouetteCrossing>&, const Triangles<T>&,            \
+                                            const Frames&, int, const T*, const T*, AntialiasWanted, ThreadTeam&);
 EDGEGRAD_OF(float)
 EDGEGRAD_OF(double)
 

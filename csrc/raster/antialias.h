@@ -24,7 +24,7 @@ struct EdgeGroups {
 };
 
 // Describes a silhouette between the centres of two pixels.
-struct Crossing {
+struct SilhouetteCrossing {
     int64_t near, far;  // They are the pixel whose triangle ends, and the other.
     int32_t triangle;   // This triangle ends.
     int8_t side, axis;  // The side is opposite to this corner; the pixels lie along x (0) or y (1).
@@ -33,12 +33,12 @@ struct Crossing {
 
 // Finds the crossings, image by image.
 template <class T>
-std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& frames, const EdgeGroups& edges,
-                                     const T* rast, ThreadTeam& team);
+std::vector<SilhouetteCrossing> find_crossings(const Triangles<T>& mesh, const Frames& frames, const EdgeGroups& edges,
+                                               const T* rast, ThreadTeam& team);
 
 // Returns the blended image (pixels, channels).
 template <class T>
-Array<T> antialias(const std::vector<Crossing>& crossings, const Frames& frames, int channels, const T* color,
+Array<T> antialias(const std::vector<SilhouetteCrossing>& crossings, const Frames& frames, int channels, const T* color,
                    ThreadTeam& team);
 
 template <class T>
@@ -50,7 +50,8 @@ struct AntialiasWanted {
 };
 
 template <class T>
-AntialiasGrad<T> antialias_vjp(const std::vector<Crossing>& crossings, const Triangles<T>& mesh, const Frames& frames,
-                               int channels, const T* color, const T* bar, AntialiasWanted wanted, ThreadTeam& team);
+AntialiasGrad<T> antialias_vjp(const std::vector<SilhouetteCrossing>& crossings, const Triangles<T>& mesh,
+                               const Frames& frames, int channels, const T* color, const T* bar, AntialiasWanted wanted,
+                               ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -4,14 +4,14 @@ namespace edgegrad {
 
 namespace {
 
-struct Pair {
+struct DoubleDouble {
     double high, low;  // Their sum is exact.
 };
-Pair two_sum(double a, double b) {
+DoubleDouble two_sum(double a, double b) {
     const double s = a + b, bb = s - a;
     return {s, (a - (s - bb)) + (b - bb)};
 }
-Pair two_product(double a, double b) {
+DoubleDouble two_product(double a, double b) {
     const double p = a * b;
     return {p, std::fma(a, b, -p)};
 }
@@ -21,14 +21,14 @@ class Expansion {
    public:
     void add(double x) {
         for (int i = 0; i < size_; ++i) {
-            const Pair s = two_sum(x, part_[i]);
+            const DoubleDouble s = two_sum(x, part_[i]);
             part_[i] = s.low, x = s.high;
         }
         part_[size_++] = x;
     }
     // Adds a b c.
     void add_product(double a, double b, double c) {
-        const Pair ab = two_product(a, b), high = two_product(ab.high, c), low = two_product(ab.low, c);
+        const DoubleDouble ab = two_product(a, b), high = two_product(ab.high, c), low = two_product(ab.low, c);
         add(low.low), add(high.low), add(low.high), add(high.high);
     }
     // Returns the sign of the largest part.

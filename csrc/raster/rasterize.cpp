@@ -161,13 +161,13 @@ void find_nearest(const Triangles<T>& mesh, const Frames& frames, const Window& 
 }
 
 // Holds u and v at a pixel, their changes one pixel to the right and up, and intermediate results.
-struct Barycentrics {
+struct PixelBarycentrics {
     double sum, u, v;
     double dx, dy;  // They are the size of a pixel.
     double u_x, u_y, v_x, v_y;
     Vec3 total;  // It is the sum of the sides' lines; its product with the centre is `sum`.
 
-    Barycentrics(const Facet& f, const Weights& w, const Frames& frames)
+    PixelBarycentrics(const Facet& f, const Weights& w, const Frames& frames)
         : sum(w.sum()), u(w.e[0] / sum), v(w.e[1] / sum), dx(2 / double(frames.width)), dy(2 / double(frames.height)) {
         total = f.facing * (f.side[0].n + f.side[1].n + f.side[2].n);
         const Vec3 a = f.facing * f.side[0].n, b = f.facing * f.side[1].n;
@@ -202,7 +202,7 @@ RasterImages<T> rasterize(const Triangles<T>& mesh, const Frames& frames, const 
                 Facet f(mesh, item, t);
                 f.orient();
                 const Weights w = weights_at(f, frames.x(x), frames.y(y));
-                const Barycentrics b(f, w, frames);
+                const PixelBarycentrics b(f, w, frames);
                 T* to = out.rast.data() + at;
                 to[0] = T(b.u), to[1] = T(b.v), to[2] = T(w.depth(f)), to[3] = T(t + 1);
                 if (!derivatives) continue;
@@ -230,7 +230,7 @@ Array<T> rasterize_vjp(const Triangles<T>& mesh, const Frames& frames, const T* 
                 f.orient();
                 if (f.facing == 0) continue;  // The positions differ from those that were rasterized.
                 const Vec3 p{frames.x(x), frames.y(y), 1};
-                const Barycentrics b(f, weights_at(f, p.x, p.y), frames);
+                const PixelBarycentrics b(f, weights_at(f, p.x, p.y), frames);
                 // u = e₀ / s and ∂u/∂X = dx (n₀.x − u N.x) / s, where s = p · N and N = n₀ + n₁ + n₂; v likewise.
                 const double s = f.facing / b.sum;
                 double u_bar = bar[0], v_bar = bar[1];

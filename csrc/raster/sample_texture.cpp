@@ -19,7 +19,7 @@ class PixelLookUp {
     PixelLookUp(const TextureInput<T>& in, int64_t pixel) : in_(in) {
         const int n = in.coordinates();
         for (int k = 0; k < n; ++k) uv_.at[k] = double(in.uv[n * pixel + k]);
-        valid_ = place_of(uv_, in.shape.border, place_);
+        valid_ = place_of(uv_, in.shape.boundary_mode, place_);
         if (!valid_ || in.look_up == LookUp::nearest || in.look_up == LookUp::linear) return;
         double level = 0;
         if (in.uv_da) {
@@ -33,12 +33,12 @@ class PixelLookUp {
     }
     bool valid() const { return valid_; }
 
-    int64_t nearest(const TexelGrid& grid) const { return nearest_texel(grid, place_, in_.shape.border); }
-    BorderedFootprint linear(const TexelGrid& grid) const { return footprint(grid, place_, in_.shape.border); }
+    int64_t nearest(const TexelGrid& grid) const { return nearest_texel(grid, place_, in_.shape.boundary_mode); }
+    BorderedFootprint linear(const TexelGrid& grid) const { return footprint(grid, place_, in_.shape.boundary_mode); }
 
     // Adds the cotangents, given those of s and t and of the level.
     void vjp(Vec2 place_bar, double level_bar, TextureCoordinates& uv_bar) const {
-        place_vjp(uv_, in_.shape.border, place_, place_bar, uv_bar);
+        place_vjp(uv_, in_.shape.boundary_mode, place_, place_bar, uv_bar);
         if (!level_.is_between || !in_.uv_da || level_bar == 0) return;
         const Mat2 jacobian = texels_a_pixel(uv_, in_.shape, place_);
         const Mat2 bar = long_axis_vjp(jacobian, LongAxis(jacobian), level_bar);

@@ -23,7 +23,7 @@ struct TextureInput {
     const T* uv_da;  // (pixels, 4), or 6: their derivatives in the image
     const T* bias;   // (pixels,) added to the level, or the level itself if uv_da is null
 
-    int coordinates() const { return shape.border == Border::cube ? 3 : 2; }
+    int coordinates() const { return shape.boundary_mode == BoundaryMode::cube ? 3 : 2; }
 };
 
 // Returns (pixels, channels).

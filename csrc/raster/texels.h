@@ -13,16 +13,16 @@ namespace edgegrad {
 
 // Says how coordinates continue beyond a border, as nvdiffrast does. Unlike Wrap, `wrap` subtracts whole periods before
 // coordinates are scaled to texels, and `clamp` clamps coordinates rather than texels.
-enum class Border { wrap, clamp, zero, cube };
+enum class BoundaryMode { wrap, clamp, zero, cube };
 
 // Describes levels of halves, one after the other. Each has all images' textures with their sides, row by row.
 struct TextureShape {
     int64_t images;  // 1 means that all images share the texture.
     int64_t height, width;
     int channels, levels;
-    Border border;
+    BoundaryMode boundary_mode;
 
-    int sides() const { return border == Border::cube ? 6 : 1; }
+    int sides() const { return boundary_mode == BoundaryMode::cube ? 6 : 1; }
     int64_t rows(int level) const { return level_size(height, level); }
     int64_t columns(int level) const { return level_size(width, level); }
     int64_t texels(int level) const { return images * sides() * rows(level) * columns(level); }
@@ -105,35 +105,37 @@ inline int64_t cube_texel(const TexelGrid& grid, int side, int64_t x, int64_t y)
 }
 
 // Holds one coordinate as two texels, the weight of the second, and its derivative by the position in texels.
-struct Steps {
+struct LinearTexels {
     int64_t i0, i1;  // −1 means outside.
     double share, slope;
 };
-inline Steps steps(double s, int64_t n, Border border) {
-    if (border == Border::wrap) s -= std::floor(s);
+inline LinearTexels linear_texels(double s, int64_t n, BoundaryMode boundary_mode) {
+    if (boundary_mode == BoundaryMode::wrap) s -= std::floor(s);
     double x = s * double(n) - 0.5, slope = 1;
-    if (border == Border::clamp && !(x >= 0 && x <= double(n - 1))) x = std::clamp(x, 0.0, double(n - 1)), slope = 0;
+    if (boundary_mode == BoundaryMode::clamp && !(x >= 0 && x <= double(n - 1)))
+        x = std::clamp(x, 0.0, double(n - 1)), slope = 0;
     x = std::clamp(x, -2.0, double(n) + 1);  // An integer might overflow beyond this, and nothing is there.
     const double floor = std::floor(x);
-    Steps out{int64_t(floor), int64_t(floor) + 1, x - floor, slope};
-    if (border == Border::wrap) {
+    LinearTexels out{int64_t(floor), int64_t(floor) + 1, x - floor, slope};
+    if (boundary_mode == BoundaryMode::wrap) {
         if (out.i0 < 0) out.i0 = n - 1;
         if (out.i1 >= n) out.i1 = 0;
-    } else if (border == Border::clamp) {
+    } else if (boundary_mode == BoundaryMode::clamp) {
         out.i1 = std::min(out.i1, n - 1);
-    } else if (border == Border::zero) {
+    } else if (boundary_mode == BoundaryMode::zero) {
         if (out.i0 < 0 || out.i0 >= n) out.i0 = -1;
         if (out.i1 < 0 || out.i1 >= n) out.i1 = -1;
     }
     return out;
 }
 
-inline BorderedFootprint footprint(const TexelGrid& grid, const TexturePlace& at, Border border) {
-    const Steps x = steps(at.s, grid.width, border), y = steps(at.t, grid.height, border);
+inline BorderedFootprint footprint(const TexelGrid& grid, const TexturePlace& at, BoundaryMode boundary_mode) {
+    const LinearTexels x = linear_texels(at.s, grid.width, boundary_mode),
+                       y = linear_texels(at.t, grid.height, boundary_mode);
     BorderedFootprint out{{{}, x.share, y.share}, {x.slope, y.slope}};
     for (int k = 0; k < 4; ++k) {
         const int64_t i = k & 1 ? x.i1 : x.i0, j = k & 2 ? y.i1 : y.i0;
-        if (border != Border::cube) {
+        if (boundary_mode != BoundaryMode::cube) {
             out.texel[k] = i < 0 || j < 0 ? -1 : grid.at(i, j);
         } else {
             out.texel[k] = cube_texel(grid, at.side, i, j);
@@ -144,11 +146,11 @@ inline BorderedFootprint footprint(const TexelGrid& grid, const TexturePlace& at
 }
 
 // Returns the texel that contains a point, or −1.
-inline int64_t nearest_texel(const TexelGrid& grid, const TexturePlace& at, Border border) {
+inline int64_t nearest_texel(const TexelGrid& grid, const TexturePlace& at, BoundaryMode boundary_mode) {
     const auto cell = [&](double s, int64_t n) {
-        if (border == Border::wrap) s -= std::floor(s);
+        if (boundary_mode == BoundaryMode::wrap) s -= std::floor(s);
         const double x = std::floor(s * double(n));
-        if (border == Border::zero && !(x >= 0 && x < double(n))) return int64_t(-1);
+        if (boundary_mode == BoundaryMode::zero && !(x >= 0 && x < double(n))) return int64_t(-1);
         return int64_t(std::clamp(x, 0.0, double(n - 1)));
     };
     const int64_t x = cell(at.s, grid.width), y = cell(at.t, grid.height);

@@ -16,8 +16,8 @@ struct TextureCoordinates {
 };
 
 // Returns false where a cube has no such direction.
-inline bool place_of(const TextureCoordinates& uv, Border border, TexturePlace& out) {
-    if (border != Border::cube) {
+inline bool place_of(const TextureCoordinates& uv, BoundaryMode boundary_mode, TexturePlace& out) {
+    if (boundary_mode != BoundaryMode::cube) {
         out = {0, uv.at[0], uv.at[1]};
         return true;
     }
@@ -28,9 +28,9 @@ inline bool place_of(const TextureCoordinates& uv, Border border, TexturePlace& 
     out = {side, 0.5 * (axes.s_sign * uv.at[axes.s] / m + 1), 0.5 * (axes.t_sign * uv.at[axes.t] / m + 1)};
     return true;
 }
-inline void place_vjp(const TextureCoordinates& uv, Border border, const TexturePlace& place, Vec2 bar,
+inline void place_vjp(const TextureCoordinates& uv, BoundaryMode boundary_mode, const TexturePlace& place, Vec2 bar,
                       TextureCoordinates& uv_bar) {
-    if (border != Border::cube) {
+    if (boundary_mode != BoundaryMode::cube) {
         uv_bar.at[0] += bar.x, uv_bar.at[1] += bar.y;
         return;
     }
@@ -43,7 +43,7 @@ inline void place_vjp(const TextureCoordinates& uv, Border border, const Texture
 // Returns how (s, t) in texels change for a pixel to the right (X) and up (Y): rows of s and of t.
 inline Mat2 texels_a_pixel(const TextureCoordinates& uv, const TextureShape& t, const TexturePlace& place) {
     const double w = double(t.width), h = double(t.height), *d = uv.by_pixel;
-    if (t.border != Border::cube) return {w * d[0], w * d[1], h * d[2], h * d[3]};
+    if (t.boundary_mode != BoundaryMode::cube) return {w * d[0], w * d[1], h * d[2], h * d[3]};
     // s = (±x_s / m + 1) / 2 gives ∂s = (±∂x_s − (2 s − 1) ∂m) / (2 m).
     const SideAxes& axes = side_axes[place.side];
     const double scale = 0.5 * w / std::fabs(uv.at[axes.major]), s = 2 * place.s - 1, r = 2 * place.t - 1;
@@ -56,7 +56,7 @@ inline void texels_a_pixel_vjp(const TextureCoordinates& uv, const TextureShape&
                                const Mat2& bar, TextureCoordinates& uv_bar) {
     const double w = double(t.width), h = double(t.height);
     double* d = uv_bar.by_pixel;
-    if (t.border != Border::cube) {
+    if (t.boundary_mode != BoundaryMode::cube) {
         d[0] += w * bar.xx, d[1] += w * bar.xy, d[2] += h * bar.yx, d[3] += h * bar.yy;
         return;
     }
@@ -70,7 +70,7 @@ inline void texels_a_pixel_vjp(const TextureCoordinates& uv, const TextureShape&
         d[2 * axes.major + k] -= axes.sign * (s * s_bar[k] + r * t_bar[k]);
         by_s -= m * s_bar[k], by_t -= m * t_bar[k];
     }
-    place_vjp(uv, t.border, place, {2 * by_s, 2 * by_t}, uv_bar);
+    place_vjp(uv, t.boundary_mode, place, {2 * by_s, 2 * by_t}, uv_bar);
     // This adds the cotangent of 1 / m.
     const Mat2 jacobian = texels_a_pixel(uv, t, place);
     const double along = jacobian.xx * bar.xx + jacobian.xy * bar.xy + jacobian.yx * bar.yx + jacobian.yy * bar.yy;

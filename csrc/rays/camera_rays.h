@@ -40,7 +40,7 @@ class CameraFrame {
     // face near its border that the ray misses. At a silhouette of a fine mesh, that is a neighbour narrower than the
     // spacing of floats. `meets(face)` decides, in double where that matters; the ray passes through rejected faces.
     template <class Meets>
-    int32_t beyond_float(Vec2 n, int32_t face, RayCaster::Ignored ignored, Meets meets) const;
+    int32_t exact_hit(Vec2 n, int32_t face, RayCaster::Ignored ignored, Meets meets) const;
 
    private:
     friend class CameraRays;
@@ -87,7 +87,7 @@ void CameraFrame::cast_with_alpha_test(CameraRays& rays, const RayCaster::Ignore
 }
 
 template <class Meets>
-int32_t CameraFrame::beyond_float(Vec2 n, int32_t face, RayCaster::Ignored ignored, Meets meets) const {
+int32_t CameraFrame::exact_hit(Vec2 n, int32_t face, RayCaster::Ignored ignored, Meets meets) const {
     if (face < 0 || meets(face)) return face;
     CameraRays ray(*this);
     ray.n_x[0] = n.x, ray.n_y[0] = n.y, ray.count = 1;

@@ -47,7 +47,7 @@ class KeptGeometry {
             if (!topology_) topology_ = std::make_unique<Topology>(faces, n_faces_, n_verts_, team);
             topology_->weld(verts_, spacing_, team);
         }
-        if (make_parts_) parts_ = std::make_unique<Parts>(faces, n_faces_, n_verts_, team);
+        if (make_parts_) parts_ = std::make_unique<ConnectedParts>(faces, n_faces_, n_verts_, team);
         if (find_intersections_) {
             work.intersections = true;
             const Topology& topology = topology_ ? *topology_ : *geometry_->topology_;
@@ -107,7 +107,7 @@ class KeptGeometry {
     std::shared_ptr<Geometry> geometry_;
     bool weld_ = false, make_parts_ = false, find_intersections_ = false;
     std::unique_ptr<Topology> topology_;
-    std::unique_ptr<Parts> parts_;
+    std::unique_ptr<ConnectedParts> parts_;
     std::unique_ptr<Intersections> intersections_;
     FaceOrder order_;
 };

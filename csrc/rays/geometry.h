@@ -31,7 +31,7 @@ class Geometry {
 
     // These exist if acquire_geometry was asked for them; edges and intersections are those at the current positions.
     const Topology& topology() const { return *topology_; }
-    const Parts& parts() const { return *parts_; }
+    const ConnectedParts& parts() const { return *parts_; }
     const Intersections& intersections() const { return *intersections_; }
 
    private:
@@ -41,7 +41,7 @@ class Geometry {
     std::vector<double> verts_;
     RayCaster caster_;
     std::unique_ptr<Topology> topology_;
-    std::unique_ptr<Parts> parts_;
+    std::unique_ptr<ConnectedParts> parts_;
     std::unique_ptr<Intersections> intersections_;  // Null means not found yet at the current positions.
     FaceOrder order_;                               // The intersections were found in this order.
     Spacing spacing_;                               // It decides which vertices are welded.

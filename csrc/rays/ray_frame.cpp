@@ -66,9 +66,9 @@ RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
     unit = std::sqrt(*std::max_element(farthest.begin(), farthest.end())), radius = 1;
     if (!(unit > 0)) unit = 1;  // The scene is a single point.
     if (!all.faces) return frame;
-    constexpr int ordinary = 20, most = 70, most_of_radius = 36;  // They are powers of two.
+    constexpr int ordinary_span = 20, most_span = 70, most_of_radius = 36;  // They are powers of two.
     const double size = double(all.powers) / (2 * double(all.faces)), span = std::log2(unit) - size;
-    if (span > most) {
+    if (span > most_span) {
         char text[256];
         std::snprintf(text, sizeof text,
                       "verts: expected faces within 1e21 times their size of each other, got a vertex %.1e away from "
@@ -76,7 +76,7 @@ RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
                       unit, std::exp2(size));
         throw std::invalid_argument(text);
     }
-    if (span <= ordinary) return frame;
+    if (span <= ordinary_span) return frame;
     radius = std::exp2(std::min(int(span / 2), most_of_radius));
     unit /= radius;
     return frame;

@@ -95,8 +95,8 @@ void RayCaster::cast_with_alpha_test(RayBatch& batch, const Ignored* ignored, co
 
 template <class Meets>
 void RayCaster::cast_occluded_with_alpha_test(RayBatch& batch, const Meets& meets) const {
-    const Decision asked = decision(meets);
-    cast_occluded(batch, nullptr, &asked);
+    const Decision decide = decision(meets);
+    cast_occluded(batch, nullptr, &decide);
 }
 
 }  // namespace edgegrad

@@ -4,7 +4,7 @@
 #include <cmath>
 
 #include "rays/alpha_mask.h"
-#include "rays/meeting.h"
+#include "rays/plane_hit.h"
 
 namespace edgegrad {
 
@@ -28,7 +28,7 @@ Vec3 point_on(const SceneView<T>& scene, int64_t face, const double* b) {
 
 // Returns the hit moved onto the face. Float may hit a face at its border that the ray misses by a rounding; the border
 // counts as hit, because the neighbour may be missed as well.
-Barycentrics onto_face(const Meeting& m) {
+Barycentrics onto_face(const PlaneHit& m) {
     double u = std::max(m.u, 0.0), v = std::max(m.v, 0.0);
     if (u + v > 1) u /= u + v, v = 1 - u;
     return {u, v};
@@ -58,7 +58,7 @@ RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRa
         for (int i = 0; i < n && rays.ignored; ++i)
             if (rays.ignored[first + i] >= 0) without[i] = {rays.ignored[first + i]};
         cast_each(caster, n, out.face.data() + first, without, ray, [&](int i, int32_t face) {
-            const Meeting m = meet(scene, face, ray(i));
+            const PlaneHit m = intersect_plane(scene, face, ray(i));
             if (!m.exists() || m.t < 0) return false;
             const Barycentrics at = onto_face(m);
             if (!shows(scene, face, at)) return false;
@@ -70,7 +70,7 @@ RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRa
 }
 
 template <class T>
-void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out) {
+void test_visibility(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out) {
     RayBatch batch;
     for (int64_t first = 0; first < lines.size; first += RayBatch::size) {
         batch.count = int(std::min<int64_t>(RayBatch::size, lines.size - first));
@@ -86,10 +86,10 @@ void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& l
         caster.cast_occluded_with_alpha_test(batch, [&](int i, int32_t face) {
             const int32_t own = lines.face[first + i];
             if (face == own) return false;
-            const Meeting m = meet(scene, face, ray[i]);
+            const PlaneHit m = intersect_plane(scene, face, ray[i]);
             if (!(m.exists() && m.inside() && m.t < 1 - contact[i])) return false;
             // The position of faces that share a vertex with the point's own face is exact, however close they are.
-            if (!lies_beyond(m.t, contact[i], Meeting::rounding, [&] { return share_vertex(scene, face, own); }))
+            if (!lies_beyond(m.t, contact[i], PlaneHit::rounding, [&] { return share_vertex(scene, face, own); }))
                 return false;
             return shows(scene, face, inside({m.u, m.v}));
         });
@@ -102,14 +102,16 @@ std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster,
                              ThreadTeam& team) {
     std::vector<uint8_t> out(lines.size);
     each_batch(lines.size, team, [&](int64_t first, int n) {
-        see(scene, caster, {lines.face + first, lines.b + 2 * first, lines.to + 3 * first, lines.contact + first, n},
-            out.data() + first);
+        test_visibility(scene, caster,
+                        {lines.face + first, lines.b + 2 * first, lines.to + 3 * first, lines.contact + first, n},
+                        out.data() + first);
     });
     return out;
 }
 
 template <class T>
-void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures& rays, int32_t* face, double* b) {
+void trace_from_surface(const SceneView<T>& scene, const RayCaster& caster, const SurfaceRays& rays, int32_t* face,
+                        double* b) {
     std::vector<int32_t> without[RayBatch::size];
     for (int64_t first = 0; first < rays.size; first += RayBatch::size) {
         const int n = int(std::min<int64_t>(RayBatch::size, rays.size - first));
@@ -123,9 +125,9 @@ void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures
             caster, n, face + first, without, [&](int i) { return ray[i]; },
             [&](int i, int32_t hit) {
                 const int64_t k = first + i;
-                const Meeting m = meet(scene, hit, ray[i]);
-                // The position of faces that share a vertex is exact, as in see().
-                if (!m.exists() || !lies_beyond(m.t, rays.contact[k], Meeting::rounding * extent(ray[i].origin),
+                const PlaneHit m = intersect_plane(scene, hit, ray[i]);
+                // The position of faces that share a vertex is exact, as in test_visibility().
+                if (!m.exists() || !lies_beyond(m.t, rays.contact[k], PlaneHit::rounding * extent(ray[i].origin),
                                                 [&] { return share_vertex(scene, hit, rays.face[k]); }))
                     return false;
                 const Barycentrics at = onto_face(m);
@@ -136,12 +138,12 @@ void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures
     }
 }
 
-template void depart(const SceneView<float>&, const RayCaster&, const Departures&, int32_t*, double*);
-template void depart(const SceneView<double>&, const RayCaster&, const Departures&, int32_t*, double*);
+template void trace_from_surface(const SceneView<float>&, const RayCaster&, const SurfaceRays&, int32_t*, double*);
+template void trace_from_surface(const SceneView<double>&, const RayCaster&, const SurfaceRays&, int32_t*, double*);
 template RayHits trace(const SceneView<float>&, const RayCaster&, const TracedRays&, ThreadTeam&);
 template RayHits trace(const SceneView<double>&, const RayCaster&, const TracedRays&, ThreadTeam&);
-template void see(const SceneView<float>&, const RayCaster&, const Sightlines&, uint8_t*);
-template void see(const SceneView<double>&, const RayCaster&, const Sightlines&, uint8_t*);
+template void test_visibility(const SceneView<float>&, const RayCaster&, const Sightlines&, uint8_t*);
+template void test_visibility(const SceneView<double>&, const RayCaster&, const Sightlines&, uint8_t*);
 template std::vector<uint8_t> visible(const SceneView<float>&, const RayCaster&, const Sightlines&, ThreadTeam&);
 template std::vector<uint8_t> visible(const SceneView<double>&, const RayCaster&, const Sightlines&, ThreadTeam&);
 

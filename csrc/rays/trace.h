@@ -38,10 +38,10 @@ std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster,
                              ThreadTeam& team);
 // Does the same on one thread.
 template <class T>
-void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out);
+void test_visibility(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out);
 
 // Holds N rays from points on faces (barycentrics (N, 2)) in unit directions (N, 3).
-struct Departures {
+struct SurfaceRays {
     const int32_t* face;
     const double *b, *directions;
     const double* contact;  // (N,) world units: anything nearer than this to the point is not hit
@@ -50,6 +50,7 @@ struct Departures {
 // Finds the nearest face that each ray hits, −1: none, and its barycentrics (N, 2), on one thread. A ray does not hit
 // the face that it leaves.
 template <class T>
-void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures& rays, int32_t* face, double* b);
+void trace_from_surface(const SceneView<T>& scene, const RayCaster& caster, const SurfaceRays& rays, int32_t* face,
+                        double* b);
 
 }  // namespace edgegrad

@@ -117,7 +117,7 @@ EDGEGRAD_VECTORIZED unsigned overlapping_lanes(const BoxGroup& g, const FaceBox&
     return hits;
 }
 
-EDGEGRAD_VECTORIZED unsigned overlapping_lanes(const BoxGroup& g, const AskewBox& box) {
+EDGEGRAD_VECTORIZED unsigned overlapping_lanes(const BoxGroup& g, const OrientedBox& box) {
     float middle[3][BoxGroup::size], half[3][BoxGroup::size];
     for (int j = 0; j < 3; ++j) {
         EDGEGRAD_ROLLED
@@ -167,7 +167,7 @@ FaceBox BoxGroup::box(int lane) const {
 }
 
 unsigned BoxGroup::overlapping(const FaceBox& box) const { return overlapping_lanes(*this, box); }
-unsigned BoxGroup::overlapping(const AskewBox& box) const { return overlapping_lanes(*this, box); }
+unsigned BoxGroup::overlapping(const OrientedBox& box) const { return overlapping_lanes(*this, box); }
 
 unsigned CornerGroup::may_cross(const FacePlane& plane, double spacing) const {
     const Vec3 N = plane.normal;

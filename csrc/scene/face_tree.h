@@ -34,7 +34,7 @@ struct FaceBox {
 };
 
 // An oriented box contains the points p for which |axis[k] · (p − middle)| is at most half[k].
-struct AskewBox {
+struct OrientedBox {
     float middle[3], axis[3][3], half[3];
 };
 
@@ -50,7 +50,7 @@ struct BoxGroup {
     // Returns a mask whose bit i says that box i overlaps this one.
     unsigned overlapping(const FaceBox& box) const;
     // Returns a mask of boxes that may overlap this one: no face of the oriented box separates them.
-    unsigned overlapping(const AskewBox& box) const;
+    unsigned overlapping(const OrientedBox& box) const;
 };
 
 // Holds the plane of a face for comparison with its neighbours.

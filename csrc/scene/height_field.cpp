@@ -34,11 +34,11 @@ struct Prism {
 };
 
 // Holds the three coordinates of the corners of eight faces.
-struct Placed {
+struct PrismCoordinates {
     float x[3][3][lanes];  // Indices are coordinate and corner.
 };
 
-inline void place(const CornerGroup& g, const float (&axis)[3][3], const float (&offset)[3], Placed& out) {
+inline void place(const CornerGroup& g, const float (&axis)[3][3], const float (&offset)[3], PrismCoordinates& out) {
     for (int k = 0; k < 3; ++k)
         for (int c = 0; c < 3; ++c) {
             EDGEGRAD_ROLLED
@@ -68,7 +68,7 @@ EDGEGRAD_VECTORIZED void add_normals(const CornerGroup& g, float (&sum)[3]) {
 
 EDGEGRAD_VECTORIZED void widen(const CornerGroup& g, const float (&axis)[3][3], const float (&offset)[3],
                                Interval (&own)[3]) {
-    Placed p;
+    PrismCoordinates p;
     place(g, axis, offset, p);
     for (int k = 0; k < 3; ++k) {
         float low = own[k].low, high = own[k].high;
@@ -87,7 +87,7 @@ struct Touching {
 
 EDGEGRAD_VECTORIZED Touching touching_lanes(const CornerGroup& g, const Prism& prism, const float (&offset)[3],
                                             const float e) {
-    Placed p;
+    PrismCoordinates p;
     place(g, prism.axis, offset, p);
     float low[3][lanes], high[3][lanes];
     for (int k = 0; k < 3; ++k) {
@@ -222,8 +222,8 @@ class PrismTest {
     }
 
     // Returns the prism as an oriented box for the tree, whose boxes are rounded to floats in the world.
-    AskewBox box() const {
-        AskewBox box;
+    OrientedBox box() const {
+        OrientedBox box;
         Vec3 middle = origin_;
         for (int k = 0; k < 3; ++k) {
             const Interval& i = prism_.own[k];
@@ -291,7 +291,8 @@ HeightFields::HeightFields(const FaceTree& tree, const Topology& topology, Threa
     team.parallel_for_blocks(leaves, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t leaf = first; leaf < last; ++leaf)
             for (int lane = 0; lane < FaceTree::leaf_size; ++lane)
-                if (const int32_t f = tree.face(leaf, lane); f >= 0 && topology.goes_on(f)) closed[leaf] |= 1 << lane;
+                if (const int32_t f = tree.face(leaf, lane); f >= 0 && topology.has_all_neighbours(f))
+                    closed[leaf] |= 1 << lane;
     });
     team.parallel_for_with_state(
         nodes, [&] { return std::make_unique<Search>(tree, closed, by_); },

@@ -40,9 +40,9 @@ struct FoundIntersections {
 };
 
 // A pilot of this many leaves estimates the number of intersections if there are twice as many leaves. All are found up
-// to `few` plus one for each of some faces; otherwise, samples are drawn.
+// to `most_to_find_all` plus one for each of some faces; otherwise, samples are drawn.
 constexpr int64_t leaves_in_pilot = 128, most_in_pilot = 32;
-constexpr int64_t few = 1 << 12, faces_for_one_of_few = 8, many = 1 << 14, faces_for_one_of_many = 2;
+constexpr int64_t most_to_find_all = 1 << 12, faces_for_one_found = 8, most_drawn = 1 << 14, faces_for_one_drawn = 2;
 constexpr int64_t leaves_in_block = 16;
 
 // Selects the faces among which intersections are searched. They are all faces, or, if the leaves have masks, the drawn
@@ -70,8 +70,8 @@ struct DrawnPairs {
     }
 };
 
-// Pairs a face with its geometry.
-struct Placed {
+// Holds the number of a face, and its geometry.
+struct NumberedFace {
     const PlacedFace& placed;
     int32_t face;
 };
@@ -84,7 +84,7 @@ PlacedFace placed(const PlacedFaces& faces, int32_t face) {
 }
 
 // Adds the intersection of two faces.
-void add_pair(const Placed& one, const Placed& other, const DrawnPairs& drawn, FoundIntersections& out) {
+void add_pair(const NumberedFace& one, const NumberedFace& other, const DrawnPairs& drawn, FoundIntersections& out) {
     // Ordering the faces gives the same numbers whichever comes first.
     const auto [f, g] = one.face < other.face ? std::tie(one, other) : std::tie(other, one);
     FacePair pair;
@@ -105,9 +105,9 @@ void add_pair(const Placed& one, const Placed& other, const DrawnPairs& drawn, F
                          .b = pair.b});
 }
 
-class PairFinder {
+class FacePairFinder {
    public:
-    PairFinder(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces, const DrawnPairs& drawn)
+    FacePairFinder(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces, const DrawnPairs& drawn)
         : tree_(tree), fields_(fields), faces_(faces), drawn_(drawn), coarsest_(faces.spacing.coarsest()) {}
 
     // Calls found(other) for leaves from this one on that overlap it, if drawn faces may pass through each other.
@@ -172,17 +172,17 @@ class PairFinder {
 // Lists the faces at some edges, by the edges' vertices.
 using FacesAtEdges = std::map<std::array<int32_t, 2>, std::vector<int32_t>>;
 void find_faces(FacesAtEdges& at, const PlacedFaces& faces) {
-    std::vector<uint8_t> asked;  // It marks vertices.
+    std::vector<uint8_t> wanted;  // It marks vertices.
     for (const auto& [edge, none] : at) {
-        asked.resize(std::max<size_t>(asked.size(), edge[1] + 1), 0);
-        asked[edge[0]] = asked[edge[1]] = 1;
+        wanted.resize(std::max<size_t>(wanted.size(), edge[1] + 1), 0);
+        wanted[edge[0]] = wanted[edge[1]] = 1;
     }
-    const auto is_asked = [&](int32_t v) { return size_t(v) < asked.size() && asked[v]; };
+    const auto is_wanted = [&](int32_t v) { return size_t(v) < wanted.size() && wanted[v]; };
     for (int64_t e = 0; e < faces.topology.n_edges(); ++e)
         for (const HalfEdge& h : faces.topology.half_edges(e)) {
             const int32_t* v = faces.faces + 3 * int64_t(h.face);
             const auto [low, high] = std::minmax(v[h.first()], v[h.second()]);
-            if (!is_asked(low) || !is_asked(high)) continue;
+            if (!is_wanted(low) || !is_wanted(high)) continue;
             if (const auto found = at.find({low, high}); found != at.end()) found->second.push_back(h.face);
         }
 }
@@ -322,8 +322,8 @@ Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, cons
     const int64_t leaves = tree.n_leaves(), blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
     std::vector<FoundIntersections> of_block(blocks);
     team.parallel_for_with_state(
-        blocks, [&] { return std::make_unique<PairFinder>(tree, fields, faces, drawn); },
-        [&](PairFinder& pairs, int64_t block) {
+        blocks, [&] { return std::make_unique<FacePairFinder>(tree, fields, faces, drawn); },
+        [&](FacePairFinder& pairs, int64_t block) {
             FoundIntersections part;
             for (int64_t leaf = block * leaves_in_block; leaf < std::min(leaves, (block + 1) * leaves_in_block); ++leaf)
                 pairs.each_overlapping(leaf, [&](int64_t other) { pairs.add(leaf, other, part); });
@@ -344,14 +344,15 @@ Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, cons
 }  // namespace
 
 // Returns the pairs of a sample of leaves, if there are many leaves.
-std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& faces, ThreadTeam& team) const {
+std::vector<Intersections::IntersectingPair> Intersections::some_pairs(const PlacedFaces& faces,
+                                                                       ThreadTeam& team) const {
     const int64_t step = tree_->n_leaves() / leaves_in_pilot;
     if (step < 2) return {};
     const DrawnPairs all;
-    std::vector<std::vector<Pair>> of_leaf(leaves_in_pilot);
+    std::vector<std::vector<IntersectingPair>> of_leaf(leaves_in_pilot);
     team.parallel_for_with_state(
-        leaves_in_pilot, [&] { return std::make_unique<PairFinder>(*tree_, *fields_, faces, all); },
-        [&](PairFinder& pairs, int64_t i) {
+        leaves_in_pilot, [&] { return std::make_unique<FacePairFinder>(*tree_, *fields_, faces, all); },
+        [&](FacePairFinder& pairs, int64_t i) {
             const int64_t leaf = i * step;
             int64_t others = 0;
             pairs.each_overlapping(leaf, [&](int64_t) { ++others; });
@@ -364,7 +365,7 @@ std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& fa
             for (const Intersection& f : found.through)
                 of_leaf[i].push_back({{f.face[0], f.face[1]}, double(step) / part});
         });
-    std::vector<Pair> out;
+    std::vector<IntersectingPair> out;
     for (const auto& pairs : of_leaf) out.insert(out.end(), pairs.begin(), pairs.end());
     return out;
 }
@@ -375,10 +376,10 @@ Intersections::Intersections(const PlacedFaces& faces, FaceOrder& order, ThreadT
         fields_ = std::make_unique<HeightFields>(*tree_, faces.topology, team);
         pilot_ = some_pairs(faces, team);
         double sum = 0;
-        for (const Pair& p : pilot_) sum += p.stands_for;
+        for (const IntersectingPair& p : pilot_) sum += p.stands_for;
         return sum;
     };
-    const double most = double(few + faces.n_faces / faces_for_one_of_few);
+    const double most = double(most_to_find_all + faces.n_faces / faces_for_one_found);
     const bool kept_order = !order_.face.empty();
     double n = expected();
     // The leaves decide what is drawn; they must not depend on earlier positions of the vertices.
@@ -398,8 +399,9 @@ Intersections::Intersections(const PlacedFaces& faces, FaceOrder& order, ThreadT
 Array<Intersection> Intersections::drawn(const PlacedFaces& faces, const Array<float>& share, uint64_t seed,
                                          ThreadTeam& team) const {
     double expected = 0;
-    for (const Pair& p : pilot_) expected += p.stands_for * double(share[p.face[0]]) * double(share[p.face[1]]);
-    const double most = double(many + faces.n_faces / faces_for_one_of_many);
+    for (const IntersectingPair& p : pilot_)
+        expected += p.stands_for * double(share[p.face[0]]) * double(share[p.face[1]]);
+    const double most = double(most_drawn + faces.n_faces / faces_for_one_drawn);
     DrawnPairs some{.faces_of_leaf = std::vector<uint8_t>(tree_->n_leaves(), 0),
                     .share = share.data(),
                     .copies = copies_.data(),

@@ -62,18 +62,18 @@ class Intersections {
 
    private:
     // Holds two faces that pass through each other, and how many such pairs they represent.
-    struct Pair {
+    struct IntersectingPair {
         int32_t face[2];
         double stands_for;
     };
-    std::vector<Pair> some_pairs(const PlacedFaces& faces, ThreadTeam& team) const;
+    std::vector<IntersectingPair> some_pairs(const PlacedFaces& faces, ThreadTeam& team) const;
 
     Array<Intersection> all_{0};
     // These serve drawing; they are null where all were found.
     FaceOrder order_;
     std::unique_ptr<FaceTree> tree_;
     std::unique_ptr<HeightFields> fields_;
-    std::vector<Pair> pilot_;
+    std::vector<IntersectingPair> pilot_;
     Array<float> copies_{0};  // (F,) 1 over the number of copies of a face
 };
 

@@ -21,9 +21,9 @@ constexpr int64_t check_every = 1 << 14;
 // of 8 spacings of the largest coordinate is therefore one position. No two positions of one spacing lie within each
 // other's reach, so a cell of some reaches holds few of them. Finding one takes a constant time however many vertices
 // coincide. Spacings and magnitudes have their own cells.
-class PlaceGrid {
+class VertexGrid {
    public:
-    explicit PlaceGrid(size_t vertices) : head_(std::bit_ceil(std::max<size_t>(64, vertices)), -1) {}
+    explicit VertexGrid(size_t vertices) : head_(std::bit_ceil(std::max<size_t>(64, vertices)), -1) {}
 
     // Returns the nearest position of this spacing within reach of the vertex, −1: none.
     int32_t nearest(const double* verts, int32_t vertex, double spacing) const {
@@ -39,13 +39,13 @@ class PlaceGrid {
                 for (int64_t y = begin[1]; y <= end[1]; ++y)
                     for (int64_t z = begin[2]; z <= end[2]; ++z) {
                         const uint64_t key = key_of(e, spacing, x, y, z);
-                        for (int32_t i = head_[key & (head_.size() - 1)]; i >= 0; i = place_[i].next) {
-                            if (place_[i].key != key) continue;
-                            const double* o = verts + 3 * int64_t(place_[i].vertex);
+                        for (int32_t i = head_[key & (head_.size() - 1)]; i >= 0; i = stored_[i].next) {
+                            if (stored_[i].key != key) continue;
+                            const double* o = verts + 3 * int64_t(stored_[i].vertex);
                             const double apart =
                                 std::max({std::fabs(p[0] - o[0]), std::fabs(p[1] - o[1]), std::fabs(p[2] - o[2])});
-                            if (apart < least || (apart == least && (found < 0 || place_[i].vertex < found)))
-                                least = apart, found = place_[i].vertex;
+                            if (apart < least || (apart == least && (found < 0 || stored_[i].vertex < found)))
+                                least = apart, found = stored_[i].vertex;
                         }
                     }
         }
@@ -58,12 +58,12 @@ class PlaceGrid {
         const double cell = cell_of(e, spacing);
         const uint64_t key = key_of(e, spacing, index(p[0], cell), index(p[1], cell), index(p[2], cell));
         int32_t& head = head_[key & (head_.size() - 1)];
-        place_.push_back({key, vertex, head});
-        head = int32_t(place_.size()) - 1;
+        stored_.push_back({key, vertex, head});
+        head = int32_t(stored_.size()) - 1;
     }
 
    private:
-    struct Place {
+    struct StoredVertex {
         uint64_t key;
         int32_t vertex, next;
     };
@@ -79,7 +79,7 @@ class PlaceGrid {
     }
 
     std::vector<int32_t> head_;
-    std::vector<Place> place_;
+    std::vector<StoredVertex> stored_;
 };
 
 // Joins the sets 0 … n − 1 one by one, and names each after its least member (Galler and Fischer 1964).
@@ -102,7 +102,8 @@ class DisjointSets {
 
 }  // namespace
 
-Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team) : part_(n_verts) {
+ConnectedParts::ConnectedParts(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team)
+    : part_(n_verts) {
     DisjointSets sets(n_verts);
     for (int64_t i = 0; i < 3 * n_faces; ++i) {
         if (i % check_every == 0) team.check();
@@ -146,17 +147,17 @@ void Topology::weld(const double* verts, const Spacing& spacing, ThreadTeam& tea
     std::vector<int32_t> welded(n_verts_);
     std::iota(welded.begin(), welded.end(), 0);
     bool any = false;
-    PlaceGrid places(candidates_.size());
+    VertexGrid grid(candidates_.size());
     for (size_t k = 0; k < spacings.size(); ++k)
         for (size_t i = 0; i < candidates_.size(); ++i) {
             if (i % check_every == 0) team.check();
             const int32_t v = candidates_[i];
             if (spacing.of(v) != spacings[k]) continue;
-            int32_t place = -1;
-            for (size_t coarser = 0; coarser <= k && place < 0; ++coarser)
-                place = places.nearest(verts, v, spacings[coarser]);
-            if (place >= 0) welded[v] = place, any = true;
-            else places.add(verts, v, spacings[k]);
+            int32_t found = -1;
+            for (size_t coarser = 0; coarser <= k && found < 0; ++coarser)
+                found = grid.nearest(verts, v, spacings[coarser]);
+            if (found >= 0) welded[v] = found, any = true;
+            else grid.add(verts, v, spacings[k]);
         }
     if (!any) welded.clear();
     if (welded == welded_) return;
@@ -166,7 +167,7 @@ void Topology::weld(const double* verts, const Spacing& spacing, ThreadTeam& tea
 
 void Topology::build(ThreadTeam& team) {
     // Buckets of half-edges by lower vertex, each sorted by the upper one, take time linear in the number of faces.
-    struct Entry {
+    struct BucketedHalfEdge {
         int32_t upper;
         HalfEdge half_edge;
     };
@@ -195,7 +196,7 @@ void Topology::build(ThreadTeam& team) {
         for (int c = 0; c < 3; ++c) ++begin[std::min(at(f, c), at(f, c + 1)) + 1];
     }
     std::partial_sum(begin.begin(), begin.end(), begin.begin());
-    std::vector<Entry> entries(begin.back());
+    std::vector<BucketedHalfEdge> entries(begin.back());
     std::vector<int64_t> fill(begin.begin(), begin.end() - 1);
     for (int64_t f = 0; f < n_faces_; ++f) {
         if (f % check_every == 0) team.check();
@@ -211,7 +212,8 @@ void Topology::build(ThreadTeam& team) {
     for (int64_t v = 0; v < n_verts_; ++v) {
         if (v % check_every == 0) team.check();
         const auto first = entries.begin() + begin[v], last = entries.begin() + begin[v + 1];
-        std::stable_sort(first, last, [](const Entry& a, const Entry& b) { return a.upper < b.upper; });
+        std::stable_sort(first, last,
+                         [](const BucketedHalfEdge& a, const BucketedHalfEdge& b) { return a.upper < b.upper; });
         for (auto e = first; e != last; ++e) {
             const int64_t i = e - entries.begin();
             half_edge_[i] = e->half_edge;
@@ -220,7 +222,7 @@ void Topology::build(ThreadTeam& team) {
         }
     }
     joins_two_.resize(n_edges());
-    goes_on_.assign(n_faces_, 1);
+    has_all_neighbours_.assign(n_faces_, 1);
     DisjointSets sets(n_faces_);
     // The first half-edge defines the direction of an edge.
     for (int64_t e = 0; e < n_edges(); ++e) {
@@ -230,7 +232,7 @@ void Topology::build(ThreadTeam& team) {
         joins_two_[e] = offset_[e + 1] - offset_[e] == 2 && half_edge_[offset_[e] + 1].backwards;
         if (joins_two_[e]) sets.join(half_edges(e)[0].face, half_edges(e)[1].face);
         else
-            for (const HalfEdge& h : half_edges(e)) goes_on_[h.face] = 0;
+            for (const HalfEdge& h : half_edges(e)) has_all_neighbours_[h.face] = 0;
     }
     surface_.resize(n_faces_);
     for (int64_t f = 0; f < n_faces_; ++f) surface_[f] = sets.first(int32_t(f));

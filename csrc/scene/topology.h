@@ -27,9 +27,9 @@ struct HalfEdge {
 };
 
 // Groups faces into connected parts: faces that share vertices by index, directly or through others.
-class Parts {
+class ConnectedParts {
    public:
-    Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team);
+    ConnectedParts(const int32_t* faces, int64_t n_faces, int64_t n_verts, ThreadTeam& team);
 
     int64_t size() const { return size_; }
     // Returns the part of a face, by one of its vertices.
@@ -65,7 +65,7 @@ class Topology {
     bool joins_two(int64_t edge) const { return joins_two_[edge]; }
 
     // Returns whether all edges of a face join two faces.
-    bool goes_on(int32_t face) const { return goes_on_[face]; }
+    bool has_all_neighbours(int32_t face) const { return has_all_neighbours_[face]; }
     // Returns the connected surface of a face, across such edges, named by one of its faces.
     int32_t surface(int32_t face) const { return surface_[face]; }
 
@@ -88,9 +88,9 @@ class Topology {
     std::vector<int64_t> offset_;
     std::vector<HalfEdge> half_edge_;
     std::vector<int32_t> face_;
-    std::vector<uint8_t> joins_two_;  // It is indexed by edge.
-    std::vector<uint8_t> goes_on_;    // It is indexed by face.
-    std::vector<int32_t> surface_;    // It is indexed by face.
+    std::vector<uint8_t> joins_two_;           // It is indexed by edge.
+    std::vector<uint8_t> has_all_neighbours_;  // It is indexed by face.
+    std::vector<int32_t> surface_;             // It is indexed by face.
 };
 
 }  // namespace edgegrad

@@ -3,7 +3,7 @@
 // Between four texels a bilinear α is f + x f_x + y f_y + x y f_xy. The alpha edge F = α − cutoff = 0 is therefore a
 // hyperbola whose axes are the texture's. A branch is monotonous and convex, so a line across its chord meets it once,
 // and before the other branch. The position t along the chord therefore parametrises the branch. Where the filter is
-// nearest, alpha edges are borders of texels.
+// nearest, alpha edges are texel edges.
 #pragma once
 
 #include <algorithm>

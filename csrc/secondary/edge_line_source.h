@@ -41,10 +41,11 @@ struct EdgeLine {
     int64_t segment = 0;                    // number that identifies the sampler's segment (secondary_edges.cpp)
     int32_t receiver = -1, reflector = -1;  // faces of y₁ and y₂
     Barycentrics at = {}, from = {};        // barycentrics of y₁ and y₂
-    Barycentrics asked = {};  // where the reflector's radiance is evaluated: next to y₂, if the edge lies on that face
-    double share = 0;         // λ
-    double distance = 0;      // |y₂ − y₁|
-    double facing = 0;        // sign tells the side of the receiver's plane on which the reflector lies
+    Barycentrics radiance_at =
+        {};               // where the reflector's radiance is evaluated: next to y₂, if the edge lies on that face
+    double share = 0;     // λ
+    double distance = 0;  // |y₂ − y₁|
+    double facing = 0;    // sign tells the side of the receiver's plane on which the reflector lies
 };
 
 template <class T>
@@ -105,7 +106,7 @@ class EdgeLineSource {
     // Returns the receiver and the reflector. The reflector's radiance is not wanted.
     SampleSurfaces surfaces(const Sample& sample) const {
         const EdgeLine& line = sample.curve;
-        return {{{line.receiver, line.at, sample.point.z}, {line.reflector, line.asked, sample.point.z}}};
+        return {{{line.receiver, line.at, sample.point.z}, {line.reflector, line.radiance_at, sample.point.z}}};
     }
 
     // Light passes where F > 0.

@@ -8,7 +8,7 @@
 
 #include "estimator/view.h"
 #include "rays/alpha_mask.h"
-#include "rays/meeting.h"
+#include "rays/plane_hit.h"
 #include "scene/contact.h"
 #include "scene/light_parts.h"
 #include "secondary/light_wedge.h"
@@ -27,7 +27,7 @@ class LightRays {
 
     // Adds the ray from a point of the light past the place t of an edge or an alpha edge. `segment` identifies it.
     void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
-        Pending& w = pending_[count_];
+        PendingRay& w = pending_[count_];
         w.point = {.caster = {},
                    .part = piece.part,
                    .uv = from.uv,
@@ -64,27 +64,28 @@ class LightRays {
     void cast(const std::function<void(const ShadowPoint&, double)>& body) {
         while (count_ > 0) {
             int32_t face[RayBatch::size];
-            Meeting met[RayBatch::size];
+            PlaneHit met[RayBatch::size];
             cast_each(
                 view_.geometry.caster(), count_, face, without_, [&](int i) { return pending_[i].ray; },
                 [&](int i, int32_t f) { return accept(pending_[i], f, met[i]); });
-            int going_on = 0;
+            int continued = 0;
             for (int i = 0; i < count_; ++i) {
                 if (face[i] < 0) continue;
-                Pending& w = pending_[i];
+                PendingRay& w = pending_[i];
                 w.point.face = face[i], w.point.on = inside({met[i].u, met[i].v});
                 w.point.along = light_.infinite ? met[i].t - w.before : met[i].t;
                 // A face before the edge, or touching it, bears no shadow boundary. The shadow begins there, along a
                 // curve that the camera sees as an edge.
                 if (met[i].t > w.before + touching(w, face[i])) body(w.point, w.weight);
-                if (casters_.alpha_masks.on(face[i]) && !shows(casters_, face[i], w.point.on)) go_on(going_on++, i);
+                if (casters_.alpha_masks.on(face[i]) && !shows(casters_, face[i], w.point.on))
+                    continue_ray(continued++, i);
             }
-            count_ = going_on;
+            count_ = continued;
         }
     }
 
    private:
-    struct Pending {
+    struct PendingRay {
         ShadowPoint point;
         double weight;
         int64_t edge;
@@ -95,7 +96,7 @@ class LightRays {
     };
 
     // Continues the i-th ray, as the k-th, behind the face that it met.
-    void go_on(int k, int i) {
+    void continue_ray(int k, int i) {
         std::vector<int32_t>& without = without_[i];
         without.insert(std::upper_bound(without.begin(), without.end(), pending_[i].point.face),
                        pending_[i].point.face);
@@ -104,14 +105,14 @@ class LightRays {
         without_[k].swap(without);
     }
 
-    bool set_edge(int64_t edge, double t, Pending& w) const {
+    bool set_edge(int64_t edge, double t, PendingRay& w) const {
         if (!casts(edge, t, w.point)) return false;
         w.point.caster = occluder_of(view_.scene, view_.geometry.topology().half_edges(edge)[0], t);
         w.p = w.point.caster.sum(w.point.caster.weight, vertices());
         return true;
     }
 
-    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, Pending& w) const {
+    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, PendingRay& w) const {
         AlphaEdgePoint place{};
         if (!AlphaEdgeFinder<T>(casters_).place(alpha_edge, t, place)) return false;
         w.point.caster = occluder_of(casters_, alpha_edge, place);
@@ -129,7 +130,7 @@ class LightRays {
         return [&](int32_t i) { return vec(view_.scene.verts + 3 * int64_t(i)); };
     }
     // Returns the faces of the edge, or the face of the alpha edge.
-    std::span<const int32_t> adjacent_faces(const Pending& w) const {
+    std::span<const int32_t> adjacent_faces(const PendingRay& w) const {
         return w.edge < 0 ? std::span<const int32_t>(&w.face, 1) : view_.geometry.topology().faces(w.edge);
     }
 
@@ -151,16 +152,16 @@ class LightRays {
         return on_side[0] != on_side[1];
     }
 
-    bool accept(const Pending& w, int32_t face, Meeting& m) const {
-        m = meet(view_.scene, face, w.ray);
-        if (!m.exists() || m.t <= 0 || m.margin() < -Meeting::rounding) return false;
+    bool accept(const PendingRay& w, int32_t face, PlaneHit& m) const {
+        m = intersect_plane(view_.scene, face, w.ray);
+        if (!m.exists() || m.t <= 0 || m.margin() < -PlaneHit::rounding) return false;
         // A ray through the border of a face hits or misses it as if the light had moved a little (FacesBeforeLight).
         // An example is a light in the side of a box.
-        if (m.margin() <= Meeting::rounding) {
-            constexpr double little = 1e-7;
-            const Vec3 moved = (little * length(w.ray.direction)) * FacesBeforeLight<T>::aside;
+        if (m.margin() <= PlaneHit::rounding) {
+            constexpr double perturbation = 1e-7;
+            const Vec3 moved = (perturbation * length(w.ray.direction)) * FacesBeforeLight<T>::aside;
             const Vec3 origin = w.ray.origin + (light_.infinite ? w.before : 1) * moved;
-            const Meeting adjacent = meet(view_.scene, face, {origin, w.p - origin});
+            const PlaneHit adjacent = intersect_plane(view_.scene, face, {origin, w.p - origin});
             if (!adjacent.exists() || adjacent.margin() < 0) return false;
         }
         // This is the light itself: its point lies on this face or on a neighbour.
@@ -169,10 +170,10 @@ class LightRays {
     }
 
     // Returns how far along its ray an edge may lie from a face that it touches, up to the rounding of the input.
-    double touching(const Pending& w, int32_t face) const {
+    double touching(const PendingRay& w, int32_t face) const {
         const SceneView<T>& scene = view_.scene;
         for (const int32_t adjacent : adjacent_faces(w))
-            if (share_vertex(scene, face, adjacent)) return Meeting::rounding * w.before;
+            if (share_vertex(scene, face, adjacent)) return PlaneHit::rounding * w.before;
         const int32_t* v = scene.faces + 3 * int64_t(face);
         double size = 0;
         for (int i = 0; i < 3; ++i)
@@ -189,7 +190,7 @@ class LightRays {
     const SceneView<T>& casters_;
     const LightParts& light_;
     const std::vector<AlphaEdge>& alpha_edges_;
-    Pending pending_[RayBatch::size];
+    PendingRay pending_[RayBatch::size];
     std::vector<int32_t> without_[RayBatch::size];
     int count_ = 0;
 };

@@ -7,7 +7,7 @@
 
 #include "core/sampler.h"
 #include "estimator/view.h"
-#include "rays/meeting.h"
+#include "rays/plane_hit.h"
 #include "secondary/secondary_edges.h"
 #include "shading/lit/indirect.h"
 #include "shading/lit/lit.h"
@@ -30,8 +30,8 @@ struct LineLight {
     bool is_seen() const { return lit.seen; }
 };
 
-// Ends holds pairs of points: a receiver and a reflector each.
-class Ends {
+// LineEnds holds pairs of points: a receiver and a reflector each.
+class LineEnds {
    public:
     int64_t size() const { return int64_t(face_[0].size()); }
     void add(int receiver_or_reflector, int64_t face, double u, double v) {
@@ -54,7 +54,8 @@ class Ends {
                                 &b_[1][3 * i],
                                 &seed[i]};
             send_between(scene.lit.lit, scene.casters, scene.view.geometry.caster(), some,
-                         scene.is_seen() ? Received::by_viewer : Received::there, paths, &out[i * C]);
+                         scene.is_seen() ? SentRadiance::seen_by_viewer : SentRadiance::at_receiver, paths,
+                         &out[i * C]);
         }
         return out;
     }
@@ -98,7 +99,7 @@ void light_reflectors(const LineLight<T>& light, const std::vector<CurveRecords>
             light.view.team.check();
             const size_t k = begin + size_t(block);
             const CurveRecords& record = records[k];
-            Ends ends;
+            LineEnds ends;
             for (int64_t i = 0; i < record.size(); ++i)
                 for (int end = 0; end < 2; ++end) {
                     const int64_t at = surfaces * i + end;

@@ -12,7 +12,7 @@
 #include <vector>
 
 #include "estimator/view.h"
-#include "rays/meeting.h"
+#include "rays/plane_hit.h"
 #include "secondary/lune.h"
 #include "secondary/occluder.h"
 #include "secondary/specular_lines.h"
@@ -39,7 +39,7 @@ struct DirectionCells {
 // PooledLines holds root mean squares of the lines' contributions, by part and direction.
 class PooledLines {
    public:
-    explicit PooledLines(const Parts& parts)
+    explicit PooledLines(const ConnectedParts& parts)
         : parts_(parts),
           tables_(std::min<int64_t>(parts.size(), most_tables)),
           squares_(tables_ * DirectionCells::count, 0.0),
@@ -68,7 +68,7 @@ class PooledLines {
     static constexpr int64_t most_tables = 1 << 12;
     static constexpr double unguided = 0.15;
 
-    const Parts& parts_;
+    const ConnectedParts& parts_;
     int64_t tables_;
     std::vector<double> squares_;
     std::vector<int64_t> lines_;
@@ -94,7 +94,7 @@ class EdgeLines {
         if (piece < topology_.n_edges()) set_edge(piece);
         else set_alpha_edge(alpha_edges_[piece - topology_.n_edges()]);
         lune_ = {a_, b_, opposite_};
-        across_ = means_.empty() ? 1 : int(std::clamp(std::ceil(lune_.width() / widest), 1.0, most_across));
+        across_ = means_.empty() ? 1 : int(std::clamp(std::ceil(lune_.width() / widest_cell), 1.0, most_cells_across));
         sum_.clear();
         const double measure = stands_for_ * lune_.measure();
         if (means_.empty() || lune_.empty()) return measure;
@@ -107,13 +107,13 @@ class EdgeLines {
         return measure * sum / double(sum_.size());
     }
 
-    struct Line {
+    struct DrawnLine {
         double t;     // position on the edge
         Vec3 w;       // unit direction
         double area;  // ∫ dt dω over what the line stands for, were it the only one of this piece; 0: no line is drawn
     };
     // Maps numbers in [0, 1) to a line. `choice` selects the strategy.
-    Line at(double along_edge, Vec2 u, double choice) {
+    DrawnLine at(double along_edge, Vec2 u, double choice) {
         double t = along_edge;
         Vec2 there = u;
         if (!sum_.empty()) {
@@ -123,18 +123,18 @@ class EdgeLines {
             t = std::clamp((s - before(k)) / (sum_[k] - before(k)), 0.0, 1.0);
             there = {(double(k / across_) + u.x) / along, (double(k % across_) + u.y) / across_};
         }
-        Lune::Place place{lune_.direction(there.x, there.y), there.x, there.y};
-        if (mirrors_.empty() || lune_.empty()) return {t, place.w, stands_for_ * area(place)};
+        Lune::Coordinates line{lune_.direction(there.x, there.y), there.x, there.y};
+        if (mirrors_.empty() || lune_.empty()) return {t, line.w, stands_for_ * area(line)};
         mirrored_.set(mirrors_, (1 - t) * a_ + t * b_, lune_);
         const double share = mirrored_.share();
         if (choice < share) {
             const Vec3 w = mirrored_.draw(choice / share, u);
-            place = dot(w, w) > 0 ? lune_.locate(w) : Lune::Place();
-            if (!place.is_there()) return {t, place.w, 0};
+            line = dot(w, w) > 0 ? lune_.locate(w) : Lune::Coordinates();
+            if (!line.is_there()) return {t, line.w, 0};
         }
-        double pdf = (1 - share) / area(place);
-        if (share > 0) pdf += share * mirrored_.pdf(place.w);
-        return {t, place.w, stands_for_ / pdf};
+        double pdf = (1 - share) / area(line);
+        if (share > 0) pdf += share * mirrored_.pdf(line.w);
+        return {t, line.w, stands_for_ / pdf};
     }
     int64_t cell(Vec3 w) const { return pooled_.cell(vertex_, w); }
 
@@ -161,7 +161,7 @@ class EdgeLines {
     }
 
     static constexpr int along = 8;
-    static constexpr double widest = M_PI / 8, most_across = 8;  // azimuths of a cell, radians and number
+    static constexpr double widest_cell = M_PI / 8, most_cells_across = 8;  // azimuths of a cell, radians and number
 
     static double angle_at_middle(int j) {
         static const std::vector<double> angles = [] {
@@ -173,10 +173,10 @@ class EdgeLines {
     }
     double before(int64_t k) const { return k ? sum_[k - 1] : 0; }
     // Returns the reciprocal pdf of the lines that cells draw.
-    double area(const Lune::Place& place) const {
-        const double all = lune_.weight(place.w);
+    double area(const Lune::Coordinates& line) const {
+        const double all = lune_.weight(line.w);
         if (sum_.empty()) return all;
-        const int j = std::min(int(place.u * along), along - 1), i = std::min(int(place.v * across_), across_ - 1);
+        const int j = std::min(int(line.u * along), along - 1), i = std::min(int(line.v * across_), across_ - 1);
         const int64_t k = int64_t(j) * across_ + i;
         return all * sum_.back() / ((sum_[k] - before(k)) * double(sum_.size()));
     }

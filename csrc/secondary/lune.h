@@ -54,14 +54,14 @@ class Lune {
         const double phi = low_ + width_ * v;
         return std::cos(theta) * e_ + std::sin(theta) * (std::cos(phi) * x_ + std::sin(phi) * y_);
     }
-    // A Place is the line along w, oriented as at(θ, v) returns it. u is the fraction of the polar measure below θ. v <
-    // 0 marks a line outside the lune.
-    struct Place {
+    // Coordinates locate the line along w, oriented as at(θ, v) returns it. u is the fraction of the polar measure
+    // below θ. v < 0 marks a line outside the lune.
+    struct Coordinates {
         Vec3 w;
         double u, v = -1;
         bool is_there() const { return v >= 0; }
     };
-    Place locate(Vec3 w) const {
+    Coordinates locate(Vec3 w) const {
         if (!(width_ > 0)) return {};
         for (const double sign : {1.0, -1.0}) {
             const Vec3 l = sign * w;

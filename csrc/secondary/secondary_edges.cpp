@@ -49,7 +49,7 @@ class EdgeLineSampler {
             [&](Paths& paths, int64_t block) {
                 light_.view.team.check();
                 PilotStatistics& own = found[block];
-                Ends ends;
+                LineEnds ends;
                 const int64_t first = block * pilots_of_block, last = std::min(first + pilots_of_block, places.size());
                 receiver.cast_pilots(
                     [&](auto body) {
@@ -59,7 +59,7 @@ class EdgeLineSampler {
                         if (!(size > 0)) return;
                         own.cell.push_back(line.segment), own.value.push_back(size);
                         ends.add(0, line.receiver, line.at.u, line.at.v);
-                        ends.add(1, line.reflector, line.asked.u, line.asked.v);
+                        ends.add(1, line.reflector, line.radiance_at.u, line.radiance_at.v);
                     });
                 const std::vector<double> sent = ends.sent(light_, 19, 2 * first, paths);
                 for (size_t i = 0; i < own.value.size(); ++i) {
@@ -155,7 +155,7 @@ void append_indirect(const BackwardView<T>& view, const EdgeLine& line, double w
     const Vec3 N = normal_of(view, line);
     append(records.x, {0.0, 0.0});
     for (int k = 0; k < CurveRecords::surfaces; ++k) {
-        const Barycentrics b = k == 0 ? line.at : line.asked;
+        const Barycentrics b = k == 0 ? line.at : line.radiance_at;
         records.face.push_back(k == 0 ? line.receiver : k == 1 ? line.reflector : -2);
         records.factor.push_back(k == 0 ? weight : 0), append(records.b, {b.u, b.v});
     }

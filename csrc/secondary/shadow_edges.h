@@ -9,7 +9,7 @@
 
 #include "core/sampler.h"
 #include "estimator/view.h"
-#include "rays/meeting.h"
+#include "rays/plane_hit.h"
 #include "scene/light_parts.h"
 #include "secondary/light_wedge.h"
 #include "secondary/occluder.h"
@@ -71,9 +71,9 @@ class FacesBeforeLight {
         for (int i = 0; i < 3; ++i) {
             const Vec3 to = light_.infinite ? light_.at(part, i) : light_.at(part, i) - p.corner;
             h[i] = dot(p.normal, to);
-            constexpr double slack = 16;  // factor on the rounding with which a light's point lies on its face
+            constexpr double roundings = 16;  // factor on the rounding with which a light's point lies on its face
             edge_on = edge_on &&
-                      std::fabs(h[i]) <= slack * p.rounding * (std::fabs(to.x) + std::fabs(to.y) + std::fabs(to.z));
+                      std::fabs(h[i]) <= roundings * p.rounding * (std::fabs(to.x) + std::fabs(to.y) + std::fabs(to.z));
         }
         edge_on |= face == light_.face[part];
         if (!edge_on) return {{h[0], h[1], h[2]}, false};
@@ -170,14 +170,14 @@ class ShadowEdgeFinder {
                 if (may_cast(e)) part.push_back(e);
             return part;
         });
-        int64_t asking = 0;
-        for (const auto& part : may) asking += int64_t(part.size());
-        const int64_t asked = std::clamp<int64_t>(tests / std::max<int64_t>(asking, 1), 1, light_.count);
+        int64_t edges_tested = 0;
+        for (const auto& part : may) edges_tested += int64_t(part.size());
+        const int64_t parts_tested = std::clamp<int64_t>(tests / std::max<int64_t>(edges_tested, 1), 1, light_.count);
         std::vector<std::vector<ShadowPiece>> parts(may.size());
         view_.team.parallel_for(int64_t(may.size()), [&](int64_t k) {
             EdgeWedge<T> wedge(view_, casters_, faces_, alpha_edges_);
             std::vector<ShadowPiece> part;
-            for (const int64_t e : may[k]) add(e, asked, wedge, part);
+            for (const int64_t e : may[k]) add(e, parts_tested, wedge, part);
             parts[k] = std::move(part);
         });
         for (auto& block : of_alpha_edges(tests / 4)) parts.push_back(std::move(block));
@@ -218,18 +218,18 @@ class ShadowEdgeFinder {
         if (light_.infinite || !light_.extended) return false;
         const Vec3 c = light_.at(part, 0), n = cross(light_.at(part, 1) - c, light_.at(part, 2) - c);
         const auto on = [&](Vec3 p) {
-            constexpr double relative = 1e-9;
-            return std::fabs(dot(n, p - c)) <= relative * length(n) * length(p - c);
+            constexpr double tolerance = 1e-9;
+            return std::fabs(dot(n, p - c)) <= tolerance * length(n) * length(p - c);
         };
         return on(a) && on(b);
     }
 
-    void add(int64_t e, int64_t asked, EdgeWedge<T>& wedge, std::vector<ShadowPiece>& out) const {
+    void add(int64_t e, int64_t parts_tested, EdgeWedge<T>& wedge, std::vector<ShadowPiece>& out) const {
         const HalfEdge& h = view_.geometry.topology().half_edges(e)[0];
         const Vec3 a = corner(view_.scene, h.face, h.first()), b = corner(view_.scene, h.face, h.second());
         const double shift = to_unit(hash(hash(view_.options.seed, 8, gradient_stream), e));
-        const double step = double(light_.count) / double(asked);
-        for (int64_t i = 0; i < asked; ++i) {
+        const double step = double(light_.count) / double(parts_tested);
+        for (int64_t i = 0; i < parts_tested; ++i) {
             const int64_t part = std::min(int64_t((double(i) + shift) * step), light_.count - 1);
             if (lies_in_plane(part, a, b) || !wedge.set(e, part)) continue;
             add(e, part, a, b, step, *wedge, out);
@@ -246,10 +246,10 @@ class ShadowEdgeFinder {
     }
 
     std::vector<std::vector<ShadowPiece>> of_alpha_edges(int64_t tests) const {
-        const int64_t asked =
+        const int64_t parts_tested =
             std::clamp<int64_t>(tests / std::max<int64_t>(int64_t(alpha_edges_.size()), 1), 1, light_.count);
         const Hash random(hash(view_.options.seed, 12, gradient_stream), 0);
-        const double step = double(light_.count) / double(asked);
+        const double step = double(light_.count) / double(parts_tested);
         return view_.team.map_blocks(int64_t(alpha_edges_.size()), [&](int64_t begin, int64_t end) {
             EdgeWedge<T> wedge(view_, casters_, faces_, alpha_edges_);
             std::vector<ShadowPiece> out;
@@ -257,7 +257,7 @@ class ShadowEdgeFinder {
                 const AlphaEdge& alpha_edge = alpha_edges_[k];
                 const Vec3 a = on_face(alpha_edge, alpha_edge.begin), b = on_face(alpha_edge, alpha_edge.end);
                 const double shift = to_unit(random(uint64_t(k)));
-                for (int64_t i = 0; i < asked; ++i) {
+                for (int64_t i = 0; i < parts_tested; ++i) {
                     const int64_t part = std::min(int64_t((double(i) + shift) * step), light_.count - 1);
                     if (lies_in_plane(part, a, b) || !wedge.set_alpha_edge(alpha_edge.face, part)) continue;
                     add(ShadowPiece::of_alpha_edge(k), part, a, b, step * alpha_edge.share, *wedge, out);

@@ -14,14 +14,14 @@
 
 namespace edgegrad {
 
-constexpr double most_of_edge = 64;  // maximum number of pieces of an edge
-constexpr int pilots = 4;            // number of pilots per interval
+constexpr double most_of_edge = 64;    // maximum number of pieces of an edge
+constexpr int pilots_of_interval = 4;  // number of pilots per interval
 constexpr int64_t intervals_of_block = 64;
-constexpr int64_t neighbours = 16;       // number of intervals on either side whose pilots are shared
-constexpr int64_t mirrored = 2;          // samples per place before a light with an extent
-constexpr double own_share = 0.3;        // fraction of the mean square that comes from the interval itself
-constexpr double uniform_share = 0.1;    // fraction of the density that is independent of pilots
-constexpr int64_t pair_tests = 1 << 22;  // number of tested pairs of edges and light parts
+constexpr int64_t intervals_around = 16;   // number of intervals on either side whose pilots are shared
+constexpr int64_t antithetic_samples = 2;  // samples per place before a light with an extent
+constexpr double own_share = 0.3;          // fraction of the mean square that comes from the interval itself
+constexpr double uniform_share = 0.1;      // fraction of the density that is independent of pilots
+constexpr int64_t pair_tests = 1 << 22;    // number of tested pairs of edges and light parts
 constexpr int64_t fewest_intervals = 1 << 10, most_intervals = 1 << 15, samples_of_interval = 16;
 
 // Cuts edges with much of the measure, because samples run along the light's wedges, at drawn places of the edge.
@@ -46,7 +46,7 @@ class ShadowPieces {
 
     bool empty() const { return !(systematic_.total() > 0); }
 
-    struct Place {
+    struct PiecePoint {
         int64_t piece;
         double fraction;  // position within the piece
         double weight;    // reciprocal density of evenly drawn places
@@ -56,7 +56,7 @@ class ShadowPieces {
         const double p = std::min(position * systematic_.total(), std::nextafter(systematic_.total(), 0.0));
         return before < 0 ? systematic_.primitive(p) : systematic_.primitive(p, before);
     }
-    Place at(double position, int64_t before) const {
+    PiecePoint at(double position, int64_t before) const {
         const int64_t k = piece(position, before);
         const double measure = systematic_.measure_of(k);
         return {k, std::clamp((position * systematic_.total() - systematic_.begin_of(k)) / measure, 0.0, 1.0),
@@ -94,28 +94,29 @@ struct ShadowStatistics {
     }
 };
 
-// ShadowPlaces draws n places from a density that is constant in equal intervals of the pieces' positions. Places are
+// ShadowPositions draws n positions along the pieces from a density that is constant in equal intervals. They are
 // equally spaced, except in a piece whose expected number is at least one. There they are spread evenly from end to
-// end, each jittered in its stratum. Otherwise rounding the number of places per piece would cause most of the variance
-// between vertices. The estimate is unbiased given any number of places.
-class ShadowPlaces {
+// end, each jittered in its stratum. Otherwise rounding their number per piece would cause most of the variance
+// between vertices. The estimate is unbiased given any number of positions.
+class ShadowPositions {
    public:
-    // `density` has one number per interval and becomes its running sum. `whole` gives pieces whole numbers of places.
-    ShadowPlaces(const ShadowPieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed,
-                 ThreadTeam& team)
+    // `density` has one number per interval and becomes its running sum. `whole` gives pieces whole numbers of
+    // positions.
+    ShadowPositions(const ShadowPieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed,
+                    ThreadTeam& team)
         : pieces_(pieces), intervals_(density.size()), whole_(whole), seed_(seed), systematic_(density, team) {
         systematic_.draw(n, to_unit(seed));
         spacing_ = systematic_.total() / double(n);
     }
 
-    struct Place {
+    struct DrawnPosition {
         double position;  // position along the pieces
         int64_t interval;
         double weight;  // reciprocal density
     };
 
-    // Returns the i-th place; i must ascend between calls.
-    Place operator()(int64_t i) {
+    // Returns the i-th position; i must ascend between calls.
+    DrawnPosition operator()(int64_t i) {
         const double even = systematic_.position(i);
         interval_ = interval_ < 0 ? systematic_.primitive(even) : systematic_.primitive(even, interval_);
         const double position = position_of(even, interval_);
@@ -145,7 +146,7 @@ class ShadowPlaces {
         const double fraction = (sum - systematic_.begin_of(k)) / systematic_.measure_of(k);
         return (double(k) + std::clamp(fraction, 0.0, 1.0)) / double(intervals_);
     }
-    // Returns the number of the first place at or after a sum.
+    // Returns the number of the first position at or after a sum.
     int64_t number_from(double sum) const { return int64_t(std::ceil((sum - systematic_.position(0)) / spacing_)); }
     double weight_of(int64_t interval) const { return systematic_.weight(interval) / double(intervals_); }
 
@@ -217,9 +218,10 @@ inline Array<double> density_of(const std::vector<ShadowStatistics>& of_interval
     double known = 0;
     for (int64_t i = 0; i < count; ++i) {
         double around = 0;
-        const int64_t low = std::max<int64_t>(i - neighbours, 0), high = std::min(i + neighbours, count - 1);
+        const int64_t low = std::max<int64_t>(i - intervals_around, 0),
+                      high = std::min(i + intervals_around, count - 1);
         for (int64_t k = low; k <= high; ++k) around += of_interval[k].squares / double(high - low + 1);
-        measure[i] = std::sqrt((own_share * of_interval[i].squares + (1 - own_share) * around) / pilots),
+        measure[i] = std::sqrt((own_share * of_interval[i].squares + (1 - own_share) * around) / pilots_of_interval),
         known += measure[i] / double(count);
     }
     for (int64_t i = 0; i < count; ++i) measure[i] += uniform_share * (known > 0 ? known : 1);
@@ -250,7 +252,8 @@ class ShadowSampler {
     // Returns the length of the boundary that pilots found, px, averaged over the light.
     double length() const {
         double sum = 0;
-        for (const ShadowStatistics& found : of_interval_) sum += found.length / double(pilots * intervals_);
+        for (const ShadowStatistics& found : of_interval_)
+            sum += found.length / double(pilots_of_interval * intervals_);
         return sum;
     }
 
@@ -264,8 +267,9 @@ class ShadowSampler {
                 ShadowChunk chunk(scene_, mix(seed), body);
                 for (int64_t i = first; i < last; ++i) {
                     const double shift = to_unit(hash(seed, i));
-                    for (int k = 0; k < pilots; ++k)
-                        chunk.add(i * pilots + k, (double(i) + (k + shift) / pilots) / double(intervals_), i, 1, 1);
+                    for (int k = 0; k < pilots_of_interval; ++k)
+                        chunk.add(i * pilots_of_interval + k,
+                                  (double(i) + (k + shift) / pilots_of_interval) / double(intervals_), i, 1, 1);
                 }
                 chunk.cast();
             };
@@ -277,7 +281,7 @@ class ShadowSampler {
     // Returns the number of places for n samples.
     int64_t lay_out(int64_t n) {
         const bool extended = scene_.light.extended;
-        samples_of_place_ = extended ? mirrored : 1;
+        samples_of_place_ = extended ? antithetic_samples : 1;
         const int64_t places = (n + samples_of_place_ - 1) / samples_of_place_;
         density_ = density_of(of_interval_);
         places_.emplace(pieces_, density_, places, extended, seed_of(streams_.places), scene_.view.team);
@@ -287,7 +291,7 @@ class ShadowSampler {
     template <class Body>
     void trace(int64_t first, int64_t last, Body body) const {
         ShadowChunk chunk(scene_, seed_of(streams_.rays), body);
-        ShadowPlaces place(*places_);
+        ShadowPositions place(*places_);
         for (int64_t i = first; i < last; ++i) {
             const auto [position, interval, weight] = place(i);
             chunk.add(i, position, interval, weight, samples_of_place_);
@@ -313,7 +317,7 @@ class ShadowSampler {
     std::vector<ShadowStatistics> of_interval_;
     int64_t samples_of_place_ = 1;
     Array<double> density_{0};
-    std::optional<ShadowPlaces> places_;
+    std::optional<ShadowPositions> places_;
 };
 
 }  // namespace edgegrad

@@ -14,7 +14,7 @@
 #include <cmath>
 #include <vector>
 
-#include "rays/meeting.h"
+#include "rays/plane_hit.h"
 #include "secondary/lune.h"
 #include "shading/lit/bsdf_sampling.h"
 #include "shading/lit/lit_scene.h"
@@ -36,7 +36,7 @@ class Mirrors {
         const auto most = targets_.empty() ? 0 : ptrdiff_t(most_pairs / targets_.size());
         if (ptrdiff_t(faces_.size()) <= most) return;
         std::nth_element(faces_.begin(), faces_.begin() + most, faces_.end(),
-                         [](const Face& a, const Face& b) { return a.area > b.area; });
+                         [](const GlossyFace& a, const GlossyFace& b) { return a.area > b.area; });
         faces_.resize(most);
     }
 
@@ -46,12 +46,12 @@ class Mirrors {
     friend class SpecularLines;
     static constexpr size_t most_pairs = 32;  // maximum number of pairs of a face, largest first, and a target
 
-    struct Target {
+    struct MirroredTarget {
         Vec3 place;  // position, or the unit direction towards it
         bool infinite;
         double extent;  // radius of a ball around it
     };
-    struct Face {
+    struct GlossyFace {
         Vec3 corner[3], n;
         double alpha, area;
         bool two_sided;
@@ -93,8 +93,8 @@ class Mirrors {
         faces_.push_back({{p[0], p[1], p[2]}, o.frame.g, alpha, area, mesh.two_sided});
     }
 
-    std::vector<Target> targets_;
-    std::vector<Face> faces_;
+    std::vector<MirroredTarget> targets_;
+    std::vector<GlossyFace> faces_;
 };
 
 // SpecularLines draws unit directions of unoriented lines past one point, and returns their pdf by solid angle.
@@ -104,8 +104,8 @@ class SpecularLines {
     void set(const Mirrors& mirrors, Vec3 p, const Lune& lune) {
         lobes_.clear(), sum_.clear(), share_ = 0;
         double sum = 0;
-        for (const Mirrors::Face& face : mirrors.faces_)
-            for (const Mirrors::Target& target : mirrors.targets_)
+        for (const Mirrors::GlossyFace& face : mirrors.faces_)
+            for (const Mirrors::MirroredTarget& target : mirrors.targets_)
                 if (const double weight = add(face, target, p, lune); weight > 0)
                     share_ = std::max(share_, most_share * weight), sum_.push_back(sum += weight);
     }
@@ -131,15 +131,15 @@ class SpecularLines {
 
    private:
     static constexpr double most_share = 0.5;
-    static constexpr double outside =
+    static constexpr double weight_outside =
         0.1;  // relative weight of a mirror that does not contain y, or of a line outside the lune
 
-    struct Lobe {
+    struct FaceLobe {
         Vec3 n;  // normal of the face, on the side of p
         DrawnLobe by;
     };
 
-    double add(const Mirrors::Face& face, const Mirrors::Target& target, Vec3 p, const Lune& lune) {
+    double add(const Mirrors::GlossyFace& face, const Mirrors::MirroredTarget& target, Vec3 p, const Lune& lune) {
         const double height = dot(face.n, p - face.corner[0]), side = height > 0 ? 1 : -1;
         const Vec3 n = side * face.n;
         const Vec3 e = target.place, to_e = target.infinite ? e : e - face.corner[0];
@@ -159,13 +159,13 @@ class SpecularLines {
         const Vec3 e1 = face.corner[1] - face.corner[0], e2 = face.corner[2] - face.corner[0], M = cross(e1, e2),
                    y = p + (own / dot(n, l)) * m - face.corner[0];
         const double b1 = dot(cross(y, e2), M), b2 = dot(cross(e1, y), M), whole = dot(M, M);
-        if (std::min({b1, b2, whole - b1 - b2}) < -near * whole) weight *= outside;
-        if (!lune.locate(m).is_there()) weight *= outside;
+        if (std::min({b1, b2, whole - b1 - b2}) < -tolerance * whole) weight *= weight_outside;
+        if (!lune.locate(m).is_there()) weight *= weight_outside;
         return weight;
     }
-    static constexpr double near = 0.1;  // tolerance in barycentrics
+    static constexpr double tolerance = 0.1;  // tolerance in barycentrics
 
-    std::vector<Lobe> lobes_;
+    std::vector<FaceLobe> lobes_;
     std::vector<double> sum_;  // running sum of the lobes' weights
     double share_ = 0;
 };

@@ -35,30 +35,30 @@ namespace {
 
 constexpr int64_t fewest_places = 256, places_of_samples = 4;
 // Light is evaluated this far next to the curve, in lengths of its piece and in roundings of the input.
-constexpr double little = 1e-5, roundings = 64;
+constexpr double offset_of_length = 1e-5, offset_in_roundings = 64;
 
-// A Part is one part of a face next to a place of a curve.
-struct Part {
+// A FacePart is one part of a face next to a point of a curve.
+struct FacePart {
     int32_t face;
     int of;         // index of the face among those that meet there
     Vec3 across;    // unit vector on the face, from the curve into the part
     double factor;  // dℓ / |∇F|, negative where F < 0
 };
 
-// A Place is a point of a curve in the world, with the parts of faces that end there.
-struct Place {
-    struct Row {
+// A CurvePoint is a point of a curve in the world, with the parts of faces that end there.
+struct CurvePoint {
+    struct VertexDerivative {
         int of;
         int32_t vertex;
         Vec3 by;
     };
     Vec3 p;
-    std::vector<Part> parts;
-    std::vector<Row> rows;  // derivatives of F by vertices, for each face
-    Occluder alpha_edge;    // derivatives of f by the texture
+    std::vector<FacePart> parts;
+    std::vector<VertexDerivative> rows;  // derivatives of F by vertices, for each face
+    Occluder alpha_edge;                 // derivatives of f by the texture
 
-    void append_motion(const Part& part, int64_t sample, CurveRecords& records) const {
-        for (const Row& row : rows) {
+    void append_motion(const FacePart& part, int64_t sample, CurveRecords& records) const {
+        for (const VertexDerivative& row : rows) {
             if (row.of != part.of) continue;
             records.row_of.push_back(sample), records.vertex.push_back(row.vertex);
             append(records.by_q, {row.by.x, row.by.y, row.by.z});
@@ -67,11 +67,11 @@ struct Place {
     }
 };
 
-// BorderPieces holds the curves, laid end to end by their lengths.
+// SurfaceEdges holds the curves, laid end to end by their lengths.
 template <class T>
-class BorderPieces {
+class SurfaceEdges {
    public:
-    BorderPieces(const BackwardView<T>& view, const SceneView<T>& casters, MovingEdges moving)
+    SurfaceEdges(const BackwardView<T>& view, const SceneView<T>& casters, MovingEdges moving)
         : view_(view), casters_(casters) {
         const uint64_t seed = view.options.seed;
         if (moving.crossings) {
@@ -95,8 +95,8 @@ class BorderPieces {
         return out;
     }
 
-    // Sets the place t of a piece. Returns false where no surface ends.
-    bool set(int64_t k, double t, Place& out) const {
+    // Sets the point t of a piece. Returns false where no surface ends.
+    bool set(int64_t k, double t, CurvePoint& out) const {
         out.parts.clear(), out.alpha_edge = {};
         if (k < int64_t(crossings_->size())) return set_crossing((*crossings_)[k], t, out);
         return set_alpha_edge(alpha_edges_[k - int64_t(crossings_->size())], t, out);
@@ -114,29 +114,30 @@ class BorderPieces {
         return cross(corner(view_.scene, face, 1) - q, corner(view_.scene, face, 2) - q);
     }
     // Returns how far next to the curve light is evaluated.
-    double aside(int64_t k, int32_t face) const {
+    double offset(int64_t k, int32_t face) const {
         double size = 0;
         for (int i = 0; i < 3; ++i) {
             const Vec3 v = corner(view_.scene, face, i);
             size = std::max({size, std::fabs(v.x), std::fabs(v.y), std::fabs(v.z)});
         }
         const auto [a, b, stands_for] = piece(k);
-        return little * length(b - a) +
-               roundings * view_.scene.spacing->of(view_.scene.faces[3 * int64_t(face)]) * size;
+        return offset_of_length * length(b - a) +
+               offset_in_roundings * view_.scene.spacing->of(view_.scene.faces[3 * int64_t(face)]) * size;
     }
 
    private:
-    struct Piece {
+    struct CurvePiece {
         Vec3 a, b;
         double stands_for;
     };
-    Piece piece(int64_t k) const {
+    CurvePiece piece(int64_t k) const {
         if (k < int64_t(crossings_->size())) {
             const Intersection& o = (*crossings_)[k];
             return {o.a, o.b, o.weight};
         }
         const AlphaEdge& alpha_edge = alpha_edges_[k - int64_t(crossings_->size())];
-        return {place(alpha_edge.face, alpha_edge.begin), place(alpha_edge.face, alpha_edge.end), alpha_edge.share};
+        return {position(alpha_edge.face, alpha_edge.begin), position(alpha_edge.face, alpha_edge.end),
+                alpha_edge.share};
     }
     Array<Intersection> draw_all(const Intersections& found, uint64_t seed) const {
         Array<float> share(view_.scene.n_faces);
@@ -145,12 +146,12 @@ class BorderPieces {
                                 view_.geometry.topology()};
         return found.drawn(faces, share, seed, view_.team);
     }
-    Vec3 place(int32_t face, Barycentrics b) const {
+    Vec3 position(int32_t face, Barycentrics b) const {
         Vec3 out;
         for (int i = 0; i < 3; ++i) out += b[i] * corner(view_.scene, face, i);
         return out;
     }
-    bool set_crossing(const Intersection& o, double t, Place& out) const {
+    bool set_crossing(const Intersection& o, double t, CurvePoint& out) const {
         out.p = (1 - t) * o.a + t * o.b;
         Vec3 n[2];
         Barycentrics at[2];
@@ -159,7 +160,7 @@ class BorderPieces {
             if (!shows(casters_, o.face[k], at[k])) return false;
         }
         const double sine = length(cross(n[0], n[1])), factor = o.weight * length(o.b - o.a) / sine;
-        if (!(sine > flat)) return false;
+        if (!(sine > least_angle)) return false;
         out.rows.clear();
         for (int own = 0; own < 2; ++own) {
             const Vec3 other = n[1 - own], across = (1 / sine) * (other - dot(other, n[own]) * n[own]);
@@ -171,20 +172,20 @@ class BorderPieces {
         }
         return true;
     }
-    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, Place& out) const {
+    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, CurvePoint& out) const {
         AlphaEdgePoint there{};
         if (!AlphaEdgeFinder<T>(casters_).place(alpha_edge, t, there)) return false;
         const Vec3 q = corner(view_.scene, alpha_edge.face, 0), e1 = corner(view_.scene, alpha_edge.face, 1) - q,
                    e2 = corner(view_.scene, alpha_edge.face, 2) - q, M = cross(e1, e2);
         const Vec3 gradient = there.slope.u * cross(e2, M) + there.slope.v * cross(M, e1);  // gradient of f times |M|²
-        out.p = place(alpha_edge.face, there.b), out.rows.clear(),
+        out.p = position(alpha_edge.face, there.b), out.rows.clear(),
         out.alpha_edge = occluder_of(casters_, alpha_edge, there);
         out.parts.push_back(
             {alpha_edge.face, 0, unit(gradient), alpha_edge.share * std::fabs(there.kappa) * length(M)});
         return true;
     }
 
-    static constexpr double flat = 1e-9;  // radians; planes at a smaller angle are taken for one
+    static constexpr double least_angle = 1e-9;  // radians; planes at a smaller angle are taken for one
 
     const BackwardView<T>& view_;
     const SceneView<T>& casters_;
@@ -196,8 +197,8 @@ class BorderPieces {
 
 // A LitPoint is a point that a ray from a part of a face meets.
 struct LitPoint {
-    const Place& place;
-    const Part& part;
+    const CurvePoint& place;
+    const FacePart& part;
     Barycentrics from;
     int32_t face;
     Barycentrics at;
@@ -212,36 +213,38 @@ struct LitPoint {
     }
 };
 
-// LeavingRays traces rays from both sides of all parts of faces next to a place, to the points that they light.
+// SurfaceEdgeRays traces rays from both sides of all parts of faces next to a point of a curve, to the points that they
+// light.
 template <class T>
-class LeavingRays {
+class SurfaceEdgeRays {
    public:
-    LeavingRays(const LineLight<T>& light, const BorderPieces<T>& pieces) : light_(light), pieces_(pieces) {
+    SurfaceEdgeRays(const LineLight<T>& light, const SurfaceEdges<T>& edges) : light_(light), edges_(edges) {
         for (const Light& light : light.lit.lit.lights) eps_ = std::max(eps_, light.eps);
     }
 
-    // Calls body(LitPoint, weight) for those of the place t of a piece.
+    // Calls body(LitPoint, weight) for those of the point t of a piece.
     template <class Body>
     void trace(int64_t piece, double t, Vec2 u, double weight, Body body) {
-        if (!pieces_.set(piece, t, place_)) return;
+        if (!edges_.set(piece, t, place_)) return;
         part_.clear(), face_.clear(), b_.clear(), directions_.clear(), contact_.clear();
-        for (const Part& part : place_.parts) {
-            const Vec3 asked = place_.p + pieces_.aside(piece, part.face) * part.across;
-            const Barycentrics b = pieces_.barycentrics(part.face, asked);
+        for (const FacePart& part : place_.parts) {
+            const Vec3 start = place_.p + edges_.offset(piece, part.face) * part.across;
+            const Barycentrics b = edges_.barycentrics(part.face, start);
             // A neighbour continues the surface where the face ends at the curve.
             if (std::min({b.u, b.v, 1 - b.u - b.v}) < 0 || !light_.lit.lit.mesh_of(part.face).has_material) continue;
-            const Vec3 n = unit(pieces_.normal(part.face));
+            const Vec3 n = unit(edges_.normal(part.face));
             for (const double side : {1.0, -1.0}) {
                 const Vec3 w = draw_by_cosine(side * n, u);
                 part_.push_back(&part), face_.push_back(part.face);
                 append(b_, {b.u, b.v}), append(directions_, {w.x, w.y, w.z});
-                contact_.push_back(16 * eps_ * std::max({std::fabs(asked.x), std::fabs(asked.y), std::fabs(asked.z)}));
+                contact_.push_back(16 * eps_ * std::max({std::fabs(start.x), std::fabs(start.y), std::fabs(start.z)}));
             }
         }
         const auto n = int64_t(part_.size());
         hit_.resize(n), hit_b_.resize(2 * n);
-        depart(light_.casters, light_.view.geometry.caster(),
-               {face_.data(), b_.data(), directions_.data(), contact_.data(), n}, hit_.data(), hit_b_.data());
+        trace_from_surface(light_.casters, light_.view.geometry.caster(),
+                           {face_.data(), b_.data(), directions_.data(), contact_.data(), n}, hit_.data(),
+                           hit_b_.data());
         for (int64_t i = 0; i < n; ++i)
             if (hit_[i] >= 0)
                 body(
@@ -252,10 +255,10 @@ class LeavingRays {
 
    private:
     const LineLight<T>& light_;
-    const BorderPieces<T>& pieces_;
+    const SurfaceEdges<T>& edges_;
     double eps_ = 0;
-    Place place_;
-    std::vector<const Part*> part_;
+    CurvePoint place_;
+    std::vector<const FacePart*> part_;
     std::vector<int32_t> face_, hit_;
     std::vector<double> b_, directions_, contact_, hit_b_;
 };
@@ -265,13 +268,13 @@ template <class T>
 class SurfaceEdgeSampler {
    public:
     SurfaceEdgeSampler(const LineLight<T>& light, MovingEdges moving)
-        : light_(light), pieces_(light.view, light.casters, moving) {}
+        : light_(light), edges_(light.view, light.casters, moving) {}
 
-    bool is_empty() const { return pieces_.size() == 0; }
+    bool is_empty() const { return edges_.size() == 0; }
     template <class Receiver>
     void cast_pilots(const Receiver&) {}
     int64_t lay_out(int64_t n) {
-        places_.emplace(pieces_.measure(), std::max(n / places_of_samples, fewest_places), to_unit(seed_of(21)),
+        places_.emplace(edges_.measure(), std::max(n / places_of_samples, fewest_places), to_unit(seed_of(21)),
                         light_.view.team);
         return places_->size();
     }
@@ -279,7 +282,7 @@ class SurfaceEdgeSampler {
     template <class Body>
     void trace(int64_t first, int64_t last, Body body) const {
         const ShiftedSequence sequence(seed_of(22));
-        LeavingRays rays(light_, pieces_);
+        SurfaceEdgeRays rays(light_, edges_);
         places_->each(first, last, [&](int64_t i, int64_t piece, double t, double weight) {
             rays.trace(piece, t, sequence(uint64_t(i)), weight, body);
         });
@@ -289,7 +292,7 @@ class SurfaceEdgeSampler {
     uint64_t seed_of(uint64_t stream) const { return hash(light_.view.options.seed, stream, gradient_stream); }
 
     const LineLight<T>& light_;
-    const BorderPieces<T> pieces_;
+    const SurfaceEdges<T> edges_;
     std::optional<SystematicPlaces> places_;
 };
 

@@ -8,7 +8,7 @@
 #include "boundary/curve.h"
 #include "estimator/view.h"
 #include "rays/alpha_mask.h"
-#include "rays/meeting.h"
+#include "rays/plane_hit.h"
 #include "scene/contact.h"
 #include "secondary/edge_line_source.h"
 #include "secondary/lune.h"
@@ -24,14 +24,14 @@ class TracedEdgeLines {
         : view_(view), casters_(casters), alpha_edges_(alpha_edges), caster_(view.geometry.caster()) {
         // A ray starts this far before the edge, so that single precision finds faces that touch the edge.
         const RayFrame& frame = caster_.frame();
-        constexpr double floats = 0x1p-18;
-        size_ = frame.radius * frame.unit, before_ = floats * size_;
+        constexpr double rounding_of_floats = 0x1p-18;
+        size_ = frame.radius * frame.unit, before_ = rounding_of_floats * size_;
     }
 
     // Adds a line along the unit direction w, of either sign, past the place t of an edge. Alpha edges are numbered
     // after all edges. `segment` is the caller's number for it.
     void add(int64_t piece, double t, Vec3 w, int64_t segment, double weight) {
-        Pending& o = pending_[count_];
+        PendingLine& o = pending_[count_];
         const int64_t edges = view_.geometry.topology().n_edges();
         o.line = EdgeLine();
         o.edge = piece < edges ? piece : -1, o.weight = weight, o.line.w = w, o.line.segment = segment;
@@ -69,7 +69,7 @@ class TracedEdgeLines {
         Barycentrics at;
         double distance;  // distance from the edge; 0: the edge lies on that face
     };
-    struct Pending {
+    struct PendingLine {
         EdgeLine line;
         double weight;
         int64_t edge;     // −1 for an alpha edge
@@ -84,12 +84,12 @@ class TracedEdgeLines {
         return [&](int32_t i) { return vec(view_.scene.verts + 3 * int64_t(i)); };
     }
     // Returns the faces of the edge, or the face of the alpha edge.
-    std::span<const int32_t> adjacent_faces(const Pending& o) const {
+    std::span<const int32_t> adjacent_faces(const PendingLine& o) const {
         return o.edge < 0 ? std::span<const int32_t>(&o.face, 1) : view_.geometry.topology().faces(o.edge);
     }
 
     // Lines are drawn as if all passed where faces may be masked. Lines past the opaque faces are kept.
-    bool set_edge(double t, Pending& o) {
+    bool set_edge(double t, PendingLine& o) {
         const auto halves = view_.geometry.topology().half_edges(o.edge);
         const HalfEdge& own = halves[0];
         o.line.occluder = occluder_of(view_.scene, own, t);
@@ -102,11 +102,11 @@ class TracedEdgeLines {
             return true;
         const Lune lune(corner(view_.scene, own.face, own.first()), corner(view_.scene, own.face, own.second()),
                         opposite_);
-        const Lune::Place place = lune.locate(o.line.w);
-        o.line.w = place.w;
-        return place.is_there();
+        const Lune::Coordinates line = lune.locate(o.line.w);
+        o.line.w = line.w;
+        return line.is_there();
     }
-    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, Pending& o) const {
+    bool set_alpha_edge(const AlphaEdge& alpha_edge, double t, PendingLine& o) const {
         AlphaEdgePoint place{};
         if (!AlphaEdgeFinder<T>(casters_).place(alpha_edge, t, place)) return false;
         o.line.occluder = occluder_of(casters_, alpha_edge, place);
@@ -130,23 +130,23 @@ class TracedEdgeLines {
     }
 
     // Returns whether the line ends on a face.
-    bool accept(const Pending& o, int side, int32_t face, End& end) const {
+    bool accept(const PendingLine& o, int side, int32_t face, End& end) const {
         const SceneView<T>& scene = view_.scene;
         const Vec3 d = o.direction(side), q = corner(scene, face, 0);
         const Vec3 m = cross(corner(scene, face, 1) - q, corner(scene, face, 2) - q);
-        const Meeting met = meet(scene, face, {o.p, d});
+        const PlaneHit met = intersect_plane(scene, face, {o.p, d});
         if (!met.exists()) return false;
-        const bool outside = met.margin() < -Meeting::rounding;
+        const bool outside = met.margin() < -PlaneHit::rounding;
         end.at = inside({met.u, met.v}), end.distance = met.t;
         if (!shows(casters_, face, end.at)) return false;
         // Near a face's border single and double precision may differ. Far away single precision decides, because a
         // line that passed a face might pass its neighbour too.
-        constexpr double near = 4;  // distance in sizes of the face
-        const bool meets = !outside || met.t * met.t > near * near * length(m);
+        constexpr double far_in_sizes = 4;  // distance in sizes of the face
+        const bool meets = !outside || met.t * met.t > far_in_sizes * far_in_sizes * length(m);
         // The position of faces that share a vertex with the edge's faces is exact, however near they are.
         const auto own = adjacent_faces(o);
         if (std::any_of(own.begin(), own.end(), [&](int32_t f) { return share_vertex(scene, face, f); }))
-            return meets && met.t > Meeting::rounding * size_;
+            return meets && met.t > PlaneHit::rounding * size_;
         const double touching = distance_in_contact(o, face, length(m) / std::fabs(dot(m, d)));
         if (std::fabs(met.t) > touching) return meets && met.t > 0;
         // The edge lies on this face. Lines into it end there, on the side on which the edge's faces stand.
@@ -155,7 +155,7 @@ class TracedEdgeLines {
     }
 
     // Returns the distance along the line that counts as contact, from the rounding of the input.
-    double distance_in_contact(const Pending& o, int32_t face, double slant) const {
+    double distance_in_contact(const PendingLine& o, int32_t face, double slant) const {
         const double size = extent(face);
         return contact(spacing_at(o, face), size, size) * slant;
     }
@@ -168,7 +168,7 @@ class TracedEdgeLines {
         }
         return size;
     }
-    double spacing_at(const Pending& o, int32_t face) const {
+    double spacing_at(const PendingLine& o, int32_t face) const {
         const Spacing& spacing = *view_.scene.spacing;
         return std::max(spacing.of(view_.scene.faces[3 * int64_t(face)]), spacing.of(o.line.occluder.vertex[0]));
     }
@@ -186,21 +186,21 @@ class TracedEdgeLines {
     }
 
     // Sets one end of the line as the receiver. Returns false where the edge lies on it: there the camera sees an edge.
-    bool set(Pending& o, int receiver) const {
+    bool set(PendingLine& o, int receiver) const {
         const End &near = o.end[receiver], &far = o.end[1 - receiver];
         if (near.distance == 0) return false;
         EdgeLine& line = o.line;
-        line.receiver = near.face, line.reflector = far.face, line.at = near.at, line.from = line.asked = far.at;
+        line.receiver = near.face, line.reflector = far.face, line.at = near.at, line.from = line.radiance_at = far.at;
         line.distance = near.distance + far.distance, line.share = far.distance / line.distance;
         const Vec3 q = corner(view_.scene, near.face, 0);
         const Vec3 m = cross(corner(view_.scene, near.face, 1) - q, corner(view_.scene, near.face, 2) - q);
         line.facing = -dot(m, o.direction(receiver));
-        if (far.distance == 0) line.asked = adjacent(o, far.face);
+        if (far.distance == 0) line.radiance_at = adjacent(o, far.face);
         return true;
     }
 
     // Returns a point on a face that contains the edge, moved slightly to the side where light passes.
-    Barycentrics adjacent(const Pending& o, int32_t face) const {
+    Barycentrics adjacent(const PendingLine& o, int32_t face) const {
         const SceneView<T>& scene = view_.scene;
         const Vec3 q = corner(scene, face, 0), e1 = corner(scene, face, 1) - q, e2 = corner(scene, face, 2) - q;
         const Vec3 m = cross(e1, e2), across = unit(cross(m, o.tangent));
@@ -221,7 +221,7 @@ class TracedEdgeLines {
     const std::vector<AlphaEdge>& alpha_edges_;
     const RayCaster& caster_;
     double size_, before_;
-    Pending pending_[RayBatch::size];
+    PendingLine pending_[RayBatch::size];
     std::vector<int32_t> without_[RayBatch::size];
     std::vector<Vec3> opposite_;
     int count_ = 0;

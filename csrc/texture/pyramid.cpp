@@ -10,14 +10,14 @@ namespace edgegrad {
 
 namespace {
 
-struct Window {
+struct TexelRange {
     int64_t first, end;
     double share;  // It is the weight of one of them.
 };
 // Returns which of `of` texels in a row each of `count` texels over the same length meets. A coarser texel meets the
 // finer ones of its mean, and a finer one the coarser ones that contain it.
-std::vector<Window> windows(int64_t count, int64_t of) {
-    std::vector<Window> out;
+std::vector<TexelRange> texel_ranges(int64_t count, int64_t of) {
+    std::vector<TexelRange> out;
     for (int64_t i = 0; i < count; ++i) {
         const int64_t first = i * of / count, end = ((i + 1) * of + count - 1) / count;
         out.push_back({first, end, 1.0 / double(end - first)});
@@ -28,16 +28,16 @@ std::vector<Window> windows(int64_t count, int64_t of) {
 // Describes how one level lies on the next finer one.
 struct Halving {
     TexelGrid fine, coarse;
-    std::vector<Window> down, across;       // They belong to the coarser rows and columns.
-    std::vector<Window> of_row, of_column;  // They belong to the finer ones.
+    std::vector<TexelRange> down, across;       // They belong to the coarser rows and columns.
+    std::vector<TexelRange> of_row, of_column;  // They belong to the finer ones.
 
     explicit Halving(const TexelGrid& fine_)
         : fine(fine_),
           coarse(fine_.halved()),
-          down(windows(coarse.height, fine.height)),
-          across(windows(coarse.width, fine.width)),
-          of_row(windows(fine.height, coarse.height)),
-          of_column(windows(fine.width, coarse.width)) {}
+          down(texel_ranges(coarse.height, fine.height)),
+          across(texel_ranges(coarse.width, fine.width)),
+          of_row(texel_ranges(fine.height, coarse.height)),
+          of_column(texel_ranges(fine.width, coarse.width)) {}
     double share(int64_t row, int64_t column) const { return down[row].share * across[column].share; }
 };
 

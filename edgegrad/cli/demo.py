@@ -39,6 +39,8 @@ def run(args: argparse.Namespace) -> int:
             break
         if k == 0:
             write_outputs(args.out, run.fit)
-    good = sum(run.end.degrees <= demo.GOOD and run.end.percent <= demo.GOOD for run in runs)
-    print(f"\n{good} of {len(runs)} within {demo.GOOD}° and {demo.GOOD} %; pictures of the first in {args.out}")
+    good = sum(run.end.degrees <= demo.FOUND_WITHIN and run.end.percent <= demo.FOUND_WITHIN for run in runs)
+    print(
+        f"\n{good} of {len(runs)} within {demo.FOUND_WITHIN}° and {demo.FOUND_WITHIN} %; pictures of the first in {args.out}"
+    )
     return INTERRUPTED if runs[-1].fit.interrupted else 0

@@ -21,14 +21,14 @@ USUAL_FPS = 25
 MOST_FPS = 1000  # more is an error in a header, or a typing error
 
 
-class Film(NamedTuple):
+class ImageSequence(NamedTuple):
     """Pictures (H, W, 3) of linear radiance in their order."""
 
     frames: Iterator[Tensor]
     fps: Fraction | None  # None for a folder, and for a video that has none
 
 
-def read_film(path: Path, camera: Path | None = None) -> Film:
+def read_film(path: Path, camera: Path | None = None) -> ImageSequence:
     """Return a film of at least one frame, whose images are upright or stored as the camera file needs. Raises OSError,
     ValueError or ImportError, also while frames are read."""
     if path.is_dir():
@@ -38,7 +38,7 @@ def read_film(path: Path, camera: Path | None = None) -> Film:
     return _video(path)
 
 
-def _folder(folder: Path, camera: Path | None) -> Film:
+def _folder(folder: Path, camera: Path | None) -> ImageSequence:
     from .. import read_image
     from ..files.image import READABLE
     from .inputs import seen_by
@@ -47,10 +47,10 @@ def _folder(folder: Path, camera: Path | None) -> Film:
     if not paths:
         raise ValueError(f"{folder}: expected a folder with images, got none of {', '.join(READABLE)} in it")
     kind = type(seen_by(camera, paths[0]))  # upright or stored, for all frames
-    return Film((read_image(kind(path), channels=3) for path in paths), None)
+    return ImageSequence((read_image(kind(path), channels=3) for path in paths), None)
 
 
-def _video(path: Path) -> Film:
+def _video(path: Path) -> ImageSequence:
     from ..optional import require
 
     av = require("av", *VIDEO)
@@ -66,7 +66,7 @@ def _video(path: Path) -> Film:
     first = next(frames, None)
     if first is None:
         raise ValueError(f"{path}: expected a video, got one without frames")
-    return Film(chain([first], frames), fps if fps is not None and 0 < fps <= MOST_FPS else None)
+    return ImageSequence(chain([first], frames), fps if fps is not None and 0 < fps <= MOST_FPS else None)
 
 
 def _decoded(path: Path, av: Any) -> Iterator[Tensor]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..fit import TrackedPose
     from ..scene.scene import Scene
 
-EVERY = 10  # frames between two writings of poses.json
+FRAMES_BETWEEN_WRITES = 10  # frames between two writings of poses.json
 FOUND, LOST = (60, 230, 90), (230, 60, 60)  # colours of contours
 
 
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         for pose in track(scene, watched(), camera, init.matrix, max_size=args.size, spp=args.spp, seed=args.seed):
             poses.append(pose)
-            if pose.index % EVERY == 0:
+            if pose.index % FRAMES_BETWEEN_WRITES == 0:
                 with suppress(OSError):  # the last copy reports errors
                     _write_poses(args.out, poses)
             state = "lost" if pose.lost else f"{pose.explained:.0%} of the edges"

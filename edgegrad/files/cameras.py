@@ -20,7 +20,7 @@ from .paths import PathLike, check_readable, check_suffix, write_json
 
 CALIBRATIONS = (".yml", ".yaml", ".xml")
 UNREAD = "not all of it is read"
-ALONE = 1e-4  # units by which float32 may move the eyes of cameras that have no distance to compare with
+SINGLE_EYE_ROUNDING = 1e-4  # units by which float32 may move the eyes of cameras that have no distance to compare with
 
 
 def save_camera(path: PathLike, camera: Camera) -> None:
@@ -223,7 +223,7 @@ def _typed(path: PathLike, cameras: list[Camera], dtype: torch.dtype | None, unr
         eyes = torch.cat([camera.eye.reshape(-1, 3) for camera in cameras])
         moved = float((torch.cat([c.to(torch.float64).eye.reshape(-1, 3) for c in rounded]) - eyes).abs().max())
         extent = float((eyes.amax(0) - eyes.amin(0)).max())
-        precise = moved > (1e-6 * extent if extent > 0.0 else ALONE)
+        precise = moved > (1e-6 * extent if extent > 0.0 else SINGLE_EYE_ROUNDING)
         if precise and dtype is torch.float32:
             unread.note("eyes in float64", f"moved by up to {moved:.2g}, for they are rounded to float32 as dtype says")
         cameras = cameras if precise and dtype is None else rounded

@@ -19,7 +19,7 @@ DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
 RADIANCE = (".exr", ".hdr")  # floating point, linear
 IMAGES = (*DISPLAY, *RADIANCE)
 READABLE = (*IMAGES, ".webp")
-SEVERAL = (".tif", ".tiff", ".exr", ".webp")  # may hold more images than one
+MULTI_IMAGE = (".tif", ".tiff", ".exr", ".webp")  # may hold more images than one
 MOST_NUMBERS = 1 << 30  # pixels times channels, four bytes each; a small file may announce more
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRGB shares
 
@@ -81,7 +81,7 @@ def read_stored(path: PathLike, exact: bool = False) -> Stored:
         reason = _reason(stored)
         fix = "; save it as 8, 16 or 32 bit, by array.astype(numpy.uint16)" * ("64 bits per sample" in reason)
         raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({reason}){fix}")
-    if file.suffix.lower() in SEVERAL and (opened := oiio.ImageInput.open(str(file))) is not None:
+    if file.suffix.lower() in MULTI_IMAGE and (opened := oiio.ImageInput.open(str(file))) is not None:
         if opened.seek_subimage(1, 0):
             warn(f"images of {path}", f"{path}: the first of its images is read; save the others as files of their own")
         opened.close()

@@ -138,7 +138,7 @@ def _read_3mf(data: bytes, kind: str, context: LoadContext) -> MeshFile:
 
 def _read_plain(data: bytes, kind: str, context: LoadContext) -> MeshFile:
     """Read OBJ, PLY, STL and OFF."""
-    found, parts = [part for part in PLAIN[kind](data, context) if len(part.faces)], []
+    found, parts = [part for part in PART_READERS[kind](data, context) if len(part.faces)], []
     for part in found:
         with _errors_with_part(part.name, alone=len(found) == 1):
             parts.append(_finished(part, np.eye(4)))
@@ -169,5 +169,5 @@ def _errors_with_part(name: str, alone: bool) -> Iterator[None]:
         raise FormatError(str(error) if alone else f"part {name!r}: {error}") from error.__cause__
 
 
-PLAIN = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "off": off.read}
-READERS = {"gltf": _read_gltf, "glb": _read_gltf, "3mf": _read_3mf, **dict.fromkeys(PLAIN, _read_plain)}
+PART_READERS = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "off": off.read}
+READERS = {"gltf": _read_gltf, "glb": _read_gltf, "3mf": _read_3mf, **dict.fromkeys(PART_READERS, _read_plain)}

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .autograd import FIRST_ORDER
-from .operators import Hits, backward_kernel, forward_kernel
+from .operators import HitBuffers, backward_kernel, forward_kernel
 from .request import IS_TENSOR, POSITIONS, SLOTS, Request, join, others_of, tensors_of
 from .threads import parallel_map
 
@@ -59,7 +59,7 @@ class _RenderBatch(torch.autograd.Function):
             coverage, depth, hit, seen, *tensors = groups[k]
             request = Request.unpack(join(tensors, ctx.others[k]))
             names = {i: name for i, name in zip(POSITIONS, SLOTS, strict=True) if i in wanted[k]}
-            found, _ = backward_kernel(bar[None], Hits(coverage, depth, hit, seen), request, list(names.values()))
+            found, _ = backward_kernel(bar[None], HitBuffers(coverage, depth, hit, seen), request, list(names.values()))
             return {i: found[name].to(request.slot(name).dtype) for i, name in names.items()}
 
         out: list[Tensor | None] = [None] * (WIDTH * len(groups))

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 # What the kernel counts.
 CURVES = ("silhouettes", "creases", "intersections", "lens_boundary")
 COUNTS = (
-    "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "step_lines", *CURVES,
+    "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "discontinuity_lines", *CURVES,
 )  # fmt: skip
 
 

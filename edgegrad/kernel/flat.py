@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..check import all_below, values_visible
 from ..scene.material import WRAPS
-from ..scene.mesh import FILTERS, PLAIN, Mesh
+from ..scene.mesh import DEFAULT_RADIANCE, FILTERS, Mesh
 from ..scene.scene import Scene
 
 
@@ -29,15 +29,14 @@ class Flat(NamedTuple):
     uv_corners: Tensor  # (F, 3) int32, rows of uvs, −1 for none; (0, 3) when corners say as much
     alphas: Tensor  # (Y, 1), alpha textures end to end, row by row
     alpha_masks: Tensor  # (M, 6) int64: first of its alphas, height, width, wrap of u and v, filter
-    face_alpha_mask: Tensor  # (F,) int32: alpha-tested face of the face, −1 for none; (0,) when the scene has none
+    face_alpha_mask: Tensor  # (F,) int32: row of alpha_masks, −1 for none; (0,) when the scene has none
     background: Tensor  # (C,) or (H, W, C)
-    cutoffs: list[float]  # of the alpha-tested faces
-    spacing: list[
-        float
-    ]  # of the numbers in which the vertices were given: pairs of a vertex and the spacing from there on
+    cutoffs: list[float]  # the least alpha that is shown, of each alpha mask
+    # Relative spacing of the numbers in which vertices were given: pairs of a vertex and the spacing from there on.
+    spacing: list[float]
 
     @property
-    def has_steps(self) -> bool:
+    def has_discontinuities(self) -> bool:
         """Return whether something jumps within a face: it is cut out, or its texels are."""
         if len(self.alpha_masks) > 0 or len(self.textures) == 0:
             return len(self.alpha_masks) > 0
@@ -90,7 +89,7 @@ def _sampler(mesh: Mesh) -> list[int]:
 def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
     """Return the arrays of a scene; every step is a differentiable torch operation, so gradients find their way back.
 
-    all_uvs   also texture coordinates that neither a texture nor a alpha-tested face needs
+    all_uvs   also texture coordinates that neither a texture nor an alpha mask needs
     blended   whether meshes that blend are there as a whole; else they are cut out where their alpha is below ½
     """
     C = scene.channels
@@ -158,7 +157,7 @@ def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
                 rows = mesh.face_colors
                 index = torch.arange(F, dtype=torch.int32, device=cpu)[:, None].expand(F, 3)
             else:
-                rows = torch.full((1, C), PLAIN, dtype=dtype, device=cpu)
+                rows = torch.full((1, C), DEFAULT_RADIANCE, dtype=dtype, device=cpu)
                 index = torch.zeros((F, 3), dtype=torch.int32, device=cpu)
             colors.append(rows.cpu().to(dtype))
             if not by_vertex:

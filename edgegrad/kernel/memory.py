@@ -15,7 +15,7 @@ from ..library import core
 clear_geometry = core.clear_geometry
 
 # Below, a render goes ahead: asking the system takes a fifth of a millisecond, as long as a small image.
-LOOK_FROM = 256 << 20
+CHECKED_FROM = 256 << 20
 
 # -- what there is ----------------------------------------------------------------------------------------------------
 
@@ -75,7 +75,7 @@ def room(what: str, needs: Mapping[str, int], lower: Callable[[], str]) -> Itera
         listed = ", ".join(f"{name} {size(count)}" for name, count in largest if count)
         return MemoryError(f"{what}: expected to need {limit}, got about {size(needed)} ({listed}); lower {lower()}")
 
-    if needed >= LOOK_FROM and needed > available():
+    if needed >= CHECKED_FROM and needed > available():
         clear_geometry()  # what other calls left behind; then nothing of this one's is there either
         if needed > (there := available()):
             raise error(f"at most the {size(there)} of memory that are free")

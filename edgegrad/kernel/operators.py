@@ -17,13 +17,13 @@ from ..scene.scene import Scene
 from ..warnings import warn
 from . import memory as memory
 from .flat import Flat
-from .request import PER_CAMERA, SCHEMA, SLOTS, PackedCamera, Request, Work, derived_seed, label
+from .request import PER_CAMERA, SCHEMA, SLOTS, PackedCamera, Request, WantedTerms, derived_seed, label
 from .threads import threads
 
 Profile = dict[str, float]
 
 
-class Hits(NamedTuple):
+class HitBuffers(NamedTuple):
     """Hits of the image pass of B cameras, for the backward pass."""
 
     coverage: Tensor  # (B, H, W): the filtered share of a pixel where something is hit
@@ -32,7 +32,7 @@ class Hits(NamedTuple):
     seen: Tensor  # (B, F) uint8: 0, or the side, 1 or 2, from which a face was hit
 
     @classmethod
-    def empty(cls, request: Request) -> Hits:
+    def empty(cls, request: Request) -> HitBuffers:
         B, height, width = request.cameras, request.camera.height, request.camera.width
         flat = request.scene
         return cls(
@@ -81,7 +81,7 @@ def warn_of_ends(cameras: Sequence[Any]) -> None:
     )
 
 
-def kernel_hits(hits: Hits, index: int = 0) -> Any:
+def kernel_hits(hits: HitBuffers, index: int = 0) -> Any:
     kind = core.HitsDouble if hits.coverage.dtype == torch.float64 else core.HitsFloat
     return kind(**{name: part[index].numpy() for name, part in hits._asdict().items()})
 
@@ -90,13 +90,13 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
+def forward_kernel(request: Request) -> tuple[Tensor, HitBuffers, list[Profile]]:
     """image (B, H, W, C), what the backward pass takes from it, and what the kernel did for each camera. Raises MemoryError."""
     with image_memory(request):
         scene, options = kernel_scene(request.scene), request.image._asdict()
         B, height, width = request.cameras, request.camera.height, request.camera.width
         image = request.scene.colors.new_empty((B, height, width, request.channels))
-        hits = Hits.empty(request)
+        hits = HitBuffers.empty(request)
         cameras = [kernel_camera(request.camera, b, by_distortion=False) for b in range(B)]
         warn_of_ends(cameras)
         profiles = []
@@ -117,7 +117,7 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
 
 def backward_kernel(
     adjoint: Tensor,
-    hits: Hits,
+    hits: HitBuffers,
     request: Request,
     wanted: Collection[str],
     *,
@@ -158,7 +158,7 @@ def backward_kernel(
         return {name: torch.from_numpy(grad) for name, grad in grads.items()}, profiles
 
 
-def jvp_kernel(hits: Hits, request: Request, tangents: Mapping[str, Tensor], directions: int) -> Tensor:
+def jvp_kernel(hits: HitBuffers, request: Request, tangents: Mapping[str, Tensor], directions: int) -> Tensor:
     """Derivatives (D, B, H, W, C) of the image in D directions, in the type of the image: `tangents` (D, …) by slot, zero
     where there is none. Raises MemoryError."""
     with derivatives_memory(request, tangents, directions):
@@ -195,7 +195,7 @@ def _channel_weights(request: Request) -> Tensor:
     return weights
 
 
-def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Tensor:
+def screen_gradient_kernel(adjoint: Tensor, hits: HitBuffers, request: Request) -> Tensor:
     """Return how the loss changes as what is seen in a pixel moves right and down: (B, H, W, 2). Raises MemoryError."""
     with derivatives_memory(request, ["verts"], 1):
         scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
@@ -217,14 +217,14 @@ def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Ten
 def _gradient_options(
     request: Request, wanted: Collection[str], camera: int, dry: bool = False, lit: bool = False
 ) -> Any:
-    options, work = request.gradient, Work.of(request, wanted)
+    options, terms = request.gradient, WantedTerms.from_request(request, wanted)
     return core.GradientOptions(
         seed=camera_seed(options.grad_seed, camera),
         surface_samples=options.surface_samples,
         edge_samples=options.edge_samples,
-        interior_geometry=work.motion,
-        boundary=work.boundary,
-        steps=work.steps,
+        interior_geometry=terms.motion,
+        boundary=terms.boundary,
+        discontinuities=terms.discontinuities,
         step_spacing=options.step_spacing,
         lit=lit,
         dry=dry,
@@ -285,7 +285,7 @@ def image_memory(request: Request) -> AbstractContextManager[None]:
 
 def gradient_memory(adjoint: Tensor, request: Request, wanted: Collection[str]) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the gradients do not fit."""
-    work, options = Work.of(request, wanted), request.gradient
+    terms, options = WantedTerms.from_request(request, wanted), request.gradient
     needs = {}
     for name in SLOTS:
         if name in wanted:
@@ -294,9 +294,9 @@ def gradient_memory(adjoint: Tensor, request: Request, wanted: Collection[str]) 
     needs["gradient by the image"] = adjoint.numel() * adjoint.element_size() * (not adjoint.is_contiguous())
     needs |= core.gradient_bytes(
         pass_size(request),
-        motion=work.motion,
-        boundary=work.boundary,
-        steps=work.steps,
+        motion=terms.motion,
+        boundary=terms.boundary,
+        discontinuities=terms.discontinuities,
         wanted=list(wanted),
         surface_samples=options.surface_samples,
         edge_samples=options.edge_samples,
@@ -306,10 +306,16 @@ def gradient_memory(adjoint: Tensor, request: Request, wanted: Collection[str]) 
 
 def derivatives_memory(request: Request, wanted: Collection[str], directions: int) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if derivatives in so many directions do not fit."""
-    work, options, size = Work.of(request, wanted), request.gradient, pass_size(request)
+    terms, options, size = WantedTerms.from_request(request, wanted), request.gradient, pass_size(request)
     width = directions * request.channels
     needs = core.gradient_bytes(
-        size, motion=work.motion, boundary=work.boundary, steps=work.steps, wanted=[], surface_samples=0, edge_samples=0
+        size,
+        motion=terms.motion,
+        boundary=terms.boundary,
+        discontinuities=terms.discontinuities,
+        wanted=[],
+        surface_samples=0,
+        edge_samples=0,
     )
     needs["derivatives"] = 2 * 8 * request.cameras * request.camera.height * request.camera.width * width
     samples = max(options.surface_samples, options.edge_samples)
@@ -355,7 +361,7 @@ def _render_cpu(*args: Any) -> tuple[Tensor, ...]:
 def _render_fake(*args: Any) -> tuple[Tensor, ...]:
     request = Request.unpack(args)
     size = request.cameras, request.camera.height, request.camera.width, request.channels
-    return request.scene.colors.new_empty(size), *Hits.empty(request)
+    return request.scene.colors.new_empty(size), *HitBuffers.empty(request)
 
 
 @torch.library.impl("edgegrad::faces_at_centers", "CPU")
@@ -380,10 +386,10 @@ def _faces_at_centers_fake(*args: Any) -> Tensor:
     return request.scene.faces.new_empty(request.cameras, request.camera.height, request.camera.width)
 
 
-def _arguments(args: Sequence[Any]) -> tuple[Tensor, Hits, Request, list[bool]]:
+def _arguments(args: Sequence[Any]) -> tuple[Tensor, HitBuffers, Request, list[bool]]:
     """Return the arguments of edgegrad::render_backward: adjoint, hits, request, and which gradients are wanted."""
     adjoint, coverage, depth, hit, seen, *packed, wanted = args
-    return adjoint, Hits(coverage, depth, hit, seen), Request.unpack(packed), wanted
+    return adjoint, HitBuffers(coverage, depth, hit, seen), Request.unpack(packed), wanted
 
 
 @torch.library.impl("edgegrad::render_backward", "CPU")
@@ -407,7 +413,7 @@ def _render_backward_fake(*args: Any) -> tuple[Tensor, ...]:
 def _render_jvp_cpu(*args: Any) -> Tensor:
     coverage, depth, hit, seen, *packed, tangents, directions = args
     given = {name: tangent for name, tangent in zip(SLOTS, tangents, strict=True) if tangent is not None}
-    return jvp_kernel(Hits(coverage, depth, hit, seen), Request.unpack(packed), given, directions)
+    return jvp_kernel(HitBuffers(coverage, depth, hit, seen), Request.unpack(packed), given, directions)
 
 
 @torch.library.register_fake("edgegrad::render_jvp")

@@ -58,7 +58,7 @@ class GradientOptions(NamedTuple):
     grad_seed: int
     channels_vary: bool  # over a face; if not, moving it changes nothing inside
     visibility: bool  # whether what moves at silhouettes and other jumps counts
-    step_spacing: float  # px between the lines along which steps are looked for
+    step_spacing: float  # px between the lines along which discontinuities are looked for
 
 
 class Request(NamedTuple):
@@ -113,7 +113,7 @@ PER_CAMERA = (*PackedCamera._fields, "vertex_attributes")  # slots with a row fo
 MOVING = ("verts", *(name for name in SLOTS if name in PackedCamera._fields))  # slots that move the image
 APPEARANCE = ("colors", "uvs", "texels", "vertex_attributes", "face_attributes")
 LEAST_SPACING = 1 / 64  # px, of step_spacing
-STEPPING = (*MOVING, "uvs", "alphas")  # slots that move what is cut out, and the borders of nearest texels
+DISCONTINUITY_SLOTS = (*MOVING, "uvs", "alphas")  # slots that move alpha edges and texel edges
 
 
 def label(slot: str) -> str:
@@ -143,22 +143,25 @@ def required(request: Request) -> tuple[str, ...]:
     return tuple(name for name in SLOTS if torch.is_grad_enabled() and request.slot(name).requires_grad)
 
 
-class Work(NamedTuple):
+class WantedTerms(NamedTuple):
     """Which terms the backward pass runs: what the kernel is told, and what plan() tells."""
 
     motion: bool  # inside faces, of what moves them: vertices and camera
     appearance: bool  # inside faces, of colours, textures and texture coordinates
     boundary: bool  # at edges, of what moves them
-    steps: bool  # where faces are cut out, and at the borders of nearest texels
+    discontinuities: bool  # within faces: at alpha edges and texel edges
 
     @classmethod
-    def of(cls, request: Request, wanted: Collection[str]) -> Work:
+    def from_request(cls, request: Request, wanted: Collection[str]) -> WantedTerms:
         options = request.gradient
         moves = any(name in wanted for name in MOVING)
         appearance = any(name in wanted for name in APPEARANCE)
-        steps = request.scene.has_steps and any(name in wanted for name in STEPPING)
+        discontinuities = request.scene.has_discontinuities and any(name in wanted for name in DISCONTINUITY_SLOTS)
         return cls(
-            moves and options.channels_vary, appearance, moves and options.visibility, steps and options.visibility
+            moves and options.channels_vary,
+            appearance,
+            moves and options.visibility,
+            discontinuities and options.visibility,
         )
 
 

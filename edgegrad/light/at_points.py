@@ -15,7 +15,7 @@ from ..library import core
 from .sampling import DARK
 
 
-class Points(NamedTuple):
+class PointTensors(NamedTuple):
     """Tensors of points, but for their barycentrics and the differences of these from pixel to pixel."""
 
     face: Tensor  # (N,) int64
@@ -26,7 +26,7 @@ class Points(NamedTuple):
     lit: Tensor | None  # (N,) uint8
 
 
-class Options(NamedTuple):
+class LitOptions(NamedTuple):
     """csrc/shading/lit/lit_scene.h."""
 
     shadows: bool
@@ -56,7 +56,7 @@ class AtPoints(NamedTuple):
     @property
     def _first(self) -> int:
         """Return the place of the first table among the tensors."""
-        return 2 + len(Points._fields)
+        return 2 + len(PointTensors._fields)
 
     @property
     def moving(self) -> Sequence[int]:
@@ -70,8 +70,8 @@ class AtPoints(NamedTuple):
         """Return the kernel's scene."""
         return kernel_scene(self._flat(tensors))
 
-    def arguments(self, tensors: Tensors, options: Options) -> dict[str, Any]:
-        points = Points(*tensors[2 : self._first])  # pyright: ignore[reportArgumentType]
+    def arguments(self, tensors: Tensors, options: LitOptions) -> dict[str, Any]:
+        points = PointTensors(*tensors[2 : self._first])  # pyright: ignore[reportArgumentType]
         arrays = {name: None if t is None else array(t) for name, t in points._asdict().items()}
         b, spread = tensors[:2]
         assert b is not None
@@ -96,7 +96,7 @@ class Shading(NamedTuple):
     Without `values`, zeros with the radiance's derivatives."""
 
     at: AtPoints
-    options: Options
+    options: LitOptions
     values: bool
 
     @property
@@ -133,7 +133,7 @@ class Indirect(NamedTuple):
     derivatives. The paths are found again for these."""
 
     at: AtPoints
-    options: Options
+    options: LitOptions
     values: bool
 
     @property

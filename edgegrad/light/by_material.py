@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..points.hits import Hits
-from ..points.surfaces import View
+from ..points.surfaces import CameraView
 from ..scene.lights import Light, LightPoints
 from . import in_kernel
 
@@ -17,6 +17,6 @@ def points_by_material(hits: Hits, light: Light, samples: int) -> list[LightPoin
     Those of a light whose shadow boundary is sampled are given. For hits of trace(), each of which has another viewer, they are
     drawn by what the light emits.
     """
-    if light.punctual or hits._knows_light(light) or not isinstance(hits._view, View):
+    if light.punctual or hits._knows_light(light) or not isinstance(hits._view, CameraView):
         return [hits.light_points(light, k, samples) for k in range(samples)]
     return in_kernel.light_points(hits, light, samples)

@@ -9,13 +9,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ..points.hits import Hits
-from ..points.surfaces import Rays, Surfaces, View
+from ..points.surfaces import CameraView, Rays, Surfaces
 from ..scene.appearance import jumps
 from ..scene.lights import SphericalHarmonics
 from . import in_kernel
 from .bsdf import dot, terminator
 
-ABOVE = 0.01  # the horizon, by which a lobe reaches there
+ABOVE_HORIZON = 0.01  # the horizon, by which a lobe reaches there
 
 
 def note_jumps(hits: Hits, indirect: bool = False) -> None:
@@ -74,7 +74,7 @@ def _face_normals(surfaces: Surfaces, index: int) -> Tensor:
     return surfaces.face_normals(_faces_of(surfaces, index))[:, None].expand(-1, 3, -1)
 
 
-def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays, indirect: bool) -> Tensor:
+def _flat_radiance(surfaces: Surfaces, index: int, view: CameraView | Rays, indirect: bool) -> Tensor:
     """Return what may jump at edges of a mesh without shading normals, besides colours (F, 3, K).
 
     That is the face's normal on the viewer's side; if all light is that of punctual lights, only of faces that one of them
@@ -87,7 +87,7 @@ def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays, indirect: 
     assert material is not None
     harmonics = any(isinstance(light, SphericalHarmonics) for light in scene.lights)
     points_alone = not harmonics and not indirect and all(light.punctual for light in scene.casting)
-    if not points_alone or material.normal_map is not None or not isinstance(view, View):
+    if not points_alone or material.normal_map is not None or not isinstance(view, CameraView):
         return _face_normals(surfaces, index)
     verts = mesh.verts.detach().double()
     places = [light.place(light.draw(verts[:1])).detach().to(verts) for light in scene.casting]
@@ -101,7 +101,7 @@ def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays, indirect: 
     return torch.where(away[:, None], -g, g) * (found != 0).any(-1, keepdim=True)
 
 
-def _shadow_terminators(surfaces: Surfaces, index: int, view: View | Rays, indirect: bool) -> Tensor:
+def _shadow_terminators(surfaces: Surfaces, index: int, view: CameraView | Rays, indirect: bool) -> Tensor:
     """Return n·l times the shadow terminator at corners, with interpolated normals n, for each light (F, 3, K).
 
     The face's normal g enters through the terminator alone, which is 1 where g·l ≥ (g·n)(n·l). So of a fine mesh only edges near
@@ -118,10 +118,10 @@ def _shadow_terminators(surfaces: Surfaces, index: int, view: View | Rays, indir
     n = torch.where(dot(n, g) < 0, -n, n)
     position = mesh.verts.detach().to(g)
     assert mesh.material is not None
-    if found and mesh.material.is_glossy and isinstance(view, View):
+    if found and mesh.material.is_glossy and isinstance(view, CameraView):
         v = view.to_viewer(position).to(g)[mesh.faces.long()].reshape(-1, 3)
         v = torch.where(dot(n, v) < 0, -v, v)
-        l = normalize(2 * dot(n, v) * n - v + ABOVE * n, dim=-1)
+        l = normalize(2 * dot(n, v) * n - v + ABOVE_HORIZON * n, dim=-1)
         found.append(terminator(g, n, l).reshape(-1, 3, 1))
     for light in lights:
         if light.punctual:

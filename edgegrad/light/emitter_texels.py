@@ -1,6 +1,6 @@
 """Derivatives of what emissive meshes give to surfaces, by the edges of their nearest texels. Light samples have none for these:
 
-f max(0, n·l) V cos θ / r² · [E_i − E_{i−1}] δp / |∇p|        (scene/texel_borders.py)
+f max(0, n·l) V cos θ / r² · [E_i − E_{i−1}] δp / |∇p|        (scene/texel_edges.py)
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ..kernel.derivatives import differentiates, moves
 from ..points.hits import Hits
 from ..scene.lights import LightPoints
 from ..scene.mesh_light import MeshLight
-from ..scene.texel_borders import TexelBorders
+from ..scene.texel_edges import TexelEdges
 from .shaded_points import ShadedPoints, of_each_mesh, on_mesh, scattered, where_seen
 
 
@@ -25,19 +25,19 @@ def moving_emitters(hits: Hits) -> list[MovingEmitter]:
     if not differentiates() or hits._forced is not None or len(hits) == 0:
         return found
     for number, light in enumerate(scene.casting):
-        if not isinstance(light, MeshLight) or not light.has_borders or not moves(light.coordinates):
+        if not isinstance(light, MeshLight) or not light.has_texel_edges or not moves(light.coordinates):
             continue
         stream = len(scene.casting) + number
         first, second = hits.random(2, stream)[0].tolist()
-        borders = light.borders((first, second))
-        if borders is not None:
-            found.append(MovingEmitter(light, borders, stream))
+        edges = light.texel_edges((first, second))
+        if edges is not None:
+            found.append(MovingEmitter(light, edges, stream))
     return found
 
 
 class MovingEmitter(NamedTuple):
     light: MeshLight
-    borders: TexelBorders
+    edges: TexelEdges
     stream: int  # of random numbers
 
 
@@ -53,9 +53,9 @@ def by_texel_edges(hits: Hits, lights: list[MovingEmitter], shadows: bool, sampl
             return total
         with torch.no_grad():
             surface = ShadedPoints.from_hits(own, at, material)
-        for light, borders, stream in lights:
+        for light, edges, stream in lights:
             for sample in range(samples):
-                drawn = borders.draw(own.random(2, stream, sample, samples))
+                drawn = edges.draw(own.random(2, stream, sample, samples))
                 with torch.no_grad():
                     reaches = scattered(
                         own,
@@ -68,8 +68,8 @@ def by_texel_edges(hits: Hits, lights: list[MovingEmitter], shadows: bool, sampl
                         ).to(y),
                     )
                     reaches = where_seen(own, material, reaches / samples)
-                total = total + reaches * borders.motion(drawn).to(reaches)
+                total = total + reaches * edges.motion(drawn).to(reaches)
         return total
 
-    # Of other hits, which keep nothing that is computed here, and declare no steps.
+    # Of other hits, which keep nothing that is computed here, and declare no discontinuities.
     return of_each_mesh(hits._subset(slice(None)), of_mesh)

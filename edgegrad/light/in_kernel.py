@@ -15,16 +15,16 @@ from ..kernel.derivatives import moves
 from ..kernel.first_order import apply, array, without_derivatives
 from ..kernel.request import derived_seed
 from ..library import core
-from ..points.frame import Frame
 from ..points.hits import Hits
+from ..points.image_context import ImageContext
 from ..points.records import CurveRecords
-from ..points.surfaces import View
+from ..points.surfaces import CameraView
 from ..scene.environment import Environment
 from ..scene.lights import Light, LightPoints
 from ..scene.material import Texture
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
-from .at_points import AtPoints, Indirect, Options, Points, Shading
+from .at_points import AtPoints, Indirect, LitOptions, PointTensors, Shading
 from .layout import channel_groups, layout_of
 from .sampling import DARK, MOST_SETS, SET_SIZE
 
@@ -71,7 +71,7 @@ def _radiance(hits: Hits, shadows: bool, samples: int, channels: slice) -> Tenso
     # Without values nothing is computed now; but once it must be, to note the lights whose shadows are asked for.
     known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
     values = hits._needs_values or not known
-    options = Options(shadows=shadows, samples=samples, only=only, antithetic=not hits._needs_values)
+    options = LitOptions(shadows=shadows, samples=samples, only=only, antithetic=not hits._needs_values)
     found, *kept = apply(Shading(at, options, values), tensors)
     if not values:
         return found.to(surfaces.verts)
@@ -98,7 +98,7 @@ def indirect(hits: Hits, shadows: bool, bounces: int, only_near_field: float = 0
     If the hits need no values, these are zeros with the same derivatives.
     """
     at, tensors = _at(hits)
-    options = Options(
+    options = LitOptions(
         shadows, 1, bounces=bounces, near=only_near_field or hits._near, only_near_field=only_near_field > 0
     )
     return apply(Indirect(at, options, hits._needs_values), tensors)[0].to(hits._surfaces.verts)
@@ -106,11 +106,11 @@ def indirect(hits: Hits, shadows: bool, bounces: int, only_near_field: float = 0
 
 def _at(hits: Hits, channels: slice = slice(None)) -> tuple[AtPoints, list[Tensor | None]]:
     surfaces, view = hits._surfaces, hits._view
-    assert isinstance(view, View)
+    assert isinstance(view, CameraView)
     layout, tables = layout_of(surfaces, view, channels)
     forced, casters = hits._forced, surfaces.casters
     known = (None,) * 4 if forced is None else _forced(forced.points, forced.lit)
-    points = Points(hits._face.cpu(), hits._seed.cpu(), *known)
+    points = PointTensors(hits._face.cpu(), hits._seed.cpu(), *known)
     spread = hits._spread.cpu() if "mipmap" in _filters(surfaces.scene) else None
     number = -1 if forced is None else forced.light
     at = AtPoints(layout, len(tables), number, surfaces.verts.dtype, casters.cutoffs, casters.spacing)
@@ -118,10 +118,10 @@ def _at(hits: Hits, channels: slice = slice(None)) -> tuple[AtPoints, list[Tenso
     return at, [hits._exact.cpu(), spread, *points, *tables, *arrays]
 
 
-def image(frame: Frame, options: Options, points: int) -> Tensor:
+def image(context: ImageContext, options: LitOptions, points: int) -> Tensor:
     """Return the image (H · W, C) of surfaces before black, without derivatives; `points` of each face in a pixel are shaded."""
-    layout, tables = layout_of(frame.fixed, frame.fixed_view)
-    seed, again = (int(frame.seeds(kind, 1)) & _64_BITS for kind in ("image", "image again"))
+    layout, tables = layout_of(context.fixed, context.fixed_view)
+    seed, again = (int(context.seeds(kind, 1)) & _64_BITS for kind in ("image", "image again"))
 
     def compute(kernel: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor) -> Sequence[Tensor]:
         found, asked = kernel.lit_image(
@@ -134,14 +134,16 @@ def image(frame: Frame, options: Options, points: int) -> Tensor:
         )
         return torch.from_numpy(found), torch.from_numpy(asked)
 
-    found, asked = frame.sampler.lit_image(compute, *tables)
+    found, asked = context.sampler.lit_image(compute, *tables)
     if options.shadows:
-        lights = range(len(frame.surfaces.scene.casting))
-        frame.surfaces.shadowing.update(light for light in lights if asked[light, 0])
-    return frame.here(found)
+        lights = range(len(context.surfaces.scene.casting))
+        context.surfaces.shadowing.update(light for light in lights if asked[light, 0])
+    return context.here(found)
 
 
-def secondary_edge_samples(frame: Frame, options: Options, further: int) -> tuple[CurveRecords, Tensor, Tensor]:
+def secondary_edge_samples(
+    context: ImageContext, options: LitOptions, further: int
+) -> tuple[CurveRecords, Tensor, Tensor]:
     """Return samples on secondary edges, and (S, C) float64 the jump of the image there times what a sample stands for.
 
     Where light goes `further` steps after that, it is the light that has come to the first point of each sample instead, and
@@ -149,43 +151,43 @@ def secondary_edge_samples(frame: Frame, options: Options, further: int) -> tupl
     """
     own = {"further": further, "seen": further == 0}
     return _samples_of_lines(
-        frame, options, "secondary_edge_samples", derived_seed(frame.sampler.grad_seed, -further), own
+        context, options, "secondary_edge_samples", derived_seed(context.sampler.grad_seed, -further), own
     )
 
 
 def surface_edge_samples(
-    frame: Frame, options: Options, further: int, crossings: bool, alpha_edges: bool
+    context: ImageContext, options: LitOptions, further: int, crossings: bool, alpha_edges: bool
 ) -> tuple[CurveRecords, Tensor, Tensor]:
     """Return samples on the curves at which emitters or reflectors end: where faces pass through each other, and alpha edges.
     The first point of each gets light from there, that may go `further` steps after that; see secondary_edge_samples()."""
     own = {"further": further, "crossings": crossings, "alpha_edges": alpha_edges}
-    seed = derived_seed(frame.sampler.grad_seed, -core.MOST_BOUNCES - further)
-    return _samples_of_lines(frame, options, "surface_edge_samples", seed, own)
+    seed = derived_seed(context.sampler.grad_seed, -core.MOST_BOUNCES - further)
+    return _samples_of_lines(context, options, "surface_edge_samples", seed, own)
 
 
 def _samples_of_lines(
-    frame: Frame, options: Options, method: str, seed: int, own: dict[str, Any]
+    context: ImageContext, options: LitOptions, method: str, seed: int, own: dict[str, Any]
 ) -> tuple[CurveRecords, Tensor, Tensor]:
-    layout, tables = layout_of(frame.fixed, frame.fixed_view)
+    layout, tables = layout_of(context.fixed, context.fixed_view)
 
     def compute(
         kernel: Any, casters: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
         return getattr(kernel, method)(casters, layout.kernel(tables, faces), options.kernel, **own, **arguments)
 
-    count = frame.request.gradient.edge_samples
-    casters = frame.fixed.casters if frame.surfaces.scene.blends else None
-    return frame.sampler.secondary_edge_samples(compute, tables, seed, count, moves(frame.intrinsics), casters)
+    count = context.request.gradient.edge_samples
+    casters = context.fixed.casters if context.surfaces.scene.blends else None
+    return context.sampler.secondary_edge_samples(compute, tables, seed, count, moves(context.intrinsics), casters)
 
 
-def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, int]) -> list[Tensor]:
+def towards_camera(context: ImageContext, arrivals: Sequence[Tensor], steps: tuple[int, int]) -> list[Tensor]:
     """Return what reaches the image of light that has come to points, without derivatives: the point it comes from (M,) int64,
     places in the image (M, 2), and radiance times px² (M, C). See csrc/shading/lit/light_tracing.h.
 
     arrivals  faces (N,), barycentrics (N, 3), seeds (N,), unit directions (N, 3) where the light came from, and how much (N, C)
     steps     the first and the last after which it goes to the camera
     """
-    layout, tables = layout_of(frame.fixed, frame.fixed_view)
+    layout, tables = layout_of(context.fixed, context.fixed_view)
 
     def compute(kernel: Any, faces: Tensor, arguments: dict[str, Any], *tensors: Tensor) -> Sequence[Tensor]:
         names, given = ("face", "b", "seed", "origin", "carried"), len(tensors) - len(tables)
@@ -199,14 +201,14 @@ def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, i
         )
         return [torch.from_numpy(part) for part in found]
 
-    return list(frame.sampler.lit_image(compute, *(t.cpu() for t in arrivals), *tables))
+    return list(context.sampler.lit_image(compute, *(t.cpu() for t in arrivals), *tables))
 
 
 def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
     """Return `samples` points of a light for each of the hits, as radiance() draws them for the first channels that it takes.
     Where nothing arrives their density is infinite."""
     surfaces, view = hits._surfaces, hits._view
-    assert isinstance(view, View)
+    assert isinstance(view, CameraView)
     layout, tables = layout_of(surfaces, view, channel_groups(surfaces.scene)[0])
     filtered = "mipmap" in _filters(surfaces.scene)
 
@@ -218,7 +220,7 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
         found = core.light_points(lit, points, options, hits._index(light), torch.get_num_threads())
         return [torch.from_numpy(x) for x in found]
 
-    given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), surfaces.bare.faces]
+    given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), surfaces.geometry.faces]
     given += [*([hits._spread.cpu()] if filtered else ()), *tables]
     index, uv, density = (x.to(hits._face.device) for x in without_derivatives(compute, *given))
     density = torch.where(density > 0, density, math.inf)
@@ -226,7 +228,7 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
 
 
 def light_on_faces(
-    verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, power: Tensor
+    verts: Tensor, faces: Tensor, view: CameraView, infinite: list[bool], place: Tensor, power: Tensor
 ) -> Tensor:
     """Return E max(0, n·l) at the corners of flat faces (F, 3, L) float64, over its maximum (csrc/shading/lit/flat_light.h).
 

@@ -15,7 +15,7 @@ from ..library import core
 from ..points.footprints import pyramid_of
 from ..points.records import values_of
 from ..points.seeds import mixed_bits
-from ..points.surfaces import Surfaces, View
+from ..points.surfaces import CameraView, Surfaces
 from ..scene.environment import Environment
 from ..scene.lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
 from ..scene.material import WRAPS, Parameter, Texture
@@ -60,9 +60,9 @@ class Layout(NamedTuple):
     ball: list[float]
 
     @classmethod
-    def from_surfaces(cls, surfaces: Surfaces, view: View, tables: _Tables) -> Layout:
+    def from_surfaces(cls, surfaces: Surfaces, view: CameraView, tables: _Tables) -> Layout:
         scene = surfaces.scene
-        verts, seen_from = tables.add(surfaces.bare.verts, 3), tables.add(view.eye, 3)
+        verts, seen_from = tables.add(surfaces.geometry.verts, 3), tables.add(view.eye, 3)
         firsts = np.cumsum([0, *(len(mesh.verts) for mesh in scene.meshes)])
         meshes = [_mesh(surfaces, index, int(vertex), tables) for index, vertex in enumerate(firsts[:-1])]
         eps = torch.finfo(surfaces.verts.dtype).eps
@@ -85,7 +85,7 @@ def channel_groups(scene: Scene) -> list[slice]:
     return [slice(None)] if count == 1 else [slice(C * k // count, C * (k + 1) // count) for k in range(count)]
 
 
-def layout_of(surfaces: Surfaces, view: View, channels: slice = slice(None)) -> tuple[Layout, list[Tensor]]:
+def layout_of(surfaces: Surfaces, view: CameraView, channels: slice = slice(None)) -> tuple[Layout, list[Tensor]]:
     """Return the layout of surfaces and a view, and its tables; they are kept for points that have no derivatives."""
     if surfaces.layout is None or surfaces.layout[0] is not view or surfaces.layout[1] != channels:
         tables = _Tables(channels)
@@ -203,7 +203,11 @@ def _kernel_light(scene: Scene, light: Light, number: int, eps: float, tables: _
     if isinstance(light, SphericalHarmonics):
         coefficients = tables.add(light.coefficients, light.coefficients.shape[1])
         return described("spherical harmonics", radiance=coefficients, rotation=tables.add_numbers(light.rotation))
-    assert isinstance(light, (DirectionalLight, PointLight, SpotLight))
+    if not isinstance(light, (DirectionalLight, PointLight, SpotLight)):
+        raise TypeError(
+            f"lights: expected lights that edgegrad shades with, got {type(light).__name__}; shade with it in a shader= of "
+            "your own, by hits.light_points()"
+        )
     power = {"intensity": tables.add(light.intensity, 1), "color": tables.add_numbers(light.color)}
     if isinstance(light, DirectionalLight):
         return described("directional", direction=tables.add(light.direction, 3), **power)

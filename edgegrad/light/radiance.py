@@ -19,9 +19,9 @@ from ..kernel.first_order import unreached
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request
 from ..library import core
-from ..points.frame import Frame
 from ..points.hits import Hits
-from ..points.splat import Term
+from ..points.image_context import ImageContext
+from ..points.splat import SplatTerm
 from ..scene.appearance import coordinates
 from ..scene.environment import Environment
 from ..scene.lights import Light
@@ -30,7 +30,7 @@ from ..scene.tree import tensors_in
 from ..shader import Radiance, ShadingTraits, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
-from .at_points import Options
+from .at_points import LitOptions
 from .bounces import check_bounces
 from .creases import note_jumps
 from .emitter_texels import by_texel_edges, moving_emitters
@@ -44,8 +44,8 @@ from .shaded_points import of_each_mesh, on_mesh
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 # Where glossy surfaces end or meet, points of a light for each sample of it: these are few points, and what is wanted of them is
 # the difference of both sides.
-AT_CURVES = 4
-# By which lines that look for alpha edges and borders of nearest texels lie closer where surfaces light each other: these
+SAMPLES_FACTOR_AT_CURVES = 4
+# By which lines that look for alpha edges and texel edges lie closer where surfaces light each other: these
 # have some samples a pixel, and each side of a sample has one path.
 CLOSER_STEPS = 8.0
 # Distance, in texels, from a texel edge at which both of its sides are shaded: the kernel reads the texel in which a point lies.
@@ -155,7 +155,7 @@ class Lighting(NamedTuple):
         return self._replace(samples=-(-points * self.samples // more)), more
 
     def __call__(self, hits: Hits) -> Tensor:
-        more = AT_CURVES if hits._on_curve and self.resamples(hits._surfaces.scene) else 1
+        more = SAMPLES_FACTOR_AT_CURVES if hits._on_curve and self.resamples(hits._surfaces.scene) else 1
         return radiance(hits, *self._replace(samples=more * self.samples))
 
 
@@ -180,45 +180,45 @@ class _LitRadiance(Radiance):
     def __call__(self, hits: Hits) -> Tensor:
         return self._lighting(hits)
 
-    def image(self, frame: Frame) -> Tensor | None:
-        return None if self._in_image is None else _kernel_image(frame, *self._in_image)
+    def image(self, context: ImageContext) -> Tensor | None:
+        return None if self._in_image is None else _kernel_image(context, *self._in_image)
 
     def declare(self, hits: Hits) -> None:
         declare_texel_edges(hits)
 
-    def near_field(self, frame: Frame, hits: Hits) -> tuple[float, Tensor] | None:
+    def near_field(self, context: ImageContext, hits: Hits) -> tuple[float, Tensor] | None:
         if not self._near_field:
             return None
         near, scene, shadows, bounces = (
-            radius(frame),
-            frame.surfaces.scene,
+            radius(context),
+            context.surfaces.scene,
             self._lighting.shadows,
             self._lighting.bounces,
         )
         declare = declare_texel_edges if any(nearest_textures(mesh) for mesh in scene.meshes) else None
-        nearby = NearField(frame, hits, lambda there: in_kernel.indirect(there, shadows, bounces, near), declare)
-        return near, nearby.term() if near > 0 else hits._exact.new_zeros((len(hits), 1)).to(frame.dtype)
+        nearby = NearField(context, hits, lambda there: in_kernel.indirect(there, shadows, bounces, near), declare)
+        return near, nearby.term() if near > 0 else hits._exact.new_zeros((len(hits), 1)).to(context.dtype)
 
-    def indirect(self, frame: Frame, watch: Watch) -> list[Term]:
+    def indirect(self, context: ImageContext, watch: Watch) -> list[SplatTerm]:
         shadows, bounces = self._lighting.shadows, self._lighting.bounces
-        terms: list[Term] = []
+        terms: list[SplatTerm] = []
         if bounces == 1:
             return terms
         if shadows:
-            with watch.part("unseen shadows"):
-                terms += indirect_shadows(frame, bounces, watch)
-        with watch.part("bounce edges"):
-            options = Options(shadows, samples=1, dark=0.0, bounces=bounces, near=radius(frame))
-            terms += secondary_edges(frame, options)
+            with watch.part("indirect shadows"):
+                terms += indirect_shadows(context, bounces, watch)
+        with watch.part("secondary edges"):
+            options = LitOptions(shadows, samples=1, dark=0.0, bounces=bounces, near=radius(context))
+            terms += secondary_edges(context, options)
         return terms
 
 
-def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
+def _kernel_image(context: ImageContext, lighting: Lighting, points: int) -> Tensor | None:
     """Return the image of surfaces before black (H · W, C), with `points` of each face in a pixel shaded, or None if it is not
     finite. Then points are shaded one by one, and an error names the first that is not."""
-    note_jumps(frame.no_hits, lighting.bounces > 1)
-    options = Options(lighting.shadows, lighting.samples, bounces=lighting.bounces)
-    found = in_kernel.image(frame, options, points)
+    note_jumps(context.no_hits, lighting.bounces > 1)
+    options = LitOptions(lighting.shadows, lighting.samples, bounces=lighting.bounces)
+    found = in_kernel.image(context, options, points)
     return found if all_finite(found) else None
 
 

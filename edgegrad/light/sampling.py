@@ -10,11 +10,11 @@ import numpy as np
 
 from ..library import core
 from ..points.records import values_of
-from ..scene.environment import EVEN, Environment
+from ..scene.environment import UNIFORM_SHARE, Environment
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
 
-EACH = 8  # candidates for one point that is kept, half of them by the BSDF lobe if it is narrow
+CANDIDATES_FOR_ONE = 8  # candidates for one point that is kept, half of them by the BSDF lobe if it is narrow
 WIDEST_LOBE = 0.65  # roughness
 # Where radiance has derivatives, points are drawn as if no surface were darker, for what is black has derivatives too.
 DARK = 0.05
@@ -43,7 +43,7 @@ def hides(light: MeshLight) -> bool:
 def least_brightness(light: MeshLight) -> float:
     """Return what is added to the brightness of a light, so that dark parts have a gradient too."""
     mean = float(light.mean_emission)
-    return EVEN * mean if mean > 0 else 1.0
+    return UNIFORM_SHARE * mean if mean > 0 else 1.0
 
 
 def how_drawn(scene: Scene) -> str:
@@ -56,7 +56,8 @@ def how_drawn(scene: Scene) -> str:
     if not any(material.is_glossy for material in materials):
         return ", drawn by the light, for no surface is glossy"
     of = ["skies"] * (skies > 0) + ["meshes that emit"] * (len(lights) > 0)
-    said = f"; on glossy surfaces of {EACH} candidates for each, by light and, up to roughness {WIDEST_LOBE}, by lobe"
+    said = f"; on glossy surfaces of {CANDIDATES_FOR_ONE} candidates for each, by light and, "
+    said += f"up to roughness {WIDEST_LOBE}, by lobe"
     said += f", one is kept by what it gives ({', '.join(of)})"
     if lights:
         said += "; a light well within the lobe by the light alone, of a round one directions to a ball around it"

@@ -16,7 +16,7 @@ from ..files.formats.gltf_pack import to_glb
 from ..fit.views import displayed
 from ..optional import require
 from ..scene.material import Material, vertex_normals
-from ..scene.mesh import PLAIN, Mesh
+from ..scene.mesh import DEFAULT_RADIANCE, Mesh
 from ..scene.tree import named_tensors
 from .snapshot import BONE, CONTRAST, Snapshot, as_bytes
 
@@ -28,7 +28,7 @@ AMBIENT = 1.5
 FOV, MIN_ANGLE = 0.8, 0.9  # radians: field of view of the page's camera, and angle between it and the cameras shown
 BODY_OPACITY = 0.6  # of a mesh around its bones
 MAX_POINTS = 500  # of the curve
-GREY = (round(255 * (1.055 * PLAIN ** (1 / 2.4) - 0.055)),) * 3  # sRGB
+GREY = (round(255 * (1.055 * DEFAULT_RADIANCE ** (1 / 2.4) - 0.055)),) * 3  # sRGB
 PANEL_TITLE = f"target | render | difference × {CONTRAST}"
 
 

@@ -9,22 +9,22 @@ from torch import Tensor
 
 from ..scene.appearance import OnMesh
 from ..scene.textures import look_up
-from .frame import Frame
 from .hits import Hits
+from .image_context import ImageContext
 from .records import CurveRecords, trace
 from .surfaces import Surfaces
 
-MOST = 8  # surfaces along a ray; what lies behind the last is left out
+MOST_LAYERS = 8  # surfaces along a ray; what lies behind the last is left out
 
 
 class Blended:
     """A shader that composes what is seen along a ray: α L + (1 − α) L_behind (Porter and Duff 1984, "over")."""
 
-    def __init__(self, frame: Frame, shader: Callable[[Hits], Tensor], background: Tensor | None) -> None:
-        self._frame, self._shader, self._background = frame, shader, background
+    def __init__(self, context: ImageContext, shader: Callable[[Hits], Tensor], background: Tensor | None) -> None:
+        self._context, self._shader, self._background = context, shader, background
 
     def __call__(self, hits: Hits) -> Tensor:
-        return self._from(hits, MOST)
+        return self._from(hits, MOST_LAYERS)
 
     def _from(self, hits: Hits, left: int) -> Tensor:
         radiance = self._shader(hits)
@@ -38,32 +38,32 @@ class Blended:
 
     def _behind(self, hits: Hits, channels: int, left: int) -> Tensor:
         """Return the radiance (N, C) of what rays meet behind hits."""
-        frame = self._frame
+        context = self._context
         with torch.no_grad():
-            found = trace(hits._surfaces.bare, hits.position.double(), -hits.view.double(), hits._face)
-            face = frame.here(found.face)
+            found = trace(hits._surfaces.geometry, hits.position.double(), -hits.view.double(), hits._face)
+            face = context.here(found.face)
             meets = (face >= 0).nonzero()[:, 0]
             x, seed = hits.pixel.double().cpu(), hits._seed[meets]
         total = self._behind_all(x, channels)
         if len(meets) == 0:
             return total
         x = x[meets.cpu()]
-        if hits._surfaces is frame.surfaces:
-            next_ = frame.moving_hits(face[meets], frame.rays_at(x), x, seed)
+        if hits._surfaces is context.surfaces:
+            next_ = context.moving_hits(face[meets], context.rays_at(x), x, seed)
         else:
-            next_ = frame.fixed_hits(face[meets], frame.here(found.b)[meets], x, seed)
+            next_ = context.fixed_hits(face[meets], context.here(found.b)[meets], x, seed)
         radiance = self._from(next_, left - 1)
         return total.to(radiance.dtype).index_copy(0, meets, radiance)
 
     def _behind_all(self, x: Tensor, channels: int) -> Tensor:
         """Return the background (N, C) at places (N, 2)."""
-        frame, background = self._frame, self._background
+        context, background = self._context, self._background
         if background is None:
-            return frame.fixed.verts.new_zeros((len(x), channels))
+            return context.fixed.verts.new_zeros((len(x), channels))
         if background.dim() == 1:
             return background.expand(len(x), -1)
-        column, row = (x[:, k].floor().long().clamp(0, n - 1) for k, n in enumerate((frame.width, frame.height)))
-        return background[frame.here(row), frame.here(column)]
+        column, row = (x[:, k].floor().long().clamp(0, n - 1) for k, n in enumerate((context.width, context.height)))
+        return background[context.here(row), context.here(column)]
 
 
 def transparent(surfaces: Surfaces) -> Tensor:
@@ -72,11 +72,11 @@ def transparent(surfaces: Surfaces) -> Tensor:
     return blends[surfaces.mesh_of_face]
 
 
-def let_through(frame: Frame, records: CurveRecords) -> Tensor:
+def let_through(context: ImageContext, records: CurveRecords) -> Tensor:
     """Return the share Π (1 − α) that surfaces before samples on curves let through (S,) float64, without derivatives."""
-    sample = frame.here(records.transparent_row_of)
-    passed = frame.fixed_hits(records.transparent, records.transparent_b, records.x[records.transparent_row_of])
-    total = torch.ones(len(records.x), dtype=torch.float64, device=frame.device)
+    sample = context.here(records.transparent_row_of)
+    passed = context.fixed_hits(records.transparent, records.transparent_b, records.x[records.transparent_row_of])
+    total = torch.ones(len(records.x), dtype=torch.float64, device=context.device)
     return total.scatter_reduce(0, sample, 1 - opacity(passed)[:, 0].double(), "prod")
 
 

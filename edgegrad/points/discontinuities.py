@@ -1,8 +1,8 @@
-"""Steps that a shader declares (hits.where, hits.floor), and where they lie in the image.
+"""Discontinuities that a shader declares (hits.where, hits.floor), and where they lie in the image.
 
-Only values of a step's function s are known, so lines find where it is zero (Crofton). s is evaluated on a grid of points with
-one random shift; between neighbours of different sign bisection finds the zero. A horizontal line crosses a curve with
-the unit normal n once in Δ / |n_x| of its length, a vertical one once in Δ / |n_y|, so that
+Only values of a discontinuity's function s are known, so lines find where it is zero (Crofton). s is evaluated on a grid of
+points with one random shift; between neighbours of different sign bisection finds the zero. A horizontal line crosses a
+curve with the unit normal n once in Δ / |n_x| of its length, a vertical one once in Δ / |n_y|, so that
 
     Σ_{horizontal crossings} Δ g |n_x|  +  Σ_{vertical crossings} Δ g |n_y|
 
@@ -25,9 +25,9 @@ MOST_LEVELS = 4  # of a floor() between two neighbours; if there are more, so ma
 
 
 class Discontinuities:
-    """The values of the step functions that a shader declares at some points, in its order.
+    """The values of the functions of discontinuities that a shader declares at some points, in its order.
 
-    `states` (N, K), if given, are the sides that the steps are forced to, whatever the values say.
+    `states` (N, K), if given, are the sides that the discontinuities are forced to, whatever the values say.
     """
 
     def __init__(self, states: Tensor | None = None) -> None:
@@ -58,11 +58,11 @@ class Discontinuities:
 
 
 class DiscontinuitiesOfSubset(Discontinuities):
-    """Steps that are declared of some of the points, and noted as steps of all."""
+    """Discontinuities declared of some of the points, and noted as those of all."""
 
-    def __init__(self, steps: Discontinuities, index: Tensor, count: int) -> None:
+    def __init__(self, discontinuities: Discontinuities, index: Tensor, count: int) -> None:
         super().__init__()
-        self._all, self._index, self._count = steps, index, count
+        self._all, self._index, self._count = discontinuities, index, count
 
     def _note(self, kind: str, values: Tensor) -> Tensor | None:
         nothing = values.new_full((self._count,), torch.nan)
@@ -76,8 +76,8 @@ UNEQUAL = (
 )
 
 
-class Points(NamedTuple):
-    """Points of the image, and the step functions there."""
+class ImagePoints(NamedTuple):
+    """Points of the image, and the functions of discontinuities there."""
 
     x: Tensor  # (N, 2)
     face: Tensor  # (N,) int64, −1: none
@@ -85,38 +85,38 @@ class Points(NamedTuple):
     b: Tensor  # (N, 2)
     values: Tensor  # (N, K) float64; NaN where there is no face
 
-    def select(self, index: Tensor) -> Points:
-        return Points(*(part[index] for part in self))
+    def select(self, index: Tensor) -> ImagePoints:
+        return ImagePoints(*(part[index] for part in self))
 
     @staticmethod
-    def choose(first: Tensor, a: Points, b: Points) -> Points:
+    def choose(first: Tensor, a: ImagePoints, b: ImagePoints) -> ImagePoints:
         """Return the points of `a` where `first` (N,), of `b` elsewhere."""
         pairs = zip(a, b, strict=True)
-        return Points(*(torch.where(first[:, None] if u.dim() == 2 else first, u, v) for u, v in pairs))
+        return ImagePoints(*(torch.where(first[:, None] if u.dim() == 2 else first, u, v) for u, v in pairs))
 
 
 class Crossings(NamedTuple):
-    """Where lines cross steps."""
+    """Where lines cross discontinuities."""
 
     x: Tensor  # (M, 2)
     face: Tensor  # (M,)
     b: Tensor  # (M, 2)
-    step: Tensor  # (M,) int64, the number of the step, below K
+    number: Tensor  # (M,) int64, the number of the discontinuity, below K
     axis: Tensor  # (M,) int64: 0 on horizontal lines, 1 on vertical ones
     weight: Tensor  # (M,) px of lines that it stands for
-    before: Tensor  # (M, K) the sides of all steps just before it on the line
+    before: Tensor  # (M, K) the sides of all discontinuities just before it on the line
     after: Tensor  # (M, K) and just after it
     rises: Tensor  # (M,) bool: whether the function increases along the line
 
 
-At = Callable[[Tensor], Points]
+At = Callable[[Tensor], ImagePoints]
 
 
 class _Lines(NamedTuple):
     """Pieces of lines between neighbours."""
 
-    low: Points
-    high: Points
+    low: ImagePoints
+    high: ImagePoints
     axis: Tensor
 
     def select(self, index: Tensor) -> _Lines:
@@ -124,10 +124,10 @@ class _Lines(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Changes of a step's side between neighbours."""
+    """Changes of a discontinuity's side between neighbours."""
 
     line: Tensor  # (M,) int64
-    step: Tensor
+    number: Tensor
     level: Tensor  # (M,) float64, the value that the function crosses
     weight: Tensor
 
@@ -135,7 +135,8 @@ class _Candidates(NamedTuple):
 def find_crossings(
     at: At, kinds: list[str], size: tuple[int, int], margin: float, spacing: float, seed: int
 ) -> Crossings:
-    """Return the crossings in an image of `size` (height, width), widened by `margin` px. at(x) gives Points at places (N, 2)."""
+    """Return the crossings in an image of `size` (height, width), widened by `margin` px. at(x) gives
+    ImagePoints at places (N, 2)."""
     generator = np.random.default_rng(seed)  # torch's own draws nothing under torch.vmap
     lines = _at_jumps(at, _grid(at, size, margin, spacing, generator))
     found = []
@@ -197,17 +198,19 @@ def _at_jumps(at: At, lines: _Lines) -> _Lines:
 
 
 def _joined(a: _Lines, b: _Lines) -> _Lines:
-    def points(p: Points, q: Points) -> Points:
-        return Points(*map(torch.cat, zip(p, q, strict=True)))
+    def points(p: ImagePoints, q: ImagePoints) -> ImagePoints:
+        return ImagePoints(*map(torch.cat, zip(p, q, strict=True)))
 
     return _Lines(points(a.low, b.low), points(a.high, b.high), torch.cat([a.axis, b.axis]))
 
 
-def _bisect(at: At, low: Points, high: Points, like_low: Callable[[Points, Points], Tensor]) -> tuple[Points, Points]:
+def _bisect(
+    at: At, low: ImagePoints, high: ImagePoints, like_low: Callable[[ImagePoints, ImagePoints], Tensor]
+) -> tuple[ImagePoints, ImagePoints]:
     for _ in range(BISECTIONS if len(low.x) else 0):
         middle = at((low.x + high.x) / 2)
         lower = like_low(middle, low)
-        low, high = Points.choose(lower, middle, low), Points.choose(lower, high, middle)
+        low, high = ImagePoints.choose(lower, middle, low), ImagePoints.choose(lower, high, middle)
     return low, high
 
 
@@ -233,15 +236,17 @@ def _candidates(lines: _Lines, kinds: list[str], generator: np.random.Generator)
     return _Candidates(*map(torch.cat, zip(*found, strict=True)))
 
 
-def _refine(at: At, lines: _Lines, kinds: list[str], candidates: _Candidates) -> tuple[Points, Points, Tensor]:
+def _refine(
+    at: At, lines: _Lines, kinds: list[str], candidates: _Candidates
+) -> tuple[ImagePoints, ImagePoints, Tensor]:
     """Return short pieces around the crossings, by their ends, and whether the function is continuous in each."""
-    where, step, level = candidates.line, candidates.step, candidates.level
-    signs = torch.tensor([kind == SIGN for kind in kinds])[step]
+    where, number, level = candidates.line, candidates.number, candidates.level
+    signs = torch.tensor([kind == SIGN for kind in kinds])[number]
 
-    def function(points: Points) -> Tensor:
-        return points.values.gather(1, step[:, None])[:, 0] - level
+    def function(points: ImagePoints) -> Tensor:
+        return points.values.gather(1, number[:, None])[:, 0] - level
 
-    def above(points: Points) -> Tensor:
+    def above(points: ImagePoints) -> Tensor:
         f = function(points)
         return torch.where(signs, f > 0, f >= 0)
 
@@ -256,18 +261,24 @@ def _refine(at: At, lines: _Lines, kinds: list[str], candidates: _Candidates) ->
 
 
 def _crossings(
-    low: Points, high: Points, kinds: list[str], candidates: _Candidates, keep: Tensor, axis: Tensor, spacing: float
+    low: ImagePoints,
+    high: ImagePoints,
+    kinds: list[str],
+    candidates: _Candidates,
+    keep: Tensor,
+    axis: Tensor,
+    spacing: float,
 ) -> Crossings:
     c = _Candidates(*(part[keep] for part in candidates))
-    f = torch.stack([p.values.gather(1, c.step[:, None])[:, 0] - c.level for p in (low, high)])
+    f = torch.stack([p.values.gather(1, c.number[:, None])[:, 0] - c.level for p in (low, high)])
     t = (f[0] / (f[0] - f[1]))[:, None].clamp(0, 1)
     signs = torch.tensor([kind == SIGN for kind in kinds])
     before, after = (torch.where(signs, (p.values > 0).double(), p.values.floor().nan_to_num()) for p in (low, high))
     same = (low.face == high.face)[:, None]  # else the crossing is put on the first face
-    # Where several steps change at once, the first stands for all.
-    first = (before != after).double().argmax(1) == c.step
+    # Where several discontinuities change at once, the first stands for all.
+    first = (before != after).double().argmax(1) == c.number
     found = Crossings(
-        torch.lerp(low.x, high.x, t), low.face, torch.where(same, torch.lerp(low.b, high.b, t), low.b), c.step,
+        torch.lerp(low.x, high.x, t), low.face, torch.where(same, torch.lerp(low.b, high.b, t), low.b), c.number,
         axis[c.line], spacing * c.weight,
         before, after, f[1] > f[0],
     )  # fmt: skip

@@ -11,14 +11,14 @@ from torch import Tensor
 from ..kernel.derivatives import moves
 from .pyramid import Pyramid
 from .records import RayRecords
-from .surfaces import Surfaces, View
+from .surfaces import CameraView, Surfaces
 
 
 class Footprints(NamedTuple):
     """The footprints of pixels at N points of surfaces."""
 
     surfaces: Surfaces
-    view: View
+    view: CameraView
     face: Tensor  # (N,)
     pixel: Tensor  # (N, 2)
     rays_at: Callable[[Tensor], RayRecords]

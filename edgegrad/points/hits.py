@@ -22,7 +22,7 @@ from .records import RayRecords, visible
 from .seeds import uniform
 from .shadow_rays import Forced, seen_from
 from .sobol import key_of, sobol
-from .surfaces import Rays, Surfaces, View, every_face
+from .surfaces import CameraView, Rays, Surfaces, every_face
 
 LightSampler = Callable[["Hits", Light, int], list[LightPoints]]  # so many points of a light for each of the hits
 
@@ -42,12 +42,12 @@ class Hits:
     def __init__(
         self,
         surfaces: Surfaces,
-        view: View | Rays,
+        view: CameraView | Rays,
         face: Tensor,
         barycentrics: Tensor,  # (N, 3) float64
         pixel: Tensor | None = None,  # (N, 2)
         rays_at: Callable[[Tensor], RayRecords] | None = None,  # those of the camera
-        steps: Discontinuities | None = None,
+        discontinuities: Discontinuities | None = None,
         seed: Tensor | None = None,  # (N,) int64, of random()
         forced: Forced | None = None,
     ) -> None:
@@ -59,7 +59,7 @@ class Hits:
         self._forced = forced
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
-        self._pixel, self._discontinuities = pixel, steps or Discontinuities()
+        self._pixel, self._discontinuities = pixel, discontinuities or Discontinuities()
         self._all: tuple[Hits, Tensor] | None = None  # the hits that these are a subset of, and their rows there
         self._drawn: dict[
             tuple[LightSampler, int, int], list[LightPoints]
@@ -91,13 +91,13 @@ class Hits:
             raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
         return self._subset(index, DiscontinuitiesOfSubset(self._discontinuities, index % max(count, 1), count))
 
-    def _subset(self, index: Tensor | slice, steps: Discontinuities | None = None) -> Hits:
-        """Return some of the points, with steps of their own, while select() passes them on to the whole."""
+    def _subset(self, index: Tensor | slice, discontinuities: Discontinuities | None = None) -> Hits:
+        """Return some of the points, with discontinuities of their own, while select() passes them on to the whole."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
         forced = None if self._forced is None else self._forced.select(index)
         place = self._face[index], self._exact[index], pixel
-        some = Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
+        some = Hits(self._surfaces, view, *place, self._rays_at, discontinuities, self._seed[index], forced)
         some._needs_values, some._on_curve = self._needs_values, self._on_curve
         some._near = self._near
         if self._all is None:
@@ -237,7 +237,7 @@ class Hits:
         surface when None.
 
         wrap     beyond the border: "repeat", "clamp" or "mirror", or two of these, for u and for v
-        filter   "linear" between the centres of texels; "nearest", the texel itself, whose borders are steps: see where()
+        filter   "linear" between the centres of texels; "nearest", the texel itself, whose edges are discontinuities: see where()
         mipmap   True: texels are averaged over squares of 2, 4, 8 … so that neighbouring pixels are about a texel apart, linear
                  between two such levels (Williams 1983). Only for hits of a camera
 
@@ -285,7 +285,7 @@ class Hits:
             raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
         return Footprints(self._surfaces, self._view, self._face, self._pixel, self._rays_at).spread()
 
-    # -- steps ---------------------------------------------------------------------------------------------------------
+    # -- discontinuities -----------------------------------------------------------------------------------------------
 
     def where(self, s: Tensor, a: Tensor | float, b: Tensor | float) -> Tensor:
         """Return `a` where s > 0 and `b` elsewhere (N, C). The discontinuity is declared: where it lies has a gradient.

@@ -21,26 +21,26 @@ def barycentrics(
     along the axis go through. With several rays for each face, one after another, the face is the same for each of them.
     """
     tensors = [verts.cpu().double(), world_to_camera.cpu().double(), along.cpu().double(), faces.cpu(), face.cpu()]
-    return apply(_Meeting(perspective), tensors)[0].to(verts.device)
+    return apply(_RayPlaneIntersection(perspective), tensors)[0].to(verts.device)
 
 
 def barycentrics_by(
     verts: Tensor, faces: Tensor, face: Tensor, world_to_camera: Tensor, along: Tensor, by: Tensor, perspective: bool
 ) -> tuple[Tensor, Tensor]:
     """Return barycentrics() and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K), without a graph."""
-    meeting = _Meeting(perspective)
+    intersection = _RayPlaneIntersection(perspective)
 
     def compute(*tensors: Tensor) -> Sequence[Tensor]:
         *moving, by = tensors
-        columns = [meeting.jvp((None, None, column), (), moving) for column in by.unbind(-1)]
-        return meeting.value(moving)[0], torch.stack(columns, -1)
+        columns = [intersection.jvp((None, None, column), (), moving) for column in by.unbind(-1)]
+        return intersection.value(moving)[0], torch.stack(columns, -1)
 
     tensors = (verts.double(), world_to_camera.double(), along.double(), faces, face, by)
     b, by = without_derivatives(compute, *(t.cpu() for t in tensors))
     return b.to(verts.device), by.to(verts.device)
 
 
-class _Meeting(NamedTuple):
+class _RayPlaneIntersection(NamedTuple):
     """csrc/forward/moving_hits.h"""
 
     perspective: bool
@@ -60,16 +60,16 @@ class _Meeting(NamedTuple):
         }
 
     def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
-        return (torch.from_numpy(core.meet(**self._arguments(tensors))),)
+        return (torch.from_numpy(core.barycentrics_of_rays(**self._arguments(tensors))),)
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
-        found = core.meet_vjp(bar=array(bar), wanted=list(wanted), **self._arguments(tensors))
+        found = core.barycentrics_of_rays_vjp(bar=array(bar), wanted=list(wanted), **self._arguments(tensors))
         return [torch.from_numpy(g) for g in found]
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
         names = ("verts_dot", "pose_dot", "along_dot")
         given = {name: doubles(tangent) for name, tangent in zip(names, tangents, strict=True)}
-        return torch.from_numpy(core.meet_jvp(**given, **self._arguments(tensors)))
+        return torch.from_numpy(core.barycentrics_of_rays_jvp(**given, **self._arguments(tensors)))
 
 
 class Form(NamedTuple):

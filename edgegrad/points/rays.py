@@ -43,7 +43,7 @@ def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
     if bool(zero.any()):
         raise ValueError(f"directions: expected lengths above zero, got zeros in row {int(zero.nonzero()[0])}")
     surfaces = Surfaces(scene)
-    found = trace_records(surfaces.bare, given["origins"], d)
+    found = trace_records(surfaces.geometry, given["origins"], d)
     index = (found.face >= 0).nonzero()[:, 0]
     face, index = found.face[index].to(like.device), index.to(like.device)
     rays = Rays(index, given["origins"][index], d[index])

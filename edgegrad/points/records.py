@@ -63,9 +63,7 @@ class CurveRecords(NamedTuple):
     # For borders of shadows alone: the first point is the one in the light, the second the one in the shadow.
     light: Tensor  # (S,) int64, the part of the light
     light_uv: Tensor  # (S, 2) float64, where on it
-    by_light: (
-        Tensor  # (S, 3) float64, by the place in camera coordinates, or by the direction towards a light at infinity
-    )
+    by_light: Tensor  # (S, 3) float64, by place in camera coordinates, or by direction towards a light at infinity
 
 
 class LightParts(NamedTuple):
@@ -79,7 +77,7 @@ class LightParts(NamedTuple):
     two_sided: bool
 
 
-class PlaceRecords(NamedTuple):
+class ImagePointRecords(NamedTuple):
     """Points of surfaces that are seen at places in the image."""
 
     face: Tensor  # (N,) int64, −1: none
@@ -149,12 +147,12 @@ def double_array(tensor: Tensor) -> np.ndarray:
     return tensor.cpu().double().contiguous().numpy()
 
 
-def bare(scene: Scene, blended: bool = True) -> Flat:
+def geometry(scene: Scene, blended: bool = True) -> Flat:
     """Return the surfaces of a scene alone; see flatten()."""
-    return without_colors(flatten(scene, blended=blended))
+    return with_attributes(flatten(scene, blended=blended))
 
 
-def without_colors(flat: Flat, attributes: Tensor | None = None) -> Flat:
+def with_attributes(flat: Flat, attributes: Tensor | None = None) -> Flat:
     """Return the geometry of a scene with these numbers (F, 3, K) for colours."""
     F = len(flat.faces)
     if attributes is not None and attributes.numel():

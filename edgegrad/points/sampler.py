@@ -13,8 +13,8 @@ from torch import Tensor
 from ..kernel import memory as memory
 from ..kernel.derivatives import moves
 from ..kernel.flat import Flat
-from ..kernel.operators import Hits as ImageHits
 from ..kernel.operators import (
+    HitBuffers,
     camera_seed,
     faces_with_textures,
     kernel_camera,
@@ -31,9 +31,9 @@ from .records import (
     CURVE_BYTES,
     SURFACE_BYTES,
     CurveRecords,
+    ImagePointRecords,
     LightParts,
     PixelRecords,
-    PlaceRecords,
     RayRecords,
     SurfaceRecords,
     apply_to_values,
@@ -94,7 +94,7 @@ class Sampler:
         self._kept: tuple[list[Any], Flat, Any] | None = None
         height, width, faces = request.camera.height, request.camera.width, len(request.scene.faces)
         dtype = request.scene.colors.dtype
-        self._hits = ImageHits(
+        self._hits = HitBuffers(
             torch.empty((1, height, width), dtype=dtype),
             torch.empty((1, height, width), dtype=torch.float32),
             torch.empty((1, height, width, 2), dtype=torch.int32),
@@ -186,7 +186,7 @@ class Sampler:
         interior: bool,
         boundary: bool,
         intrinsics: bool = False,
-        steps: bool = False,
+        discontinuities: bool = False,
         lit: Scene | None = None,
         importance: Tensor | None = None,
     ) -> tuple[SurfaceRecords, CurveRecords]:
@@ -209,7 +209,7 @@ class Sampler:
                     interior_geometry=interior,
                     boundary=boundary,
                     intrinsics=intrinsics,
-                    steps=steps,
+                    discontinuities=discontinuities,
                     step_spacing=options.step_spacing,
                     lit=lit is not None,
                 ),
@@ -295,16 +295,16 @@ class Sampler:
             "transparent": self._transparent,
         }
 
-    def hits_at(self, x: Tensor) -> PlaceRecords:
+    def hits_at(self, x: Tensor) -> ImagePointRecords:
         """Return what is seen at places (N, 2) in the image."""
 
-        def compute(request: Request, camera: Any, x: Tensor) -> PlaceRecords:
+        def compute(request: Request, camera: Any, x: Tensor) -> ImagePointRecords:
             found = self._scene(request.scene).hits_at(
                 camera=camera, x=double_array(x), threads=torch.get_num_threads()
             )
-            return record_from(PlaceRecords, found)
+            return record_from(ImagePointRecords, found)
 
-        return PlaceRecords(*self._compute(self._request, compute, x))
+        return ImagePointRecords(*self._compute(self._request, compute, x))
 
     def rays_at(self, x: Tensor, intrinsics: bool = True) -> RayRecords:
         """Return the rays to places (N, 2) in the image, with their derivatives by the intrinsics."""

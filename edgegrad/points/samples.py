@@ -26,14 +26,14 @@ from ..kernel.derivatives import moves
 from ..kernel.request import Request, make_request
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene, as_scene
-from .frame import Frame
 from .hits import Hits
+from .image_context import ImageContext
 from .moving import Form, velocity
-from .records import CurveRecords, SurfaceRecords, without_colors
+from .records import CurveRecords, SurfaceRecords, with_attributes
 from .sampler import shaded_memory
 from .shadow_rays import Forced
 from .shadows import ShadowLight
-from .splat import Term, boundary, splat
+from .splat import SplatTerm, boundary, splat
 from .surfaces import every_face
 
 ALL_AT_ONCE = 1 << 40
@@ -49,15 +49,15 @@ class PrimaryHits:
     """
 
     def __init__(self, scene: Scene, request: Request) -> None:
-        self.frame = frame = Frame(scene, request)
-        ((_, found),) = frame.sampler.pixel_hits(ALL_AT_ONCE)
-        seed = frame.seeds_of_pixels("image", found.pixel, 1)
-        self.hits = frame.moving_hits(found.face, frame.rays_at(found.x), found.x, seed)
-        self.index, self.weight = frame.here(found.pixel), frame.here(found.weight).to(frame.dtype)
-        self.coverage = frame.here(frame.sampler.coverage)
+        self.context = context = ImageContext(scene, request)
+        ((_, found),) = context.sampler.pixel_hits(ALL_AT_ONCE)
+        seed = context.seeds_of_pixels("image", found.pixel, 1)
+        self.hits = context.moving_hits(found.face, context.rays_at(found.x), found.x, seed)
+        self.index, self.weight = context.here(found.pixel), context.here(found.weight).to(context.dtype)
+        self.coverage = context.here(context.sampler.coverage)
 
     def __repr__(self) -> str:
-        return f"PrimaryHits({len(self.hits)} points in {self.frame.height} x {self.frame.width} pixels)"
+        return f"PrimaryHits({len(self.hits)} points in {self.context.height} x {self.context.width} pixels)"
 
     def image(self, radiance: Tensor, background: Tensor | None = None) -> Tensor:
         """Return the image (H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
@@ -66,9 +66,9 @@ class PrimaryHits:
         or ValueError that names the argument.
         """
         radiance = _rows("radiance", radiance, len(self.hits))
-        background = _background(background, radiance, self.frame)
-        sums = self.frame.image(self.index, self.weight.to(radiance.dtype)[:, None] * radiance)
-        return self.frame.composed(sums, background)
+        background = _background(background, radiance, self.context)
+        sums = self.context.image(self.index, self.weight.to(radiance.dtype)[:, None] * radiance)
+        return self.context.composed(sums, background)
 
 
 class SurfaceSamples:
@@ -78,9 +78,9 @@ class SurfaceSamples:
     weight  (S,) px² that each stands for
     """
 
-    def __init__(self, frame: Frame, records: SurfaceRecords, first: int = 0) -> None:
-        self.frame, self._records, self._first = frame, records, first
-        self.weight = frame.here(records.weight)
+    def __init__(self, context: ImageContext, records: SurfaceRecords, first: int = 0) -> None:
+        self.context, self._records, self._first = context, records, first
+        self.weight = context.here(records.weight)
         self._hits: Hits | None = None
 
     def __len__(self) -> int:
@@ -91,13 +91,13 @@ class SurfaceSamples:
 
     def part(self, first: int, end: int) -> SurfaceSamples:
         """Return the samples from `first` to `end`."""
-        return SurfaceSamples(self.frame, SurfaceRecords(*(part[first:end] for part in self._records)), first)
+        return SurfaceSamples(self.context, SurfaceRecords(*(part[first:end] for part in self._records)), first)
 
     @property
     def hits(self) -> Hits:
         if self._hits is None:
-            seed = self.frame.seeds("inside", len(self), self._first)
-            self._hits = self.frame.moving_hits(self._records.face, self._records, self._records.x, seed)
+            seed = self.context.seeds("inside", len(self), self._first)
+            self._hits = self.context.moving_hits(self._records.face, self._records, self._records.x, seed)
         return self._hits
 
     def image(self, radiance: Tensor) -> Tensor:
@@ -105,11 +105,11 @@ class SurfaceSamples:
         areas, so its gradient is the interior term. Raises TypeError or ValueError that names the argument."""
         radiance = _rows("radiance", radiance, len(self))
         weighted = self.weight.to(radiance.dtype)[:, None] * radiance
-        return self.frame.composed(splat(self._records.x, weighted, self.frame.request), None)
+        return self.context.composed(splat(self._records.x, weighted, self.context.request), None)
 
-    def _term(self, radiance: Tensor) -> Term:
+    def _term(self, radiance: Tensor) -> SplatTerm:
         """Return the radiance of the samples as a term of attached()."""
-        return Term(self._records.x, radiance, self._records.weight)
+        return SplatTerm(self._records.x, radiance, self._records.weight)
 
 
 class EdgeSamples:
@@ -124,43 +124,47 @@ class EdgeSamples:
     """
 
     def __init__(
-        self, frame: Frame, records: CurveRecords, light: ShadowLight | None = None, only: bool = False
+        self, context: ImageContext, records: CurveRecords, light: ShadowLight | None = None, only: bool = False
     ) -> None:
         """`light`: the samples lie on borders of its shadow. `only`: all hits are in the light, and what is wanted of them is the
         radiance that it adds."""
-        self.frame, self._records = frame, records
-        self.x = frame.here(records.x)
+        self.context, self._records = context, records
+        self.x = context.here(records.x)
         self._in_order = only and len(records.hit_sample) == len(records.x)  # hit i belongs to sample i
-        self.sample, self._factor = frame.here(records.hit_sample), frame.here(records.hit_factor)
+        self.sample, self._factor = context.here(records.hit_sample), context.here(records.hit_factor)
         of_hits = slice(None) if self._in_order else self.sample
-        self.to_background = frame.here(records.to_background)
+        self.to_background = context.here(records.to_background)
         points = None
         if light is not None:
-            points, share = light.points(frame.here(records.light), frame.here(records.light_uv))
+            points, share = light.points(context.here(records.light), context.here(records.light_uv))
             self._factor, self.to_background = self._factor * share[of_hits], self.to_background * share
         # All sides of a sample draw the same points of lights.
-        seed = frame.seeds("edges" if light is None else "shadows", len(self))[of_hits]
+        seed = context.seeds("edges" if light is None else "shadows", len(self))[of_hits]
         forced = None
         if light is not None and points is not None:
-            lit = frame.here(records.hit_side == 0).to(frame.dtype)
+            lit = context.here(records.hit_side == 0).to(context.dtype)
             some = torch.ones_like(lit, dtype=torch.bool)
             forced = Forced(light.number, points.select(of_hits), lit, some, only)
-        self.hits = frame.fixed_hits(records.hit_face, records.hit_b, records.hit_x, seed, forced=forced)
+        self.hits = context.fixed_hits(records.hit_face, records.hit_b, records.hit_x, seed, forced=forced)
         self.hits._on_curve = True
-        flat = frame.request.scene if light is None else frame.surfaces.casters
+        flat = context.request.scene if light is None else context.surfaces.casters
         forms = [
-            (Form(records.row_of, records.vertex, records.by_q), frame.view.in_camera(frame.surfaces.verts)),
+            (Form(records.row_of, records.vertex, records.by_q), context.view.in_camera(context.surfaces.verts)),
             (Form(records.uv_row_of, records.uv, records.by_uv), flat.uvs),
             (Form(records.alpha_row_of, records.alpha, records.by_alpha[:, None]), flat.alphas[:, :1]),
         ]
         every = torch.arange(len(self))
         if len(records.by_k):
-            forms.append((Form(every, torch.zeros_like(every), records.by_k), frame.intrinsics[None]))
-        if light is not None and points is not None and (moves(frame.view.world_to_camera) or light.moves(light.light)):
+            forms.append((Form(every, torch.zeros_like(every), records.by_k), context.intrinsics[None]))
+        if (
+            light is not None
+            and points is not None
+            and (moves(context.view.world_to_camera) or light.moves(light.light))
+        ):
             place = light.light.place(points).double()
-            place = frame.view.turned(place) if light.light.infinite else frame.view.in_camera(place)
+            place = context.view.turned(place) if light.light.infinite else context.view.in_camera(place)
             forms.append((Form(every, every, records.by_light), place))
-        self.velocity = frame.here(velocity(len(self), forms))
+        self.velocity = context.here(velocity(len(self), forms))
 
     def __len__(self) -> int:
         return len(self.x)
@@ -211,9 +215,9 @@ def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSa
     """
     request = _request_of(primary, "surface_samples", count)
     with shaded_memory(request._replace(gradient=request.gradient._replace(edge_samples=0)), gradient=True):
-        moving = moves(primary.frame.intrinsics)
-        surface, _ = primary.frame.sampler.samples(request, interior=True, boundary=False, intrinsics=moving)
-    return SurfaceSamples(primary.frame, surface)
+        moving = moves(primary.context.intrinsics)
+        surface, _ = primary.context.sampler.samples(request, interior=True, boundary=False, intrinsics=moving)
+    return SurfaceSamples(primary.context, surface)
 
 
 def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool | Tensor = True) -> EdgeSamples:
@@ -227,7 +231,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
     Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
     """
     request = _request_of(primary, "edge_samples", count)
-    F = len(primary.frame.surfaces.faces)
+    F = len(primary.context.surfaces.faces)
     attributes = None
     if isinstance(creases, Tensor):
         check_float("creases", creases)
@@ -238,13 +242,17 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
         attributes = every_face(F)
     elif creases is not False:
         raise TypeError(f"creases: expected True, False or a tensor (F, 3, K), got {type(creases).__name__}")
-    request = request._replace(scene=without_colors(request.scene, attributes))
-    frame = primary.frame
+    request = request._replace(scene=with_attributes(request.scene, attributes))
+    context = primary.context
     with shaded_memory(request._replace(gradient=request.gradient._replace(surface_samples=0)), gradient=True):
-        _, curves = frame.sampler.samples(
-            request, interior=False, boundary=True, intrinsics=moves(frame.intrinsics), steps=request.scene.has_steps
+        _, curves = context.sampler.samples(
+            request,
+            interior=False,
+            boundary=True,
+            intrinsics=moves(context.intrinsics),
+            discontinuities=request.scene.has_discontinuities,
         )
-    return EdgeSamples(frame, curves)
+    return EdgeSamples(context, curves)
 
 
 def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, background: Tensor | None = None) -> Tensor:
@@ -259,20 +267,20 @@ def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, backgroun
     """
     if not isinstance(samples, EdgeSamples):
         raise TypeError(f"samples: expected what edge_samples() returned, got {type(samples).__name__}")
-    frame = samples.frame
+    context = samples.context
     jump = _rows("jump", jump, len(samples)).detach()
     image = as_tensor("image", image, like=jump, floating=True)
     check_float("image", image)
-    check_shape("image", image, (frame.height, frame.width, jump.shape[1]))
-    background = _background(background, jump, frame)
+    check_shape("image", image, (context.height, context.width, jump.shape[1]))
+    background = _background(background, jump, context)
     terms = boundary(samples.x, samples.velocity, jump, samples.to_background, background)
-    return frame.attached(image, terms)
+    return context.attached(image, terms)
 
 
 def _request_of(primary: PrimaryHits, name: str, count: int | None) -> Request:
     if not isinstance(primary, PrimaryHits):
         raise TypeError(f"primary: expected what primary_hits() returned, got {type(primary).__name__}")
-    request = primary.frame.request
+    request = primary.context.request
     if count is None:
         return request
     number = check_positive_int("count", count, most=1 << 40)
@@ -286,10 +294,10 @@ def _rows(name: str, value: Tensor, count: int) -> Tensor:
     return value
 
 
-def _background(background: Tensor | None, like: Tensor, frame: Frame) -> Tensor | None:
+def _background(background: Tensor | None, like: Tensor, context: ImageContext) -> Tensor | None:
     if background is None:
         return None
     background = as_tensor("background", background, like=like, floating=True)
     check_float("background", background)
-    check_shape("background", background, (like.shape[1],), (frame.height, frame.width, like.shape[1]))
+    check_shape("background", background, (like.shape[1],), (context.height, context.width, like.shape[1]))
     return background

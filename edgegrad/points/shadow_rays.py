@@ -11,7 +11,7 @@ from ..scene.lights import Light, LightPoints
 from .surfaces import Surfaces
 
 # Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a light must not hide itself.
-THIN = 2.0**-40
+LEAST_ROUNDING = 2.0**-40
 
 
 class Forced(NamedTuple):
@@ -45,4 +45,4 @@ def seen_from(light: Light, points: LightPoints, surfaces: Surfaces, here: Tenso
         center, radius = surfaces.ball
         return here + place * ((here - center).norm(dim=1, keepdim=True) + 1.01 * radius), 16 * spacing * size
     size = torch.maximum(size, place.abs().amax(1))
-    return place, 16 * (spacing if light.punctual else max(spacing, THIN)) * size
+    return place, 16 * (spacing if light.punctual else max(spacing, LEAST_ROUNDING)) * size

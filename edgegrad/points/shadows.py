@@ -17,7 +17,7 @@ from .surfaces import Surfaces
 
 MOST_FACES = 4096  # of an emissive mesh: if it has more, so many are drawn with each seed
 DIRECTIONS = 1 << 14  # drawn from an environment, to find where it is bright
-SHARES = 12  # no part of an environment holds more than one in so many of these
+LEAST_PARTS_OF_ENVIRONMENT = 12  # no part of an environment holds more than one in so many of these
 
 
 class ShadowLight(NamedTuple):
@@ -84,7 +84,7 @@ def triangles_of(directions: Tensor) -> tuple[Tensor, Tensor]:
     """Return triangles around the origin (L, 3, 3), and (L,) about the share of the unit directions (N, 3) through each.
     They are the faces of an octahedron, divided until no share is large."""
     triangles, chances = [], []
-    most = len(directions) / SHARES
+    most = len(directions) / LEAST_PARTS_OF_ENVIRONMENT
     octant = (directions < 0).long() @ torch.tensor([1, 2, 4])
     for k in range(8):
         signs = torch.tensor([1.0 - 2 * (k >> axis & 1) for axis in range(3)], dtype=torch.float64)

@@ -14,7 +14,7 @@ from ..kernel.request import Request
 from ..library import core
 
 
-class Term(NamedTuple):
+class SplatTerm(NamedTuple):
     """Σ k(x − c) · weight · value over samples, times what is behind, if anything; only its derivatives count."""
 
     x: Tensor  # (S, 2)
@@ -25,15 +25,15 @@ class Term(NamedTuple):
 
 def splat(x: Tensor, values: Tensor, request: Request) -> Tensor:
     """Return Σ k(x − c) · value (H · W, C) over points x (S, 2) with values (S, C), for pixels with centres c."""
-    return apply(_Splat(Film.of(request)), [values, x])[0]
+    return apply(_Splat(Film.from_request(request)), [values, x])[0]
 
 
-def attached(image: Tensor, terms: Sequence[Term], request: Request) -> Tensor:
+def attached(image: Tensor, terms: Sequence[SplatTerm], request: Request) -> Tensor:
     """Return the image (H · W, C), with the derivatives of terms by their values. It has no second derivatives, for how the
     samples' places and visibility change is not known."""
     values = (term.values for term in terms)
     fixed = (part for term in terms for part in (term.x, term.weight, term.behind))
-    return apply(_Attached(Film.of(request), len(terms)), [image, *values, *fixed])[0]
+    return apply(_Attached(Film.from_request(request), len(terms)), [image, *values, *fixed])[0]
 
 
 class Film(NamedTuple):
@@ -42,7 +42,7 @@ class Film(NamedTuple):
     height: int
 
     @classmethod
-    def of(cls, request: Request) -> Film:
+    def from_request(cls, request: Request) -> Film:
         return cls(request.image.filter, request.camera.width, request.camera.height)
 
     def sum(self, x: Tensor | None, values: Tensor) -> Tensor:
@@ -118,11 +118,11 @@ class _Attached(NamedTuple):
 
 def boundary(
     x: Tensor, velocity: Tensor, jump: Tensor, to_background: Tensor | None, background: Tensor | None
-) -> list[Term]:
+) -> list[SplatTerm]:
     """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
     x, velocity = x.detach(), velocity.to(jump.dtype)[:, None]
-    terms = [Term(x, velocity * jump)]
+    terms = [SplatTerm(x, velocity * jump)]
     if background is not None and to_background is not None:
         behind = background.detach().reshape(-1, jump.shape[1]).to(jump)
-        terms.append(Term(x, velocity * to_background.to(jump.dtype)[:, None], behind=behind))
+        terms.append(SplatTerm(x, velocity * to_background.to(jump.dtype)[:, None], behind=behind))
     return terms

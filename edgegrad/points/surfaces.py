@@ -18,7 +18,7 @@ from ..scene.rows import areas, columns, dot, rows_of, scaled, unit
 from ..scene.scene import Scene
 from .moving import barycentrics, barycentrics_by
 from .pyramid import Pyramid
-from .records import bare, values_of
+from .records import geometry, values_of
 
 
 class Surfaces:
@@ -27,8 +27,8 @@ class Surfaces:
     It also notes what a shader asks for: properties that may differ on the two sides of an edge, and shadows.
     """
 
-    def __init__(self, scene: Scene, bare: Flat | None = None) -> None:
-        """`bare`: of bare(), if it was made before."""
+    def __init__(self, scene: Scene, geometry: Flat | None = None) -> None:
+        """`geometry`: of geometry(), if it was made before."""
         meshes = scene.meshes
         first = [sum(len(m.verts) for m in meshes[:k]) for k in range(len(meshes))]
         dtype = max((m.verts.dtype for m in meshes), key=lambda t: torch.finfo(t).bits)
@@ -37,7 +37,7 @@ class Surfaces:
         counts = torch.tensor([len(m.faces) for m in meshes])
         self.mesh_of_face = torch.repeat_interleave(torch.arange(len(meshes)), counts).to(self.verts.device)
         self.scene = scene
-        self._bare = bare
+        self._geometry = geometry
         self.jumping: dict[Any, Callable[[], Tensor]] = {}  # values (F, 3, K) at corners, of properties that may jump
         self.shadowing: set[int] = set()  # lights, by their place in scene.casting, whose shadows a shader asks for
         self.pyramids: dict[int, tuple[Tensor, Pyramid]] = {}  # of textures, by their ids
@@ -50,11 +50,11 @@ class Surfaces:
         """Return the surfaces without derivatives. Both share their notes."""
         other = Surfaces.__new__(Surfaces)
         other.__dict__.update(self.__dict__)
-        for name in ("bare", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
+        for name in ("geometry", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
             other.__dict__.pop(name, None)
-        if self._bare is not None:
-            parts = self._bare._asdict().items()
-            other._bare = self._bare._replace(**{k: v.detach() for k, v in parts if isinstance(v, Tensor)})
+        if self._geometry is not None:
+            parts = self._geometry._asdict().items()
+            other._geometry = self._geometry._replace(**{k: v.detach() for k, v in parts if isinstance(v, Tensor)})
         other.verts, other.scene, other.pyramids, other._tangents = self.verts.detach(), self.scene.detach(), {}, {}
         other.layout, other.has_derivatives, other._moving = None, False, self
         return other
@@ -65,14 +65,14 @@ class Surfaces:
         return [sum(len(m.faces) for m in self.scene.meshes[:k]) for k in range(len(self.scene.meshes))]
 
     @cached_property
-    def bare(self) -> Flat:
+    def geometry(self) -> Flat:
         """For the kernel, without colours."""
-        return bare(self.scene) if self._bare is None else self._bare
+        return geometry(self.scene) if self._geometry is None else self._geometry
 
     @cached_property
     def casters(self) -> Flat:
         """Return the surfaces that shadow rays meet: alpha-blended faces count where their alpha is at least ½."""
-        return bare(self.scene, blended=False) if self.scene.blends else self.bare
+        return geometry(self.scene, blended=False) if self.scene.blends else self.geometry
 
     @cached_property
     def ball(self) -> tuple[Tensor, float]:
@@ -133,10 +133,10 @@ class Surfaces:
         """Return (F, 3, K): all properties that may jump and were asked for, each divided by its largest value."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
         attributes = columns([scaled(p) for p in parts if p.shape[-1]], len(self.faces), self.verts)
-        return _NextToSteps.apply(attributes) if transformed() else attributes
+        return _BatchedAttributes.apply(attributes) if transformed() else attributes
 
 
-class _NextToSteps(torch.autograd.Function):
+class _BatchedAttributes(torch.autograd.Function):
     """Attributes (F, 3, K). Under torch.vmap, those of all elements side by side: these share the samples of one image."""
 
     @staticmethod
@@ -158,7 +158,7 @@ class _NextToSteps(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int, ...], *args: Any) -> tuple[Tensor, None]:
         (attributes,), (batch,) = args, in_dims
-        return _NextToSteps.apply(attributes.movedim(batch, -1).flatten(2)), None
+        return _BatchedAttributes.apply(attributes.movedim(batch, -1).flatten(2)), None
 
 
 def every_face(count: int) -> Tensor:
@@ -167,7 +167,7 @@ def every_face(count: int) -> Tensor:
     return (torch.arange(count).double() * 0.6180339887498949 % 1 + 0.5)[:, None, None].expand(-1, 3, 1)
 
 
-def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
+def intersect_planes(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
     """Return (N, 3) barycentrics where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
     e1, e2, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
     p, q = torch.linalg.cross(direction, e2), torch.linalg.cross(s, e1)
@@ -176,14 +176,14 @@ def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
     return torch.stack([1 - u - v, u, v], 1)
 
 
-class View:
+class CameraView:
     """A camera's view: points in its coordinates, and where its rays meet faces."""
 
     def __init__(self, world_to_camera: Tensor, perspective: bool) -> None:
         self.world_to_camera, self.perspective = world_to_camera, perspective  # (4, 4) float64
 
-    def detach(self) -> View:
-        return View(self.world_to_camera.detach(), self.perspective)
+    def detach(self) -> CameraView:
+        return CameraView(self.world_to_camera.detach(), self.perspective)
 
     def in_camera(self, points: Tensor) -> Tensor:
         """Return world points (..., 3) in camera coordinates, float64."""
@@ -196,13 +196,13 @@ class View:
     def barycentrics(self, surfaces: Surfaces, face: Tensor, along: Tensor) -> Tensor:
         """Return (N, 3) where rays meet the planes of faces. `along` (N, 3): the directions of rays from the eye in camera
         coordinates, or, in an orthographic view, points that rays along the axis go through."""
-        bare = surfaces.bare
-        return barycentrics(bare.verts, bare.faces, face, self.world_to_camera, along, self.perspective)
+        flat = surfaces.geometry
+        return barycentrics(flat.verts, flat.faces, face, self.world_to_camera, along, self.perspective)
 
     def barycentrics_by(self, surfaces: Surfaces, face: Tensor, along: Tensor, by: Tensor) -> tuple[Tensor, Tensor]:
         """Return barycentrics() and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K)."""
-        bare = surfaces.bare
-        return barycentrics_by(bare.verts, bare.faces, face, self.world_to_camera, along, by, self.perspective)
+        flat = surfaces.geometry
+        return barycentrics_by(flat.verts, flat.faces, face, self.world_to_camera, along, by, self.perspective)
 
     def depth(self, points: Tensor) -> Tensor:
         """Return (N,) along the axis."""
@@ -231,7 +231,7 @@ class Rays(NamedTuple):
 
     def barycentrics(self, corners: Tensor, b: Tensor) -> Tensor:
         """Return the barycentrics b (N, 3) of hits, as functions of the corners (N, 3, 3) and the rays."""
-        moved = meet(corners, self.origin, self.direction)
+        moved = intersect_planes(corners, self.origin, self.direction)
         return b + (moved - moved.detach())
 
     def depth(self, points: Tensor) -> Tensor:

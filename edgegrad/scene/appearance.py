@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from ..library import core
 from .material import Parameter, Texture
-from .mesh import PLAIN, Mesh
+from .mesh import DEFAULT_RADIANCE, Mesh
 from .mikktspace import tangents
 from .rows import columns, rows_of, scaled, unit
 from .textures import look_up
@@ -79,7 +79,7 @@ class OnMesh(NamedTuple):
         own = self.color()
         of_material = None if self.mesh.material is None else self.mesh.material.base_color
         if of_material is None:
-            return self.b.new_full((1, 1), PLAIN) if own is None else own
+            return self.b.new_full((1, 1), DEFAULT_RADIANCE) if own is None else own
         factor = self.value(of_material)
         return factor if own is None else own * factor
 

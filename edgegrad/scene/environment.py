@@ -16,7 +16,7 @@ from .lights import Light, LightPoints
 from .material import numbers
 from .textures import adjacent
 
-EVEN = 0.1  # the share of points of a light that is drawn evenly, so that what is dark has a gradient too
+UNIFORM_SHARE = 0.1  # the share of points of a light that is drawn evenly, so that what is dark has a gradient too
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class Environment(Light):
         too."""
         mean = (self._magnitude * self._solid_angles).sum() / (4 * math.pi)
         mean = torch.where(mean > 0, mean, 1.0)
-        return ((1 - EVEN) * self._magnitude + EVEN * mean).reshape(-1)
+        return ((1 - UNIFORM_SHARE) * self._magnitude + UNIFORM_SHARE * mean).reshape(-1)
 
     @cached_property
     def _table(self) -> tuple[Tensor, Tensor]:
@@ -107,7 +107,7 @@ class Environment(Light):
             power = image * angle
             total = float(power.sum())
             share = angle / (4 * math.pi)
-            chance = (1 - EVEN) * power / total + EVEN * share if total > 0 else share
+            chance = (1 - UNIFORM_SHARE) * power / total + UNIFORM_SHARE * share if total > 0 else share
             return chance.reshape(-1).cumsum(0), (chance / angle).reshape(-1)
 
     def draw(self, u: Tensor) -> LightPoints:

@@ -18,20 +18,20 @@ from torch import Tensor
 
 from ..check import check_flag, check_int, check_positive
 from .mesh import Mesh
-from .nearest import NEIGHBOURS, Places, SurfaceIndex
+from .nearest import NEIGHBOURS, NearestPoints, SurfaceIndex
 from .scene import Scene, as_scene
 from .symmetries import Symmetries, SymmetryAxis, about
 
-SAMPLES = 600  # of the surface, and as many vertices, whose distances decide
-ROUGH = 120  # of these for what only ranks candidates
+DECIDING_SAMPLES = 600  # of the surface, and as many vertices, whose distances decide
+RANKING_SAMPLES = 120  # of these for what only ranks candidates
 TURNS = 24  # of a rotation about an axis, by which it counts as continuous
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))  # multiples of this angle are evenly spread
 GRID = 600  # rotations of the grid over all, some 25° apart
-REFINED = 16  # of these, the best that are not NEAR a symmetry that is known, refined
-NEAR = math.radians(30.0)
-STEPS = 12  # of iterated closest points
-LONGEST = 0.3  # radians of such a step
-FEWER = 4  # faces near a point that are looked at in the first half of these
+REFINED_ROTATIONS = 16  # of these, refined: the best at least DISTINCT_ROTATION from known symmetries
+DISTINCT_ROTATION = math.radians(30.0)
+ICP_STEPS = 12  # of iterated closest points
+LONGEST_STEP = 0.3  # radians of such a step
+FEWER_NEIGHBOURS = 4  # faces near a point that are looked at in the first half of these
 SMALLEST_POLYHEDRAL, LARGEST_POLYHEDRAL = 12, 60  # rotations of the tetrahedron and of the icosahedron
 LARGEST_GROUP = 144
 ODD_COLORS = 0.01  # share of the points whose colours may differ: at the borders of texels
@@ -87,14 +87,14 @@ class _SymmetrySearch:
     def __post_init__(self) -> None:
         surface = self.surface
         self.center, self.variances, self.axes = _moments(surface.triangles, surface.area)
-        samples = surface.samples(SAMPLES, seed=0)
+        samples = surface.samples(DECIDING_SAMPLES, seed=0)
         corners = np.unique(surface.triangles.reshape(-1, 3), axis=0)
-        corners = corners[np.linspace(0, len(corners) - 1, min(SAMPLES, len(corners))).round().astype(int)]
+        corners = corners[np.linspace(0, len(corners) - 1, min(DECIDING_SAMPLES, len(corners))).round().astype(int)]
         self.points = np.concatenate([samples.position, corners]) - self.center
         farthest = np.linalg.norm(surface.triangles.reshape(-1, 3) - self.center, axis=1).max()
         self.size = 2.0 * float(farthest)
         self.limit = self.tolerance * self.size
-        self.few = samples.position[:: SAMPLES // ROUGH] - self.center
+        self.few = samples.position[:: DECIDING_SAMPLES // RANKING_SAMPLES] - self.center
         colors = surface.colors(samples) if self.textured else None
         self.brightest = 1.0 if colors is None else max(float(colors.max()), 1e-30)
         self.colors = None if colors is None else self._seen(colors)
@@ -145,7 +145,9 @@ class _SymmetrySearch:
             return False
         if self.colors is None:
             return True
-        colors = self.surface.colors(Places(there.position[:SAMPLES], there.face[:SAMPLES], there.b[:SAMPLES]))
+        colors = self.surface.colors(
+            NearestPoints(there.position[:DECIDING_SAMPLES], there.face[:DECIDING_SAMPLES], there.b[:DECIDING_SAMPLES])
+        )
         assert colors is not None
         odd = (self._seen(colors) - self.colors).abs().amax(1) > self.color_tolerance
         return float(odd.double().mean()) <= ODD_COLORS
@@ -199,13 +201,13 @@ class _SymmetrySearch:
         order = np.argsort(self._rough(grid), kind="stable")
         tried = 0
         for R in grid[order]:
-            if tried == REFINED or len(group) >= LARGEST_POLYHEDRAL:
+            if tried == REFINED_ROTATIONS or len(group) >= LARGEST_POLYHEDRAL:
                 break
-            if self._nearest_in(R, group) < NEAR:  # they lead to what is known
+            if self._nearest_in(R, group) < DISTINCT_ROTATION:  # they lead to what is known
                 continue
             tried += 1
             R = self._refined(R)
-            if self._nearest_in(R, group) < NEAR / 2 or not self._maps(R):
+            if self._nearest_in(R, group) < DISTINCT_ROTATION / 2 or not self._maps(R):
                 continue
             axis, _ = _axis_angle(R)
             if self._continuous(axis):
@@ -221,19 +223,19 @@ class _SymmetrySearch:
     def _refined(self, R: np.ndarray) -> np.ndarray:
         """Take Gauss-Newton steps on the distances to the planes of the nearest faces, about the centroid. They stop where they
         do not lead near a symmetry."""
-        for k in range(STEPS):
+        for k in range(ICP_STEPS):
             turned = self.few @ R.T
-            there = self.surface.nearest(turned + self.center, FEWER if k < STEPS // 2 else NEIGHBOURS)
+            there = self.surface.nearest(turned + self.center, FEWER_NEIGHBOURS if k < ICP_STEPS // 2 else NEIGHBOURS)
             n = self.surface.normal[there.face]
             residual = (n * (turned + self.center - there.position)).sum(1)
-            if k == STEPS // 3 and np.sqrt((residual**2).mean()) > 2.0 * self.limit:
+            if k == ICP_STEPS // 3 and np.sqrt((residual**2).mean()) > 2.0 * self.limit:
                 break
             J = np.cross(turned, n)
             damping = 1e-9 * np.trace(J.T @ J) * np.eye(3)
             step = -np.linalg.solve(J.T @ J + damping, J.T @ residual)
             length = float(np.linalg.norm(step))
             if length > 0.0:
-                R = _turn(step / length, min(length, LONGEST)) @ R
+                R = _turn(step / length, min(length, LONGEST_STEP)) @ R
         return R
 
     # -- what they make together -----------------------------------------------------------------------------------------

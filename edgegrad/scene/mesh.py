@@ -26,7 +26,7 @@ from .affine import Affine
 from .material import LARGEST_UV, LOOKUPS, Material, Texture, checked_wrap
 from .tree import map_tensors, moved
 
-PLAIN = 0.7  # radiance, or base colour, of a mesh without colours, in every channel
+DEFAULT_RADIANCE = 0.7  # radiance, or base colour, of a mesh without colours, in every channel
 FILTERS: tuple[str, ...] = core.TEXTURE_FILTERS  # linear, nearest
 _SETTINGS = ("alpha_cutoff", "wrap", "filter", "material", "name")  # fields that are no tensors
 _INDEXING = ("verts", "faces", "uv_faces", "normal_faces")  # what takes no type from the vertices

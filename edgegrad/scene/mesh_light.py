@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from .appearance import OnMesh, coordinates
-from .environment import EVEN, pick
+from .environment import UNIFORM_SHARE, pick
 from .lights import Light, LightPoints
 from .material import Texture
 from .mesh import Mesh
 from .rows import areas, dot, unit
-from .texel_borders import TexelBorders
+from .texel_edges import TexelEdges
 
 
 class MeshLight(Light):
@@ -23,7 +23,7 @@ class MeshLight(Light):
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self._borders: tuple[TexelBorders | None] | None = None  # once they were asked for
+        self._texel_edges: tuple[TexelEdges | None] | None = None  # once they were asked for
 
     def __repr__(self) -> str:
         return f"MeshLight({self.mesh!r})"
@@ -57,7 +57,9 @@ class MeshLight(Light):
         with torch.no_grad():
             area, power = self._powers
             share = area / area.sum() if float(area.sum()) > 0 else torch.full_like(area, 1 / len(area))
-            chance = (1 - EVEN) * power / power.sum() + EVEN * share if float(power.sum()) > 0 else share
+            chance = (
+                (1 - UNIFORM_SHARE) * power / power.sum() + UNIFORM_SHARE * share if float(power.sum()) > 0 else share
+            )
             return chance.cumsum(0), torch.where(area > 0, chance / torch.where(area > 0, area, 1.0), 0.0)
 
     @cached_property
@@ -131,7 +133,7 @@ class MeshLight(Light):
         return emission if isinstance(emission, Texture) else None
 
     @property
-    def has_borders(self) -> bool:
+    def has_texel_edges(self) -> bool:
         """Return whether its emission is that of the nearest texel."""
         return self.texture is not None and self.texture.filter == "nearest"
 
@@ -139,12 +141,12 @@ class MeshLight(Light):
     def coordinates(self) -> Tensor:
         return coordinates(self.mesh, self.texture)[0]
 
-    def borders(self, u: tuple[float, float]) -> TexelBorders | None:
-        """Return borders between the texels of its emission, where there are jumps; u picks some of too many, the first
+    def texel_edges(self, u: tuple[float, float]) -> TexelEdges | None:
+        """Return the texel edges of its emission, where there are jumps; u picks some of too many, the first
         time."""
-        if self._borders is None:
+        if self._texel_edges is None:
             assert self.texture is not None
             with torch.no_grad():
                 face = torch.arange(len(self.mesh.faces), device=self.mesh.verts.device)
-                self._borders = (TexelBorders.from_mesh(self.mesh, self.texture, self._area(face).norm(dim=1), u),)
-        return self._borders[0]
+                self._texel_edges = (TexelEdges.from_mesh(self.mesh, self.texture, self._area(face).norm(dim=1), u),)
+        return self._texel_edges[0]

@@ -16,7 +16,7 @@ DENSE = 20_000  # samples in the tree
 NEIGHBOURS = 12  # faces that are looked at exactly: those of so many samples that are nearest to a point
 
 
-class Places(NamedTuple):
+class NearestPoints(NamedTuple):
     position: np.ndarray  # (N, 3) float64
     face: np.ndarray  # (N,) int64, counted through all meshes
     b: np.ndarray  # (N, 3) float64, barycentrics
@@ -43,7 +43,7 @@ class SurfaceIndex:
         self._tree = spatial.cKDTree(np.concatenate([dense.position, self.triangles.mean(1)]))
         self._face = np.concatenate([dense.face, np.arange(len(self.triangles))])
 
-    def samples(self, count: int, seed: int) -> Places:
+    def samples(self, count: int, seed: int) -> NearestPoints:
         """Return points evenly over the area; the same seed gives the same points."""
         total = self.area.sum()
         if not total > 0.0:
@@ -54,13 +54,13 @@ class SurfaceIndex:
         face = np.minimum(np.searchsorted(np.cumsum(self.area), share, side="right"), len(self.area) - 1)
         u, v = np.sqrt(random.random(count)), random.random(count)
         b = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=1)
-        return Places(np.einsum("nk,nkd->nd", b, self.triangles[face]), face, b)
+        return NearestPoints(np.einsum("nk,nkd->nd", b, self.triangles[face]), face, b)
 
     def rough_distance(self, points: np.ndarray) -> np.ndarray:
         """Return distances (…,) from points (…, 3) to the nearest sample: too large by up to about the spacing of samples."""
         return self._tree.query(points.reshape(-1, 3))[0].reshape(points.shape[:-1])
 
-    def nearest(self, points: np.ndarray, neighbours: int = NEIGHBOURS) -> Places:
+    def nearest(self, points: np.ndarray, neighbours: int = NEIGHBOURS) -> NearestPoints:
         """Return the nearest points of the surface to points (N, 3)."""
         from trimesh.triangles import closest_point, points_to_barycentric
 
@@ -79,9 +79,9 @@ class SurfaceIndex:
         with np.errstate(all="ignore"):
             b = points_to_barycentric(self.triangles[face], position, method="cross")
         b = np.where(np.isfinite(b).all(1, keepdims=True), b, 1.0 / 3.0)  # of faces without area
-        return Places(position, face, np.clip(b, 0.0, 1.0))
+        return NearestPoints(position, face, np.clip(b, 0.0, 1.0))
 
-    def colors(self, places: Places) -> Tensor | None:
+    def colors(self, places: NearestPoints) -> Tensor | None:
         """Return radiance (N, C) float64, or base colours of lit meshes; None where no mesh has any."""
         if all(mesh.channels is None for mesh in self.meshes):
             return None

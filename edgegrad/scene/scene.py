@@ -109,6 +109,11 @@ class Scene:
                     )
                 meshes = (*meshes, light)
             elif isinstance(light, Light) and not isinstance(light, MeshLight):
+                if not dataclasses.is_dataclass(light):
+                    raise TypeError(
+                        f"lights[{i}]: expected a light whose class is a dataclass, for its fields are what gets gradients, got "
+                        f"{type(light).__name__}; write @dataclass(frozen=True, eq=False) above the class"
+                    )
                 own.append(light)
             else:
                 raise TypeError(

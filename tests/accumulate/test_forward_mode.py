@@ -203,7 +203,7 @@ def test_all_directions_take_one_pass(monkeypatch):
 
 
 def test_more_directions_than_memory(monkeypatch):
-    monkeypatch.setattr(memory, "LOOK_FROM", 0)
+    monkeypatch.setattr(memory, "CHECKED_FROM", 0)
     monkeypatch.setattr(memory, "available", lambda: 20_000_000)
     with pytest.raises(MemoryError, match=r"jvp: .*\(samples in pixels 3.* GB.*ask for fewer directions"):
         eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(2000, 3, 3, dtype=F64)}, 4)

@@ -15,7 +15,7 @@ from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangl
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
-from edgegrad.scene.mesh import PLAIN, Mesh
+from edgegrad.scene.mesh import DEFAULT_RADIANCE, Mesh
 from edgegrad.scene.scene import Scene
 
 pytestmark = pytest.mark.unsanitized
@@ -349,8 +349,8 @@ def test_background_image_fills_what_is_not_covered(filter: str) -> None:
     background = random(12, 16, 3).abs()
     mesh = cube().replace(colors=None)
     white = reference.render(Scene(mesh, torch.ones(3, dtype=torch.float64)), camera, 4, filter)
-    coverage = (1.0 - white) / (1.0 - PLAIN)
-    expected = PLAIN * coverage + (1.0 - coverage) * background
+    coverage = (1.0 - white) / (1.0 - DEFAULT_RADIANCE)
+    expected = DEFAULT_RADIANCE * coverage + (1.0 - coverage) * background
     torch.testing.assert_close(reference.render(Scene(mesh, background), camera, 4, filter), expected)
     if filter == "box":
         exact = exact_image(Scene(mesh, background), camera)

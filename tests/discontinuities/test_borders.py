@@ -12,7 +12,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from benchmarks.stability.painted import PAINTED
-from edgegrad.points import borders
+from edgegrad.points import discontinuous_pixels
 
 pytestmark = pytest.mark.quick
 
@@ -34,7 +34,7 @@ def images(
 
 def without_borders(monkeypatch: pytest.MonkeyPatch) -> None:
     nowhere = torch.zeros((SIZE, SIZE), dtype=torch.bool)
-    monkeypatch.setattr(borders.Borders, "found", lambda self: (nowhere, 1))
+    monkeypatch.setattr(discontinuous_pixels.DiscontinuousPixels, "found", lambda self: (nowhere, 1))
 
 
 def dots(hits: eg.Hits) -> Tensor:

@@ -174,7 +174,7 @@ def test_steps_that_differ_within_a_batch_are_refused():
     ones, zeros = torch.ones((2, 3), dtype=F64), torch.zeros(2, dtype=F64)
     assert torch.equal(*torch.vmap(image, (None, 0))(zeros[0], ones))
     with pytest.raises(
-        RuntimeError, match=r"torch\.vmap: expected declared steps that are the same for all of a batch"
+        RuntimeError, match=r"torch\.vmap: expected declared discontinuities that are the same for all of a batch"
     ):
         torch.vmap(image, (0, None))(zeros, ones[0])
 

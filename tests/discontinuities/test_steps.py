@@ -345,7 +345,7 @@ def test_same_bits_at_any_number_of_threads():
 def test_plan_says_what_is_looked_for():
     def of(mesh: eg.Mesh, what: str, **options: object) -> Term:
         mesh = mesh.replace(**{what: getattr(mesh, what).clone().requires_grad_()})
-        return eg.plan(mesh, CAMERA, **options)["steps"]
+        return eg.plan(mesh, CAMERA, **options)["discontinuities"]
 
     for mesh, what in ((cut(), "verts"), (cut(), "uvs"), (cut(), "alpha"), (board(), "uvs")):
         assert of(mesh, what).on

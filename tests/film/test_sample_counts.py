@@ -23,7 +23,7 @@ from torch_scenes import (
 
 import edgegrad as eg
 from edgegrad.kernel.flat import flatten
-from edgegrad.kernel.operators import Hits, kernel_camera, kernel_channels, kernel_hits, kernel_scene
+from edgegrad.kernel.operators import HitBuffers, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad.kernel.request import make_request, pack_camera
 from edgegrad.library import core
 
@@ -35,7 +35,7 @@ def relative_error(a: Tensor, b: Tensor) -> float:
 def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = True) -> tuple[int, int]:
     """What the kernel says it drew for the triangle's vertices."""
     # All pixels covered by many samples, so that no budget binds; nothing is occluded.
-    hits = Hits(
+    hits = HitBuffers(
         torch.ones(1, SIZE, SIZE, dtype=F64),
         torch.full((1, SIZE, SIZE), torch.inf),
         torch.zeros((1, SIZE, SIZE, 2), dtype=torch.int32),

@@ -14,7 +14,7 @@ def free(monkeypatch):
     """Sets how many bytes are free; renders of any size ask for it."""
 
     def set_free(count):
-        monkeypatch.setattr(memory, "LOOK_FROM", 0)
+        monkeypatch.setattr(memory, "CHECKED_FROM", 0)
         monkeypatch.setattr(memory, "available", lambda: count)
 
     return set_free
@@ -85,7 +85,7 @@ def test_a_backward_pass_that_does_not_fit(kind, free):
 def test_kept_geometry_makes_room(monkeypatch):
     """Other meshes' ray structures are given up before a render is refused."""
     counts = iter([1_000_000, 100_000_000])
-    monkeypatch.setattr(memory, "LOOK_FROM", 0)
+    monkeypatch.setattr(memory, "CHECKED_FROM", 0)
     monkeypatch.setattr(memory, "available", lambda: next(counts))
     forgotten = []
     monkeypatch.setattr(memory, "clear_geometry", lambda: forgotten.append(True))

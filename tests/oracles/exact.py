@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from edgegrad.camera.camera import Camera
-from edgegrad.scene.mesh import PLAIN, Mesh
+from edgegrad.scene.mesh import DEFAULT_RADIANCE, Mesh
 from edgegrad.scene.scene import Scene
 
 # Pixels. A point this close to a line counts as on it: above the rounding of coordinates (1e-14), far below anything
@@ -237,7 +237,7 @@ def corner_colors(mesh: Mesh, channels: int) -> Tensor:
         return mesh.corner_colors.double()
     if mesh.face_colors is not None:
         return mesh.face_colors.double()[:, None].expand(-1, 3, -1)
-    return torch.full((len(mesh.faces), 3, channels), PLAIN, dtype=torch.float64)
+    return torch.full((len(mesh.faces), 3, channels), DEFAULT_RADIANCE, dtype=torch.float64)
 
 
 def _barycentrics(edges: Tensor, x: Tensor) -> Tensor:

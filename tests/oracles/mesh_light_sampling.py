@@ -13,7 +13,7 @@ from torch import Tensor
 from edgegrad.light.bsdf import dot
 from edgegrad.light.sampling import hides, least_brightness, tree_of
 from edgegrad.points.records import values_of
-from edgegrad.points.shadow_rays import THIN
+from edgegrad.points.shadow_rays import LEAST_ROUNDING
 from edgegrad.scene.lights import LightPoints
 from edgegrad.scene.mesh_light import MeshLight
 from edgegrad.scene.rows import unit
@@ -26,7 +26,7 @@ FARTHEST_LOBE = 4.0  # between them, in half angles of the lobe
 SMALLEST_EMITTER = 0.1  # solid angle over that of a lobe, below which points of a flat light are interchangeable
 
 
-class MeshTowards(NamedTuple):
+class EmissiveMeshSampler(NamedTuple):
     """A light as N points of surfaces meet it, without derivatives, in float64."""
 
     light: MeshLight
@@ -35,16 +35,16 @@ class MeshTowards(NamedTuple):
     contact: Tensor  # (N,) distance within which nothing hides it
 
     @classmethod
-    def of(cls, light: MeshLight, position: Tensor, own: Tensor) -> MeshTowards:
+    def of(cls, light: MeshLight, position: Tensor, own: Tensor) -> EmissiveMeshSampler:
         size = position.abs().amax(1).clamp(min=tree_of(light).ball[4])
-        spacing = max(torch.finfo(light.mesh.verts.dtype).eps, THIN)
+        spacing = max(torch.finfo(light.mesh.verts.dtype).eps, LEAST_ROUNDING)
         return cls(light, position, own, 32 * spacing * size)
 
-    def select(self, rows: Tensor) -> MeshTowards:
-        return MeshTowards(self.light, *(part[rows] for part in self[1:]))
+    def select(self, rows: Tensor) -> EmissiveMeshSampler:
+        return EmissiveMeshSampler(self.light, *(part[rows] for part in self[1:]))
 
-    def repeated(self, times: int) -> MeshTowards:
-        return MeshTowards(self.light, *(part.repeat_interleave(times, 0) for part in self[1:]))
+    def repeated(self, times: int) -> EmissiveMeshSampler:
+        return EmissiveMeshSampler(self.light, *(part.repeat_interleave(times, 0) for part in self[1:]))
 
     def _ball(self) -> tuple[Tensor, Tensor]:
         """(N, 1) the sine of half the angle of a ball around the light, 1 inside of it; (N, 3) the direction to its middle."""

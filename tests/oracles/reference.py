@@ -25,7 +25,7 @@ from torch import Tensor
 
 from edgegrad.camera.camera import Camera
 from edgegrad.light.radiance import check_unlit
-from edgegrad.scene.mesh import PLAIN, Mesh
+from edgegrad.scene.mesh import DEFAULT_RADIANCE, Mesh
 from edgegrad.scene.scene import Scene
 
 BLOCK = 128  # image points that are tested against all faces at once
@@ -180,7 +180,7 @@ def _corner_values(mesh: Mesh, channels: int, faces: Tensor) -> Tensor:
         return mesh.corner_colors.double()[faces]
     if mesh.face_colors is not None:
         return mesh.face_colors.double()[faces][:, None].expand(-1, 3, -1)
-    return torch.full((len(faces), 3, channels), PLAIN, dtype=torch.float64)
+    return torch.full((len(faces), 3, channels), DEFAULT_RADIANCE, dtype=torch.float64)
 
 
 def _corner_uvs(mesh: Mesh, faces: Tensor) -> Tensor:

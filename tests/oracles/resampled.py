@@ -13,14 +13,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from edgegrad.light.bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
-from edgegrad.light.sampling import DARK, EACH, MOST_SETS, SET_SIZE, SETS
+from edgegrad.light.sampling import CANDIDATES_FOR_ONE, DARK, MOST_SETS, SET_SIZE, SETS
 from edgegrad.points.sobol import key_of, sobol
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import Light, LightPoints
 
 from .antithetic import antithetic_set, seen_aside
 from .lobes import Lobes, sobol_parts
-from .mesh_light_sampling import MeshTowards
+from .mesh_light_sampling import EmissiveMeshSampler
 
 AT_ONCE = 1 << 19  # candidates
 
@@ -66,7 +66,12 @@ class Glossy(NamedTuple):
 
 
 def resampled(
-    light: Light, stream: int, surfaces: Glossy, count: int, meets: MeshTowards | None = None, antithetic: bool = False
+    light: Light,
+    stream: int,
+    surfaces: Glossy,
+    count: int,
+    meets: EmissiveMeshSampler | None = None,
+    antithetic: bool = False,
 ) -> list[LightPoints]:
     """`count` points for each surface, from random numbers of a stream. Where nothing arrives their density is infinite.
     Surfaces `meets` a mesh that emits; an environment is everywhere the same.
@@ -88,7 +93,7 @@ def resampled(
         interchangeable = torch.zeros_like(asked) if meets is None else meets.interchangeable(lobes)
         by_ball = torch.zeros_like(asked) if meets is None else meets.is_drawn_by_ball(lobes)
         for kept, few, ask_lobe, ball in itertools.product(keeps.unique().tolist(), *[(False, True)] * 3):
-            all = kept if few else EACH * kept
+            all = kept if few else CANDIDATES_FOR_ONE * kept
             rows_ = every[(keeps == kept) & (interchangeable == few) & (asked == ask_lobe) & (by_ball == ball)]
             for rows in rows_.split(max(1, AT_ONCE // (all * together))) if len(rows_) else ():
                 some = None if meets is None else meets.select(rows)
@@ -116,7 +121,7 @@ class _Drawn(NamedTuple):
     stream: int
     surfaces: Glossy
     lobes: Lobes
-    meets: MeshTowards | None
+    meets: EmissiveMeshSampler | None
     by_ball: bool  # around the mesh
     together: int  # K directions in each
 

@@ -19,7 +19,7 @@ from edgegrad.scene.lights import Light, LightPoints, SphericalHarmonics
 from edgegrad.scene.material import Material
 from edgegrad.scene.mesh_light import MeshLight
 
-from .mesh_light_sampling import MeshTowards
+from .mesh_light_sampling import EmissiveMeshSampler
 from .resampled import Glossy, resampled
 
 
@@ -81,7 +81,11 @@ def _points_of(hits: Hits, light: Light, count: int, surface: ShadedPoints) -> l
         first_faces, meshes = hits._surfaces.first_faces, hits._surfaces.scene.meshes
         first = next(first for first, mesh in zip(first_faces, meshes, strict=True) if mesh is light.mesh)
         return resampled(
-            light, index, glossy, count, MeshTowards.of(light, surface.position.detach().double(), hits._face - first)
+            light,
+            index,
+            glossy,
+            count,
+            EmissiveMeshSampler.of(light, surface.position.detach().double(), hits._face - first),
         )
     if hits._needs_values:
         return resampled(light, index, glossy, count)

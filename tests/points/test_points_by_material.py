@@ -15,7 +15,7 @@ import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel
 from edgegrad.light.bsdf import Scattering
-from edgegrad.points.frame import Frame
+from edgegrad.points.image_context import ImageContext
 
 pytestmark = pytest.mark.quick
 
@@ -40,7 +40,7 @@ def leaves() -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("light", [0, 1], ids=["sky", "emitter"])
 def test_the_kernel_draws_what_pytorch_draws(light: int):
-    frame = Frame(scene(**leaves()), make_request(scene(**leaves()), CAMERA, 2, 0))
+    frame = ImageContext(scene(**leaves()), make_request(scene(**leaves()), CAMERA, 2, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
     seed = frame.seeds("image", len(found.face))
     hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)

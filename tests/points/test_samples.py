@@ -180,7 +180,7 @@ def views() -> dict[str, eg.Camera]:
 def test_places_show_what_pixels_do(view: str):
     """What is seen at a place, and the ray that goes there and its derivative by the place, next to the hits of an image."""
     primary = eg.primary_hits(ball(1), views()[view], spp=4)
-    hits, frame = primary.hits, primary.frame
+    hits, frame = primary.hits, primary.context
     x = hits.pixel
     places = frame.sampler.hits_at(x)
     assert float((places.face == hits.face).double().mean()) > 0.999

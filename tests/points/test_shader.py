@@ -554,7 +554,7 @@ def test_in_parts_of_bounded_size(monkeypatch: pytest.MonkeyPatch):
 
     whole, most = gradients(), max(sizes)
     sizes.clear()
-    monkeypatch.setattr("edgegrad.shader.AT_ONCE", 128)
+    monkeypatch.setattr("edgegrad.shader.POINTS_AT_ONCE", 128)
     for a, b in zip(gradients(), whole, strict=True):
         assert torch.allclose(a, b, rtol=1e-6, atol=1e-9 * float(b.abs().max()))
     assert max(sizes) <= 1024 < most  # rows of an image are whole

@@ -286,7 +286,7 @@ def test_shader(lens: str) -> None:
     primary = eg.primary_hits(scene, view.replace(K=view.K.clone().requires_grad_()))
     samples = eg.edge_samples(primary, creases=False)
     assert len(samples) > 500 and len(samples.hits) == len(samples)
-    assert bool(primary.frame.sampler.rays_at(samples.x).along.isfinite().all())
+    assert bool(primary.context.sampler.rays_at(samples.x).along.isfinite().all())
 
 
 # -- where it costs nothing ---------------------------------------------------------------------------------------------

@@ -485,12 +485,12 @@ def test_profile_of_a_lit_scene():
         "samples",
         "surface shading",
         "edge shading",
-        "steps",
+        "discontinuities",
         "shadows",
         "backward",
         "python",
     ]
-    assert all((seconds > 0) == (name != "steps") for name, seconds in found.items())
+    assert all((seconds > 0) == (name != "discontinuities") for name, seconds in found.items())
     assert found.samples["image_samples"] == eg.plan(scene, CAMERA, 4)["image"].samples
     assert min(found.samples[name] for name in ("surface_samples", "edge_samples", "shadow_samples")) > 0
     unshadowed = eg.profile(scene, CAMERA, spp=4, repeats=1, shadows=False).samples

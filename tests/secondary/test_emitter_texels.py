@@ -11,7 +11,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.light.radiance import declare_texel_edges
-from edgegrad.scene import texel_borders
+from edgegrad.scene import texel_edges
 from edgegrad.scene.lights import LightPoints
 from edgegrad.scene.mesh_light import MeshLight
 
@@ -164,7 +164,7 @@ def test_borders_that_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def sums(*u: float) -> Tensor:
         """The measure, and its moments by barycentrics and axis."""
-        found = texel_borders.TexelBorders.from_mesh(mesh, texture, area, u)
+        found = texel_edges.TexelEdges.from_mesh(mesh, texture, area, u)
         assert found is not None
         measure = found.running.diff(prepend=torch.zeros(1, dtype=F64))
         middle = (found.begin + found.end) / 2
@@ -173,8 +173,8 @@ def test_borders_that_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
     exact = sums(0.0, 0.0)
     for most_lines, most_segments in ((7, 1 << 18), (1 << 17, 11), (9, 13)):
-        monkeypatch.setattr(texel_borders, "MOST_LINES", most_lines)
-        monkeypatch.setattr(texel_borders, "MOST_SEGMENTS", most_segments)
+        monkeypatch.setattr(texel_edges, "MOST_LINES", most_lines)
+        monkeypatch.setattr(texel_edges, "MOST_SEGMENTS", most_segments)
         numbers = torch.rand((250, 2), generator=torch.Generator().manual_seed(1)).tolist()
         some = torch.stack([sums(*u) for u in numbers])
         error = some.std(0) / len(some) ** 0.5

@@ -126,7 +126,7 @@ def test_both_modes_and_any_number_of_threads() -> None:
 
 
 def test_plan() -> None:
-    row = "indirect shadow edges"
+    row = "indirect shadow boundaries"
 
     def moving(name: str) -> tuple[eg.Scene, eg.Camera]:
         return case_of("emitter", name)(torch.zeros((), dtype=F64, requires_grad=True))

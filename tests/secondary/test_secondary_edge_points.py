@@ -14,9 +14,9 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad import shader
 from edgegrad.light import in_kernel, secondary_edges
-from edgegrad.light.at_points import Options
-from edgegrad.points.frame import Frame
-from edgegrad.points.splat import Term
+from edgegrad.light.at_points import LitOptions
+from edgegrad.points.image_context import ImageContext
+from edgegrad.points.splat import SplatTerm
 
 F64 = torch.float64
 LOOKS: dict[str, dict[str, Any]] = {
@@ -105,7 +105,7 @@ def test_light_that_is_followed_to_the_camera(looks: tuple[str, str], monkeypatc
     follow = in_kernel.towards_camera
     monkeypatch.setattr(in_kernel, "towards_camera", lambda frame, arrivals, _: follow(frame, arrivals, (0, 0)))
 
-    def passed_on(frame: Frame, options: Options) -> list[Term]:
+    def passed_on(frame: ImageContext, options: LitOptions) -> list[SplatTerm]:
         found = in_kernel.secondary_edge_samples(frame, options._replace(bounces=3), 1)
         return secondary_edges._passed_on(frame, found, "secondary edges", 1)
 
@@ -157,7 +157,7 @@ def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
 
 
 def test_plan() -> None:
-    row, strip = "bounce edges", leaves_of(Strip.standard())
+    row, strip = "secondary edges", leaves_of(Strip.standard())
     scene = strip.scene(LOOKS["lambert"], LOOKS["lambert"])
     off, two, four = (eg.plan(scene, strip.camera, 64, bounces=n)[row] for n in (1, 2, 4))
     assert not off.on and two.samples == 6 * 8 * 64 // 8 and four.samples == 3 * two.samples

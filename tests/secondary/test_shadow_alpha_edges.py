@@ -225,6 +225,6 @@ def test_forward_mode_is_reverse_mode() -> None:
 def test_plan_says_that_rims_move() -> None:
     floor, leaf = plane(material=eg.Material()), quad(alpha=disc(9), material=eg.Material())
     scene = eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0, 0, 3))])
-    assert not eg.plan(scene, ABOVE)["shadow edges"].on
+    assert not eg.plan(scene, ABOVE)["shadow boundaries"].on
     moving = leaf.replace(alpha=disc(9).requires_grad_())
-    assert eg.plan(scene.replace(meshes=[floor, moving]), ABOVE)["shadow edges"].on
+    assert eg.plan(scene.replace(meshes=[floor, moving]), ABOVE)["shadow boundaries"].on

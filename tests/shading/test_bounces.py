@@ -15,11 +15,11 @@ from torch.nn.functional import normalize
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel
-from edgegrad.light.at_points import Options
+from edgegrad.light.at_points import LitOptions
 from edgegrad.light.bsdf import dot, terminator
 from edgegrad.light.shaded_points import ShadedPoints, on_mesh
-from edgegrad.points.frame import Frame
 from edgegrad.points.hits import Hits
+from edgegrad.points.image_context import ImageContext
 from edgegrad.scene.lights import LightPoints, SphericalHarmonics
 
 F64 = torch.float64
@@ -54,7 +54,7 @@ def room(words: str, n: Leaves) -> eg.Scene:
 
 def hits_of(scene: eg.Scene, camera: eg.Camera) -> Hits:
     """Few of those that an image of the scene has."""
-    frame = Frame(scene, make_request(scene, camera, 1, 0))
+    frame = ImageContext(scene, make_request(scene, camera, 1, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
     some = torch.arange(0, len(found.face), max(1, len(found.face) // FEW))
     seed = frame.seeds("image", len(found.face))[some]
@@ -76,7 +76,7 @@ class Oracle:
     def __init__(self, hits: Hits, unfiltered: Hits, bounces: int) -> None:
         self._hits, self._unfiltered = hits, unfiltered
         at, tensors = in_kernel._at(hits)
-        options = Options(shadows=True, samples=1, bounces=bounces)
+        options = LitOptions(shadows=True, samples=1, bounces=bounces)
         found = parts.paths(at.kernel(tensors), **at.arguments(tensors, options))
         self.paths = {name: torch.from_numpy(value) for name, value in found.items()}
 

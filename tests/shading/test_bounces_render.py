@@ -15,7 +15,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel, radiance
-from edgegrad.points.frame import Frame
+from edgegrad.points.image_context import ImageContext
 
 F64 = torch.float64
 ROOMS: dict[str, dict[str, Any]] = {
@@ -29,7 +29,7 @@ ROOMS: dict[str, dict[str, Any]] = {
 def check_points(room: str, bounces: int, rows: tuple[int, ...], paths: int) -> None:
     """Points of the image against the oracle; four standard errors of both."""
     scene = box_room(**ROOMS[room])
-    frame = Frame(scene, make_request(scene, towards_room(8), 1, 0))
+    frame = ImageContext(scene, make_request(scene, towards_room(8), 1, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
     for row in rows:
         same = torch.full((paths,), row)
@@ -200,7 +200,7 @@ def test_creases_that_no_light_reaches_directly() -> None:
     """The front and the top of the block, both turned away from a point light, show different light of the walls."""
     scene = box_room("point")
     scene = scene.replace(lights=[scene.lights[0].replace(position=vector(0.0, 0.9, 0.1))])
-    frame = Frame(scene, make_request(scene, towards_room(8), 1, 0))
+    frame = ImageContext(scene, make_request(scene, towards_room(8), 1, 0))
     first = frame.fixed.first_faces[4]
     differ = []
     for bounces in (1, 2):

@@ -12,7 +12,7 @@ from finite_differences import Case, check, gradient
 from lit_scenes import F64, ball, by_quadrature, from_above, plane, vector
 from oracles import shading
 from oracles.lobes import Lobes, sobol_parts
-from oracles.mesh_light_sampling import MeshTowards
+from oracles.mesh_light_sampling import EmissiveMeshSampler
 from oracles.resampled import Glossy, resampled
 from scenes import icosphere
 from torch import Tensor
@@ -23,7 +23,7 @@ from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel
 from edgegrad.light.bsdf import Scattering
 from edgegrad.light.sampling import tree_of
-from edgegrad.points.frame import Frame
+from edgegrad.points.image_context import ImageContext
 from edgegrad.scene.mesh_light import MeshLight
 
 
@@ -131,7 +131,7 @@ def test_directions_to_a_ball_have_their_density(distance: float):
     mesh, n = icosphere(1), 40_000
     mesh = eg.Mesh(mesh.verts.double() + distance * normalize(vector(0.3, -0.5, 0.8), dim=0), mesh.faces)
     light = MeshLight(eg.AreaLight.of(mesh, 1.0))
-    meets = MeshTowards.of(light, torch.zeros((n, 3), dtype=F64), torch.full((n,), -1))
+    meets = EmissiveMeshSampler.of(light, torch.zeros((n, 3), dtype=F64), torch.full((n,), -1))
     ray, points = meets.towards(meets.draw_by_ball(sobol_parts(torch.arange(n), 5, 1)))
     assert len(ray.unique()) == len(ray)  # of a convex light only what lies in front
     cone = 2 * math.pi * (1 - math.sqrt(1 - 1 / distance**2))
@@ -161,7 +161,7 @@ def test_all_directions_may_miss_a_emitter():
     drawn = []
     for seed in range(40):
         one = Glossy.of(n, n, n, rough, torch.tensor([seed * 7919]))
-        (points,) = resampled(emitter, 5, one, 1, MeshTowards.of(emitter, y, torch.tensor([-1])))
+        (points,) = resampled(emitter, 5, one, 1, EmissiveMeshSampler.of(emitter, y, torch.tensor([-1])))
         drawn.append(bool(points.density.isfinite()))
     assert 5 < sum(drawn) < 35
 
@@ -173,14 +173,14 @@ def test_the_kernel_draws_what_pytorch_draws():
     emitter = eg.AreaLight.of(eg.Mesh(icosphere(1).verts * 0.6 + vector(1.7, 0.1, 0.8), icosphere(1).faces), 3.0)
     floor = plane(2.0, material=rough).replace(verts=plane(2.0).verts - vector(0, 0, 1.2))
     scene = eg.Scene([ball(2, material=metal), floor, emitter])
-    frame = Frame(scene, make_request(scene, from_above(20), 2, 0))
+    frame = ImageContext(scene, make_request(scene, from_above(20), 2, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
     hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, frame.seeds("image", len(found.face)))
     (light,) = hits.lights
     assert isinstance(light, MeshLight)
     position, own = hits.position.detach().double(), torch.full_like(hits.mesh, -1)
     lobes = Lobes.of(hits.view, hits.shading_normal, vector(0.3)[None])
-    asked = MeshTowards.of(light, position, own).is_drawn_by(lobes)[hits.mesh == 0]
+    asked = EmissiveMeshSampler.of(light, position, own).is_drawn_by(lobes)[hits.mesh == 0]
     assert bool(asked.any()) and not bool(asked.all())
     for a, b in zip(shading.points_by_material(hits, light, 3), in_kernel.light_points(hits, light, 3), strict=True):
         some = a.density.isfinite()
@@ -260,7 +260,7 @@ def test_points_are_unbiased(name: str):
 
     seeds, count = 6_000, 2
     seed = torch.arange(seeds) * 7919 + 13
-    meets = MeshTowards.of(light, y.expand(seeds, 3), torch.full((seeds,), -1))
+    meets = EmissiveMeshSampler.of(light, y.expand(seeds, 3), torch.full((seeds,), -1))
     for roughness in (0.15, 0.4, 0.9):
         scattering = Scattering(vector(0.3, 0.6, 0.9)[None], vector(0.6)[None], vector(roughness)[None])
 
@@ -287,7 +287,7 @@ def test_lobes_draw_only_where_they_gain():
     def asked(size: float, roughness: float, x: float) -> bool:
         verts, faces = quad(2.0, size)
         light = MeshLight(eg.AreaLight.of(eg.Mesh(verts + vector(x, 0, 0), faces), 1.0))
-        meets = MeshTowards.of(light, torch.zeros((1, 3), dtype=F64), torch.tensor([-1]))
+        meets = EmissiveMeshSampler.of(light, torch.zeros((1, 3), dtype=F64), torch.tensor([-1]))
         return bool(meets.is_drawn_by(Lobes.of(v[None], n[None], vector(roughness)[None])))
 
     assert asked(1.0, 0.2, -0.6) and asked(0.3, 0.1, -0.6) and asked(5.0, 0.6, 0.0)

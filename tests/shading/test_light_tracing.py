@@ -15,7 +15,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel
-from edgegrad.points.frame import Frame
+from edgegrad.points.image_context import ImageContext
 
 SIZE = 24
 GLOSSY: dict[str, Any] = {"metallic": 0.6, "roughness": 0.4}
@@ -48,7 +48,7 @@ def room(floor: dict[str, Any] | None = None) -> eg.Scene:
     return scene.replace(meshes=[*scene.meshes[:4], round_, *scene.meshes[5:]])
 
 
-def weights(frame: Frame) -> Tensor:
+def weights(frame: ImageContext) -> Tensor:
     """(pixels, 3) by which they count."""
     y, x = torch.meshgrid(*(torch.arange(n, dtype=F64) / n for n in (frame.height, frame.width)), indexing="ij")
     one = 0.6 + 0.35 * torch.cos(2.1 * x + 3.3 * y + 0.4) + 0.2 * torch.sin(5 * x - 2 * y)
@@ -56,7 +56,7 @@ def weights(frame: Frame) -> Tensor:
 
 
 def from_pixels(scene: eg.Scene, seen_from: eg.Camera, spp: int, seed: int, bounces: int) -> float:
-    frame = Frame(scene, make_request(scene, seen_from, spp, seed))
+    frame = ImageContext(scene, make_request(scene, seen_from, spp, seed))
     total = 0.0
     for _, found in frame.sampler.pixel_hits(1 << 17, spp):
         hits = frame.fixed_hits(found.face, found.b, found.x, frame.seeds_of_pixels("image", found.pixel, spp))
@@ -67,7 +67,7 @@ def from_pixels(scene: eg.Scene, seen_from: eg.Camera, spp: int, seed: int, boun
 
 def from_light(scene: eg.Scene, seen_from: eg.Camera, count: int, seed: int, bounces: int) -> float:
     """Points spread over all surfaces take the light of the scene's point light on."""
-    frame = Frame(scene, make_request(scene, seen_from, 1, seed))
+    frame = ImageContext(scene, make_request(scene, seen_from, 1, seed))
     (light,) = scene.lights
     assert isinstance(light, eg.PointLight)
     corner = frame.fixed.verts[frame.fixed.faces.long()]

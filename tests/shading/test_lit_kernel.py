@@ -18,9 +18,9 @@ from edgegrad.kernel.derivatives import transformed
 from edgegrad.kernel.first_order import unreached
 from edgegrad.kernel.request import make_request
 from edgegrad.light import creases, in_kernel, radiance
-from edgegrad.points import borders
-from edgegrad.points.frame import Frame
+from edgegrad.points import discontinuous_pixels
 from edgegrad.points.hits import Hits
+from edgegrad.points.image_context import ImageContext
 from edgegrad.points.shadow_rays import Forced
 from edgegrad.scene.lights import LightPoints
 
@@ -151,7 +151,7 @@ def scene_of(words: str, n: Leaves) -> eg.Scene:
 
 
 def hits_of(scene: eg.Scene, camera: eg.Camera) -> Hits:
-    frame = Frame(scene, make_request(scene, camera, 2, 0))
+    frame = ImageContext(scene, make_request(scene, camera, 2, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 40)
     seed = frame.seeds("image", len(found.face))
     return frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
@@ -331,7 +331,11 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
     leaves = numbers_of(words)
     camera = AROUND[view].replace(world_to_camera=AROUND[view].world_to_camera.double())
     plain = scene_of(words, leaves)
-    pictured, again, kept = plain.replace(background=torch.rand(*camera.size, 3).double()), [], borders.Borders.found
+    pictured, again, kept = (
+        plain.replace(background=torch.rand(*camera.size, 3).double()),
+        [],
+        discontinuous_pixels.DiscontinuousPixels.found,
+    )
     for scene, options in (
         (pictured, {"spp": 7, "seed": 5}),
         (plain, {"spp": 1}),
@@ -346,7 +350,7 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
                     if "nearest" in words:  # whose borders only PyTorch tells
                         patch.setattr(radiance, "is_fused", lambda scene: False)
                     keep = lambda self: (again.append(found := kept(self)), found)[1]  # noqa: E731
-                    patch.setattr(borders.Borders, "found", keep)
+                    patch.setattr(discontinuous_pixels.DiscontinuousPixels, "found", keep)
                 found.append(eg.render(scene, camera, **options))
         assert float(found[0].max()) > 0.1
         assert float((found[0] - found[1]).abs().max()) <= 1e-12 * float(found[0].abs().max())
@@ -404,7 +408,7 @@ def test_light_on_flat_faces(view: str) -> None:
     """E max(0, n·l) at corners, with the normal on the viewer's side; over the greatest."""
     leaves = numbers_of("point directional")
     scene = scene_of("point directional", leaves).replace(meshes=scene_of("point", leaves).meshes[:1])
-    frame = Frame(scene, make_request(scene, CAMERAS[view], 2, 0))
+    frame = ImageContext(scene, make_request(scene, CAMERAS[view], 2, 0))
     found = creases._flat_radiance(frame.fixed, 0, frame.fixed_view, indirect=False)
     (mesh,) = scene.meshes
     corner = mesh.verts[mesh.faces.long()]

@@ -14,7 +14,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel, near_field
-from edgegrad.points.frame import Frame
+from edgegrad.points.image_context import ImageContext
 from edgegrad.points.records import barycentrics
 
 F64 = torch.float64
@@ -54,7 +54,7 @@ def test_without_differences_noise_has_no_bound(monkeypatch: pytest.MonkeyPatch)
         return estimate(found).error
 
     quiet = noise()
-    monkeypatch.setattr(near_field, "RADIUS", 0.0)
+    monkeypatch.setattr(near_field, "RADIUS_PX", 0.0)
     assert noise() > 5 * quiet
 
 
@@ -93,7 +93,7 @@ def check(case: Case, h: float) -> None:
 def test_all_light_is_near_or_not() -> None:
     """Of all that is near values are whole, and no derivatives by places are left; of what is not, none and all of them."""
     scene, camera = camera_of(corner())(torch.zeros((), dtype=F64))
-    frame = Frame(scene, make_request(scene, camera, 1, 0))
+    frame = ImageContext(scene, make_request(scene, camera, 1, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 20)
     seeds = frame.seeds("inside", len(found.x))
 

@@ -21,7 +21,7 @@ import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel
 from edgegrad.light.radiance import CLOSER_STEPS
-from edgegrad.points.frame import Frame
+from edgegrad.points.image_context import ImageContext
 from edgegrad.scene.lights import Light
 
 Places = Sequence[Sequence[float]] | Tensor
@@ -272,7 +272,7 @@ def adjoint() -> Tensor:
 
 def indirect_loss(scene: eg.Scene, camera: eg.Camera, spp: int, seed: int, bounces: int) -> float:
     """The weighted mean of an image of what light gives that is scattered more than once, a path for each sample."""
-    frame = Frame(scene, make_request(scene, camera, spp, seed))
+    frame = ImageContext(scene, make_request(scene, camera, spp, seed))
     total = 0.0
     with torch.no_grad():
         for _, found in frame.sampler.pixel_hits(1 << 17, spp):

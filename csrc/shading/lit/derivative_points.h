@@ -19,7 +19,7 @@ class ResampledAntitheticSets {
         : tables_(lit.tables), light_(light), target_(o, lit.channels, dark), lobe_(o), v_(plain(o.v)), n_(plain(o.n)) {
         const double roughness = plain(o.scattering.roughness);
         alpha_ = std::max(roughness * roughness, least_alpha);
-        draw_candidates(lit, light, lobe_, numbers, each * count, shares_,
+        draw_candidates(lit, light, lobe_, numbers, candidates_for_one * count, shares_,
                         [&](const Candidate& c, bool of_lobe) { add(c.point, c.l, of_lobe); });
     }
 
@@ -41,7 +41,7 @@ class ResampledAntitheticSets {
     }
 
    private:
-    static constexpr int each = 8;  // This many candidates are drawn for each set that is kept.
+    static constexpr int candidates_for_one = 8;  // This many candidates are drawn for each set that is kept.
     struct AntitheticPoints {
         LightPoint point[AntitheticSet::most] = {{0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}};
         double target = 0, running = 0;  // `pdf` of a point holds its measure.
@@ -72,10 +72,10 @@ class ResampledAntitheticSets {
 
     const std::vector<Table>& tables_;
     const Light& light_;
-    Resampled::Target target_;
+    Resampled::TargetFunction target_;
     DrawnLobe lobe_;
     Vec3 v_, n_;
-    Shares shares_;
+    CandidateCounts shares_;
     double alpha_ = 0, total_ = 0;
     std::vector<AntitheticPoints> kept_;
 };
@@ -98,9 +98,9 @@ inline void stand_for_all(LightPoint* points, int drawn, int count) {
 }
 
 // Samples a constant environment for a Lambertian surface by the cosine. Direct light alone keeps its uniform samples.
-inline void draw_even_sky(const LitScene& lit, const Light& light, const RandomNumbers& numbers, Vec3 n, int count,
-                          LightPoint* out) {
-    const RandomNumbers::Parts of_light = numbers.of_light(count);
+inline void draw_constant_environment(const LitScene& lit, const Light& light, const RandomNumbers& numbers, Vec3 n,
+                                      int count, LightPoint* out) {
+    const RandomNumbers::Sequence of_light = numbers.of_light(count);
     for (int s = 0; s < count; ++s) {
         const Vec3 l = draw_by_cosine(n, of_light(s));
         out[s] = point_towards(lit.tables, light, l), out[s].pdf = dot(n, l) / M_PI;
@@ -117,7 +117,8 @@ void light_points(const LitScene& lit, const LitPoints& points, const LitOptions
         LightPoint* own = out + k;
         if (options.bounces > 1 && light.kind == Light::Kind::environment && !light.is_image &&
             o.scattering.lambertian && points.forced.light != number) {
-            draw_even_sky(lit, light, RandomNumbers{light, uint64_t(points.seed[i])}, plain(o.n), count, own);
+            draw_constant_environment(lit, light, RandomNumbers{light, uint64_t(points.seed[i])}, plain(o.n), count,
+                                      own);
         } else if (!draws_antithetic(lit, options, light)) {
             light_points(lit, points, i, number, count, options.dark, o, own);
         } else if (o.scattering.lambertian || points.forced.light == number) {

@@ -35,7 +35,7 @@ class EmissiveFaceTree {
         size_ = std::max({std::fabs(low.x), std::fabs(low.y), std::fabs(low.z), std::fabs(high.x), std::fabs(high.y),
                           std::fabs(high.z)});
         find_shape(verts, n_verts, faces);
-        nodes_.reserve(2 * triangles_.size() / leaf + 2);
+        nodes_.reserve(2 * triangles_.size() / leaf_size + 2);
         nodes_.emplace_back();
         split(0, 0, int32_t(n_faces));
     }
@@ -54,13 +54,13 @@ class EmissiveFaceTree {
     bool fills_ball() const { return convex_ && area_ >= least_filled * 4 * M_PI * radius_ * radius_; }
 
     // Records where origin + t direction hits a face.
-    struct Crossing {
+    struct Hit {
         int32_t face;
         double u, v, t;
     };
-    // Calls found(crossing) for hits with t in (start, end), near ones about first. It returns a new `end`.
+    // Calls found(hit) for hits with t in (start, end), near ones about first. It returns a new `end`.
     template <class Found>
-    void each_crossing(Vec3 origin, Vec3 direction, double start, double end, Found found) const {
+    void each_hit(Vec3 origin, Vec3 direction, double start, double end, Found found) const {
         const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
         int32_t waiting[64], n = 0;  // The tree halves its faces at each level.
         waiting[n++] = 0;
@@ -73,14 +73,14 @@ class EmissiveFaceTree {
                 continue;
             }
             for (int32_t k = node.first; k < node.first + node.count; ++k) {
-                Crossing c;
+                Hit c;
                 if (triangles_[k].meets(origin, direction, c) && c.t > start && c.t < end) end = found(c);
             }
         }
     }
 
    private:
-    static constexpr int leaf = 4;
+    static constexpr int leaf_size = 4;
     static constexpr double least_filled = 0.5;
     // Float rounding may move vertices out of their plane by this part of the size.
     static constexpr double flatness = 1e-6;
@@ -96,7 +96,7 @@ class EmissiveFaceTree {
         Vec3 corner(int i) const { return i == 0 ? q0 : q0 + (i == 1 ? e1 : e2); }
         // Möller and Trumbore 1997. A point within rounding of the edge counts as a hit, because the neighbour may be
         // missed as well.
-        bool meets(Vec3 origin, Vec3 direction, Crossing& c) const {
+        bool meets(Vec3 origin, Vec3 direction, Hit& c) const {
             constexpr double rounding = 1e-12;
             const Vec3 p = cross(direction, e2), s = origin - q0;
             const double scale = 1 / dot(e1, p);
@@ -138,7 +138,7 @@ class EmissiveFaceTree {
             low_middle = k == first ? m : least(low_middle, m), high_middle = k == first ? m : most(high_middle, m);
         }
         nodes_[node].low = low, nodes_[node].high = high;
-        if (last - first <= leaf) return void((nodes_[node].first = first, nodes_[node].count = last - first));
+        if (last - first <= leaf_size) return void((nodes_[node].first = first, nodes_[node].count = last - first));
         const Vec3 extent = high_middle - low_middle;
         const int axis = extent.x >= extent.y && extent.x >= extent.z ? 0 : extent.y >= extent.z ? 1 : 2;
         const int32_t half = (first + last) / 2;
@@ -169,8 +169,8 @@ class EmissiveFaceTree {
         for (const Triangle& t : triangles_)
             if (area(t) > area(*largest)) largest = &t;
         flat_ = is_side(*largest, 1) && is_side(*largest, -1);
-        constexpr int64_t few = 1 << 22;  // It counts pairs of vertices and faces.
-        convex_ = !flat_ && n_verts * int64_t(triangles_.size()) <= few &&
+        constexpr int64_t most_tests = 1 << 22;  // It counts pairs of vertices and faces.
+        convex_ = !flat_ && n_verts * int64_t(triangles_.size()) <= most_tests &&
                   std::all_of(triangles_.begin(), triangles_.end(), [&](const Triangle& t) { return is_side(t, 1); }) &&
                   is_closed(verts, faces);
     }

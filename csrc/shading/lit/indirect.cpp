@@ -14,9 +14,9 @@ std::shared_ptr<Paths> path_buffers(const LitScene& lit, const LitOptions& optio
 }
 
 template <class T>
-void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-                 Paths& paths, double* out, int8_t* seen) {
-    paths.find_whole(scene, caster, points);
+void shade_by_paths(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                    Paths& paths, double* out, int8_t* seen) {
+    paths.find_for_image(scene, caster, points);
     const size_t K = paths.lights().size();
     double along[most_lit_channels];
     for (int64_t i = 0; i < points.size; ++i) {
@@ -28,18 +28,18 @@ void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster
             const auto at = [&](int k) -> const Surface<double>& { return paths.surface(j, k); };
             path_radiance(lit, paths.lights(), path, at, along);
             for (int c = 0; c < lit.channels; ++c) total[c] += along[c] / paths_of_point;
-            if (path.points > 0) add_met(lit, path, 0, at(0), total);
+            if (path.points > 0) add_emitter_hit(lit, path, 0, at(0), total);
         }
         const Path path = paths.path(own);
         if (path.points > 0) {
-            add_drawn(lit, paths.lights(), path, 0, paths.surface(own, 0), total);
+            add_sampled_light(lit, paths.lights(), path, 0, paths.surface(own, 0), total);
             std::copy(path.seen_at(0), path.seen_at(0) + K, seen + i * K);
         } else {
-            std::fill(seen + i * K, seen + (i + 1) * K, not_asked);
+            std::fill(seen + i * K, seen + (i + 1) * K, not_sampled);
         }
         if (Surface<double> first = paths.surface(own, 0); !first.is_black()) {
             if (!first.mesh->has_material) look_up_material(lit, first);
-            add_own(lit, first, total);
+            add_own_radiance(lit, first, total);
         }
     }
 }
@@ -48,8 +48,8 @@ namespace {
 
 // Removes the near part from the cotangent of the first point's position on its face.
 template <class At>
-void leave_out_near_field(const LitScene& lit, const LitOptions& options, const Path& path, At at,
-                          const double* total_bar, const PathBuffers& found, FacePointBar& at_bar) {
+void remove_near_field(const LitScene& lit, const LitOptions& options, const Path& path, At at, const double* total_bar,
+                       const PathBuffers& found, FacePointBar& at_bar) {
     const NearField near(options.near);
     const Surface<double>& o = at(0);
     const Vec3 d = at(1).y - o.y;
@@ -96,7 +96,7 @@ void indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& c
 template <class T>
 void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   const LitOptions& options, const double* bar, const std::vector<TableBar>& to,
-                  LitPlaces<double> places, ThreadTeam& team) {
+                  LitPositions<double> places, ThreadTeam& team) {
     clear(places, points.size);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
         Paths paths(lit, options);
@@ -117,7 +117,7 @@ void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
                 path_radiance_vjp(lit, paths.lights(), path, at, bar + (first + i) * lit.channels, buffers, at_bar,
                                   chunk);
                 if (options.near > 0)
-                    leave_out_near_field(lit, options, path, at, bar + (first + i) * lit.channels, buffers, at_bar);
+                    remove_near_field(lit, options, path, at, bar + (first + i) * lit.channels, buffers, at_bar);
                 write(at_bar, places, first + i);
             }
         }
@@ -126,7 +126,7 @@ void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
 
 template <class T>
 void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-                  const LitOptions& options, LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team) {
+                  const LitOptions& options, LitPositions<const double> dot, double* radiance_dot, ThreadTeam& team) {
     team.parallel_for_with_state(
         (points.size + shaded_at_once - 1) / shaded_at_once, [&] { return path_buffers(lit, options); },
         [&](Paths& paths, int64_t block) {
@@ -137,7 +137,7 @@ void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
             for (int64_t i = 0; i < some.size; ++i) {
                 const Path path = paths.path(i);
                 double* out = radiance_dot + (first + i) * lit.channels;
-                const auto find = [&](LitPlaces<const double> own, Dual* total) {
+                const auto find = [&](LitPositions<const double> own, Dual* total) {
                     const MovingPoint point(lit, points, own, first + i);
                     const std::vector<Surface<Dual>> surfaces = moving_surfaces(lit, path, point.surface);
                     const auto at = [&](int k) -> const Surface<Dual>& { return surfaces[k]; };
@@ -147,7 +147,7 @@ void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
                 find(dot, total);
                 for (int c = 0; c < lit.channels; ++c) out[c] = total[c].dot;
                 if (!(options.near > 0) || !dot.b || path.points < 2) continue;
-                // Removes the near part as the point slides, like leave_out_near_field().
+                // Removes the near part as the point slides, like remove_near_field().
                 const Vec3 d = paths.surface(i, 1).y - paths.surface(i, 0).y;
                 const NearField near(options.near);
                 Vec3 slid;
@@ -160,18 +160,18 @@ void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
         });
 }
 
-#define EDGEGRAD_INDIRECT(T)                                                                                      \
-    template void indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,              \
-                           const LitOptions&, double*, ThreadTeam&);                                              \
-    template void shade_whole(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,   \
-                              double*, int8_t*);                                                                  \
-    template void add_indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,  \
-                               double*);                                                                          \
-    template void indirect_vjp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,          \
-                               const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>, \
-                               ThreadTeam&);                                                                      \
-    template void indirect_jvp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,          \
-                               const LitOptions&, LitPlaces<const double>, double*, ThreadTeam&);
+#define EDGEGRAD_INDIRECT(T)                                                                                         \
+    template void indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,                 \
+                           const LitOptions&, double*, ThreadTeam&);                                                 \
+    template void shade_by_paths(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,   \
+                                 double*, int8_t*);                                                                  \
+    template void add_indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,     \
+                               double*);                                                                             \
+    template void indirect_vjp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,             \
+                               const LitOptions&, const double*, const std::vector<TableBar>&, LitPositions<double>, \
+                               ThreadTeam&);                                                                         \
+    template void indirect_jvp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,             \
+                               const LitOptions&, LitPositions<const double>, double*, ThreadTeam&);
 EDGEGRAD_INDIRECT(float)
 EDGEGRAD_INDIRECT(double)
 

@@ -26,16 +26,16 @@ void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaste
 // Writes the whole radiance (N, channels) for an image, with direct light. `seen` (N, light samples) gets the
 // visibility of one sample of each light.
 template <class T>
-void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-                 Paths& paths, double* radiance, int8_t* seen);
+void shade_by_paths(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                    Paths& paths, double* radiance, int8_t* seen);
 // Adds to the cotangents of the tables, and writes the cotangents of the points.
 template <class T>
 void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   const LitOptions& options, const double* bar, const std::vector<TableBar>& to,
-                  LitPlaces<double> places, ThreadTeam& team);
+                  LitPositions<double> places, ThreadTeam& team);
 // Writes the derivative for the tangents of the tables and of the points.
 template <class T>
 void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-                  const LitOptions& options, LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team);
+                  const LitOptions& options, LitPositions<const double> dot, double* radiance_dot, ThreadTeam& team);
 
 }  // namespace edgegrad

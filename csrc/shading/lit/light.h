@@ -53,11 +53,11 @@ struct LightPoint {
 
 // Selects one of the parts first … first + n − 1 of a running sum of probabilities, each `step` wide. `within` is the
 // position of the number u in [0, 1) inside that part, uniform as well.
-struct Picked {
+struct PickedPart {
     int64_t part;
     double within;
 };
-inline Picked pick(const double* running, int64_t first, int64_t n, int64_t step, double u) {
+inline PickedPart pick(const double* running, int64_t first, int64_t n, int64_t step, double u) {
     const auto before = [&](int64_t k) { return k == 0 ? 0.0 : running[k * step - 1]; };
     const double start = before(first), at = start + u * (before(first + n) - start);
     int64_t low = first, high = first + n - 1;  // The part lies in this range.
@@ -74,11 +74,11 @@ inline Picked pick(const double* running, int64_t first, int64_t n, int64_t step
 inline LightPoint draw(const Light& light, Vec2 u) {
     if (light.is_punctual()) return {};
     if (light.kind == Light::Kind::environment) {
-        const Picked row = pick(light.running, 0, light.height, light.width, u.x);
-        const Picked texel = pick(light.running, row.part * light.width, light.width, 1, u.y);
+        const PickedPart row = pick(light.running, 0, light.height, light.width, u.x);
+        const PickedPart texel = pick(light.running, row.part * light.width, light.width, 1, u.y);
         return {texel.part, texel.within, row.within, light.pdf[texel.part]};
     }
-    const Picked face = pick(light.running, 0, light.size, 1, u.x);
+    const PickedPart face = pick(light.running, 0, light.size, 1, u.x);
     const double root = std::sqrt(face.within);  // This is uniform in a triangle (Turk 1990).
     return {face.part, root * (1 - u.y), root * u.y, light.pdf[face.part]};
 }

@@ -70,9 +70,9 @@ struct RandomNumbers {
     uint64_t seed;
 
     // Supplies `count` numbers of one kind by their index.
-    class Parts {
+    class Sequence {
        public:
-        Parts(const RandomNumbers& of, int kind, int count)
+        Sequence(const RandomNumbers& of, int kind, int count)
             : sobol_(hash(of.seed >> 32, of.light.stream[kind])), first_(uint32_t(of.seed) * uint32_t(count)) {}
         Vec2 operator()(int j) const { return sobol_(first_ + uint32_t(j)); }
 
@@ -81,13 +81,13 @@ struct RandomNumbers {
         uint32_t first_;
     };
 
-    Parts of_light(int count) const { return Parts(*this, 0, count); }
-    Parts of_lobe(int count) const { return Parts(*this, 1, count); }
-    double of_choice() const { return Parts(*this, 2, 1)(0).x; }
+    Sequence of_light(int count) const { return Sequence(*this, 0, count); }
+    Sequence of_lobe(int count) const { return Sequence(*this, 1, count); }
+    double of_choice() const { return Sequence(*this, 2, 1)(0).x; }
 };
 
 // Holds how many candidates each technique draws.
-struct Shares {
+struct CandidateCounts {
     double light = 0, lobe = 0;
 };
 
@@ -95,13 +95,13 @@ struct Shares {
 // is set. `shares` gets the number of both kinds first. by_light(numbers, add) and towards(direction, add) define the
 // candidates.
 template <class ByLight, class Towards, class Add>
-void draw_candidates(const DrawnLobe& lobe, const RandomNumbers& numbers, int all, bool ask_lobe, Shares& shares,
-                     ByLight by_light, Towards towards, Add add) {
+void draw_candidates(const DrawnLobe& lobe, const RandomNumbers& numbers, int all, bool ask_lobe,
+                     CandidateCounts& shares, ByLight by_light, Towards towards, Add add) {
     const int of_all = ask_lobe ? all / 2 : 0, others = all - of_all;
     shares.light = others, shares.lobe = of_all;
-    const RandomNumbers::Parts of_light = numbers.of_light(others);
+    const RandomNumbers::Sequence of_light = numbers.of_light(others);
     for (int j = 0; j < others; ++j) by_light(of_light(j), [&](const Candidate& c) { add(c, false); });
-    const RandomNumbers::Parts of_lobe = numbers.of_lobe(of_all);
+    const RandomNumbers::Sequence of_lobe = numbers.of_lobe(of_all);
     for (int j = 0; j < of_all; ++j) {
         const Vec2 u = of_lobe(j);
         towards(lobe.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
@@ -110,7 +110,7 @@ void draw_candidates(const DrawnLobe& lobe, const RandomNumbers& numbers, int al
 // Draws candidates from an environment.
 template <class Add>
 void draw_candidates(const LitScene& lit, const Light& light, const DrawnLobe& lobe, const RandomNumbers& numbers,
-                     int all, Shares& shares, Add add) {
+                     int all, CandidateCounts& shares, Add add) {
     const Rotation<double> turn = Rotation<double>::of(lit.tables, light);
     draw_candidates(
         lobe, numbers, all, lobe.exists(), shares,
@@ -132,20 +132,20 @@ void draw_candidates(const LitScene& lit, const Light& light, const DrawnLobe& l
 // integral, which the candidates estimate.
 class Resampled {
    public:
-    static constexpr int each = 8;  // This many candidates are drawn for each one that is kept.
+    static constexpr int candidates_for_one = 8;  // This many candidates are drawn for each one that is kept.
 
     template <class S>
     Resampled(const LitScene& lit, const Light& light, const RandomNumbers& numbers, const Surface<S>& o, int count,
               double dark)
         : target_(o, lit.channels, dark), lobe_(o) {
-        kept_.reserve(each * count), running_.reserve(each * count);
+        kept_.reserve(candidates_for_one * count), running_.reserve(candidates_for_one * count);
         const auto add_one = [&](const Candidate& c, bool of_lobe) { add(c, of_lobe); };
         if (light.kind == Light::Kind::environment) {
-            draw_candidates(lit, light, lobe_, numbers, each * count, shares_, add_one);
+            draw_candidates(lit, light, lobe_, numbers, candidates_for_one * count, shares_, add_one);
         } else {
-            const MeshTowards mesh(lit, light, lobe_, plain(o.y), o.at.face + o.mesh->first_face);
+            const EmissiveMeshSampler mesh(lit, light, lobe_, plain(o.y), o.at.face + o.mesh->first_face);
             draw_candidates(
-                lobe_, numbers, mesh.interchangeable() ? count : each * count, mesh.by_lobe(), shares_,
+                lobe_, numbers, mesh.interchangeable() ? count : candidates_for_one * count, mesh.by_lobe(), shares_,
                 [&](Vec2 u, auto add) { mesh.draw_by_light(u, add); },
                 [&](Vec3 l, auto add) { mesh.each_towards(l, add); }, add_one);
         }
@@ -163,10 +163,10 @@ class Resampled {
     }
 
     // Evaluates the BSDF times the cosine. Nearly black colours become `dark`, as they have derivatives, too.
-    class Target {
+    class TargetFunction {
        public:
         template <class S>
-        Target(const Surface<S>& o, int channels, double dark)
+        TargetFunction(const Surface<S>& o, int channels, double dark)
             : v_(plain(o.v)), n_(plain(o.n)), g_(plain(o.g)), roughness_(plain(o.scattering.roughness)) {
             const double metallic = plain(o.scattering.metallic);
             for (int c = 0; c < channels; ++c) {
@@ -202,9 +202,9 @@ class Resampled {
         kept_.back().pdf = target;
     }
 
-    Target target_;
+    TargetFunction target_;
     DrawnLobe lobe_;
-    Shares shares_;
+    CandidateCounts shares_;
     double total_ = 0;
     std::vector<LightPoint> kept_;
     std::vector<double> running_;
@@ -224,7 +224,7 @@ void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int n
     } else if ((light.kind == Light::Kind::environment || light.tree) && !o.scattering.lambertian) {
         Resampled(lit, light, numbers, o, count, dark).keep(numbers.of_choice(), count, out);
     } else {
-        const RandomNumbers::Parts of_light = numbers.of_light(count);
+        const RandomNumbers::Sequence of_light = numbers.of_light(count);
         for (int s = 0; s < count; ++s) {
             out[s] = draw(light, of_light(s));
             if (light.kind == Light::Kind::environment) out[s] = above(lit.tables, light, out[s], plain(o.g));

@@ -105,8 +105,9 @@ class LightPaths {
         }
         const size_t n = lines_.face.size();
         lines_.seen.resize(n);
-        see(scene_, caster_, {lines_.face.data(), lines_.b.data(), lines_.to.data(), lines_.contact.data(), int64_t(n)},
-            lines_.seen.data());
+        test_visibility(scene_, caster_,
+                        {lines_.face.data(), lines_.b.data(), lines_.to.data(), lines_.contact.data(), int64_t(n)},
+                        lines_.seen.data());
         for (size_t k = 0; k < n; ++k) {
             if (!lines_.seen[k]) continue;
             out.arrival.push_back(lines_.arrival[k]);
@@ -144,9 +145,10 @@ class LightPaths {
         }
         const size_t n = extended_.size();
         rays_.hit.resize(n), rays_.hit_b.resize(2 * n);
-        depart(scene_, caster_,
-               {rays_.face.data(), rays_.b.data(), rays_.direction.data(), rays_.contact.data(), int64_t(n)},
-               rays_.hit.data(), rays_.hit_b.data());
+        trace_from_surface(
+            scene_, caster_,
+            {rays_.face.data(), rays_.b.data(), rays_.direction.data(), rays_.contact.data(), int64_t(n)},
+            rays_.hit.data(), rays_.hit_b.data());
         vertices_.clear();
         for (size_t r = 0; r < n; ++r) {
             if (rays_.hit[r] < 0) continue;

@@ -53,7 +53,7 @@ void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOp
 }
 
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, ThreadTeam& team) {
+               const double* bar, const std::vector<TableBar>& to, LitPositions<double> places, ThreadTeam& team) {
     const std::vector<LightSample> lights = light_samples(lit, options);
     clear(places, points.size);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
@@ -75,7 +75,7 @@ void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& o
 template <class T>
 void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                          const LitPoints& points, const LitOptions& options, const double* bar,
-                         const std::vector<TableBar>& to, LitPlaces<double> places, ThreadTeam& team) {
+                         const std::vector<TableBar>& to, LitPositions<double> places, ThreadTeam& team) {
     clear(places, points.size);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
         const auto buffers = shade_buffers(lit, options);
@@ -104,7 +104,7 @@ void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const R
 }
 
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team) {
+               LitPositions<const double> dot, double* radiance_dot, ThreadTeam& team) {
     const std::vector<LightSample> lights = light_samples(lit, options);
     team.parallel_for_blocks(points.size, [&](int64_t, int64_t first, int64_t last) {
         std::vector<LightPoint> of_lights(lights.size());
@@ -129,10 +129,10 @@ template void shade(const LitScene&, const SceneView<float>&, const RayCaster&, 
 template void shade(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&, const LitOptions&,
                     double*, int8_t*, ThreadTeam&);
 template void trace_and_shade_vjp(const LitScene&, const SceneView<float>&, const RayCaster&, const LitPoints&,
-                                  const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>,
+                                  const LitOptions&, const double*, const std::vector<TableBar>&, LitPositions<double>,
                                   ThreadTeam&);
 template void trace_and_shade_vjp(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&,
-                                  const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>,
+                                  const LitOptions&, const double*, const std::vector<TableBar>&, LitPositions<double>,
                                   ThreadTeam&);
 
 }  // namespace edgegrad

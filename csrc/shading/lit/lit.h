@@ -35,14 +35,14 @@ void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOp
                        LightPoint* out, ThreadTeam& team);
 // Adds to the cotangents of the tables, and writes the cotangents of the points, given what shade() found.
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, ThreadTeam& team);
+               const double* bar, const std::vector<TableBar>& to, LitPositions<double> places, ThreadTeam& team);
 // Does both at once where only derivatives are wanted: it also traces what each point sees.
 template <class T>
 void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                          const LitPoints& points, const LitOptions& options, const double* bar,
-                         const std::vector<TableBar>& to, LitPlaces<double> places, ThreadTeam& team);
+                         const std::vector<TableBar>& to, LitPositions<double> places, ThreadTeam& team);
 // Writes the derivative for the tangents of the tables and of the points.
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               LitPlaces<const double> dot, double* radiance_dot, ThreadTeam& team);
+               LitPositions<const double> dot, double* radiance_dot, ThreadTeam& team);
 
 }  // namespace edgegrad

@@ -12,7 +12,7 @@ namespace edgegrad {
 
 // Adds what a surface sends by itself: its emission, or its colour if it has no material.
 template <class S>
-void add_own(const LitScene& lit, const Surface<S>& o, S* total) {
+void add_own_radiance(const LitScene& lit, const Surface<S>& o, S* total) {
     if (!o.mesh->has_material) {
         for (int c = 0; c < lit.channels; ++c) total[c] += o.scattering.base[c];
     } else if (o.mesh->emission.exists()) {
@@ -21,8 +21,8 @@ void add_own(const LitScene& lit, const Surface<S>& o, S* total) {
         for (int c = 0; c < lit.channels; ++c) total[c] += own[c];
     }
 }
-inline void add_own_vjp(const LitScene& lit, const Surface<double>& o, const double* total_bar, SurfaceBar& bar,
-                        Cotangents& to) {
+inline void add_own_radiance_vjp(const LitScene& lit, const Surface<double>& o, const double* total_bar,
+                                 SurfaceBar& bar, Cotangents& to) {
     if (!o.mesh->has_material) {
         for (int c = 0; c < lit.channels; ++c) bar.scattering.base[c] += total_bar[c];
     } else if (o.mesh->emission.exists()) {
@@ -76,7 +76,7 @@ void radiance(const LitScene& lit, const LitOptions& options, const std::vector<
               const LightPoint* points, const Surface<S>& o, const int8_t* seen, S* total) {
     std::fill(total, total + lit.channels, S(0));
     if (o.is_black()) return;
-    if (options.only < 0) add_own(lit, o, total), add_unshadowed(lit, o, total);
+    if (options.only < 0) add_own_radiance(lit, o, total), add_unshadowed(lit, o, total);
     add_lights(lit, lights, points, o, seen, total);
 }
 // Returns whether a point has no radiance: it sees no light, and has no other source. It has no derivatives either.
@@ -89,7 +89,8 @@ inline void radiance_vjp(const LitScene& lit, const LitOptions& options, const s
                          const LightPoint* points, const Surface<double>& o, const int8_t* seen,
                          const double* total_bar, FacePointBar& at_bar, Cotangents& to) {
     SurfaceBar bar(lit.channels);
-    if (options.only < 0) add_own_vjp(lit, o, total_bar, bar, to), add_unshadowed_vjp(lit, o, total_bar, bar, to);
+    if (options.only < 0)
+        add_own_radiance_vjp(lit, o, total_bar, bar, to), add_unshadowed_vjp(lit, o, total_bar, bar, to);
     add_lights_vjp(lit, lights, points, o, seen, total_bar, bar, to);
     look_up_material_vjp(lit, o, bar, to);
     surface_vjp(lit, o, bar, to);

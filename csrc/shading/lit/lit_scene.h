@@ -89,7 +89,7 @@ struct LitPoints {
 
 // Points to the cotangents or tangents of positions.
 template <class Number>
-struct LitPlaces {
+struct LitPositions {
     Number* b = nullptr;       // (N, 3)
     Number* spread = nullptr;  // (N, 2, 2); null: not wanted, or zero
 };
@@ -116,7 +116,7 @@ struct LitOptions {
 };
 
 // Marks a light sample behind the surface, which is not traced. Otherwise visibility is 1, or 0 in shadow.
-constexpr int8_t not_asked = -1;
+constexpr int8_t not_sampled = -1;
 
 struct LightSample {
     int light, sample, count;  // It is one of `count` samples of a light.

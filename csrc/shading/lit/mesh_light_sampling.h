@@ -41,10 +41,10 @@ inline bool is_round(const EmissiveFaceTree& tree, const double* pdf, int64_t n)
     return tree.fills_ball() && *std::max_element(pdf, pdf + n) * tree.area() <= most_uneven;
 }
 
-class MeshTowards {
+class EmissiveMeshSampler {
    public:
     // `own` is the surface's face, counted in the scene.
-    MeshTowards(const LitScene& lit, const Light& light, const DrawnLobe& lobe, Vec3 y, int64_t own)
+    EmissiveMeshSampler(const LitScene& lit, const Light& light, const DrawnLobe& lobe, Vec3 y, int64_t own)
         : lit_(lit), light_(light), from_(lit.emitter(light)), tree_(*light.tree), y_(y), own_(own - from_.first) {
         const double size = std::max({std::fabs(y.x), std::fabs(y.y), std::fabs(y.z), tree_.size()});
         contact_ = 32 * light.eps * size;
@@ -100,16 +100,16 @@ class MeshTowards {
     // Calls found(candidate) for the points in the direction l.
     template <class Found>
     void each_towards(Vec3 l, Found found) const {
-        crossings_.clear();
+        hits_.clear();
         double nearest = INFINITY;
-        tree_.each_crossing(y_, l, contact_, INFINITY, [&](const EmissiveFaceTree::Crossing& c) {
-            if (c.face != own_) crossings_.push_back(c), nearest = std::min(nearest, c.t);
+        tree_.each_hit(y_, l, contact_, INFINITY, [&](const EmissiveFaceTree::Hit& c) {
+            if (c.face != own_) hits_.push_back(c), nearest = std::min(nearest, c.t);
             return light_.hides ? nearest + contact_ : INFINITY;
         });
         // Sorting by distance, then by face makes the order independent of the tree's.
-        std::sort(crossings_.begin(), crossings_.end(),
+        std::sort(hits_.begin(), hits_.end(),
                   [](const auto& a, const auto& b) { return a.t != b.t ? a.t < b.t : a.face < b.face; });
-        for (const EmissiveFaceTree::Crossing& c : crossings_) {
+        for (const EmissiveFaceTree::Hit& c : hits_) {
             if (light_.hides && c.t > nearest + contact_) break;
             Candidate found_there = of({c.face, c.u, c.v, light_.pdf[c.face]});
             if (found_there.solid_angle > 0) found(found_there);
@@ -137,7 +137,7 @@ class MeshTowards {
         if (tree_.is_convex() && sine_ < 1) return true;
         const double r = length(away);
         bool hidden = false;
-        tree_.each_crossing(y_, (-1 / r) * away, contact_, r - contact_, [&](const EmissiveFaceTree::Crossing& c) {
+        tree_.each_hit(y_, (-1 / r) * away, contact_, r - contact_, [&](const EmissiveFaceTree::Hit& c) {
             hidden |= c.face != p.index && c.face != own_;
             return hidden ? 0 : r - contact_;
         });
@@ -153,7 +153,7 @@ class MeshTowards {
     double contact_, distance_, sine_ = 1, cosine_ = 0;  // Half the bounding cone's angle has this sine and cosine.
     bool by_lobe_ = false, by_ball_ = false, interchangeable_ = false;
     Mat3 around_;  // These axes surround the direction to the centre.
-    mutable std::vector<EmissiveFaceTree::Crossing> crossings_;
+    mutable std::vector<EmissiveFaceTree::Hit> hits_;
 };
 
 }  // namespace edgegrad

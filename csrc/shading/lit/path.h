@@ -75,7 +75,7 @@ class Paths {
             const Light& light = lit.lights[k];
             eps_ = std::max(eps_, light.eps);
             if (light.kind == Light::Kind::mesh) light_of_[light.mesh] = k;
-            if (light.kind == Light::Kind::environment && sky_ < 0) sky_ = k;
+            if (light.kind == Light::Kind::environment && environment_ < 0) environment_ = k;
         }
     }
 
@@ -96,17 +96,19 @@ class Paths {
     // point i starts paths_of_point paths, path(paths_of_point · i) and those after it. The first of them has the light
     // samples of the point.
     template <class T>
-    void find_whole(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
+    void find_for_image(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
         counts_emitter_hits_ = options_.shadows, paths_of_point_ = paths_of_point;
-        by_paths_ = counts_emitter_hits_ && sky_ >= 0 && !lit_.lights[sky_].is_image ? sky_ : -1;
-        find_lit(scene, caster, from, [&](int64_t i, Surface<double>& o) {
+        by_paths_ =
+            counts_emitter_hits_ && environment_ >= 0 && !lit_.lights[environment_].is_image ? environment_ : -1;
+        find_with_light_samples(scene, caster, from, [&](int64_t i, Surface<double>& o) {
             set_surface<double>(lit_, from.face[i], from.b + 3 * i, from.spread_at(i), o);
             return true;
         });
     }
     // Traces paths from points that `place(i, surface)` sets if it returns true, and samples lights for them, too.
     template <class T, class Place>
-    void find_lit(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Place place) {
+    void find_with_light_samples(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from,
+                                 Place place) {
         begin(from, place);
         sample_lights(scene, caster, from, 0);
         extend(scene, caster, from);
@@ -216,14 +218,14 @@ class Paths {
     template <class T>
     void trace(const SceneView<T>& scene, const RayCaster& caster, int k) {
         rays_.hit.resize(rays_.index.size()), rays_.hit_b.resize(2 * rays_.index.size());
-        depart(scene, caster,
-               {rays_.face.data(), rays_.b.data(), rays_.direction.data(), rays_.contact.data(),
-                int64_t(rays_.index.size())},
-               rays_.hit.data(), rays_.hit_b.data());
+        trace_from_surface(scene, caster,
+                           {rays_.face.data(), rays_.b.data(), rays_.direction.data(), rays_.contact.data(),
+                            int64_t(rays_.index.size())},
+                           rays_.hit.data(), rays_.hit_b.data());
         for (size_t r = 0; r < rays_.index.size(); ++r) {
             const int64_t i = rays_.index[r], at = (k + 1) * n_ + i;
             if (rays_.hit[r] < 0) {
-                if (counts_emitter_hits_ && sky_ >= 0) add_environment_hit(r, k);
+                if (counts_emitter_hits_ && environment_ >= 0) add_environment_hit(r, k);
                 continue;
             }
             const double u = rays_.hit_b[2 * r], v = rays_.hit_b[2 * r + 1];
@@ -268,12 +270,14 @@ class Paths {
         const Surface<double>& o = surfaces_[k * n_ + i];
         if (!o.scattering.lambertian) return;
         const double* l = &rays_.direction[3 * r];
-        const Light& light = lit_.lights[sky_];
+        const Light& light = lit_.lights[environment_];
         LightPoint p = point_towards(lit_.tables, light, {l[0], l[1], l[2]});
         if (light.is_image) p = above(lit_.tables, light, p, o.g);
-        else p.pdf = k == 0 && by_paths_ >= 0 ? 0 : rays_.pdf[r];  // draw_even_sky() also samples by the cosine.
+        else
+            p.pdf =
+                k == 0 && by_paths_ >= 0 ? 0 : rays_.pdf[r];  // draw_constant_environment() also samples by the cosine.
         p.pdf += paths_at(k) * rays_.pdf[r] * rays_.russian_roulette_probability[r];
-        emitter_hits_[k * n_ + i] = {sky_, p};
+        emitter_hits_[k * n_ + i] = {environment_, p};
     }
     // Adds the BSDF's pdf to the pdfs of light samples that a point of a path sees (balance heuristic).
     void apply_mis(int64_t at, double paths) {
@@ -281,10 +285,10 @@ class Paths {
         for (int64_t j = 0; j < K(); ++j) {
             const int number = lights_[j].light;
             const Light& light = lit_.lights[number];
-            if (seen_[at * K() + j] <= 0 || !(number == sky_ || light.kind == Light::Kind::mesh)) continue;
+            if (seen_[at * K() + j] <= 0 || !(number == environment_ || light.kind == Light::Kind::mesh)) continue;
             LightPoint& p = drawn_[at * K() + j];
             Vec3 l = place(lit_, light, p);
-            if (number == sky_) {
+            if (number == environment_) {
                 p.pdf += paths * PathSample(o, C_).pdf(l);
                 continue;
             }
@@ -320,7 +324,7 @@ class Paths {
     const int C_;
     double eps_ = 0;                    // It is the relative spacing of positions.
     std::vector<int> light_of_;         // Maps meshes to their lights, −1: none.
-    int sky_ = -1;                      // Escaping rays hit this environment.
+    int environment_ = -1;              // Escaping rays hit this environment.
     bool counts_emitter_hits_ = false;  // Says whether emitters that paths hit count.
     int paths_of_point_ = 1;            // This many paths start at one point.
     int by_paths_ = -1;                 // These paths sample this light well enough alone.

@@ -59,20 +59,20 @@ inline void step_vjp(const LitScene& lit, const Surface<double>& o, const Surfac
 
 // Adds the direct light that a point scatters: from its light samples, and from the emitter that the path hits.
 template <class S>
-void add_drawn(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,
-               const Surface<S>& o, S* total) {
+void add_sampled_light(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,
+                       const Surface<S>& o, S* total) {
     add_unshadowed(lit, o, total);
     add_lights(lit, lights, path.drawn_at(k), o, path.seen_at(k), total);
 }
 template <class S>
-void add_met(const LitScene& lit, const Path& path, int k, const Surface<S>& o, S* total) {
+void add_emitter_hit(const LitScene& lit, const Path& path, int k, const Surface<S>& o, S* total) {
     if (path.has_emitter_hit(k))
         add_light(lit, lit.lights[path.emitter_hit_at(k).light], path.emitter_hit_at(k).point, 1.0, o, total);
 }
 template <class S>
 void add_direct(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,
                 const Surface<S>& o, S* total) {
-    add_drawn(lit, lights, path, k, o, total), add_met(lit, path, k, o, total);
+    add_sampled_light(lit, lights, path, k, o, total), add_emitter_hit(lit, path, k, o, total);
 }
 
 // Writes the radiance (channels,) of a path with the surfaces at(k).

@@ -24,7 +24,8 @@ class PathSample {
             specular += std::fabs(fresnel), diffuse += std::fabs((1 - fresnel) * s.diffuse(c));
         }
         // Both keep a part: what one technique misses has derivatives, too, and channels differ in brightness.
-        by_lobe_ = std::clamp(specular / std::max(specular + diffuse, 1e-300), least, 1 - least);
+        by_lobe_ =
+            std::clamp(specular / std::max(specular + diffuse, 1e-300), least_probability, 1 - least_probability);
     }
 
     // Returns a direction made from numbers in [0, 1); `choice` selects the technique.
@@ -40,7 +41,7 @@ class PathSample {
     }
 
    private:
-    static constexpr double least = 0.05;
+    static constexpr double least_probability = 0.05;
 
     Vec3 n_;
     DrawnLobe lobe_;

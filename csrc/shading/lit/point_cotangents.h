@@ -10,11 +10,11 @@
 
 namespace edgegrad {
 
-inline void clear(LitPlaces<double> places, int64_t points) {
+inline void clear(LitPositions<double> places, int64_t points) {
     std::fill(places.b, places.b + 3 * points, 0.0);
     if (places.spread) std::fill(places.spread, places.spread + spread_size * points, 0.0);
 }
-inline void write(const FacePointBar& bar, LitPlaces<double> places, int64_t i) {
+inline void write(const FacePointBar& bar, LitPositions<double> places, int64_t i) {
     std::copy(bar.b, bar.b + 3, places.b + 3 * i);
     if (places.spread) std::copy(bar.spread, bar.spread + spread_size, places.spread + spread_size * i);
 }
@@ -31,7 +31,7 @@ void add_cotangents(const LitScene& lit, int64_t points, const std::vector<Table
 
 // Holds point i with the tangent of its position. It refers to itself, and so cannot be copied.
 struct MovingPoint {
-    MovingPoint(const LitScene& lit, const LitPoints& points, LitPlaces<const double> dot, int64_t i) {
+    MovingPoint(const LitScene& lit, const LitPoints& points, LitPositions<const double> dot, int64_t i) {
         Dual b[3];
         set(3 * i, 3, points.b, dot.b, b);
         set(spread_size * i, spread_size, points.spread, dot.spread, spread);

@@ -80,12 +80,12 @@ inline Footprint footprint(const Source& source, Vec2 uv) { return footprint(sou
 // Selects the level of a pyramid (Williams 1983): log2 of the distance between neighbouring pixels in texels. The
 // larger distance of both directions counts. edgegrad/points/footprints.py does the same.
 template <class S>
-struct Level : PyramidLevel<S> {
+struct MipLevel : PyramidLevel<S> {
     int axis = 0;            // It is the direction with the larger distance.
     S across = 0, down = 0;  // They are that distance in texels.
 };
 template <class S>
-Level<S> level_of(const std::vector<Table>& tables, const Source& source, const FacePoint<S>& at) {
+MipLevel<S> level_of(const std::vector<Table>& tables, const Source& source, const FacePoint<S>& at) {
     Uv<S> corner[3];
     for (int i = 0; i < 3; ++i) corner[i] = corner_uv<S>(tables, source, at.face, i);
     S across[2], down[2], squared[2];
@@ -97,13 +97,13 @@ Level<S> level_of(const std::vector<Table>& tables, const Source& source, const 
     }
     // NaN counts as the larger distance here, and as no distance below.
     const int axis = plain(squared[1]) > plain(squared[0]) || std::isnan(plain(squared[1])) ? 1 : 0;
-    Level<S> o;
+    MipLevel<S> o;
     if (!(plain(squared[axis]) > 1)) return o;
     return {{S(0.5) * log2(squared[axis]), source.levels}, axis, across[axis], down[axis]};
 }
 // Adds the cotangents of `share`.
 inline void level_vjp(const std::vector<Table>& tables, const Source& source, const FacePoint<double>& at,
-                      const Level<double>& o, double bar, FacePointBar& at_bar, Cotangents& to) {
+                      const MipLevel<double>& o, double bar, FacePointBar& at_bar, Cotangents& to) {
     const double scale = bar / (M_LN2 * (o.across * o.across + o.down * o.down));
     const double u_bar = scale * o.across * source.width, v_bar = scale * o.down * source.height;
     const Uv<double> first = corner_uv<double>(tables, source, at.face, 0);
@@ -202,7 +202,7 @@ inline void value_vjp(const std::vector<Table>& tables, const Source& source, co
         return f.interpolate(s);
     };
     if (source.is_filtered(at)) {
-        const Level<double> level = level_of(tables, source, at);
+        const MipLevel<double> level = level_of(tables, source, at);
         const double fine = look_up_vjp(source.grid(level.fine), 1 - level.share);
         if (level.is_between) {
             const double coarse = look_up_vjp(source.grid(level.fine + 1), level.share);

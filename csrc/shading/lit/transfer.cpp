@@ -9,7 +9,7 @@ namespace edgegrad {
 
 template <class T>
 void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitLines& lines,
-                  Received received, Paths& paths, double* out) {
+                  SentRadiance wanted, Paths& paths, double* out) {
     const int C = lit.channels;
     std::fill(out, out + lines.size * C, 0.0);
     std::vector<Surface<double>> receivers(lines.size);
@@ -18,11 +18,13 @@ void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaste
         set_place<double>(lit, lines.receiver[i], lines.receiver_b + 3 * i, nullptr, receiver);
         set_place<double>(lit, lines.reflector[i], lines.reflector_b + 3 * i, nullptr, reflector);
         const Vec3 l = unit(reflector.y - receiver.y);
-        set_view<double>(lit, received == Received::by_viewer ? towards_viewer<double>(lit, receiver.y) : l, receiver);
+        set_view<double>(lit, wanted == SentRadiance::seen_by_viewer ? towards_viewer<double>(lit, receiver.y) : l,
+                         receiver);
         set_view<double>(lit, -l, reflector);
         return Paths::scatters(receiver) && dot(receiver.n, l) > 0 && dot(receiver.g, l) > 0;
     };
-    paths.find_lit(scene, caster, {lines.size, lines.reflector, lines.reflector_b, lines.seed, {}, nullptr}, place);
+    paths.find_with_light_samples(scene, caster,
+                                  {lines.size, lines.reflector, lines.reflector_b, lines.seed, {}, nullptr}, place);
     double sent[most_lit_channels], f[most_lit_channels];
     for (int64_t i = 0; i < lines.size; ++i) {
         const Path path = paths.path(i);
@@ -30,7 +32,7 @@ void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaste
         const auto at = [&](int k) -> const Surface<double>& { return paths.surface(i, k); };
         path_radiance(lit, paths.lights(), path, at, sent);
         add_direct(lit, paths.lights(), path, 0, at(0), sent);
-        if (received == Received::there) {
+        if (wanted == SentRadiance::at_receiver) {
             std::copy(sent, sent + C, out + i * C);
             continue;
         }
@@ -44,9 +46,9 @@ void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaste
     }
 }
 
-template void send_between(const LitScene&, const SceneView<float>&, const RayCaster&, const LitLines&, Received,
+template void send_between(const LitScene&, const SceneView<float>&, const RayCaster&, const LitLines&, SentRadiance,
                            Paths&, double*);
-template void send_between(const LitScene&, const SceneView<double>&, const RayCaster&, const LitLines&, Received,
+template void send_between(const LitScene&, const SceneView<double>&, const RayCaster&, const LitLines&, SentRadiance,
                            Paths&, double*);
 
 }  // namespace edgegrad

@@ -25,12 +25,12 @@ struct LitLines {
     const int64_t* seed = nullptr;
 };
 
-// Writes (N, channels) for a few lines, on one thread. `received` selects what the viewer sees, or L, which reaches the
+// Writes (N, channels) for a few lines, on one thread. `wanted` selects what the viewer sees, or L, which reaches the
 // shading point from wherever it is viewed. `paths` start at reflectors, and their bounces limit how often light is
 // scattered up to there.
-enum class Received { by_viewer, there };
+enum class SentRadiance { seen_by_viewer, at_receiver };
 template <class T>
 void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitLines& lines,
-                  Received received, Paths& paths, double* radiance);
+                  SentRadiance wanted, Paths& paths, double* radiance);
 
 }  // namespace edgegrad

@@ -34,7 +34,8 @@ struct ShadowRays {
     template <class T>
     void cast(const SceneView<T>& scene, const RayCaster& caster) {
         found.resize(face.size());
-        see(scene, caster, {face.data(), b.data(), to.data(), contact.data(), int64_t(face.size())}, found.data());
+        test_visibility(scene, caster, {face.data(), b.data(), to.data(), contact.data(), int64_t(face.size())},
+                        found.data());
         for (size_t k = 0; k < found.size(); ++k) *result[k] = int8_t(found[k]);
         clear();
     }
@@ -75,7 +76,7 @@ void query_lights(const LitScene& lit, const SceneView<T>& scene, const RayCaste
         for (int64_t i = 0; i < points.size; ++i) {
             if (!wanted(i)) continue;
             const Surface<double>& o = query.surfaces[i];
-            int8_t& found = query.seen[i * K + k] = not_asked;
+            int8_t& found = query.seen[i * K + k] = not_sampled;
             if (!o.mesh->has_material || o.is_black()) continue;
             if (lights[k].light == options.by_paths && o.scattering.lambertian) {
                 found = 0;

@@ -147,8 +147,11 @@ def _place(
 
 
 KINDS: dict[type[Light], str] = {DirectionalLight: "directional", PointLight: "point", SpotLight: "spot"}
-SAME = 1e-6  # of a camera's size: numbers that differ by so little are rounded
-NEAR, FAR = 1e-3, 10.0  # the planes of a camera between which other programs look, in extents of what it sees
+ROUNDING = 1e-6  # of a camera's size: numbers that differ by so little are rounded
+NEAR_PLANE, FAR_PLANE = (
+    1e-3,
+    10.0,
+)  # the planes of a camera between which other programs look, in extents of what it sees
 
 
 def light_of(light: Light) -> tuple[dict[str, Any] | None, list[str]]:
@@ -196,15 +199,15 @@ def camera_of(camera: Camera, meshes: Sequence[Mesh]) -> tuple[dict[str, Any], n
         return "its lens"
     scale = float(K[1, 1])
     middle = torch.tensor([W / 2, H / 2], dtype=torch.float64)
-    if float((K[:2, 2] - middle).abs().max()) > SAME * max(H, W):
+    if float((K[:2, 2] - middle).abs().max()) > ROUNDING * max(H, W):
         return "its principal point is off the middle"
-    if abs(float(K[0, 0]) - scale) > SAME * scale or abs(float(K[0, 1])) > SAME * scale:
+    if abs(float(K[0, 0]) - scale) > ROUNDING * scale or abs(float(K[0, 1])) > ROUNDING * scale:
         return "its pixels are not square"
     world = np.linalg.inv(pose.numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's y down and z forward
     verts = torch.cat([_double(mesh.verts) for mesh in meshes])
     depth = verts @ pose[2, :3] + pose[2, 3]
     extent = float((verts.amax(0) - verts.amin(0)).norm())
-    near, far = NEAR * extent, float(depth.max().clamp(min=0.0)) + FAR * extent
+    near, far = NEAR_PLANE * extent, float(depth.max().clamp(min=0.0)) + FAR_PLANE * extent
     if camera.projection == "perspective":
         made = {"yfov": 2.0 * math.atan(H / (2.0 * scale)), "aspectRatio": W / H, "znear": near, "zfar": far}
         return {"type": "perspective", "perspective": made}, world

@@ -15,7 +15,7 @@ from .part import FormatError
 # glTF has these codes for settings of samplers.
 WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 NEAREST, LINEAR = 9728, 9729
-FARTHER: dict[int | None, str] = {
+MIN_FILTERS: dict[int | None, str] = {
     None: "mipmap",
     NEAREST: "linear",
     LINEAR: "linear",
@@ -106,10 +106,10 @@ def _sampler(tree: dict[str, Any], texture: dict[str, Any], name: str) -> tuple[
     """Return wraps, and the filters for magnification and minification, by default a mipmap."""
     given = entry(tree, "samplers", texture["sampler"]) if "sampler" in texture else {}
     wraps, near, far = [given.get(k, 10497) for k in ("wrapS", "wrapT")], given.get("magFilter"), given.get("minFilter")
-    if any(w not in WRAPS for w in wraps) or near not in (None, NEAREST, LINEAR) or far not in FARTHER:
+    if any(w not in WRAPS for w in wraps) or near not in (None, NEAREST, LINEAR) or far not in MIN_FILTERS:
         raise FormatError(
             f"expected a sampler of glTF 2.0 for the texture {name!r}, got wraps {wraps}, magFilter {near} and minFilter {far}; "
             "export it again"
         )
     wrap = WRAPS[wraps[0]], WRAPS[wraps[1]]
-    return (wrap, "nearest", "nearest") if near == NEAREST else (wrap, "linear", FARTHER[far])
+    return (wrap, "nearest", "nearest") if near == NEAREST else (wrap, "linear", MIN_FILTERS[far])

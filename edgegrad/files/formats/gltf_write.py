@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...scene.appearance import coordinates
 from ...scene.material import Material, Texture
-from ...scene.mesh import PLAIN, Mesh
+from ...scene.mesh import DEFAULT_RADIANCE, Mesh
 from ..image import to_bytes
 from .gltf import MATT, UNLIT
 from .gltf_texture import LINEAR, NEAREST, WRAPS
@@ -83,7 +83,7 @@ class GltfAppearance:
         if corners is not None:
             self.colors = self._within(each, corners[0]).expand(-1, 3), corners[1]
         nothing = texture is None and corners is None
-        factor = torch.tensor(PLAIN if nothing else 1.0) if given is None else torch.as_tensor(given)
+        factor = torch.tensor(DEFAULT_RADIANCE if nothing else 1.0) if given is None else torch.as_tensor(given)
         factor = self._within("material.base_color", factor.detach().cpu().double())
         if texture is not None:
             name = "texture" if mesh.texture is not None else "material.base_color"

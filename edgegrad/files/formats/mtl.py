@@ -160,7 +160,7 @@ def _number(given: Mapping[str, str], name: str, default: float | None = None) -
 # How many words follow an option, at most; those of -o, -s and -t are numbers, of which the last may be missing.
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-bm": 1, "-type": 1,
            "-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # fmt: skip
-FEWER = ("-o", "-s", "-t")
+MAY_LACK_THE_LAST = ("-o", "-s", "-t")
 # These are applied, are hints on filters, or concern bumps alone.
 APPLIED = ("-o", "-s", "-clamp", "-blendu", "-blendv", "-boost", "-texres", "-bm")
 # The others change nothing with these values; for -imfchan, grey comes from brightness.
@@ -183,7 +183,7 @@ class MtlTexture(NamedTuple):
         while (option := rest.split(None, 1)[0].lower() if rest else "") in OPTIONS:
             words = rest.split(None, OPTIONS[option] + 1)[1:]
             values = words[: OPTIONS[option]]
-            if option in FEWER:
+            if option in MAY_LACK_THE_LAST:
                 values = list(takewhile(_is_number, values))
             options[option] = tuple(value.lower() for value in values)
             rest = rest.split(None, len(values) + 1)[-1] if len(words) > len(values) else ""

@@ -20,7 +20,9 @@ from .task import FOCAL_LENGTH
 from .uncertainty import PRIOR_DEVIATION
 
 MAX_ADJUST_STEPS = 12
-STILL = 0.5  # Mean step in standard deviations that counts as short: noise of the renders moves steps as far.
+SHORT_STEP_DEVIATIONS = (
+    0.5  # Mean step in standard deviations that counts as short: noise of the renders moves steps as far.
+)
 MAX_POSE_MOVE = 0.1  # Longest move of a pose in one step, in radians or object sizes.
 RETRY_DAMPING = (
     1e-3  # Relative to the curvature's diagonal, after a rejected step; each further rejection multiplies it by ten.
@@ -130,7 +132,7 @@ def _is_still(sources: Sequence[LossSource], model: Adjustment, moves: Sequence[
     whole = torch.zeros(n, dtype=torch.float64)
     for own, move in zip(rows, moves, strict=True):
         whole[own] = move
-    return float(whole @ torch.linalg.solve(model.covariance, whole)) <= STILL**2 * n
+    return float(whole @ torch.linalg.solve(model.covariance, whole)) <= SHORT_STEP_DEVIATIONS**2 * n
 
 
 def _noise(evidence: Sequence[LossModel]) -> float:

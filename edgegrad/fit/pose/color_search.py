@@ -34,7 +34,7 @@ RESTART_ROUNDS = 2
 # Where the means of blocks differ by more of the pictures' range, the object is occluded or a pose nearby is ambiguous, unless
 # the pictures show such a share of the render's edges.
 MIN_BLOCK_ERROR, CLEAR_SUPPORT = 0.03, 0.9
-ALMOST = 0.95  # A share of edges this much lower counts as equal, for noise.
+EQUAL_SUPPORT = 0.95  # A share of edges this much lower counts as equal, for noise.
 MIN_SECOND_LEVEL_SUPPORT = 0.4  # Share of edges on the second level below which a candidate is dropped.
 # A restart samples so many poses, takes a few steps from some, and refines the best.
 SAMPLED_POSES, KEPT_SAMPLES, REFINED_SAMPLES = 150, 4, 3
@@ -54,7 +54,7 @@ class Score(NamedTuple):
     def beats(self, best: Score) -> bool:
         """Return whether this is the better answer: its loss is lower, and it shows as much of the pictures' edges. Occluders
         and light contribute to the loss. Another place may lower that part, most of all a place out of view."""
-        return self.loss < best.loss and self.edge_support * self.edges > ALMOST * best.edge_support * best.edges
+        return self.loss < best.loss and self.edge_support * self.edges > EQUAL_SUPPORT * best.edge_support * best.edges
 
 
 class ColorCandidate(NamedTuple):

@@ -25,7 +25,7 @@ from .task import PoseTask, Unknowns
 from .uncertainty import Uncertainty
 
 INSIDE = 64  # Number of vertices of a mesh that are tested for lying in another.
-WITHIN = 0.9  # At the end, they are tested at this share of their distance from their mean.
+INNER_SCALE = 0.9  # At the end, they are tested at this share of their distance from their mean.
 
 
 @torch.inference_mode(False)
@@ -252,7 +252,7 @@ def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:
             points = torch.cat([mesh.verts for mesh in bodies[a]]).double()
             some = points[:: max(1, len(points) // INSIDE)]
             # A little smaller, two coinciding objects are inside one another.
-            some = some.mean(0) + WITHIN * (some - some.mean(0))
+            some = some.mean(0) + INNER_SCALE * (some - some.mean(0))
             inside = torch.stack([_inside(some, mesh) for mesh in bodies[b]]).any(0)
             if float(inside.double().mean()) >= 0.5:
                 return (

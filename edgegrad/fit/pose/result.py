@@ -179,7 +179,7 @@ def png(figure: Figure) -> bytes:
 def pose_from_json(text: str) -> Pose:
     """Read a pose from a JSON object with `mesh_to_world`, 4 × 4 by rows, or from such a matrix alone. An object with `poses`,
     as `edgegrad track` writes them, gives the last one that is not `lost`. Raises ValueError."""
-    data = _parsed(text, without_colors=True)
+    data = _parsed(text, allow_matrix=True)
     if "poses" not in data:
         _check_entries(data, "mesh_to_world")
         return pose_from_matrix("mesh_to_world", data["mesh_to_world"])
@@ -192,12 +192,12 @@ def pose_from_json(text: str) -> Pose:
     return pose_from_matrix("mesh_to_world", seen[-1]["mesh_to_world"])
 
 
-def _parsed(text: str, without_colors: bool = False) -> dict[str, Any]:
+def _parsed(text: str, allow_matrix: bool = False) -> dict[str, Any]:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise ValueError(f"pose: expected JSON, got text that is not ({error})") from None
-    if without_colors and isinstance(data, list) and data:
+    if allow_matrix and isinstance(data, list) and data:
         return {"mesh_to_world": data}
     if not isinstance(data, dict):
         raise ValueError(f'pose: expected a JSON object, got {type(data).__name__}; write {{"mesh_to_world": …}}')

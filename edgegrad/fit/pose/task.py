@@ -28,7 +28,7 @@ COARSEST_OBJECT = 24  # Pixels across the object on the coarsest level, where 15
 SMALLEST_SIDE = 12  # pixels on the shorter side of the coarsest level
 PYRAMID_BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on finer ones
 MAX_COARSE_SPP = 64  # samples a pixel on coarse levels
-FADED = 0.25  # brightness of the picture behind a render, where the background is unknown
+BACKGROUND_BRIGHTNESS = 0.25  # brightness of the picture behind a render, where the background is unknown
 
 # A step has these entries, and a constant for the first of each: a rotation vector about the centre and a shift, both along
 # the first camera's axes, logarithms of scale and focal length, the principal point in widths of the image, and distortion.

@@ -45,12 +45,12 @@ RETRY_STEPS = 8  # steps on each level, where it is not
 # The standard deviation from constant velocity, in radians and object sizes, has this first and this least value.
 STEADY, STEADIEST = 0.03, 0.005
 SHORT_STEP = 1e-3  # length of a short step on the last level, radians and object sizes
-POOR = 0.45  # share of edges below which a picture hardly shows the object
+MIN_SHOWN_SUPPORT = 0.45  # share of edges below which a picture hardly shows the object
 PATIENCE = 4  # successive poor pictures after which the object is lost
 SEARCH_INTERVAL = 5  # pictures from one search for a lost object to the next
 STEADINESS_RATE = 0.1  # weight of a picture in `steady`
 LEARNING_SUPPORT = 0.8  # share of edges in pictures that light is learnt from
-SUDDEN = 0.3  # increase of the covered share that is not believed
+MAX_COVERED_INCREASE = 0.3  # increase of the covered share that is not believed
 HARDLY, MOSTLY = 0.2, 0.6  # covered shares of the object
 # A search for a lost object renders views up to so many radians from the last good pose and this much larger or smaller,
 # takes a few steps from some matches, and refines the best.
@@ -76,7 +76,7 @@ class TrackedPose:
         """How well the pose is known, in words: "seen", or "lost: …", "hardly seen: …" or "covered: …"."""
         if self.lost:
             return "lost: where the object was seen last, since pictures one after the other hardly show it"
-        if self.explained < POOR:
+        if self.explained < MIN_SHOWN_SUPPORT:
             return (
                 f"hardly seen: where its motion leads, for the picture shows {self.explained:.0%} of the render's edges"
             )
@@ -211,7 +211,7 @@ class Tracker:
             warn_of_units(there, [task.shots[0].camera], [near], "at the start")
         predicted = self._predicted()
         pose, share, self.covered, _ = self._found(task, near, predicted)
-        if self.first or share >= POOR:
+        if self.first or share >= MIN_SHOWN_SUPPORT:
             self.poor = self.lost = 0
         else:
             self.poor += 1
@@ -236,7 +236,9 @@ class Tracker:
             if offset is not None and best.share >= LEARNING_SUPPORT and best.covered < HARDLY:
                 variance = (1.0 - STEADINESS_RATE) * self.steady**2 + STEADINESS_RATE * float(offset.square().mean())
                 self.steady = max(variance**0.5, STEADIEST)
-        if best.share < PHOTO_SUPPORT or best.covered > self.covered + SUDDEN:  # Occlusion grows gradually.
+        if (
+            best.share < PHOTO_SUPPORT or best.covered > self.covered + MAX_COVERED_INCREASE
+        ):  # Occlusion grows gradually.
             for start in [predicted] if self.first or predicted is self.good else [predicted, self.good]:
                 again = self._believed(self._down(self._levels(task, depth, start), start, RETRY_STEPS), start)
                 if again.shown > best.shown:
@@ -248,7 +250,7 @@ class Tracker:
             best = max(best, again, key=lambda end: end.shown)
         if best.share >= LEARNING_SUPPORT and best.covered < MOSTLY:
             self.light.learn(best.views)
-        return best if best.share >= POOR else best._replace(pose=predicted)
+        return best if best.share >= MIN_SHOWN_SUPPORT else best._replace(pose=predicted)
 
     def _down(self, levels: list[PhotoLevel], start: Pose, most: int, offset: Tensor | None = None) -> FrameCandidate:
         """Refine through the levels, with at most so many steps on each; `offset` as of _stepped()."""
@@ -349,7 +351,7 @@ class Tracker:
 
     def _move(self, pose: Pose, share: float, lost: bool) -> None:
         """Update position and velocity."""
-        if not (self.first or lost) and (share < POOR or self.covered > MOSTLY):
+        if not (self.first or lost) and (share < MIN_SHOWN_SUPPORT or self.covered > MOSTLY):
             self.pose = pose  # The velocity stays.
             return
         moved, self.moves = self.moves, not (self.first or lost)

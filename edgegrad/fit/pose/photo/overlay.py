@@ -9,7 +9,7 @@ from ....aovs import render_aovs
 from ...contour_colors import draw_contour
 from ..pose import Pose
 from ..robust_loss import Comparison
-from ..task import FADED, PoseTask, PyramidLevel
+from ..task import BACKGROUND_BRIGHTNESS, PoseTask, PyramidLevel
 from .light import HARMONICS, FittedLight, harmonics_of
 from .picture import Picture
 from .surface_interior import AOVS, SurfaceInterior
@@ -29,7 +29,7 @@ def overlay(task: PoseTask, level: PyramidLevel, pose: Pose) -> list[Tensor]:
             channels = render_aovs(moved, camera, AOVS, level.spp, 0)
             alpha = channels["alpha"].float()
             image = shot.target * alpha if task.colourless else _lit(task, level, pose, channels, len(found))
-        image = image + (1.0 - alpha) * FADED * shot.target
+        image = image + (1.0 - alpha) * BACKGROUND_BRIGHTNESS * shot.target
         found.append(draw_contour(image, alpha))
     return found
 

@@ -1,5 +1,5 @@
-// This file finds where unconnected parts of the surface (topology.h) meet in the image. One occludes the other there,
-// or intersects it, and no curve of either tells.
+// This file finds where unconnected parts of the surface (topology.h) overlap or adjoin in the image. One occludes the
+// other there, or intersects it, and no curve of either tells.
 #pragma once
 
 #include <algorithm>
@@ -12,10 +12,11 @@
 
 namespace edgegrad {
 
-class MeetingParts {
+class OverlappingParts {
    public:
     // `hit` (H, W, 2) has the first and the last of the faces (F, 3) that were hit in each pixel; see HitBuffers.
-    MeetingParts(const int32_t* hit, const int32_t* faces, const Parts& parts, int width, int height, ThreadTeam& team)
+    OverlappingParts(const int32_t* hit, const int32_t* faces, const ConnectedParts& parts, int width, int height,
+                     ThreadTeam& team)
         : width_(width), height_(height) {
         if (parts.size() < 2) return;
         std::vector<int32_t> part(size_t(width) * height);  // −1: no part, −2: several
@@ -35,7 +36,7 @@ class MeetingParts {
                 part[p] = first == parts.of(faces[3 * int64_t(hit[2 * p + 1])]) ? first : -2;
             }
         });
-        meet_.resize(part.size());
+        overlap_.resize(part.size());
         each_row([&](int j) {
             for (int i = 0; i < width; ++i) {
                 int32_t one = -1;
@@ -46,20 +47,20 @@ class MeetingParts {
                         several |= p == -2 || (p >= 0 && one >= 0 && p != one);
                         one = std::max(one, p);
                     }
-                meet_[size_t(j) * width + i] = several;
+                overlap_[size_t(j) * width + i] = several;
             }
         });
     }
 
-    // Returns whether parts may meet in a box of the image, or in a pixel next to it.
+    // Returns whether parts may overlap in a box of the image, or in a pixel next to it.
     bool in(Vec2 low, Vec2 high) const {
-        if (meet_.empty()) return false;
+        if (overlap_.empty()) return false;
         const int i0 = pixel(low.x, width_), i1 = pixel(high.x, width_);
         const int j0 = pixel(low.y, height_), j1 = pixel(high.y, height_);
         if (int64_t(i1 - i0 + 1) * (j1 - j0 + 1) > most_pixels) return true;
         for (int j = j0; j <= j1; ++j)
             for (int i = i0; i <= i1; ++i)
-                if (meet_[size_t(j) * width_ + i]) return true;
+                if (overlap_[size_t(j) * width_ + i]) return true;
         return false;
     }
 
@@ -69,7 +70,7 @@ class MeetingParts {
     static int pixel(double x, int count) { return int(std::clamp(x, 0.0, double(count - 1))); }
     static constexpr int64_t most_pixels = 64;  // larger boxes are not searched
     int width_, height_;
-    std::vector<uint8_t> meet_;  // (H, W): whether parts meet in a pixel or next to it; empty: there is one part
+    std::vector<uint8_t> overlap_;  // (H, W): whether parts overlap in a pixel or next to it; empty: there is one part
 };
 
 }  // namespace edgegrad

@@ -1,8 +1,8 @@
-"""Borders between texels on the faces of a mesh whose texture gives the nearest one: where what a surface emits jumps.
+"""Texel edges on the faces of a mesh whose texture gives the nearest texel: where what a surface emits jumps.
 
-On a face a texture's coordinate p, in texels, is affine in the barycentrics b. So a border p = i is a straight line in them. The
-borders of the other coordinate divide it into segments between two texels each. An integral of E(p(b)) h(b) over a face then has
-the derivative
+On a face a texture's coordinate p, in texels, is affine in the barycentrics b. So a texel edge p = i is a straight line in
+them. The edges of the other coordinate divide it into segments between two texels each. An integral of
+E(p(b)) h(b) over a face then has the derivative
 
     Σ_segments ∫ [E_i − E_{i−1}] h δp / |∇p| dℓ,
 
@@ -27,17 +27,17 @@ MOST_LINES = 1 << 17  # that are divided: of more some stand for all
 MOST_SEGMENTS = 1 << 18
 
 
-class BorderPoints(NamedTuple):
-    """N points on borders, and what each stands for: the jump over the pdf by its face's area times |∇p|."""
+class TexelEdgePoints(NamedTuple):
+    """N points on texel edges, and what each stands for: the jump over the pdf by its face's area times |∇p|."""
 
     face: Tensor  # (N,) int64
     b: Tensor  # (N, 3) float64
-    axis: Tensor  # (N,) int64, which coordinate has the border: 0 across, 1 down
+    axis: Tensor  # (N,) int64, which coordinate has the edge: 0 across, 1 down
     weight: Tensor  # (N, C) float64, times δp
 
 
-class TexelBorders(NamedTuple):
-    """Segments of borders, of all faces of a mesh."""
+class TexelEdges(NamedTuple):
+    """Segments of texel edges, of all faces of a mesh."""
 
     mesh: Mesh
     texture: Texture
@@ -49,14 +49,14 @@ class TexelBorders(NamedTuple):
     running: Tensor  # (M,) float64: the running sum of mean |jump| · dA / |∇p|
 
     @classmethod
-    def from_mesh(cls, mesh: Mesh, texture: Texture, area: Tensor, u: tuple[float, float]) -> TexelBorders | None:
-        """Return the borders of faces with these areas (F,), or None where no border has a jump. Numbers u in [0, 1) pick the
-        borders, and the segments of these, that stand for all where there are too many."""
+    def from_mesh(cls, mesh: Mesh, texture: Texture, area: Tensor, u: tuple[float, float]) -> TexelEdges | None:
+        """Return the texel edges of faces with these areas (F,), or None where none has a jump. Numbers u in [0, 1) pick the
+        edges, and the segments of these, that stand for all where there are too many."""
         uvs, uv_faces = coordinates(mesh, texture)
         image = texture.image.detach().cpu()
         corners = in_texels(image, uvs.detach().cpu())[uv_faces.cpu().long()]  # (F, 3, 2)
-        found = _BorderLines.from_corners(corners, u[0]).segments(corners, u[1])
-        i, j, across = found.border, found.cell, (found.axis == 0)
+        found = _TexelEdgeLines.from_corners(corners, u[0]).segments(corners, u[1])
+        i, j, across = found.edge, found.cell, (found.axis == 0)
         high = torch.stack([torch.where(across, i, j), torch.where(across, j, i)], 1)
         low = high - torch.stack([across.double(), 1 - across.double()], 1)
         jump = (nearest(image, high, texture.wraps) - nearest(image, low, texture.wraps)).double()
@@ -70,15 +70,15 @@ class TexelBorders(NamedTuple):
         face, begin, end, axis, jump = (part[some].to(uvs.device) for part in parts)
         return cls(mesh, texture, face, begin, end, axis, jump, measure[some].cumsum(0).to(uvs.device))
 
-    def draw(self, u: Tensor) -> BorderPoints:
+    def draw(self, u: Tensor) -> TexelEdgePoints:
         """Draw points from numbers u (N, 2) in [0, 1)."""
         k, _ = pick(self.running, u[:, 0])
         b = torch.lerp(self.begin[k], self.end[k], u[:, 1:2])
         jump = self.jump[k]
         weight = self.running[-1] * jump / jump.abs().mean(1, keepdim=True)
-        return BorderPoints(self.face[k], b, self.axis[k], weight)
+        return TexelEdgePoints(self.face[k], b, self.axis[k], weight)
 
-    def motion(self, points: BorderPoints) -> Tensor:
+    def motion(self, points: TexelEdgePoints) -> Tensor:
         """Return δp (N, 1) float64: zeros, whose derivatives are those of the texture's coordinates at fixed barycentrics."""
         uvs, uv_faces = coordinates(self.mesh, self.texture)
         uv = interpolated(points.b, uvs.double()[uv_faces[points.face].long()])
@@ -91,19 +91,19 @@ class _Segments(NamedTuple):
     begin: Tensor
     end: Tensor
     axis: Tensor
-    border: Tensor  # (M,) float64, an integer
-    cell: Tensor  # (M,) float64, an integer: between two borders of the other coordinate
+    edge: Tensor  # (M,) float64, an integer
+    cell: Tensor  # (M,) float64, an integer: between two edges of the other coordinate
     share: Tensor  # (M,) float64: twice the length over |∇p|, and how many it stands for
 
 
-class _BorderLines(NamedTuple):
+class _TexelEdgeLines(NamedTuple):
     face: Tensor  # (L,) int64
     axis: Tensor  # (L,) int64
-    border: Tensor  # (L,) float64
+    edge: Tensor  # (L,) float64
     weight: Tensor  # how many one stands for
 
     @classmethod
-    def from_corners(cls, corners: Tensor, u: float) -> _BorderLines:
+    def from_corners(cls, corners: Tensor, u: float) -> _TexelEdgeLines:
         faces = len(corners)
         first = corners.amin(1).ceil().T.reshape(-1)  # (2 F,), the first coordinate before the second
         count = (corners.amax(1).floor().T.reshape(-1) - first + 1).clamp(min=0)
@@ -122,10 +122,10 @@ class _BorderLines(NamedTuple):
         ]  # (L, 3, 3), barycentrics of the lowest, middle and highest corner
 
         def between(k: Tensor | int, m: Tensor | int, start: Tensor, end: Tensor) -> Tensor:
-            t = torch.where(end > start, (self.border - start) / (end - start), 0.0)[:, None]
+            t = torch.where(end > start, (self.edge - start) / (end - start), 0.0)[:, None]
             return torch.lerp(one_hot[rows, k], one_hot[rows, m], t)
 
-        before = (self.border < mid) | ((self.border == mid) & (mid > low))
+        before = (self.edge < mid) | ((self.edge == mid) & (mid > low))
         k = torch.where(before, 0, 1)
         a = between(0, 2, low, high)
         b = between(k, k + 1, torch.where(before, low, mid), torch.where(before, mid, high))
@@ -144,13 +144,13 @@ class _BorderLines(NamedTuple):
         )
         gradient = (p[:, 1:] - p[:, :1]).norm(dim=1)
         length = (b - a)[:, 1:].norm(dim=1) / gradient
-        # On an edge of the face: moved one way the border enters it, and moved the other way its neighbour.
-        on_edge = (p == self.border[:, None]).sum(1) == 2
+        # On an edge of the face: moved one way the texel edge enters it, and moved the other way its neighbour.
+        on_edge = (p == self.edge[:, None]).sum(1) == 2
         share = 2 * length * torch.where(on_edge, 0.5, 1.0) * self.weight
         share = torch.where(gradient > 0, share, 0.0)[line] * (s1 - s0)[:, 0] * weight
         a, b = a[line], b[line]
         return _Segments(
-            self.face[line], torch.lerp(a, b, s0), torch.lerp(a, b, s1), self.axis[line], self.border[line], cell, share
+            self.face[line], torch.lerp(a, b, s0), torch.lerp(a, b, s1), self.axis[line], self.edge[line], cell, share
         )
 
 

@@ -17,14 +17,14 @@
 
 namespace edgegrad {
 
-class SkyGuide {
+class EnvironmentGuide {
    public:
-    explicit SkyGuide(const LitScene& lit) : lit_(lit) {
+    explicit EnvironmentGuide(const LitScene& lit) : lit_(lit) {
         for (size_t k = 0; k < lit.lights.size() && light_ < 0; ++k)
             if (lit.lights[k].kind == Light::Kind::environment && lit.lights[k].is_image) light_ = int(k);
     }
 
-    bool has_sky() const { return light_ >= 0; }
+    bool has_environment() const { return light_ >= 0; }
 
     // Adds the visibility that the points of paths 0 … n − 1 found.
     void add(const Paths& paths, int64_t n) {
@@ -48,8 +48,8 @@ class SkyGuide {
         pdf_.resize(light.size), running_.resize(light.size);
         for (int64_t t = 0; t < light.size; ++t) {
             const size_t c = cell(t);
-            const double here = (double(sum_[c]) / unit + few * mean) / (double(count_[c]) + few);
-            const double factor = std::sqrt(std::max(here, least * mean));
+            const double here = (double(sum_[c]) / unit + prior_points * mean) / (double(count_[c]) + prior_points);
+            const double factor = std::sqrt(std::max(here, least_density * mean));
             mass += factor * (light.running[t] - before), before = light.running[t];
             running_[t] = mass, pdf_[t] = factor * light.pdf[t];
         }
@@ -60,8 +60,8 @@ class SkyGuide {
 
    private:
     static constexpr int64_t rows = 12, columns = 24;
-    static constexpr double few = 4;       // This many points represent the mean of all.
-    static constexpr double least = 0.02;  // It is relative to the mean.
+    static constexpr double prior_points = 4;      // This many points represent the mean of all.
+    static constexpr double least_density = 0.02;  // It is relative to the mean.
     static constexpr double unit = 1 << 20;
 
     size_t cell(int64_t texel) const {
@@ -71,7 +71,7 @@ class SkyGuide {
     }
     // Integer sums do not depend on their order.
     void add(const LightPoint& p, int8_t seen, Vec3 n) {
-        if (seen == not_asked) return;
+        if (seen == not_sampled) return;
         const double cosine = dot(n, place(lit_, lit_.lights[light_], p));
         const size_t c = cell(p.index);
         std::atomic_ref(count_[c]).fetch_add(1, std::memory_order_relaxed);

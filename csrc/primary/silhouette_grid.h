@@ -17,11 +17,11 @@
 
 namespace edgegrad {
 
-// Crossings holds segments in the cells of a grid over the image.
-class Crossings {
+// SilhouetteGrid holds segments in the cells of a grid over the image.
+class SilhouetteGrid {
    public:
     // Takes silhouettes and borders, in parts.
-    Crossings(const std::vector<std::vector<ImageSegment>>& parts, int width, int height, ThreadTeam& team) {
+    SilhouetteGrid(const std::vector<std::vector<ImageSegment>>& parts, int width, int height, ThreadTeam& team) {
         std::vector<int64_t> first(parts.size() + 1, 0);
         double total = 0;  // length
         for (size_t k = 0; k < parts.size(); ++k) {

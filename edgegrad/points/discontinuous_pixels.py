@@ -13,30 +13,30 @@ from ..check import values_visible
 from .discontinuities import FLOOR
 from .hits import Hits
 
-MOST = 8  # at most so many times the first pass's points of a face in a pixel
-SHARE = 4  # and so many times all of its points
+MOST_TIMES_A_FACE = 8  # at most so many times the first pass's points of a face in a pixel
+MOST_TIMES_IN_ALL = 4  # and so many times all of its points
 LEVELS = 1 << 14  # levels of a floor() are compared modulo this, so that int16 holds them
 
 
-class Borders:
+class DiscontinuousPixels:
     """Finds such pixels of an image of `size` (height, width), from a first pass with `points` of each face in a pixel."""
 
     def __init__(self, size: tuple[int, int], points: int) -> None:
         self._size, self._each = size, points
         self._points = torch.zeros(size[0] * size[1], dtype=torch.int32)
-        self._least: list[Tensor] = []  # (H · W,) for each step
+        self._least: list[Tensor] = []  # (H · W,) for each discontinuity
         self._greatest: list[Tensor] = []
         self._known = True
 
     def add(self, pixel: Tensor, hits: Hits) -> None:
         """Add points of the pixels (N,), after they were shaded."""
-        steps = list(zip(hits._discontinuities.kinds, hits._discontinuities.values, strict=True))
-        self._known = self._known and values_visible(*(values for _, values in steps if values is not None))
+        declared = list(zip(hits._discontinuities.kinds, hits._discontinuities.values, strict=True))
+        self._known = self._known and values_visible(*(values for _, values in declared if values is not None))
         # Each point sees another part of a light with an extent, so its neighbours say nothing about the shadow's border.
         lights = [k for k, light in enumerate(hits.lights) if light.punctual]
-        if not self._known or not (steps or lights):
+        if not self._known or not (declared or lights):
             return
-        sides = [None if values is None else _sides(kind, values) for kind, values in steps]
+        sides = [None if values is None else _sides(kind, values) for kind, values in declared]
         sides += [hits._lit.get(k) for k in lights]
         self._points += torch.bincount(pixel, minlength=len(self._points)).int()
         for k, side in enumerate(sides):
@@ -58,7 +58,7 @@ class Borders:
             low, high = -_around(-least.reshape(self._size), -LEVELS), _around(greatest.reshape(self._size), -1)
             differ |= (low < high) & (high >= 0)
         first, there = int(self._points.sum()), int(self._points[differ.reshape(-1)].sum())
-        return differ, self._each * min(MOST, max(2, SHARE * first // max(there, 1)))
+        return differ, self._each * min(MOST_TIMES_A_FACE, max(2, MOST_TIMES_IN_ALL * first // max(there, 1)))
 
 
 def _sides(kind: str, values: Tensor) -> Tensor:

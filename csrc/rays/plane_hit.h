@@ -21,7 +21,7 @@ Vec3 corner(const SceneView<T>& scene, int64_t face, int i) {
 
 // Holds where a ray meets the plane of a face: barycentrics, and the distance in lengths of its direction (Möller and
 // Trumbore 1997). They are NaN or infinite where the ray runs along the plane.
-struct Meeting {
+struct PlaneHit {
     double u, v, t;
 
     // Doubles cannot distinguish less than this from the border of a face.
@@ -34,7 +34,7 @@ struct Meeting {
     bool inside() const { return margin() >= -rounding; }
 };
 template <class T>
-Meeting meet(const SceneView<T>& scene, int64_t face, const Ray& ray) {
+PlaneHit intersect_plane(const SceneView<T>& scene, int64_t face, const Ray& ray) {
     const Vec3 q0 = corner(scene, face, 0), e1 = corner(scene, face, 1) - q0, e2 = corner(scene, face, 2) - q0,
                s = ray.origin - q0;
     const Vec3 p = cross(ray.direction, e2), q = cross(s, e1);

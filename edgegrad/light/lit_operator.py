@@ -16,17 +16,11 @@ from ..check import values_visible
 from ..kernel.first_order import Tensors, apply
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request, make_request
-from ..scene.environment import Environment
-from ..scene.lights import DirectionalLight, PointLight, SphericalHarmonics, SpotLight
-from ..scene.material import Material, Texture
-from ..scene.mesh import Mesh
-from ..scene.scene import Scene
+from ..scene.scene import CLASSES, Scene
 from ..scene.tree import from_text, tensors_in, to_text
 from .radiance import Lighting
 
-_PARTS = (
-    Scene, Mesh, Material, Texture, Camera, Environment, DirectionalLight, PointLight, SpotLight, SphericalHarmonics
-)  # fmt: skip
+_CLASSES = (*CLASSES, Camera)
 
 
 def lit_image(
@@ -48,7 +42,7 @@ def lit_image(
     )  # fmt: skip
     if not torch.compiler.is_compiling():
         moving = tuple(k for k, tensor in enumerate(tensors) if tensor.is_floating_point())
-        return apply(_Whole(recipe, numbers, moving), tensors)[0]
+        return apply(_LitImageOperation(recipe, numbers, moving), tensors)[0]
     size = (*(() if camera.batch is None else (request.cameras,)), *camera.size, scene.channels)
     return torch.ops.edgegrad.lit(tensors, recipe, numbers, size, _dtype(scene))
 
@@ -60,7 +54,7 @@ def _dtype(scene: Scene) -> torch.dtype:
     return torch.float64 if any(mesh.verts.dtype == torch.float64 for mesh in scene.meshes) else torch.float32
 
 
-class _Whole(NamedTuple):
+class _LitImageOperation(NamedTuple):
     """The operation (kernel/first_order.py) that renders `tensors`."""
 
     recipe: str  # what else the scene, the camera and the options are
@@ -70,7 +64,7 @@ class _Whole(NamedTuple):
     moving: Sequence[int]
 
     def image(self, tensors: Sequence[Tensor]) -> Tensor:
-        scene, camera, options = from_text(self.recipe, tensors, _PARTS)
+        scene, camera, options = from_text(self.recipe, tensors, _CLASSES)
         spp, seed, surface, edge, grad_seed, samples, bounces = self.numbers
         own = dict(options)
         lighting, creases = Lighting(own.pop("shadows"), samples, bounces), own.pop("creases")
@@ -116,7 +110,7 @@ torch.library.define("edgegrad::lit_backward", f"(Tensor adjoint, {_ARGUMENTS}, 
 
 @torch.library.impl("edgegrad::lit", "CompositeExplicitAutograd")
 def _lit(tensors: list[Tensor], recipe: str, numbers: list[int], size: list[int], dtype: torch.dtype) -> Tensor:
-    return _Whole(recipe, numbers, ()).value(tensors)[0].to(dtype)
+    return _LitImageOperation(recipe, numbers, ()).value(tensors)[0].to(dtype)
 
 
 @torch.library.register_fake("edgegrad::lit")
@@ -128,7 +122,7 @@ def _lit_fake(tensors: list[Tensor], recipe: str, numbers: list[int], size: list
 def _lit_backward(
     adjoint: Tensor, tensors: list[Tensor], recipe: str, numbers: list[int], moving: list[int]
 ) -> list[Tensor]:
-    return list(_Whole(recipe, numbers, moving).vjp(adjoint, [True] * len(moving), (), tensors))
+    return list(_LitImageOperation(recipe, numbers, moving).vjp(adjoint, [True] * len(moving), (), tensors))
 
 
 @torch.library.register_fake("edgegrad::lit_backward")

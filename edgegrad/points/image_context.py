@@ -14,31 +14,32 @@ from ..kernel.request import Request
 from ..scene.scene import Scene
 from .discontinuities import Discontinuities
 from .hits import Hits
-from .records import RayRecords, SurfaceRecords, barycentrics, without_colors
+from .records import RayRecords, SurfaceRecords, barycentrics, with_attributes
 from .sampler import Sampler
 from .seeds import sample_seeds
 from .shadow_rays import Forced
 from .sobol import z_order
-from .splat import Term, attached
-from .surfaces import Surfaces, View
+from .splat import SplatTerm, attached
+from .surfaces import CameraView, Surfaces
 
 _Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
 # Each kind has its own random numbers.
-SAMPLES = (
-    "image", "inside", "edges", "steps", "shadows", "image again", "indirect shadows", "secondary edges", "surface edges",
+SEED_KINDS = (
+    "image", "inside", "edges", "discontinuities", "shadows", "image again", "indirect shadows", "secondary edges",
+    "surface edges",
 )  # fmt: skip
 
 
-class Frame:
+class ImageContext:
     """One image of a scene."""
 
     def __init__(self, scene: Scene, request: Request, index: int = 0) -> None:
         packed = request.camera
-        self.request, self._index = request._replace(scene=without_colors(request.scene)), index
+        self.request, self._index = request._replace(scene=with_attributes(request.scene)), index
         self.surfaces = Surfaces(scene, self.request.scene)
         self.device, self.dtype = self.surfaces.verts.device, self.surfaces.verts.dtype
         self.sampler = Sampler(self.request, index, torch.finfo(self.dtype).eps ** (2 / 3))
-        self.view = View(packed.world_to_camera[index].to(self.device, torch.float64), packed.perspective)
+        self.view = CameraView(packed.world_to_camera[index].to(self.device, torch.float64), packed.perspective)
         self.fixed, self.fixed_view = self.surfaces.detach(), self.view.detach()
         self.intrinsics = torch.cat([packed.K[index, :2].reshape(6), packed.distortion[index]])
         self.height, self.width = packed.height, packed.width
@@ -55,7 +56,7 @@ class Frame:
         """Return the seeds (count,) int64 of the samples of a kind from `first` on."""
         request = self.request
         seed = camera_seed(request.image.seed, self._index) if kind.startswith("image") else self.sampler.grad_seed
-        return self.here(sample_seeds(seed, SAMPLES.index(kind), first, count))
+        return self.here(sample_seeds(seed, SEED_KINDS.index(kind), first, count))
 
     def seeds_of_pixels(self, kind: str, pixel: Tensor, each: int) -> Tensor:
         """Return the seeds (N,) int64 of hits in the pixels (N,) in ascending order, about `each` in one. Those of a pixel do
@@ -73,12 +74,12 @@ class Frame:
         b: Tensor,
         x: Tensor,
         seed: Tensor | None = None,
-        steps: Discontinuities | None = None,
+        discontinuities: Discontinuities | None = None,
         forced: Forced | None = None,
     ) -> Hits:
         """Return hits without derivatives; b are (N, 3), or the last two barycentrics."""
         place = self.here(face), self.here(b if b.shape[1] == 3 else barycentrics(b)), self.here(x)
-        return Hits(self.fixed, self.fixed_view, *place, self._fixed_rays_at, steps, seed, forced)
+        return Hits(self.fixed, self.fixed_view, *place, self._fixed_rays_at, discontinuities, seed, forced)
 
     @property
     def no_hits(self) -> Hits:
@@ -115,7 +116,7 @@ class Frame:
         pixels = pixels or range(self.pixels)
         return values.new_zeros((len(pixels), values.shape[1])).index_add(0, self.here(pixel) - pixels.start, values)
 
-    def attached(self, image: Tensor, terms: Sequence[Term]) -> Tensor:
+    def attached(self, image: Tensor, terms: Sequence[SplatTerm]) -> Tensor:
         """Return the image with the derivatives of the terms: see attached()."""
         return attached(image.reshape(self.pixels, -1), terms, self.request).reshape(image.shape)
 
