@@ -12,7 +12,7 @@ from PIL import Image
 from trimesh.creation import icosphere
 
 import edgegrad as eg
-from benchmarks import mitsuba, scenes
+from benchmarks import mitsuba, mitsuba_scene, scenes
 from benchmarks.command import INTERRUPTED
 from benchmarks.error_time import references
 from benchmarks.error_time import run as module
@@ -315,9 +315,9 @@ def open_ball():
 
 
 def test_what_mitsuba_gets_is_the_same_view(open_ball):
-    scene, camera, scale = mitsuba._resized(open_ball.scene, open_ball.camera)
-    assert scene.meshes[0].verts.norm(dim=1).max() == pytest.approx(mitsuba.RADIUS)
-    assert scale == pytest.approx(mitsuba.RADIUS / 0.05, rel=0.2)
+    scene, camera, scale = mitsuba_scene.resized(open_ball.scene, open_ball.camera)
+    assert scene.meshes[0].verts.norm(dim=1).max() == pytest.approx(mitsuba_scene.RADIUS)
+    assert scale == pytest.approx(mitsuba_scene.RADIUS / 0.05, rel=0.2)
     points = [
         view.project(s.meshes[0].verts.double()) for s, view in ((scene, camera), (open_ball.scene, open_ball.camera))
     ]
