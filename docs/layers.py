@@ -13,14 +13,8 @@ from pathlib import Path
 import grimp
 
 FOLDER = Path(__file__).parent
-LEFT_OUT = {
-    "image",
-    "io",
-    "lights",
-    "notebook",
-    "__main__",
-    "_core",
-}  # names for users alone, which nothing inside imports
+# Users alone import these names, and nothing inside.
+LEFT_OUT = {"image", "io", "lights", "notebook", "__main__", "_core"}
 INK, BLUE, GREY = "#222222", "#1f6fb2", "#b9bec6"
 
 

@@ -1,4 +1,4 @@
-"""A seven-joint arm of boxes and cylinders, as URDF: what examples/robot.py looks at when it is given none."""
+"""A helper of examples/robot.py: a seven-joint arm of boxes and cylinders, as URDF, at which it looks when given none."""
 
 from __future__ import annotations
 

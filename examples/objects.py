@@ -1,4 +1,4 @@
-"""What the examples of fits look at: an object that needs no file, and cameras around it."""
+"""A helper of other examples: the object that fits look at, which needs no file, and cameras around it."""
 
 from __future__ import annotations
 

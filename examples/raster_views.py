@@ -1,4 +1,4 @@
-"""What the examples of edgegrad.raster share: matrices to clip space, rotations, a cube, and how they descend."""
+"""A helper of other examples, those of edgegrad.raster: matrices to clip space, rotations, a cube, and how they descend."""
 
 from __future__ import annotations
 
