@@ -441,7 +441,7 @@ def test_profile():
     scene, camera = requiring(creased(), CAMERA, ("verts", "colors"))
     found = eg.profile(scene, camera, spp=4, repeats=3)
     assert list(found)[:2] == ["update", "forward"] and list(found)[-1] == "python"
-    assert all((seconds > 0) == (not name.startswith("step ")) for name, seconds in found.items())  # no face has steps
+    assert all((seconds > 0) == (not name.startswith("discontinuity")) for name, seconds in found.items())  # none
     assert found.seconds == pytest.approx(sum(found.values()))
     planned = eg.plan(scene, camera, 4)
     assert found.samples["image_samples"] == planned["image"].samples
