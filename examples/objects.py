@@ -1,4 +1,4 @@
-"""A helper of other examples: the object that fits look at, which needs no file, and cameras around it."""
+"""An object that needs no file, and cameras around it, for the examples of fits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import edgegrad as eg
 
 
 def pebble(texels: int = 256, subdivisions: int = 4) -> eg.Mesh:
-    """A bumpy stone, some 2 units long, with a pattern of blotches; each face of a cube around it is a sixth of the texture."""
+    """Return a bumpy stone, some 2 units long, with a pattern of blotches; each face of a cube around it is a sixth of
+    the texture."""
     cube = trimesh.creation.box().subdivide_loop(iterations=0)
     for _ in range(subdivisions):
         cube = cube.subdivide()
@@ -39,7 +40,7 @@ def pebble(texels: int = 256, subdivisions: int = 4) -> eg.Mesh:
 
 
 def blotches(size: int, seed: int = 0) -> Tensor:
-    """(size, size, 3) smooth noise of two scales, as radiance."""
+    """Return smooth noise (size, size, 3) of two scales, as radiance."""
     generator = torch.Generator().manual_seed(seed)
     total = torch.zeros(1, 3, size, size)
     for cells, height in ((9, 0.7), (36, 0.3)):
@@ -49,7 +50,7 @@ def blotches(size: int, seed: int = 0) -> Tensor:
 
 
 def around(mesh: eg.Mesh, count: int, size: int, distance: float = 1.5) -> list[eg.Camera]:
-    """Cameras on a spiral around a mesh, so many diagonals of its box away."""
+    """Return cameras on a spiral around a mesh, so many diagonals of its box away."""
     low, high = mesh.verts.detach().double().aminmax(dim=0)
     middle, diagonal = (low + high) / 2, float((high - low).norm())
     cameras = []
@@ -65,5 +66,5 @@ def around(mesh: eg.Mesh, count: int, size: int, distance: float = 1.5) -> list[
 
 
 def load(path: str | None) -> eg.Mesh:
-    """A mesh file, or the stone."""
+    """Load a mesh file, or return the stone."""
     return pebble() if path is None else eg.load_mesh(path)
