@@ -17,7 +17,7 @@ import torch
 import edgegrad as eg
 
 PROBLEMS = {
-    "pose": small_fits.pose, "light and colours": small_fits.light_and_colours,
+    "pose": small_fits.pose, "light and colours": small_fits.light_and_colors,
     "camera and material": small_fits.camera_and_material,
 }  # fmt: skip
 NEAR = 4 / 3

@@ -33,8 +33,8 @@ def of_bracket(method: str, seed: int) -> tuple[Fit, str]:
 
 
 def of_vase(method: str, seed: int) -> tuple[Fit, str]:
-    colours = 0.45 + 0.25 * torch.sin(3.0 * vase(RADII).verts)
-    image = photograph(VIEW, vase(RADII).replace(colors=colours), seed=seed, light_samples=16)
+    colors = 0.45 + 0.25 * torch.sin(3.0 * vase(RADII).verts)
+    image = photograph(VIEW, vase(RADII).replace(colors=colors), seed=seed, light_samples=16)
     start = Pose(torch.eye(3), torch.tensor([0.06, -0.04, 0.0]))
     sought = {
         "radii": Parameter(0.01, RADII * OFF, low=0.05),

@@ -178,9 +178,9 @@ def clutter(seed: int, size: int = SIZE) -> Tensor:
         u = (x[None] - middle[0]) * math.cos(angle) + (x[:, None] - middle[1]) * math.sin(angle)
         v = -(x[None] - middle[0]) * math.sin(angle) + (x[:, None] - middle[1]) * math.cos(angle)
         waves = np.sin(2.0 * math.pi * rng.uniform(2.0, 25.0) * u + 3.0 * np.sin(rng.uniform(0.0, 15.0) * v))
-        colour = rng.uniform(0.05, 0.9, 3) * (1.0 + rng.uniform(0.0, 0.35) * waves[..., None])
+        color = rng.uniform(0.05, 0.9, 3) * (1.0 + rng.uniform(0.0, 0.35) * waves[..., None])
         inside = (abs(u) < half[0]) & (abs(v) < half[1])
-        image = np.where(inside[..., None], colour * (1.0 + 0.5 * rng.uniform(-1.0, 1.0) * u[..., None]), image)
+        image = np.where(inside[..., None], color * (1.0 + 0.5 * rng.uniform(-1.0, 1.0) * u[..., None]), image)
     return srgb_to_linear(torch.from_numpy(image).float().clamp(0.0, 1.0))
 
 

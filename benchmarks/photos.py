@@ -230,14 +230,14 @@ class Run:
 def outlined(case: Case, start: Placed | None, found: Placed, camera: eg.Camera | None = None) -> Tensor:
     """Return the photograph (H, W, 3) with the contours of the start (blue) and of the fit by its own camera (yellow)."""
     image = case.picture
-    for pose, seen, colour in (
+    for pose, seen, color in (
         (start, case.camera, (0.1, 0.3, 1.0)), (found, camera or case.camera, (1.0, 0.9, 0.0)),
     ):  # fmt: skip
         if pose is None:
             continue
         alpha = case.alpha(pose, seen)[..., None]
         highest = F.max_pool2d(alpha.movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
-        image = torch.where(highest - alpha > RIM, torch.tensor(colour), image)
+        image = torch.where(highest - alpha > RIM, torch.tensor(color), image)
     return image
 
 

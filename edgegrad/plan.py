@@ -20,7 +20,7 @@ from .kernel.request import DISCONTINUITY_SLOTS, MOVING, SLOTS, Request, WantedT
 from .library import core
 from .light.bounces import check_bounces
 from .light.radiance import LIGHTING, Lighting
-from .light.sampling import MOST_SETS, SETS, how_drawn
+from .light.sampling import how_drawn
 from .light.unused_options import warn_of_unused
 from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, with_attributes
 from .points.shadows import ShadowLight
@@ -144,7 +144,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     inside = sum(lighting.in_gradient(scene, light) for light in scene.casting)
     more = (
         f"; for the gradient inside faces {inside}, in antithetic sets of four whose opposite signs cancel, and up to "
-        f"{MOST_SETS // SETS} times as many where faces are seen from aside"
+        f"{core.MOST_SETS_FOR_ONE // core.SETS_FOR_ONE} times as many where faces are seen from aside"
         if inside > lights
         else ""
     )

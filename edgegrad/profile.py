@@ -29,8 +29,10 @@ _PARTS = (
     "update", "forward", "view", "surface measure", "surface rays", "surface scatter", "curves", "edge rays",
     "edge scatter", "discontinuity rays", "discontinuity scatter", "world",
 )  # fmt: skip
-# These are the parts where points are shaded: in lit scenes, and around mipmaps.
-_SHADED = ("image", "samples", "surface shading", "edge shading", "discontinuities", "shadows", "backward")
+# These parts are always shown where points are shaded: in lit scenes, and around mipmaps.
+_SHADED = ("image", "samples", "surface shading", "edge shading", "discontinuities", "shadows")
+# These are shown where light is scattered more than once.
+_INDIRECT = ("indirect shadows", "secondary edges")
 _BAR = 24  # characters of a bar of 100 %
 
 
@@ -54,6 +56,8 @@ class Profile(Mapping[str, float]):
         edge shading       on both sides of edges
         discontinuities    finding, and shading on both sides of, texel edges
         shadows            the same of shadow boundaries
+        indirect shadows   the same of those on surfaces that the camera does not see directly, with bounces above 1
+        secondary edges    the same of edges seen from shading points, with bounces above 1
         backward           what autograd runs
         python             all the rest
     """
@@ -175,7 +179,8 @@ def _of_shaded(
             with watch.part("backward"):
                 torch.autograd.grad(image, leaves, adjoint.reshape(image.shape).to(image))
         runs.append({**watch.seconds, "python": time.perf_counter() - begin - sum(watch.seconds.values())})
-    seconds = {part: statistics.median(run.get(part, 0.0) for run in runs) for part in (*_SHADED, "python")}
+    parts = (*_SHADED, *(part for part in _INDIRECT if part in watch.seconds), "backward", "python")
+    seconds = {part: statistics.median(run.get(part, 0.0) for run in runs) for part in parts}
     image_samples = adjoint.shape[:-1].numel() * request.image.spp
     return Profile(seconds, {"image_samples": image_samples, **watch.samples})
 

@@ -53,7 +53,7 @@ SAMPLES_A_POINT = 16
 CREASES = ("auto", True, False)
 
 
-def shaded_points(spp: int) -> int:
+def points_of_face(spp: int) -> int:
     """Return how many points of a face are shaded in a pixel with so many samples."""
     return max(1, spp // SAMPLES_A_POINT)
 
@@ -68,9 +68,8 @@ class ShadingTraits(NamedTuple):
     glossy: bool = False
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
-    closer: float = (
-        1.0  # by which lines that look for discontinuities lie closer, for what is shaded next to them is noisy
-    )
+    # By which lines that look for discontinuities lie closer, for what is shaded next to them is noisy.
+    closer: float = 1.0
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     discontinuity_margin: float = 0.0  # how far from a discontinuity its sides are shaded
 
@@ -132,7 +131,7 @@ def render_shaded(
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
     radiance = shader if isinstance(shader, Radiance) else UserShader(shader)
-    traits = traits or ShadingTraits(shaded_points(request.image.spp), blended=scene.blends)
+    traits = traits or ShadingTraits(points_of_face(request.image.spp), blended=scene.blends)
     with shaded_memory(request, textured=traits.lit and scene.textured_faces is not None):
         images = [
             _Image(ImageContext(scene, request, k), radiance, creases, check, traits, watch).render()

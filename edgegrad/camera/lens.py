@@ -9,12 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-COEFFICIENT_COUNTS = {
-    "perspective": (4, 5, 8),
-    "fisheye": (4,),
-    "panorama": (),
-    "orthographic": (),
-}  # of coefficients, by projection
+# These numbers of coefficients a projection may have.
+COEFFICIENT_COUNTS = {"perspective": (4, 5, 8), "fisheye": (4,), "panorama": (), "orthographic": ()}
 MOST_COEFFICIENTS = 8  # what the kernel takes
 MOST_TURNS = 4  # how often a panorama may reach around, either way
 

@@ -136,7 +136,7 @@ def _read_3mf(data: bytes, kind: str, context: LoadContext) -> MeshFile:
     return MeshFile(_parts(threemf.instances(data, context), appearance), [])
 
 
-def _read_plain(data: bytes, kind: str, context: LoadContext) -> MeshFile:
+def _read_parts(data: bytes, kind: str, context: LoadContext) -> MeshFile:
     """Read OBJ, PLY, STL and OFF."""
     found, parts = [part for part in PART_READERS[kind](data, context) if len(part.faces)], []
     for part in found:
@@ -170,4 +170,4 @@ def _errors_with_part(name: str, alone: bool) -> Iterator[None]:
 
 
 PART_READERS = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "off": off.read}
-READERS = {"gltf": _read_gltf, "glb": _read_gltf, "3mf": _read_3mf, **dict.fromkeys(PART_READERS, _read_plain)}
+READERS = {"gltf": _read_gltf, "glb": _read_gltf, "3mf": _read_3mf, **dict.fromkeys(PART_READERS, _read_parts)}

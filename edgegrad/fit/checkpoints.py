@@ -19,7 +19,7 @@ from .options import Options, Parameter
 from .placement import Placement
 from .views import Observation
 
-FORMAT = 8
+FORMAT = 9
 STEP_OPTIONS = (  # options that steps depend on
     "loss", "mask_loss", "method", "views_per_step", "spp", "seed", "patience", "tolerance", "render",
 )  # fmt: skip

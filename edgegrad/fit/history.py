@@ -19,8 +19,8 @@ class Record(NamedTuple):
     rate: float = 1.0  # factor of the learning rates
 
 
-def plain_history(history: Sequence[Record]) -> list[dict[str, Any]]:
-    """Return the records as plain values for history.json."""
+def history_rows(history: Sequence[Record]) -> list[dict[str, Any]]:
+    """Return the records for history.json."""
     return [
         {
             "step": record.step, "loss": number_or_none(record.loss),

@@ -18,11 +18,8 @@ from torch import Tensor
 from ..camera.camera import Camera
 from ..check import as_tensor, check_float, check_positive, check_shape
 
-CHANNELS = {
-    "depths": "depth",
-    "normals": "shading_normal",
-    "positions": "position",
-}  # channels of render_aovs() by argument
+# Arguments stand for these channels of render_aovs().
+CHANNELS = {"depths": "depth", "normals": "shading_normal", "positions": "position"}
 WIDTHS = {"depth": 1, "shading_normal": 3, "position": 3}
 NORMAL_SCALE = 0.1  # about 6°
 MAD = 1.4826  # standard deviation of Gaussian noise over the median of its sizes

@@ -159,7 +159,7 @@ class Coordinates:
             found[name] = Pose(*(part.to(placement.dtype) for part in placement.pose(parts)[:3]))
         return found
 
-    def plain(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def result_values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the values without gradients, poses as matrices (4, 4) float64, as results and histories hold them."""
         with torch.no_grad():
             found = {name: tensor.detach() for name, tensor in tensors.items()}
@@ -171,7 +171,7 @@ class Coordinates:
 
     def recorded(self, record: Record) -> Record:
         """Return the record as histories hold it."""
-        return record._replace(values=self.plain(record.values)) if self.placements else record
+        return record._replace(values=self.result_values(record.values)) if self.placements else record
 
     def poses(self, tensors: Mapping[str, Tensor]) -> dict[str, Pose]:
         """Return the poses by name, in float64."""

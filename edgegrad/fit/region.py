@@ -66,10 +66,10 @@ class Palette:
 
     CELLS = 32  # a channel; all colours in a cell have the same index
 
-    def __init__(self, colours: Tensor) -> None:
-        self.colours = colours
+    def __init__(self, colors: Tensor) -> None:
+        self.colors = colors
         self._table: Tensor | None = None
-        if colours.shape[1] == 3:
+        if colors.shape[1] == 3:
             middle = (torch.arange(self.CELLS) + 0.5) / self.CELLS
             self._table = self._nearest(torch.cartesian_prod(middle, middle, middle))
 
@@ -82,7 +82,7 @@ class Palette:
         return self._table[(r * self.CELLS + g) * self.CELLS + b]
 
     def _nearest(self, pixels: Tensor) -> Tensor:
-        return torch.cdist(pixels, self.colours).argmin(1)
+        return torch.cdist(pixels, self.colors).argmin(1)
 
 
 def palette(display: Tensor, seed: int) -> Palette:
@@ -90,15 +90,15 @@ def palette(display: Tensor, seed: int) -> Palette:
     generator = torch.Generator().manual_seed(seed)
     pixels = display.flatten(0, 1)
     pixels = pixels[torch.randperm(len(pixels), generator=generator)[:SAMPLED]]
-    colours = pixels[:COLOURS].clone()
+    colors = pixels[:COLOURS].clone()
     for _ in range(LLOYD_ROUNDS):
-        distance = torch.cdist(pixels, colours)
+        distance = torch.cdist(pixels, colors)
         nearest = distance.argmin(1)
-        count = torch.bincount(nearest, minlength=len(colours))[:, None]
-        mean = torch.zeros_like(colours).index_add_(0, nearest, pixels) / count.clamp(min=1)
-        lonely = pixels[distance.amin(1).topk(len(colours)).indices]  # where colours without pixels start anew
-        colours = torch.where(count > 0, mean, lonely)
-    return Palette(colours)
+        count = torch.bincount(nearest, minlength=len(colors))[:, None]
+        mean = torch.zeros_like(colors).index_add_(0, nearest, pixels) / count.clamp(min=1)
+        lonely = pixels[distance.amin(1).topk(len(colors)).indices]  # where colours without pixels start anew
+        colors = torch.where(count > 0, mean, lonely)
+    return Palette(colors)
 
 
 class Windows:
@@ -109,16 +109,16 @@ class Windows:
     MIN_COUNT = 1e-3  # pixels of all colours that are added to every window
     PRESENT = 0.1  # pixels in a window's cell: fewer say nothing about colours
 
-    def __init__(self, size: tuple[int, int], label: Tensor, colours: Tensor, radius: float) -> None:
+    def __init__(self, size: tuple[int, int], label: Tensor, colors: Tensor, radius: float) -> None:
         """`label` (h · w,) is Palette.labels() for the palette's colours (n, C); `radius` of a window in pixels."""
         h, w = size
         cell = max(1.0, radius / CELLS)
         self.shape = math.ceil(h / cell), math.ceil(w / cell)
         rows, columns = (torch.arange(h) / cell).long(), (torch.arange(w) / cell).long()
         self.size = h, w
-        self.count = len(colours)
+        self.count = len(colors)
         self._index = label * (self.shape[0] * self.shape[1]) + (rows[:, None] * self.shape[1] + columns).flatten()
-        similar = torch.exp(-0.5 * (torch.cdist(colours, colours) / self.COLOUR_SIGMA).square())
+        similar = torch.exp(-0.5 * (torch.cdist(colors, colors) / self.COLOUR_SIGMA).square())
         self._kernel = similar / similar.sum(1, keepdim=True)
 
     def frequencies(self, share: Tensor) -> Tensor:

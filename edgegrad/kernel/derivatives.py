@@ -14,9 +14,9 @@ def transformed() -> bool:
     return functorch.peek_interpreter_stack() is not None
 
 
-def plain() -> bool:
-    """Return whether tensors are what they seem: neither a transform of torch.func, nor forward mode, nor torch.compile is
-    under way."""
+def is_eager() -> bool:
+    """Return whether tensors have values of their own: neither a transform of torch.func, nor forward mode, nor torch.compile
+    is under way."""
     return not (transformed() or torch.autograd.forward_ad._current_level >= 0 or torch.compiler.is_compiling())
 
 

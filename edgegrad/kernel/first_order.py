@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.graph import get_gradient_edge
 
 from .autograd import FIRST_ORDER, _one_by_one
-from .derivatives import plain, transformed
+from .derivatives import is_eager, transformed
 
 Tensors = Sequence[Tensor | None]
 
@@ -44,7 +44,7 @@ def apply(operation: Operation, tensors: Tensors) -> tuple[Tensor, ...]:
 
 def without_derivatives(compute: Callable[..., Sequence[Tensor]], *tensors: Tensor) -> tuple[Tensor, ...]:
     """Return compute() of the values of tensors, whatever transforms of torch.func are under way."""
-    if plain():
+    if is_eager():
         with torch.no_grad():
             return tuple(compute(*(tensor.detach() for tensor in tensors)))
     return _Values.apply(compute, *tensors)  # pyright: ignore[reportReturnType]

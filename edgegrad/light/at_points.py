@@ -11,6 +11,7 @@ from torch import Tensor
 from ..kernel.first_order import Tensors, array, doubles
 from ..kernel.flat import Flat
 from ..kernel.operators import kernel_scene
+from ..kernel.threads import threads
 from ..library import core
 from .sampling import DARK
 
@@ -81,7 +82,7 @@ class AtPoints(NamedTuple):
             "lit": self.layout.kernel(tables, self._flat(tensors).faces),
             "points": core.LitPoints(b=array(b), forced_light=self.forced, **arrays),
             "options": options.kernel,
-            "threads": torch.get_num_threads(),
+            "threads": threads(),
         }
 
     def zeros(self, tensors: Tensors) -> Tensor:

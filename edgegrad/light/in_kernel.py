@@ -14,6 +14,7 @@ from torch import Tensor
 from ..kernel.derivatives import moves
 from ..kernel.first_order import apply, array, without_derivatives
 from ..kernel.request import derived_seed
+from ..kernel.threads import threads
 from ..library import core
 from ..points.hits import Hits
 from ..points.image_context import ImageContext
@@ -26,7 +27,7 @@ from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from .at_points import AtPoints, Indirect, LitOptions, PointTensors, Shading
 from .layout import channel_groups, layout_of
-from .sampling import DARK, MOST_SETS, SET_SIZE
+from .sampling import DARK
 
 _64_BITS = 2**64 - 1
 
@@ -86,7 +87,7 @@ def _radiance(hits: Hits, shadows: bool, samples: int, channels: slice) -> Tenso
             if casting.punctual:
                 hits._note_visibility(light, own)
         sets = options.antithetic and isinstance(casting, Environment) and surfaces.scene.is_glossy
-        column += 1 if casting.punctual else samples * (MOST_SETS * SET_SIZE if sets else 1)
+        column += 1 if casting.punctual else samples * (core.MOST_SETS_FOR_ONE * core.SET_SIZE if sets else 1)
     return found.to(surfaces.verts)
 
 
@@ -217,7 +218,7 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
         points = core.LitPoints(face=array(face), b=array(b), seed=array(seed), spread=spread)
         options = core.LitOptions(shadows=False, samples=samples, only=-1, antithetic=False, dark=DARK)
         lit = layout.kernel(tables, faces)
-        found = core.light_points(lit, points, options, hits._index(light), torch.get_num_threads())
+        found = core.light_points(lit, points, options, hits._index(light), threads())
         return [torch.from_numpy(x) for x in found]
 
     given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), surfaces.geometry.faces]
@@ -238,8 +239,7 @@ def light_on_faces(
 
     def compute(*tensors: Tensor) -> Sequence[Tensor]:
         verts, faces, eye, place, power = map(array, tensors)
-        threads = torch.get_num_threads()
-        found = core.light_on_faces(verts, faces, eye, view.perspective, place, infinite, power.tolist(), threads)
+        found = core.light_on_faces(verts, faces, eye, view.perspective, place, infinite, power.tolist(), threads())
         return (torch.from_numpy(found),)
 
     tensors = (verts.double(), faces.int(), view.eye.double(), place.double(), power.double())

@@ -27,7 +27,7 @@ from ..scene.environment import Environment
 from ..scene.lights import Light
 from ..scene.scene import Scene
 from ..scene.tree import tensors_in
-from ..shader import Radiance, ShadingTraits, render_shaded, shaded_points
+from ..shader import Radiance, ShadingTraits, points_of_face, render_shaded
 from ..warnings import warn
 from . import in_kernel
 from .at_points import LitOptions
@@ -37,7 +37,6 @@ from .emitter_texels import by_texel_edges, moving_emitters
 from .in_kernel import is_fused, nearest_textures
 from .indirect_shadows import indirect_shadows
 from .near_field import NearField, radius
-from .sampling import SET_SIZE, SETS
 from .secondary_edges import secondary_edges
 from .shaded_points import of_each_mesh, on_mesh
 
@@ -98,7 +97,7 @@ class Lighting(NamedTuple):
         # more there are in a pixel, for they are spread evenly.
         extended = any(not light.punctual for light in scene.casting)
         spp = request.image.spp
-        points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else shaded_points(spp)
+        points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else points_of_face(spp)
         if self.bounces > 1:
             points = max(FEWEST_IN_PENUMBRA, spp)
         # From each point that the kernel shades for an image go several paths (csrc/shading/lit/path.h).
@@ -142,7 +141,7 @@ class Lighting(NamedTuple):
         if light.punctual:
             return 1
         sets = scene.is_glossy and isinstance(light, Environment)
-        return self.samples * (SETS * SET_SIZE if sets else 1)
+        return self.samples * (core.SETS_FOR_ONE * core.SET_SIZE if sets else 1)
 
     def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
         """Return how an image is lit without derivatives, and how many points of a face in a pixel are shaded.

@@ -1,5 +1,5 @@
-"""How points of lights with an extent are drawn for surfaces: numbers of the kernel's samplers (csrc/shading/lit/light_sample.h,
-antithetic.h, mesh_light_sampling.h), and what these need of meshes that emit."""
+"""How points of lights with an extent are drawn for surfaces: what the kernel's samplers (csrc/shading/lit/light_sample.h,
+mesh_light_sampling.h) need of meshes that emit."""
 
 from __future__ import annotations
 
@@ -14,13 +14,8 @@ from ..scene.environment import UNIFORM_SHARE, Environment
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
 
-CANDIDATES_FOR_ONE = 8  # candidates for one point that is kept, half of them by the BSDF lobe if it is narrow
-WIDEST_LOBE = 0.65  # roughness
 # Where radiance has derivatives, points are drawn as if no surface were darker, for what is black has derivatives too.
 DARK = 0.05
-SET_SIZE = 4  # directions of an antithetic set
-SETS = 2  # antithetic sets for one sample of a light
-MOST_SETS = 8  # the same where the face is seen at a grazing angle and its normal differs from the shading normal
 
 _trees: WeakKeyDictionary[MeshLight, Any] = WeakKeyDictionary()
 
@@ -56,8 +51,8 @@ def how_drawn(scene: Scene) -> str:
     if not any(material.is_glossy for material in materials):
         return ", drawn by the light, for no surface is glossy"
     of = ["skies"] * (skies > 0) + ["meshes that emit"] * (len(lights) > 0)
-    said = f"; on glossy surfaces of {CANDIDATES_FOR_ONE} candidates for each, by light and, "
-    said += f"up to roughness {WIDEST_LOBE}, by lobe"
+    said = f"; on glossy surfaces of {core.CANDIDATES_FOR_ONE} candidates for each, by light and, "
+    said += f"up to roughness {core.WIDEST_LOBE}, by lobe"
     said += f", one is kept by what it gives ({', '.join(of)})"
     if lights:
         said += "; a light well within the lobe by the light alone, of a round one directions to a ball around it"

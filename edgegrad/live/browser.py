@@ -278,8 +278,8 @@ class _Style(NamedTuple):
         material = mesh.material
         if mesh.channels not in (None, 1, 3):
             return _Style(GREY, "double", False)
-        colourless = mesh.colors is mesh.face_colors is mesh.corner_colors is None
-        if mesh.alpha is not None or mesh.has_textures or not colourless:
+        colorless = mesh.colors is mesh.face_colors is mesh.corner_colors is None
+        if mesh.alpha is not None or mesh.has_textures or not colorless:
             return None
         if material is None:
             return _Style(GREY, "double", False)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..kernel.first_order import Tensors, apply, array, doubles, without_derivatives
+from ..kernel.threads import threads
 from ..library import core
 
 
@@ -56,7 +57,7 @@ class _RayPlaneIntersection(NamedTuple):
             "verts": verts,
             "world_to_camera": world_to_camera,
             "along": along,
-            "threads": torch.get_num_threads(),
+            "threads": threads(),
         }
 
     def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
@@ -115,7 +116,7 @@ class _Velocity(NamedTuple):
                 grads.append(table.new_zeros(0))
                 continue
             parts = (array(form.sample), array(form.row), doubles(form.by), doubles(bar))
-            grad = torch.from_numpy(core.form_vjp(*parts, len(table), torch.get_num_threads()))
+            grad = torch.from_numpy(core.form_vjp(*parts, len(table), threads()))
             grads.append(grad.to(table))
         return grads
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..kernel.first_order import Tensors, apply, array
+from ..kernel.threads import threads
 from ..library import core
 from ..scene.textures import bilinear_of_rows
 
@@ -56,10 +57,10 @@ class _Means(NamedTuple):
 
     def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
         (image,) = map(array, tensors)  # pyright: ignore[reportArgumentType]
-        return (torch.from_numpy(core.pyramid(image, torch.get_num_threads())),)
+        return (torch.from_numpy(core.pyramid(image, threads())),)
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
-        return [torch.from_numpy(core.pyramid_vjp(array(bar), self.height, self.width, torch.get_num_threads()))]
+        return [torch.from_numpy(core.pyramid_vjp(array(bar), self.height, self.width, threads()))]
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
         return self.value(tangents)[0]

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..kernel.first_order import without_derivatives
 from ..kernel.flat import Flat, flatten
 from ..kernel.operators import kernel_scene
+from ..kernel.threads import threads
 from ..scene.scene import Scene
 
 
@@ -182,7 +183,7 @@ def trace(flat: Flat, origins: Tensor, directions: Tensor, ignored: Tensor | Non
             origins=double_array(origins),
             directions=double_array(directions),
             ignored=ignored[0].cpu().int().contiguous().numpy() if ignored else None,
-            threads=torch.get_num_threads(),
+            threads=threads(),
         )
         return record_from(TraceRecords, found)
 
@@ -200,7 +201,7 @@ def visible(flat: Flat, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) ->
             b=double_array(b),
             to=double_array(to),
             contact=double_array(contact),
-            threads=torch.get_num_threads(),
+            threads=threads(),
         )
         return (torch.from_numpy(found).bool(),)
 
@@ -212,7 +213,7 @@ def has_intersections(flat: Flat) -> bool:
     found: list[bool] = []
 
     def compute(values: list[Any]) -> Sequence[Tensor]:
-        found.append(kernel_scene(Flat(*values)).has_intersections(torch.get_num_threads()))
+        found.append(kernel_scene(Flat(*values)).has_intersections(threads()))
         return (torch.zeros(0),)
 
     apply_to_values(flat, compute)

@@ -25,6 +25,7 @@ from ..kernel.operators import (
     warn_of_ends,
 )
 from ..kernel.request import Request
+from ..kernel.threads import threads
 from ..library import core
 from ..scene.scene import Scene
 from .records import (
@@ -167,7 +168,7 @@ class Sampler:
         return {
             "camera": camera,
             "image": core.ImageOptions(**options._asdict()),
-            "threads": torch.get_num_threads(),
+            "threads": threads(),
             "hits": kernel_hits(self._hits),
         }
 
@@ -214,7 +215,7 @@ class Sampler:
                     lit=lit is not None,
                 ),
                 least=self._least,
-                threads=torch.get_num_threads(),
+                threads=threads(),
                 hits=kernel_hits(self._hits),
                 detailed=faces_with_textures(lit),
                 transparent=self._transparent,
@@ -290,7 +291,7 @@ class Sampler:
             "options": core.GradientOptions(seed=seed, intrinsics=intrinsics),
             "samples": samples,
             "least": self._least,
-            "threads": torch.get_num_threads(),
+            "threads": threads(),
             "hits": kernel_hits(self._hits),
             "transparent": self._transparent,
         }
@@ -299,9 +300,7 @@ class Sampler:
         """Return what is seen at places (N, 2) in the image."""
 
         def compute(request: Request, camera: Any, x: Tensor) -> ImagePointRecords:
-            found = self._scene(request.scene).hits_at(
-                camera=camera, x=double_array(x), threads=torch.get_num_threads()
-            )
+            found = self._scene(request.scene).hits_at(camera=camera, x=double_array(x), threads=threads())
             return record_from(ImagePointRecords, found)
 
         return ImagePointRecords(*self._compute(self._request, compute, x))
@@ -310,9 +309,7 @@ class Sampler:
         """Return the rays to places (N, 2) in the image, with their derivatives by the intrinsics."""
 
         def compute(request: Request, camera: Any, x: Tensor) -> RayRecords:
-            found = core.rays_at(
-                camera=camera, x=double_array(x), intrinsics=intrinsics, threads=torch.get_num_threads()
-            )
+            found = core.rays_at(camera=camera, x=double_array(x), intrinsics=intrinsics, threads=threads())
             return record_from(RayRecords, found)
 
         return RayRecords(*(part.to(x.device) for part in self._compute(self._request, compute, x)))

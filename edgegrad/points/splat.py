@@ -11,6 +11,7 @@ from torch import Tensor
 from ..check import check_finite
 from ..kernel.first_order import Tensors, apply, array, doubles
 from ..kernel.request import Request
+from ..kernel.threads import threads
 from ..library import core
 
 
@@ -51,7 +52,7 @@ class Film(NamedTuple):
 
     def adjoint(self, x: Tensor | None, bar: Tensor, weight: Tensor | None = None) -> Tensor:
         """Return (S, C)"""
-        found = core.splat_vjp(doubles(x), array(bar), *self, torch.get_num_threads(), doubles(weight))
+        found = core.splat_vjp(doubles(x), array(bar), *self, threads(), doubles(weight))
         return torch.from_numpy(found).to(bar.device)
 
 

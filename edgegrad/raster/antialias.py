@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..check import as_int, as_scalar, check_positive_int
+from ..kernel.threads import threads
 from ..library import core
 from .exact import Sampling, exact_means
 from .tensors import check_image, check_positions, contiguous, ranges_of, to_kernel, triangles
@@ -164,11 +165,10 @@ class _Antialias(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, color: Tensor, pos: Tensor, rast: Tensor, tri: Tensor, groups: Any, boost: float) -> Tensor:
-        threads = torch.get_num_threads()
-        ctx.crossings = core.find_crossings(contiguous(pos), contiguous(tri), groups, contiguous(rast), threads)
+        ctx.crossings = core.find_crossings(contiguous(pos), contiguous(tri), groups, contiguous(rast), threads())
         ctx.save_for_backward(color, pos, tri)
         ctx.boost = boost
-        return torch.from_numpy(core.antialias(ctx.crossings, contiguous(color), threads))
+        return torch.from_numpy(core.antialias(ctx.crossings, contiguous(color), threads()))
 
     @staticmethod
     @once_differentiable
@@ -176,7 +176,7 @@ class _Antialias(torch.autograd.Function):
         (bar,) = grad_outputs
         color, pos, tri = map(contiguous, ctx.saved_tensors)
         wanted = [bool(want) for want in ctx.needs_input_grad[:2]]
-        found = core.antialias_vjp(ctx.crossings, pos, tri, color, contiguous(bar), wanted, torch.get_num_threads())
+        found = core.antialias_vjp(ctx.crossings, pos, tri, color, contiguous(bar), wanted, threads())
         color_bar, pos_bar = (None if grad is None else torch.from_numpy(grad) for grad in found)
         if pos_bar is not None and ctx.boost != 1:
             pos_bar = pos_bar * ctx.boost

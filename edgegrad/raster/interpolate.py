@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..check import as_int
+from ..kernel.threads import threads
 from ..library import core
 from .tensors import check_image, contiguous, to_kernel, triangles
 
@@ -88,7 +89,7 @@ class _Interpolate(torch.autograd.Function):
         ctx: Any, tri: Tensor, chosen: list[int], attr: Tensor, rast: Tensor, rast_db: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         arrays = contiguous(attr), contiguous(rast), contiguous(tri), contiguous(rast_db)
-        values, da = map(torch.from_numpy, core.interpolate(*arrays, chosen, torch.get_num_threads()))
+        values, da = map(torch.from_numpy, core.interpolate(*arrays, chosen, threads()))
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(attr, rast, tri, rast_db)
         ctx.chosen = chosen
@@ -104,7 +105,5 @@ class _Interpolate(torch.autograd.Function):
         if bar is None and da_bar is None:
             return (None,) * 5
         wanted = [bool(want) for want in ctx.needs_input_grad[2:]]
-        found = core.interpolate_vjp(
-            *arrays, ctx.chosen, contiguous(bar), contiguous(da_bar), wanted, torch.get_num_threads()
-        )
+        found = core.interpolate_vjp(*arrays, ctx.chosen, contiguous(bar), contiguous(da_bar), wanted, threads())
         return None, None, *(None if grad is None else torch.from_numpy(grad) for grad in found)

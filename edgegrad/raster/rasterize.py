@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..check import as_int, check_int
+from ..kernel.threads import threads
 from ..library import core
 from .tensors import check_positions, contiguous, ranges_of, to_kernel, triangles
 
@@ -197,7 +198,7 @@ class _Rasterize(torch.autograd.Function):
             *arguments.size,
             contiguous(behind),
             arguments.derivatives,
-            torch.get_num_threads(),
+            threads(),
         )
         rast, rast_db = map(torch.from_numpy, found)
         ctx.set_materialize_grads(False)
@@ -218,6 +219,6 @@ class _Rasterize(torch.autograd.Function):
         bar = torch.zeros_like(rast) if rast_bar is None else rast_bar
         tri, ranges = contiguous(arguments.tri), contiguous(arguments.ranges)
         found = core.rasterize_vjp(
-            contiguous(pos), tri, ranges, contiguous(rast), contiguous(bar), contiguous(db_bar), torch.get_num_threads()
+            contiguous(pos), tri, ranges, contiguous(rast), contiguous(bar), contiguous(db_bar), threads()
         )
         return None, torch.from_numpy(found), None

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..check import as_tensor, check_choice, check_finite, check_int
+from ..kernel.threads import threads
 from ..library import core
 from .tensors import check_image, contiguous, to_kernel
 
@@ -214,7 +215,7 @@ class _Sample(torch.autograd.Function):
     def forward(ctx: Any, options: Any, *tensors: Tensor | None) -> Tensor:
         ctx.save_for_backward(*tensors)
         ctx.options = options
-        return torch.from_numpy(core.sample_texture(options, *map(contiguous, tensors), torch.get_num_threads()))
+        return torch.from_numpy(core.sample_texture(options, *map(contiguous, tensors), threads()))
 
     @staticmethod
     @once_differentiable
@@ -222,5 +223,5 @@ class _Sample(torch.autograd.Function):
         (bar,) = grad_outputs
         arrays = [contiguous(tensor) for tensor in ctx.saved_tensors]
         wanted = [bool(want) for want in ctx.needs_input_grad[1:]]
-        found = core.sample_texture_vjp(ctx.options, *arrays, contiguous(bar), wanted, torch.get_num_threads())
+        found = core.sample_texture_vjp(ctx.options, *arrays, contiguous(bar), wanted, threads())
         return None, *(None if grad is None else torch.from_numpy(grad) for grad in found)

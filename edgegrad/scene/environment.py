@@ -164,15 +164,6 @@ class Environment(Light):
         radiance = self._looked_up(self._own_directions(points))
         return (radiance / points.density[:, None]).to(position)
 
-    def brightness_at(self, points: LightPoints) -> Tensor:
-        """Return about how bright (N,) float64 the image is there, for the choice of points alone."""
-        if self._size == (1, 1):
-            return self._brightness.expand(len(points.index))
-        w = self._size[1]
-        column = (points.index % w) + points.uv[:, 0] - 0.5
-        row = torch.div(points.index, w, rounding_mode="floor") + points.uv[:, 1] - 0.5
-        return self._bilinear(self._brightness[:, None], row, column)[:, 0]
-
     def _bilinear(self, texels: Tensor, row: Tensor, column: Tensor) -> Tensor:
         """Interpolate texels (h · w, C) at rows and columns (N,), around the whole turn."""
         h, w = self._size

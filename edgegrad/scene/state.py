@@ -19,14 +19,14 @@ def to_state(thing: Any, classes: tuple[type, ...], name: str = "state") -> dict
     Dataclasses among `classes` become dictionaries, sequences lists; tensors are detached and share their memory. Raises
     TypeError for any other class.
     """
-    return {"version": VERSION, **_plain(thing, classes, name)}
+    return {"version": VERSION, **_as_dictionary(thing, classes, name)}
 
 
-def _plain(thing: Any, classes: tuple[type, ...], name: str) -> Any:
+def _as_dictionary(thing: Any, classes: tuple[type, ...], name: str) -> Any:
     if isinstance(thing, Tensor):
         return thing.detach()
     if isinstance(thing, (list, tuple)):
-        return [_plain(part, classes, f"{name}[{i}]") for i, part in enumerate(thing)]
+        return [_as_dictionary(part, classes, f"{name}[{i}]") for i, part in enumerate(thing)]
     if isinstance(thing, (str, int, float)):
         return thing
     if type(thing) not in classes:
@@ -34,7 +34,7 @@ def _plain(thing: Any, classes: tuple[type, ...], name: str) -> Any:
             f"{name}: expected one of {_names(classes)}, got {type(thing).__name__}; torch.save() of the whole object keeps it"
         )
     fields = {f.name: getattr(thing, f.name) for f in dataclasses.fields(thing)}
-    parts = {key: _plain(part, classes, f"{name}.{key}") for key, part in fields.items() if part is not None}
+    parts = {key: _as_dictionary(part, classes, f"{name}.{key}") for key, part in fields.items() if part is not None}
     return {"type": type(thing).__name__, **parts}
 
 

@@ -141,7 +141,7 @@ def patched_ball(colours: Tensor) -> eg.Mesh:
     return eg.Mesh(placed, faces, face_colors=colours[octant], normals=normals, material=eg.Material())
 
 
-def light_and_colours() -> Problem:
+def light_and_colors() -> Problem:
     """Find eight colours and the sun's direction, 27 numbers."""
     views = cameras(2, 40)
     colours = 0.2 + 0.6 * torch.rand(8, 3, generator=torch.Generator().manual_seed(1))
@@ -246,7 +246,7 @@ def covered() -> Problem:
 
 
 RIGHT = [
-    colours, shift, sunlight, emitter, light_and_colours, pose, pose_with_noise, pose_and_light, pose_and_scale, pose_by_masks,
+    colours, shift, sunlight, emitter, light_and_colors, pose, pose_with_noise, pose_and_light, pose_and_scale, pose_by_masks,
     camera_and_material, metal, vertices, covered,
 ]  # fmt: skip
 

@@ -17,7 +17,7 @@ from edgegrad.fit.options import Options
 MOST = {"adam": 260, "gauss-newton": 40}  # steps
 QUICK = {
     "adam": [small_fits.shift, small_fits.sunlight],
-    "gauss-newton": [small_fits.pose_and_light, small_fits.light_and_colours],
+    "gauss-newton": [small_fits.pose_and_light, small_fits.light_and_colors],
 }
 REST = {method: [problem for problem in RIGHT if problem not in quick] for method, quick in QUICK.items()}
 

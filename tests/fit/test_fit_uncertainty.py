@@ -14,7 +14,6 @@ import edgegrad as eg
 from edgegrad.fit import PoseFit, Uncertainty, fit_pose
 from edgegrad.fit.pose.pose import Pose
 from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask
-from edgegrad.fit.pose.uncertainty import CORRELATION_LENGTH
 from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
 
 pytestmark = pytest.mark.quick
@@ -57,22 +56,20 @@ def standing() -> Pose:
     return Pose(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), one, one)
 
 
-def test_a_covariance_is_the_inverse_of_the_curvature_in_the_worlds_axes() -> None:
+def test_a_covariance_is_the_inverse_of_the_information_in_the_worlds_axes() -> None:
     given = task()
     axes = camera().world_to_camera[:3, :3].double()
     deviations = torch.tensor([0.01, 0.02, 0.12, 0.001, 0.002, 0.08], dtype=torch.float64)
-    known = Uncertainty.from_curvature(
-        given, standing(), torch.diag(CORRELATION_LENGTH**2 / deviations**2), list(range(6)), None
-    )
+    known = Uncertainty.from_information(given, standing(), torch.diag(1.0 / deviations**2), list(range(6)), None)
     assert known.degrees == pytest.approx(math.degrees(0.12), rel=0.02)
     assert abs(float(known.axis @ axes[2])) == pytest.approx(1.0, abs=1e-6)
     assert known.shift == pytest.approx(0.08 * given.size, rel=0.02)
     assert abs(float(known.direction @ axes[2])) == pytest.approx(1.0, abs=1e-6)
     assert "rotation about (" in known.unknown and "±7° only" in known.unknown and "±8% of the size" in known.unknown
     # Of two directions that belong together, each is known less exactly than its entry alone says.
-    curvature = torch.diag(CORRELATION_LENGTH**2 / deviations**2)
-    curvature[0, 3] = curvature[3, 0] = 0.9 * (curvature[0, 0] * curvature[3, 3]).sqrt()
-    both = Uncertainty.from_curvature(given, standing(), curvature, list(range(6)), None)
+    information = torch.diag(1.0 / deviations**2)
+    information[0, 3] = information[3, 0] = 0.9 * (information[0, 0] * information[3, 3]).sqrt()
+    both = Uncertainty.from_information(given, standing(), information, list(range(6)), None)
     expected = 0.01 / math.sqrt(1.0 - 0.9**2)
     assert float((axes @ both.covariance[:3, :3] @ axes.T)[0, 0].sqrt()) == pytest.approx(expected, rel=0.02)
 
@@ -81,33 +78,33 @@ def test_a_continuous_symmetry_makes_its_axis_known() -> None:
     given = task()
     axes = camera().world_to_camera[:3, :3].double()
     up = axes @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    curvature = torch.zeros(6, 6, dtype=torch.float64)
-    curvature[:3, :3] = 1e6 * (torch.eye(3) - torch.outer(up, up))  # nothing of turns about y
-    curvature[3:, 3:] = 1e6 * torch.eye(3)
-    known = Uncertainty.from_curvature(given, standing(), curvature, list(range(6)), None)
+    information = torch.zeros(6, 6, dtype=torch.float64)
+    information[:3, :3] = 1e6 * (torch.eye(3) - torch.outer(up, up))  # nothing of turns about y
+    information[3:, 3:] = 1e6 * torch.eye(3)
+    known = Uncertainty.from_information(given, standing(), information, list(range(6)), None)
     assert known.degrees > 45.0 and abs(float(known.axis[1])) > 0.999
     spun = Symmetries(continuous=[SymmetryAxis(torch.tensor([0.0, 1.0, 0.0]))])
-    free = Uncertainty.from_curvature(given, standing(), curvature, list(range(6)), spun)
+    free = Uncertainty.from_information(given, standing(), information, list(range(6)), spun)
     assert free.degrees < 1.0 and free.unknown == ""
     other = Symmetries(continuous=[SymmetryAxis(torch.tensor([1.0, 0.0, 0.0]))])
-    assert Uncertainty.from_curvature(given, standing(), curvature, list(range(6)), other).unknown != ""
+    assert Uncertainty.from_information(given, standing(), information, list(range(6)), other).unknown != ""
 
 
 def test_an_unknown_focal_length_is_named() -> None:
-    """Where perspective hardly shows, the focal length has the curvature of the distance."""
+    """Where perspective hardly shows, the focal length has the information of the distance."""
     given = task()
     free = [*range(6), FOCAL_LENGTH]
-    curvature = 1e6 * torch.eye(7, dtype=torch.float64)
-    curvature[6, 6] = (CORRELATION_LENGTH / 0.08) ** 2
-    known = Uncertainty.from_curvature(given, standing(), curvature, free, None)
+    information = 1e6 * torch.eye(7, dtype=torch.float64)
+    information[6, 6] = 1.0 / 0.08**2
+    known = Uncertainty.from_information(given, standing(), information, free, None)
     assert known.focal == pytest.approx(0.08, rel=0.01) and known.unknown == "focal length known to ±8% only"
-    curvature[5, 6] = curvature[6, 5] = 0.9 * (curvature[5, 5] * curvature[6, 6]).sqrt()
-    assert Uncertainty.from_curvature(given, standing(), curvature, free, None).focal == pytest.approx(
+    information[5, 6] = information[6, 5] = 0.9 * (information[5, 5] * information[6, 6]).sqrt()
+    assert Uncertainty.from_information(given, standing(), information, free, None).focal == pytest.approx(
         0.08 / 0.19**0.5, rel=0.03
     )
-    curvature[6, 6], curvature[5, 6], curvature[6, 5] = 1e6, 0.0, 0.0
-    assert Uncertainty.from_curvature(given, standing(), curvature, free, None).unknown == ""
-    assert Uncertainty.from_curvature(given, standing(), curvature[:6, :6], free[:6], None).focal == 0.0
+    information[6, 6], information[5, 6], information[6, 5] = 1e6, 0.0, 0.0
+    assert Uncertainty.from_information(given, standing(), information, free, None).unknown == ""
+    assert Uncertainty.from_information(given, standing(), information[:6, :6], free[:6], None).focal == 0.0
 
 
 def test_a_vase_is_not_converged_about_its_axis_unless_that_is_a_symmetry() -> None:

@@ -80,13 +80,13 @@ def test_the_posterior_separates_colours_near_the_contour_alone():
     picture = picture_of(view, image)
     colours = palette(picture.display, 0)
     P = posterior(
-        Windows(picture.size, colours.labels(picture.display), colours.colours, 6.0), alpha, torch.ones(60, 60)
+        Windows(picture.size, colours.labels(picture.display), colours.colors, 6.0), alpha, torch.ones(60, 60)
     )
     edge = smoothed(alpha[None], 1.5)[0]
     near = (edge > 0.02) & (edge < 0.98)
     assert float(P[near & (alpha > 0.5)].min()) > 0.8 and float(P[near & (alpha < 0.5)].max()) < 0.2
     whole = posterior(
-        Windows(picture.size, colours.labels(picture.display), colours.colours, 1000.0), alpha, torch.ones(60, 60)
+        Windows(picture.size, colours.labels(picture.display), colours.colors, 1000.0), alpha, torch.ones(60, 60)
     )
     assert float(whole[near & (alpha > 0.5)].min()) < 0.6
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from edgegrad.library import core
 from edgegrad.light.bsdf import LEAST_ALPHA, dot, ggx
-from edgegrad.light.sampling import WIDEST_LOBE
 from edgegrad.points.sobol import sobol
 
 
@@ -30,7 +30,7 @@ class Lobes(NamedTuple):
         """Make the lobes of unit directions to the viewer, normals (N, 3), and roughnesses (N, 1) or (1, 1)."""
         v, n = v.detach().double(), n.detach().double()
         roughness = roughness.detach().double().expand(len(n), 1)
-        narrow = (roughness <= WIDEST_LOBE)[:, 0]
+        narrow = (roughness <= core.WIDEST_LOBE)[:, 0]
         nv = dot(n, v)
         v = torch.where(nv >= 0, v, normalize(v - nv * n, dim=-1))
         nv = nv.clamp(min=0)

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from edgegrad.library import core
 from edgegrad.light.bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
-from edgegrad.light.sampling import CANDIDATES_FOR_ONE, DARK, MOST_SETS, SET_SIZE, SETS
+from edgegrad.light.sampling import DARK
 from edgegrad.points.sobol import key_of, sobol
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import Light, LightPoints
@@ -77,7 +78,7 @@ def resampled(
     Surfaces `meets` a mesh that emits; an environment is everywhere the same.
 
     antithetic   directions to an environment in antithetic sets instead (antithetic.py; csrc/shading/lit/derivative_points.h):
-               what is drawn, weighted and kept are all four of them; SETS for each point that is asked for, MOST_SETS where
+               what is drawn, weighted and kept are all four of them; SETS_FOR_ONE for each point, MOST_SETS_FOR_ONE where
                seen_aside()
     """
     with torch.no_grad():
@@ -86,14 +87,15 @@ def resampled(
         together, keeps = 1, torch.full_like(every, count)
         if antithetic:
             aside = seen_aside(surfaces.v, surfaces.n, surfaces.g)
-            together, keeps, count = SET_SIZE, count * torch.where(aside, MOST_SETS, SETS), count * MOST_SETS
+            together, most = core.SET_SIZE, core.MOST_SETS_FOR_ONE
+            keeps, count = count * torch.where(aside, most, core.SETS_FOR_ONE), count * most
         index = torch.zeros((N, count, together), dtype=torch.int64, device=surfaces.n.device)
         uv, density = surfaces.n.new_zeros((N, count, together, 2)), surfaces.n.new_full((N, count, together), math.inf)
         asked = lobes.narrow if meets is None else meets.is_drawn_by(lobes)
         interchangeable = torch.zeros_like(asked) if meets is None else meets.interchangeable(lobes)
         by_ball = torch.zeros_like(asked) if meets is None else meets.is_drawn_by_ball(lobes)
         for kept, few, ask_lobe, ball in itertools.product(keeps.unique().tolist(), *[(False, True)] * 3):
-            all = kept if few else CANDIDATES_FOR_ONE * kept
+            all = kept if few else core.CANDIDATES_FOR_ONE * kept
             rows_ = every[(keeps == kept) & (interchangeable == few) & (asked == ask_lobe) & (by_ball == ball)]
             for rows in rows_.split(max(1, AT_ONCE // (all * together))) if len(rows_) else ():
                 some = None if meets is None else meets.select(rows)
@@ -105,6 +107,16 @@ def resampled(
         return [
             LightPoints(index[:, s, k], uv[:, s, k], density[:, s, k]) for s in range(count) for k in range(together)
         ]
+
+
+def brightness_at(sky: Environment, points: LightPoints) -> Tensor:
+    """Return about how bright (N,) float64 the image is there, for the choice of points alone."""
+    if sky._size == (1, 1):
+        return sky._brightness.expand(len(points.index))
+    w = sky._size[1]
+    column = (points.index % w) + points.uv[:, 0] - 0.5
+    row = torch.div(points.index, w, rounding_mode="floor") + points.uv[:, 1] - 0.5
+    return sky._bilinear(sky._brightness[:, None], row, column)[:, 0]
 
 
 class _Shares(NamedTuple):
@@ -169,7 +181,7 @@ class _Drawn(NamedTuple):
                 alpha = (surfaces.roughness * surfaces.roughness).clamp(min=LEAST_ALPHA)
                 L, measure = antithetic_set(surfaces.v, surfaces.n, alpha, l)
                 all += [self.light.points_at(other) for other in L.unbind(1)[1:]]
-            brightness = torch.stack([self.light.brightness_at(each) for each in all], 1)
+            brightness = torch.stack([brightness_at(self.light, each) for each in all], 1)
         index, uv, density = (torch.stack(part, 1) for part in zip(*all, strict=True))
         flat, each = L.reshape(-1, 3), surfaces.repeated(K)
         scattered = each.scattered(flat).reshape(measure.shape)

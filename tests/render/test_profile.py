@@ -80,6 +80,19 @@ def test_profile_of_a_lit_scene():
         eg.profile(scene, CAMERA, torch.ones(2, 2, 3))
 
 
+def test_profile_of_bounces_has_the_rows_of_indirect_light():
+    mesh = cube(0.5).replace(material=eg.Material(), face_colors=None)
+    scene = eg.Scene(
+        [mesh, mesh.transformed(t=torch.tensor([0.5, 1.0, 2.0]), scale=0.2)], lights=[eg.Environment(torch.ones(3))]
+    )
+    found = eg.profile(scene, CAMERA, spp=1, repeats=1, bounces=2)
+    assert list(found)[-4:] == ["indirect shadows", "secondary edges", "backward", "python"]
+    assert found["indirect shadows"] > 0 and found["secondary edges"] > 0
+    assert list(eg.profile(scene, CAMERA, spp=1, repeats=1))[-3:] == ["shadows", "backward", "python"]
+    dark = eg.profile(scene, CAMERA, spp=1, repeats=1, bounces=2, shadows=False)
+    assert "indirect shadows" not in dark and "secondary edges" in dark
+
+
 def test_profile_of_mipmaps():
     mesh = eg.Mesh(
         cube().verts, cube().faces, texture=torch.rand(8, 8, 3), uvs=cube().verts[:, :2], uv_faces=cube().faces

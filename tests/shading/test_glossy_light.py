@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
+from edgegrad.library import core
 from edgegrad.light.bsdf import Scattering
-from edgegrad.light.sampling import WIDEST_LOBE
 
 pytestmark = pytest.mark.watched
 
@@ -89,7 +89,7 @@ def test_points_are_unbiased(name: str, roughness: float):
     """The mean over draws against quadrature: of radiance, of what the diffuse share alone would give, of which a metal has
     only derivatives, and of where the sky is black."""
     base, metallic = MATERIALS[name]
-    assert 0.3 < WIDEST_LOBE < 0.9
+    assert 0.3 < core.WIDEST_LOBE < 0.9
     scattering = Scattering(base[None], vector(metallic)[None], vector(roughness)[None])
     light, v, g = sky(0.0), viewer(0.7), normalize(N + 0.1 * ACROSS, dim=0)
     seeds, count = 8_000, 3

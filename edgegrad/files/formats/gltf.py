@@ -22,9 +22,8 @@ READ = {
     PUNCTUAL, DRACO, VISIBILITY, QUANTIZED, UNLIT, "KHR_materials_emissive_strength", "KHR_texture_transform",
     "EXT_texture_webp", "KHR_xmp", "KHR_xmp_json_ld",
 }  # fmt: skip
-NEEDLESS = re.compile(
-    r"KHR_materials_(?!pbrSpecularGlossiness)"
-)  # of lit materials: a file may not require what is left out
+# These extensions of lit materials are left out, and a file may not require them.
+NEEDLESS = re.compile(r"KHR_materials_(?!pbrSpecularGlossiness)")
 
 
 GLB = b"glTF"  # its first bytes

@@ -148,10 +148,8 @@ def _place(
 
 KINDS: dict[type[Light], str] = {DirectionalLight: "directional", PointLight: "point", SpotLight: "spot"}
 ROUNDING = 1e-6  # of a camera's size: numbers that differ by so little are rounded
-NEAR_PLANE, FAR_PLANE = (
-    1e-3,
-    10.0,
-)  # the planes of a camera between which other programs look, in extents of what it sees
+# Other programs look between these planes of a camera, in extents of what it sees.
+NEAR_PLANE, FAR_PLANE = 1e-3, 10.0
 
 
 def light_of(light: Light) -> tuple[dict[str, Any] | None, list[str]]:

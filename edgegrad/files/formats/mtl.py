@@ -215,10 +215,12 @@ class MtlTexture(NamedTuple):
 
 
 def _is_neutral(option: str, values: tuple[str, ...]) -> bool:
-    def plain(word: str) -> object:
+    def number_or_word(word: str) -> object:
         return float(word) if _is_number(word) else word
 
-    return all(plain(a) == plain(b) for a, b in zip(values, NEUTRAL.get(option, ("",) * 3), strict=False))
+    return all(
+        number_or_word(a) == number_or_word(b) for a, b in zip(values, NEUTRAL.get(option, ("",) * 3), strict=False)
+    )
 
 
 def _pair(words: tuple[str, ...], default: float) -> tuple[float, float]:

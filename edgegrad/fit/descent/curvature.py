@@ -29,10 +29,10 @@ MIN_RESIDUAL = 1e-3  # of the pictures' range: smaller differences count as this
 def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> Tensor:
     """Return JᵀWJ (n, n) float64 by all numbers of the tensors, one after the other. Raises TypeError where something has no
     forward mode."""
-    plain = {name: value.detach() for name, value in tensors.items()}
-    n = sum(value.numel() for value in plain.values())
+    detached = {name: value.detach() for name, value in tensors.items()}
+    n = sum(value.numel() for value in detached.values())
     total = torch.zeros(n, n, dtype=torch.float64)
-    for name, group, render, slopes in derivatives(objective, plain, step):
+    for name, group, render, slopes in derivatives(objective, detached, step):
         if objective.regions is None:
             weight = weights_of(objective, name, group, render)
         else:
@@ -42,18 +42,18 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
             rows = J.reshape(n, -1) * w.sqrt().flatten()
             total += (rows @ rows.T).double()
     if (regularizer := objective.regularizer) is not None:
-        total += _of_term(lambda tensors: regularizer(objective.build(tensors)[0]), plain)
+        total += _of_term(lambda tensors: regularizer(objective.build(tensors)[0]), detached)
     if objective.prior is not None:
-        total += _of_term(objective.prior, plain)
+        total += _of_term(objective.prior, detached)
     return total
 
 
 def scores(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> tuple[Tensor, Tensor]:
     """Return the curvature (n, n) of the pictures alone, and Σ s sᵀ (n, n) over the scores s = w r J of all pixels."""
-    plain = {name: value.detach() for name, value in tensors.items()}
-    n, count = sum(value.numel() for value in plain.values()), len(objective.picks(step))
+    detached = {name: value.detach() for name, value in tensors.items()}
+    n, count = sum(value.numel() for value in detached.values()), len(objective.picks(step))
     H, S = (torch.zeros(n, n, dtype=torch.float64) for _ in range(2))
-    for name, group, render, slopes in derivatives(objective, plain, step):
+    for name, group, render, slopes in derivatives(objective, detached, step):
         regions = objective.regions
         if regions is None:
             weight = weights_of(objective, name, group, render)
@@ -74,26 +74,26 @@ def scores(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> tu
 def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
     """Return Σ |J| |r| / Σ |J| for each number, in the tensors' shapes: how far pixels are from their pictures where it moves
     them. It is large for what lies in a wrong place, also where the slope of the loss is zero."""
-    plain = {name: value.detach() for name, value in tensors.items()}
-    n = sum(value.numel() for value in plain.values())
+    detached = {name: value.detach() for name, value in tensors.items()}
+    n = sum(value.numel() for value in detached.values())
     off, all = torch.zeros(n, dtype=torch.float64), torch.full((n,), 1e-30, dtype=torch.float64)
-    for name, group, render, slopes in derivatives(objective, plain, step):
+    for name, group, render, slopes in derivatives(objective, detached, step):
         for i, image, J in zip(group, render, slopes, strict=True):
             if (wanted := objective.views[i].wanted.get(name)) is not None:
                 rows = J.abs().reshape(n, -1)
                 off += (rows @ (image - wanted).abs().flatten()).double()
                 all += rows.sum(1).double()
-    return _by_name(off / all, plain)
+    return _by_name(off / all, detached)
 
 
 def residuals(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
     """Return Σ J² r² / Σ J² n² for each number, in the tensors' shapes, with the noise n² of the render's samples. It is about
     1 for what lies where the pictures have it."""
-    plain = {name: value.detach() for name, value in tensors.items()}
-    n = sum(value.numel() for value in plain.values())
+    detached = {name: value.detach() for name, value in tensors.items()}
+    n = sum(value.numel() for value in detached.values())
     off, noise = (torch.full((n,), 1e-30, dtype=torch.float64) for _ in range(2))
     with torch.no_grad():
-        scene, cameras = objective.build(plain)
+        scene, cameras = objective.build(detached)
         picks = objective.picks(step)
         renders = objective.renders(scene, cameras, picks, objective.options.spp, objective.seed(step + 1))
         again = {
@@ -102,13 +102,13 @@ def residuals(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
             for name, images in channels.items()
             for i, image in zip(group, images, strict=True)
         }
-    for name, group, render, slopes in derivatives(objective, plain, step):
+    for name, group, render, slopes in derivatives(objective, detached, step):
         for i, image, J in zip(group, render, slopes, strict=True):
             if (wanted := objective.views[i].wanted.get(name)) is not None:
                 rows = J.square().reshape(n, -1)
                 off += (rows @ (image - wanted).square().flatten()).double()
                 noise += (rows @ (0.5 * (image - again[name, i]).square()).flatten()).double()
-    return _by_name(off / noise, plain)
+    return _by_name(off / noise, detached)
 
 
 def _by_name(numbers: Tensor, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -117,13 +117,13 @@ def _by_name(numbers: Tensor, tensors: Mapping[str, Tensor]) -> dict[str, Tensor
 
 
 def derivatives(
-    objective: Objective, plain: Mapping[str, Tensor], step: int
+    objective: Objective, detached: Mapping[str, Tensor], step: int
 ) -> Iterator[tuple[str, list[int], Tensor, list[Tensor]]]:
     """Yield for each batch of views and channel its name, the views' indices, the channel (B, H, W, c), and its derivatives (n,
     H, W, c) by all numbers, one tensor a view. Raises TypeError where something has no forward mode."""
     options = objective.options
     try:
-        (scene, cameras), tangents = _tangents(objective, plain)
+        (scene, cameras), tangents = _tangents(objective, detached)
         for group in objective.groups(objective.picks(step)):
             aovs = objective.views[group[0]].aovs
             images: dict[str, list[Tensor]] = {name: [] for name in aovs}

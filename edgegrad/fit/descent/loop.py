@@ -98,9 +98,9 @@ class Optimizer:
         return self.history[-1]
 
     def state(self) -> dict[str, Any]:
-        plain = {name: getattr(self, name) for name in self.saved}
+        own = {name: getattr(self, name) for name in self.saved}
         history = [tuple(record) for record in self.history]
-        return {**plain, "values": self.copied(), "history": history, "monitor": self.monitor.state()}
+        return {**own, "values": self.copied(), "history": history, "monitor": self.monitor.state()}
 
     def load(self, state: Mapping[str, Any]) -> None:
         for name in self.saved:

@@ -27,9 +27,8 @@ RENEWAL_STEPS = 3  # from one renewal to the next
 LEAST_BLUR = 0.7  # pixels, of alpha, until the pictures show their own blur
 START_BLUR, NARROWING = 3.0, 0.6  # pixels at the start, and the factor from one renewal to the next
 SURENESS_BLUR = 2.5  # pixels, of the band in which colours next to the contour are judged
-MIN_SURENESS = (
-    0.695  # of colours next to right contours; wrong ones on edges of clutter reach 0.69, right ones 0.70 … 0.81
-)
+# Of colours next to right contours: wrong ones on edges of clutter reach 0.69, right ones 0.70 … 0.81.
+MIN_SURENESS = 0.695
 MIN_COLOUR_RANGE = 1.5 / 255.0  # sRGB values: pixels that differ by no more are of one colour in eight bits
 MIN_BACKGROUND = 0.02  # share of background among the pixels near the object
 
@@ -63,7 +62,7 @@ class RegionLoss:
         near, extent = self.around(index, share)
         if extent > 0.0 and bool((near > 0.0).any()):
             windows = Windows(
-                (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index].colours, RADIUS * extent
+                (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index].colors, RADIUS * extent
             )
             self.near[index], self.posteriors[index] = near, posterior(windows, share, near)
             sides = ContourColors.from_image(self.displays[index], smoothed(share[None], CONTOUR_BLUR)[0], near)
@@ -128,13 +127,13 @@ class RegionLoss:
     def check(self, alphas: Sequence[Tensor]) -> None:
         """Check that the silhouettes of the start leave pixels of the pictures around them, of more than one colour. Raises
         ValueError."""
-        seen = coloured = 0
+        seen = colored = 0
         for k, alpha in enumerate(alphas):
             share = alpha[..., 0].float()
             near, extent = self.around(k, share)
             seen += extent > 0.0
-            colours = self.displays[k][near > 0.0]
-            coloured += len(colours) > 0 and float((colours.amax(0) - colours.amin(0)).max()) > MIN_COLOUR_RANGE
+            colors = self.displays[k][near > 0.0]
+            colored += len(colors) > 0 and float((colors.amax(0) - colors.amin(0)).max()) > MIN_COLOUR_RANGE
             if extent > 0.0 and float((near * (1.0 - share)).sum()) <= MIN_BACKGROUND * float(near.sum()):
                 raise ValueError(
                     f'scene: expected meshes with some of the picture around them, as loss="region" needs, got a scene that '
@@ -145,7 +144,7 @@ class RegionLoss:
                 'scene: expected an object that the pictures show at the start, as loss="region" needs, got one out of view of '
                 "all cameras; start nearer"
             )
-        if not coloured:
+        if not colored:
             raise ValueError(
                 'images: expected the object before something of another colour, as loss="region" needs, got one colour alone '
                 "where it is at the start and around it; start nearer, or look for what made the pictures black or white"

@@ -23,7 +23,7 @@ from ...scene.scene import Scene
 from ..contour_colors import draw_contour
 from ..edge_support import MIN_EDGE_SUPPORT, edge_support
 from ..ending import Ending, reason_of
-from ..history import Record, number_or_none, plain_history
+from ..history import Record, history_rows, number_or_none
 from ..measured import comparable
 from ..placement import Coordinates, Pose
 from ..views import Observation
@@ -130,7 +130,7 @@ class Fit:
         write_json(out / "fit.json", self._summary())
         with replacing(out / "values.pt") as temporary:
             torch.save(self.values, temporary)
-        write_json(out / "history.json", plain_history(self.history))
+        write_json(out / "history.json", history_rows(self.history))
         moved = any(n.endswith("verts") for n in self.values) or any(not n.startswith("cameras.") for n in self.poses)
         for i, mesh in enumerate(self.scene.meshes):
             number = "" if len(self.scene.meshes) == 1 else str(i)
@@ -196,7 +196,7 @@ def make_fit(objective: Objective, descent: Descent, start: Scene, coordinates: 
     share = edge_support(pairs) if objective.regions is None else objective.regions.edge_support(alphas)
     history = [coordinates.recorded(record) for record in descent.history]
     return Fit(
-        values=coordinates.plain(descent.values), poses=coordinates.poses(descent.values), scene=scene, cameras=cameras,
+        values=coordinates.result_values(descent.values), poses=coordinates.poses(descent.values), scene=scene, cameras=cameras,
         views=views, loss=loss, explained=share, ending=descent.ending, history=history, seconds=descent.seconds,
         start=start,
     )  # fmt: skip

@@ -24,7 +24,7 @@ from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..ending import Ending
-from ..history import Record, number_or_none, plain_history
+from ..history import Record, history_rows, number_or_none
 from ..views import check_image
 from .bundle_adjustment import Adjustment, adjust_bundle, poses_of
 from .camera_uncertainty import CameraUncertainty
@@ -142,7 +142,7 @@ class Calibration:
         out.mkdir(parents=True, exist_ok=True)
         written = ["calibration.json", "history.json"]
         write_json(out / "calibration.json", self._summary())
-        write_json(out / "history.json", plain_history(self.history))
+        write_json(out / "history.json", history_rows(self.history))
         for k, camera in enumerate(self.cameras):
             save_camera(out / f"camera-{k}.json", camera)
             written.append(f"camera-{k}.json")

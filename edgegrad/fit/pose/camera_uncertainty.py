@@ -75,7 +75,7 @@ class CameraUncertainty(Uncertainty):
         principal = [deviations.get(PRINCIPAL + k, 0.0) for k in (0, 1)]
         return CameraUncertainty(
             to_world @ covariance @ to_world.T, task.size, torch.empty(0, 3, dtype=torch.float64),
-            deviations.get(FOCAL_LENGTH, 0.0), MAX_CONTOUR_DEGREES if task.colourless else MAX_DEGREES,
+            deviations.get(FOCAL_LENGTH, 0.0), MAX_CONTOUR_DEGREES if task.colorless else MAX_DEGREES,
             camera.size[1] * torch.tensor(principal, dtype=torch.float64),
             torch.tensor([deviations[entry] for entry in dofs if entry >= DISTORTION], dtype=torch.float64),
             tuple(vague(camera, deviations)), own @ covariance[of_pose][:, of_pose] @ own.T,

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..edge_support import MIN_EDGE_SUPPORT, block_error, edge_amount, edge_support
 from .blur_estimate import estimate_blur
-from .gauss_newton import INITIAL_DAMPING, MEMORY, PROBES_MEMORY, GaussNewton
+from .gauss_newton import INITIAL_DAMPING, PROBES_MEMORY, GaussNewton
 from .pose import Pose, angle
 from .replay_log import DescentState, ReplayLog
 from .residuals import PoseResiduals
@@ -26,7 +26,6 @@ from .result import Step
 from .robust_loss import LOSS_NOISE, MIN_WIDTH, Comparison
 from .target_images import blurred
 from .task import ROTATION, SCALE, STEP_PARTS, TRANSLATION, PoseTask, PyramidLevel
-from .uncertainty import CORRELATION_LENGTH
 
 TILT, TILT_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each
 JUDGE_SPP = 64  # samples a pixel when candidates are compared
@@ -81,7 +80,7 @@ class ColorSearch:
         self.steps, self.tolerance, self.seed, self.further = steps, tolerance, seed, further
         self.generator = torch.Generator().manual_seed(seed)
         self.best, self.loss, self.converged, self.edge_support = start, math.nan, False, math.nan
-        self.curvature: Tensor | None = None  # JᵀJ at the answer, in units that Uncertainty.from_curvature() takes
+        self.information: Tensor | None = None  # inverse covariance of the answer
         self.history: list[Step] = []
         self.log = log or ReplayLog()
         self.after_step: Callable[[], Any] = lambda: None
@@ -119,7 +118,7 @@ class ColorSearch:
             ends = self._ranked(finer[0], self._tilted(best.pose))
             self._better(best, self._judge(*self._down(ends[0], finer[1:])), begins)
         known = self.log.replay(self._information)
-        self.curvature = torch.tensor(known, dtype=torch.float64).reshape((len(self.task.dofs),) * 2)
+        self.information = torch.tensor(known, dtype=torch.float64).reshape((len(self.task.dofs),) * 2)
         self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
 
     def _from_afar(self, best: ColorCandidate, near: Pose) -> ColorCandidate:
@@ -204,7 +203,7 @@ class ColorSearch:
     def _follow(self, level: PyramidLevel, origin: Pose, most: int, lowest: float) -> tuple[Pose, float, bool]:
         """Take steps on one level; return the pose, its loss, and whether the last step was short."""
         task = self.task
-        search = GaussNewton(PROBES_MEMORY if task.reverse_alone else MEMORY)
+        search = GaussNewton(PROBES_MEMORY if task.reverse_alone else 0.0)
         last = level.shots is self.levels[-1].shots
         if (state := self.log.next_descent()) is None:
             state = DescentState(origin, origin, lowest)
@@ -259,15 +258,15 @@ class ColorSearch:
         return estimate_blur(self.task, self.levels[-1], *self._sharp(pose, self.levels[-1]))
 
     def _information(self) -> list[float]:
-        """Return JᵀJ at the best pose, by rows, over the variance of the residuals there. The search ends within its tolerance
-        of the least loss, and knows the pose no better than that."""
+        """Return the inverse covariance of the best pose, by rows: JᵀJ over the variance of the residuals. The search ends
+        within its tolerance of the least loss, and knows the pose no better than that."""
         level = self.levels[-1]._replace(image_blur=self._softness(self.best))
         seen = PoseResiduals(self.task, level, self.best, level.spp, self.seed, self.generator)
         c = seen.compared.scale()
         curvature = seen.equations(c, first=True).curvature / max(seen.compared.variance(c), 1e-30)
         values, vectors = torch.linalg.eigh(0.5 * (curvature + curvature.T))
         known = (values.clamp(min=1e-30).reciprocal() + self.tolerance**2).reciprocal()
-        return (CORRELATION_LENGTH**2 * (vectors * known) @ vectors.T).flatten().tolist()
+        return ((vectors * known) @ vectors.T).flatten().tolist()
 
     def _judge(self, pose: Pose, short: bool) -> ColorCandidate:
         """Score a pose on the finest level."""

@@ -19,7 +19,7 @@ from ...files.cameras import save_camera
 from ...files.paths import PathLike, write_json
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
-from ..history import Record, plain_history
+from ..history import Record, history_rows
 from .bundle_adjustment import MAX_ADJUST_STEPS, adjust_bundle
 from .camera_uncertainty import CameraUncertainty
 from .fit_pose import search_pose
@@ -119,7 +119,7 @@ class CameraFit:
 
     def write_history(self, folder: PathLike) -> str:
         """Write history.json alone, with loss, gradient norms and cameras of each step; return its name. Raises OSError."""
-        write_json(Path(folder) / "history.json", plain_history(self.history))
+        write_json(Path(folder) / "history.json", history_rows(self.history))
         return "history.json"
 
     def _record(self, number: int, step: Step) -> Record:

@@ -204,8 +204,8 @@ def search_pose(
         history = list(state.history)
         cameras = [task.lens(one, best) for one in given_cameras]
         known = None
-        if state.curvature is not None:
-            known = Uncertainty.from_curvature(task, best, state.curvature, task.dofs, symmetries)
+        if state.information is not None:
+            known = Uncertainty.from_information(task, best, state.information, task.dofs, symmetries)
         conflict = ambiguity(best, state.ambiguous, symmetries, task)
         sure = state.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
@@ -257,9 +257,9 @@ def ambiguity(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None,
     if apart < SAME_POSE_ANGLE and away < MAX_SHIFT:
         return ""
     other = f"turned by {math.degrees(apart):.0f}°" if apart >= SAME_POSE_ANGLE else f"{away:.0%} of the size away"
-    colours = "the mesh's colours, " if task.colourless else ""
+    colors = "the mesh's colours, " if task.colorless else ""
     return (
-        f"ambiguous: the pictures hardly separate it from a pose that is {other}; give {colours}"
+        f"ambiguous: the pictures hardly separate it from a pose that is {other}; give {colors}"
         "symmetries of the mesh, depth, or another picture"
     )
 

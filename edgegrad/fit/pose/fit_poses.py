@@ -111,10 +111,12 @@ def fit_poses(
         for k, task in enumerate(tasks):
             own = known_symmetries[k]
             best = state.best[k] if own is None else state.best[k].closest(own, starts[k])
-            history, curvature = list(state.history[k]), state.known(k)
-            known = None if curvature is None else Uncertainty.from_curvature(task, best, curvature, task.dofs, own)
+            history, information = list(state.history[k]), state.information(k)
+            known = (
+                None if information is None else Uncertainty.from_information(task, best, information, task.dofs, own)
+            )
             unknown = known is not None and bool(known.unknown)
-            conflict = _conflict(tasks, state.best, k) if curvature is not None else ""
+            conflict = _conflict(tasks, state.best, k) if information is not None else ""
             conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
             sure = state.converged[k] and not interrupted and not conflict and not unknown
             found.append(PoseFit(

@@ -20,13 +20,13 @@ import torch
 from torch import Tensor
 
 FIRST_PROBES, PROBES = 24, 4  # images v at the first point, and at every later one
-MEMORY, PROBES_MEMORY = 0.0, 0.9  # weight of earlier JᵀJ when a new one comes, from J and from probes
+PROBES_MEMORY = 0.9  # weight of earlier JᵀJ when a new one comes from probes
 INITIAL_DAMPING, LOWEST_DAMPING = 0.1, 0.005  # relative to the diagonal of JᵀJ
+# Directions that the image does not show have noise alone: so much of the largest entry keeps them at rest.
+MIN_DAMPING = 1e-4
 MAX_STEP_ENTRY = 0.07  # The largest entry of a step: JᵀJ says little about poses further away.
-UNDAMPED_STEPS, DECAY = (
-    4,
-    0.5,
-)  # Once the loss hardly falls, steps keep their length so often and then shrink by 1 / (1 + DECAY k).
+# Once the loss hardly falls, steps keep their length so often and then shrink by 1 / (1 + DECAY k).
+UNDAMPED_STEPS, DECAY = 4, 0.5
 NOISE_FACTOR = 1.03  # A loss that rises by a smaller factor may have risen by sample noise alone.
 _STATE = ("loss", "seen", "accepted", "_settled", "damping", "_gradient", "_curvature")
 
@@ -73,7 +73,8 @@ class NormalEquations(NamedTuple):
 class GaussNewton:
     """Steps for a parameter p that is zero at the current point; its entries should be of order one."""
 
-    def __init__(self, memory: float = MEMORY) -> None:
+    def __init__(self, memory: float = 0.0) -> None:
+        """`memory`: the weight of earlier JᵀJ when a new one comes."""
         self.memory = memory
         self.loss = math.inf
         self.seen = self.accepted = 0  # points
@@ -119,12 +120,10 @@ class GaussNewton:
 
     def step(self) -> Tensor:
         """Return δp (n,) from the last accepted point."""
-        diagonal = self._curvature.diagonal()
-        # Directions that the image does not show have noise alone: 1e-4 of the largest entry keeps them at rest.
-        damped = self._curvature + torch.diag(self.damping * diagonal + 1e-4 * diagonal.max())
-        step = -torch.linalg.solve(damped, self._gradient)
-        shrink = min(1.0, MAX_STEP_ENTRY / float(step.abs().max().clamp(min=1e-30)))
-        return step * shrink / (1.0 + DECAY * max(0, self._settled - UNDAMPED_STEPS))
+        normal = NormalEquations(self._curvature, self._gradient)
+        step = normal.damped(self.damping, MIN_DAMPING, MAX_STEP_ENTRY)
+        assert step is not None, "step() is not called where the search is flat"
+        return step / (1.0 + DECAY * max(0, self._settled - UNDAMPED_STEPS))
 
     def state(self) -> dict[str, Any]:
         """Return what the steps depend on."""

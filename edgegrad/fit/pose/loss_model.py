@@ -94,7 +94,7 @@ class PhotoLoss:
         views = last.comparisons(pose, seed)
         last, weights = last.focused(views), occluder_weights(views)
         self.photo = last if weights is None else weighted(last, weights)
-        self.level = self.photo.plain
+        self.level = self.photo.pyramid_level
 
     def at(self, pose: Pose) -> LossModel:
         """Return the model at a pose, from the same samples at each."""
@@ -113,7 +113,7 @@ def loss_source(task: PoseTask, pose: Pose, max_size: int, spp: int, seed: int) 
     """Return the loss that suits the pictures best, by what light does to the mesh's colours at a pose."""
     if task.aovs != ("alpha",):
         levels = photo_levels(task, pose, [None] * len(task.shots), max_size, spp, seed)
-        lit = [] if task.colourless else [seen.lit for seen in levels[-1].comparisons(pose, seed)]
+        lit = [] if task.colorless else [seen.lit for seen in levels[-1].comparisons(pose, seed)]
         # A surface too small to show its light is compared by colours where the background is known.
         changes = [one.change() for one in lit if one is not None]
         if (task.clutter and not changes) or max(changes, default=0.0) > UNCHANGED_COLORS:

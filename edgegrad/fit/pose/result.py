@@ -143,7 +143,7 @@ class PoseFit:
             "loss": number_or_none(self.loss), "steps": self.steps, "seconds": round(self.seconds, 3),
             "converged": self.converged, "reason": self.reason, "interrupted": self.interrupted,
             "explained": number_or_none(self.explained),
-            "uncertainty": None if self.uncertainty is None else self.uncertainty.plain(),
+            "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
         }  # fmt: skip
         return json.dumps(content, indent=2)
 
@@ -162,7 +162,7 @@ class PoseFit:
             share = data.get("explained")
             share = math.nan if share is None else float(share)
             known = data.get("uncertainty")
-            known = None if known is None else Uncertainty.from_plain(known)
+            known = None if known is None else Uncertainty.from_dict(known)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
         flags = bool(data["converged"]), bool(data["interrupted"])

@@ -54,11 +54,11 @@ class Comparison:
 
     @property
     def _has_gains(self) -> bool:
-        return self.task.colours > 0 and not self.task.colourless
+        return self.task.colors > 0 and not self.task.colorless
 
     def _compose(self) -> None:
         """Apply the gains to the renders, and take their differences to the pictures."""
-        task, C = self.task, self.task.colours
+        task, C = self.task, self.task.colors
         self.renders, self.differences, self.open = [], [], []
         for shot, layer, gains in zip(self.level.shots, self.layers, self.gains, strict=True):
             parts = [gain * part for gain, part in zip(gains, self._parts(layer), strict=True)] if C else []
@@ -72,12 +72,12 @@ class Comparison:
 
     def _parts(self, layer: Tensor) -> list[Tensor]:
         """Return the parts of a layer (…, h, w, C) that have a gain each."""
-        C = self.task.colours
+        C = self.task.colors
         return [layer[..., k * C : (k + 1) * C] for k in range(1 + self.task.backed)]
 
     def _fit_gains(self, c: float, rounds: int = GAIN_ITERATIONS) -> None:
         """Find the gains that minimise the loss of width c, by iteratively reweighted least squares, and apply them."""
-        C, found = self.task.colours, []
+        C, found = self.task.colors, []
         for shot, layer, gains, r in zip(self.level.shots, self.layers, self.gains, self.differences, strict=True):
             residual = r.detach().flatten(0, 1)
             rows = torch.stack([part.detach().flatten(0, 1) for part in self._parts(layer)])
@@ -104,15 +104,15 @@ class Comparison:
 
     def _without_gains(self, k: int, w: Tensor, images: Tensor) -> Tensor:
         """Project images (…, h, w, n) onto what no change of picture k's gains makes, where each pixel counts w (h, w, 1)."""
-        C = self.task.colours
+        C = self.task.colors
         if not self._has_gains:
             return images
         moved = torch.stack([(w.sqrt() * part.detach()).flatten() for part in self._parts(self.layers[k])]).double()
         pinv = torch.linalg.pinv(moved @ moved.T, rtol=1e-9, hermitian=True)
-        colours = images[..., :C]
-        rows = colours.flatten(-3).double()
+        colors = images[..., :C]
+        rows = colors.flatten(-3).double()
         projected = rows - (rows @ moved.T @ pinv) @ moved
-        return torch.cat([projected.reshape(colours.shape).to(images), images[..., C:]], -1)
+        return torch.cat([projected.reshape(colors.shape).to(images), images[..., C:]], -1)
 
     @property
     def channels(self) -> int:
@@ -181,10 +181,10 @@ class Comparison:
         found = []
         for k, (shot, dot, r) in enumerate(zip(self.level.shots, dots, self.differences, strict=True)):
             w = self._weights(shot, r.detach(), c)
-            parts = self._parts(dot) if self.task.colours else []
-            alpha = dot[..., len(parts) * self.task.colours :]
-            colours = [gain * part for gain, part in zip(self.gains[k], parts, strict=False)]
-            image = sum(colours[1:], colours[0]) if colours else alpha[..., :0]
+            parts = self._parts(dot) if self.task.colors else []
+            alpha = dot[..., len(parts) * self.task.colors :]
+            colors = [gain * part for gain, part in zip(self.gains[k], parts, strict=False)]
+            image = sum(colors[1:], colors[0]) if colors else alpha[..., :0]
             if self.open:
                 image, alpha = image - alpha * shot.target, -self._open(shot, c) * alpha
                 found.append(torch.cat([self._without_gains(k, w, w.sqrt() * image), alpha], -1))

@@ -83,7 +83,7 @@ class PoseTask:
     aovs: tuple[str, ...]  # what is compared, in order: "image", "alpha" or both
     shots: list[TargetView]  # whole pictures
     clutter: bool  # The background is unknown: where the object is not seen, nothing is compared.
-    colourless: bool  # The meshes have no colours, and no mask shows them: pictures show them grey.
+    colorless: bool  # The meshes have no colours, and no mask shows them: pictures show them grey.
     extent: float  # norm over the channels of the pictures' range, of colours where there are any
     center: Tensor  # (3,) of the bounding box, in the mesh's units
     size: float  # diagonal of the bounding box at the start, world units
@@ -146,7 +146,7 @@ class PoseTask:
             raise ValueError(
                 "weight: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
             )
-        if colourless := plain and mask is None:
+        if colorless := plain and mask is None:
             scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
         if clutter:
             shots = [shot._replace(background=None) for shot in shots]
@@ -174,9 +174,9 @@ class PoseTask:
         dofs += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(DISTORTION, DISTORTION + lens.distortion))
         # Pixels brighter than white, as of a light source or a defect, say nothing of the range of the others, nor does a mask.
         seen = torch.cat([shot.target.flatten(0, 1) for shot in shots]).clamp(max=1.0)
-        colours = seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
+        colors = seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
         # A black object before black has no range of colours, but its mask has.
-        extent = next((r for x in (colours, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
+        extent = next((r for x in (colors, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
         if masks and not any(bool((one > 0.0).any()) for one in masks):
             raise ValueError(
                 f"{names.mask}: expected 1 on the object, got a mask that is black, 0 in every pixel; is it the object's mask?"
@@ -193,7 +193,7 @@ class PoseTask:
             )
         without_colors = scene.replace(meshes=double, background=None)
         return PoseTask(
-            without_colors, aovs, shots, clutter, colourless, extent, (low + high) / 2, size, dofs, names, white
+            without_colors, aovs, shots, clutter, colorless, extent, (low + high) / 2, size, dofs, names, white
         )
 
     def pyramid(self, start: Pose, max_size: int, spp: int) -> list[PyramidLevel]:
@@ -330,7 +330,7 @@ class PoseTask:
         return camera.replace(**fields)
 
     @property
-    def colours(self) -> int:
+    def colors(self) -> int:
         """The number of channels of the pictures that are colours; a mask is the channel after them."""
         masked = "alpha" in self.aovs and not self.clutter
         return 0 if self.aovs == ("alpha",) else self.shots[0].target.shape[-1] - masked

@@ -231,7 +231,7 @@ class Tracker:
         best = FrameCandidate(predicted, 0.0, 1.0, [])
         if not self.first and not self.lost:
             levels = self._levels(task, depth, predicted)
-            offset = torch.zeros(len(levels[-1].plain.dofs), dtype=torch.float64) if self.moves else None
+            offset = torch.zeros(len(levels[-1].pyramid_level.dofs), dtype=torch.float64) if self.moves else None
             best = self._believed(self._down(levels[-2:], predicted, TRACK_STEPS, offset), predicted)
             if offset is not None and best.share >= LEARNING_SUPPORT and best.covered < HARDLY:
                 variance = (1.0 - STEADINESS_RATE) * self.steady**2 + STEADINESS_RATE * float(offset.square().mean())
@@ -293,10 +293,10 @@ class Tracker:
                 normal = NormalEquations(normal.curvature + known, normal.gradient + known @ offset)
             move = level.step(normal)
             assert move is not None
-            pose = level.task.moved(pose, level.plain.dofs, move)
+            pose = level.task.moved(pose, level.pyramid_level.dofs, move)
             if offset is not None:
                 offset += move
-            if float(move.abs().max()) < SHORT_STEP * level.plain.coarseness:
+            if float(move.abs().max()) < SHORT_STEP * level.pyramid_level.coarseness:
                 break
         return pose, views
 

@@ -75,7 +75,7 @@ class Uncertainty:
             parts.append(f"focal length ±{self.focal:.2g} of it")
         return ", ".join(parts)
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return all numbers as JSON has them."""
         return {
             "degrees": self.degrees, "axis": self.axis.tolist(), "shift": self.shift, "direction": self.direction.tolist(),
@@ -84,8 +84,8 @@ class Uncertainty:
         }  # fmt: skip
 
     @staticmethod
-    def from_plain(data: dict[str, Any]) -> Uncertainty:
-        """Return what plain() described."""
+    def from_dict(data: dict[str, Any]) -> Uncertainty:
+        """Return what to_dict() described."""
         covariance = torch.tensor(data["covariance"], dtype=torch.float64).reshape(6, 6)
         free = torch.tensor(data["free"], dtype=torch.float64).reshape(-1, 3)
         return Uncertainty(covariance, float(data["size"]), free, float(data["focal"]), float(data["most"]))
@@ -114,12 +114,12 @@ class Uncertainty:
         return _widest(block)
 
     @staticmethod
-    def from_curvature(
-        task: PoseTask, pose: Pose, curvature: Tensor, dofs: list[int], symmetries: Symmetries | None
+    def from_information(
+        task: PoseTask, pose: Pose, information: Tensor, dofs: list[int], symmetries: Symmetries | None
     ) -> Uncertainty:
-        """Return the uncertainty from JᵀJ (n, n) of the entries `dofs` of a step."""
+        """Return the uncertainty from the inverse covariance (n, n) of the entries `dofs` of a step."""
         prior = torch.eye(len(dofs), dtype=torch.float64) / PRIOR_DEVIATION**2
-        inverse = torch.linalg.inv(curvature / CORRELATION_LENGTH**2 + prior)
+        inverse = torch.linalg.inv(information + prior)
         entries = torch.zeros(SCALE, SCALE, dtype=torch.float64)
         known = [k for k, entry in enumerate(dofs) if ROTATION <= entry < SCALE]
         rows = torch.tensor([dofs[k] for k in known])
@@ -131,8 +131,13 @@ class Uncertainty:
         focal = (
             float(inverse[dofs.index(FOCAL_LENGTH), dofs.index(FOCAL_LENGTH)].sqrt()) if FOCAL_LENGTH in dofs else 0.0
         )
-        most = MAX_CONTOUR_DEGREES if task.colourless else MAX_DEGREES
+        most = MAX_CONTOUR_DEGREES if task.colorless else MAX_DEGREES
         return Uncertainty(to_world @ entries @ to_world.T, task.size, spun, focal, most)
+
+
+def information_of(curvature: Tensor) -> Tensor:
+    """Return the inverse covariance for a log likelihood's JᵀJ, which counts the errors of pixels as independent."""
+    return curvature / CORRELATION_LENGTH**2
 
 
 def _widest(block: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,10 +20,8 @@ from .limbs import Values, loss_of
 TRIED_ANGLES = 0.15, 0.3, 0.5, 0.7  # radians, to both sides
 QUARTER_TURN = 0.5 * math.pi  # also tried where nothing hangs on the limb
 REFINED_ANGLES = 0.1, 0.05  # tried in turn after an improvement
-CHOICE_SEEDS, TEST_SEEDS = (  # The best angle by the first must be better by the others.
-    (0,),
-    (1, 2, 3),
-)  # seeds by which the best angle is chosen, and those by which it must be better
+# The best angle is chosen by the first seeds, and must be better by the others.
+CHOICE_SEEDS, TEST_SEEDS = (0,), (1, 2, 3)
 MIN_Z_SCORE = 2.0  # in units of the noise of their mean
 
 

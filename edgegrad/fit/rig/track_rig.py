@@ -15,9 +15,8 @@ from ..priors import near, towards
 from .fit_rig import fit_rig
 from .result import RigFit
 
-MOTION_SHARE = (
-    0.5  # share of the last frame's motion to start with: all of it would add up errors that no picture shows
-)
+# Share of the last frame's motion to start with: all of it would add up errors that no picture shows.
+MOTION_SHARE = 0.5
 
 
 def track_rig(

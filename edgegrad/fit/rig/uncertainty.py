@@ -19,9 +19,8 @@ from ..descent.curvature import scores
 from ..descent.objective import Objective
 from .joint_support import SUPPORT_STEPS, places_of
 
-JOINT_PRIOR_DEVIATION = (
-    1.0  # radian, or as many learning rates as make one: the deviation of what the pictures do not show at all
-)
+# Radians, or as many learning rates as make one: the deviation of what the pictures do not show at all.
+JOINT_PRIOR_DEVIATION = 1.0
 MAX_JOINT_DEGREES = 5.0  # A joint known less exactly counts as unknown.
 
 

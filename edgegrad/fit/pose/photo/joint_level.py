@@ -50,7 +50,7 @@ class JointLevel:
         """Return the entries of a step that each object has."""
         found, first = [], 0
         for level in self.objects:
-            found.append(slice(first, first := first + len(level.plain.dofs)))
+            found.append(slice(first, first := first + len(level.pyramid_level.dofs)))
         return found
 
     def comparisons(self, poses: Sequence[Pose], seed: int) -> list[list[PictureComparison]]:
@@ -63,10 +63,12 @@ class JointLevel:
         counts = [sum(len(mesh.verts) for mesh in scene.meshes) for scene in scenes]
         found: list[list[PictureComparison]] = [[] for _ in scenes]
         first = self.objects[0]
-        for n, shot in enumerate(first.plain.shots):
+        for n, shot in enumerate(first.pyramid_level.shots):
             pairs = [*zip(self.objects, poses, strict=True)]
-            motions = [level.task.motion(level.plain, level.plain.shots[n], pose) for level, pose in pairs]
-            rendered = Rendered(labelled, shot.camera, ["image"], first.plain.spp, seed)
+            motions = [
+                level.task.motion(level.pyramid_level, level.pyramid_level.shots[n], pose) for level, pose in pairs
+            ]
+            rendered = Rendered(labelled, shot.camera, ["image"], first.pyramid_level.spp, seed)
             alphas = rendered.images["image"].float().movedim(-1, 0)
             tangents = rendered.derivatives(Motions(motions, counts))["image"].float().movedim(-1, 1)
             for k, level in enumerate(self.objects):
@@ -145,7 +147,7 @@ class JointLevel:
         middle = math.exp(sum(map(math.log, extents)) / len(extents))
         first = self.objects[0]
         windows = [
-            Windows(first.pictures[n].size, first.labels[n], first.palettes[n].colours, RADIUS * (extent or middle))
+            Windows(first.pictures[n].size, first.labels[n], first.palettes[n].colors, RADIUS * (extent or middle))
             for extent in (*(one.extent for one in seen), middle)
         ]
         return posteriors(windows, torch.stack([one.alpha for one in seen]), near)

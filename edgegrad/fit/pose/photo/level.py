@@ -117,7 +117,7 @@ class PhotoLevel:
     """Pictures at one resolution, and how they are compared."""
 
     task: PoseTask
-    plain: PyramidLevel  # sizes and cameras
+    pyramid_level: PyramidLevel  # sizes and cameras
     pictures: list[Picture]
     palettes: list[Palette]
     blur: float
@@ -133,10 +133,10 @@ class PhotoLevel:
         """Compare renders at a pose with the pictures. Raises ValueError when the object leaves no trace in a picture."""
         moved = self.task.scene.transformed(pose.R, pose.t, pose.scale)
         shapes, found = without_colors(moved), []
-        for shot, picture in zip(self.plain.shots, self.pictures, strict=True):
+        for shot, picture in zip(self.pyramid_level.shots, self.pictures, strict=True):
             camera = self.task.lens(picture.camera, pose)
-            moves = self.task.motion(self.plain, shot, pose)
-            rendered = Rendered(shapes, camera, ["alpha"], self.plain.spp, seed)
+            moves = self.task.motion(self.pyramid_level, shot, pose)
+            rendered = Rendered(shapes, camera, ["alpha"], self.pyramid_level.spp, seed)
             alpha = rendered.images["alpha"][..., 0].float()
             tangents = rendered.derivatives(moves)["alpha"][..., 0].float()
             found.append(self.comparison(moved, camera, moves, picture, alpha, tangents, seed))
@@ -155,7 +155,7 @@ class PhotoLevel:
         if self.harmonics or picture.depth is not None:
             names = [name for name in AOVS if name != "image" or self.harmonics]
             with torch.no_grad():
-                channels = render_aovs(moved, cut, names, self.plain.spp, seed)
+                channels = render_aovs(moved, cut, names, self.pyramid_level.spp, seed)
             surface = SurfaceInterior.from_channels(cut, channels, moves, alpha[box] if others else None)
         lit = (
             FittedLight.from_picture(part, surface, self.harmonics) if surface is not None and self.harmonics else None
@@ -168,7 +168,7 @@ class PhotoLevel:
     ) -> tuple[NormalEquations, float]:
         """Return the equations of all terms and pictures, and the mean loss of the region term. Each term is a likelihood in
         units of its own noise, so they are added as they are. `views` are comparisons() at the pose, if known."""
-        D = len(self.plain.dofs)
+        D = len(self.pyramid_level.dofs)
         curvature, gradient = torch.zeros(D, D, dtype=torch.float64), torch.zeros(D, dtype=torch.float64)
         losses = []
         for k, seen in enumerate(self.comparisons(pose, seed) if views is None else views):
@@ -222,7 +222,9 @@ class PhotoLevel:
         with torch.no_grad():
             return sum(
                 float(
-                    render_aovs(without_colors(moved), picture.camera, ["alpha"], self.plain.spp, seed)["alpha"].sum()
+                    render_aovs(without_colors(moved), picture.camera, ["alpha"], self.pyramid_level.spp, seed)[
+                        "alpha"
+                    ].sum()
                 )
                 for picture in self.pictures
             )
@@ -265,14 +267,14 @@ class PhotoLevel:
     @cached_property
     def labels(self) -> list[Tensor]:
         """The palette's labels of the pixels of each picture; they are the same at each step."""
-        return [colours.labels(picture.display) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
+        return [colors.labels(picture.display) for picture, colors in zip(self.pictures, self.palettes, strict=True)]
 
     def _posterior(self, k: int, seen: PictureComparison) -> Tensor:
         """Return the posterior (h, w) that a pixel of picture k shows the object: by the mask, or else by its colour."""
         mask = seen.picture.mask
         if mask is not None:
             return mask.clamp(MASK_ERROR, 1.0 - MASK_ERROR)
-        windows = Windows(seen.picture.size, self.labels[k], self.palettes[k].colours, RADIUS * seen.extent)
+        windows = Windows(seen.picture.size, self.labels[k], self.palettes[k].colors, RADIUS * seen.extent)
         return posterior(windows, seen.alpha, seen.near)
 
 
@@ -307,7 +309,7 @@ def photo_levels(
     halved = [*range(halvings, -1, -1)]
     halved = halved + [0] * (1 + len(ALPHA_BLURS) - len(halved))
     masked = "alpha" in task.aovs and not task.clutter
-    harmonics = 0 if task.colourless or task.aovs == ("alpha",) else 1 if task.scene.is_shaded else HARMONICS
+    harmonics = 0 if task.colorless or task.aovs == ("alpha",) else 1 if task.scene.is_shaded else HARMONICS
     levels = []
     for k, n in enumerate(halved):
         sizes = [scaled(shot.camera.size, f / 2**n) for shot, f in zip(shots, finest, strict=True)]
@@ -318,11 +320,11 @@ def photo_levels(
         blur = ALPHA_BLURS[k] if k < len(ALPHA_BLURS) else 0.0
         # Perspective shows in fine detail only: on the coarsest level the focal length would diverge.
         dofs = [entry for entry in task.dofs if entry < FOCAL_LENGTH] if k == 0 else task.dofs
-        plain = PyramidLevel(smaller, 0.0, float(2**n), spp, dofs)
+        pyramid_level = PyramidLevel(smaller, 0.0, float(2**n), spp, dofs)
         few = min(harmonics, FEW_HARMONICS) if k == 0 else harmonics
         if palettes is None:
             palettes = [palette(picture.outlined, seed) for picture in pictures]
-        levels.append(PhotoLevel(task, plain, pictures, palettes, blur, few, k == len(halved) - 1))
+        levels.append(PhotoLevel(task, pyramid_level, pictures, palettes, blur, few, k == len(halved) - 1))
     return levels
 
 

@@ -62,11 +62,11 @@ class FittedLight:
         if int(inside.sum()) < MIN_LIT_PIXELS:
             return None
         # Channels come first, for speed: most time of a fit goes here.
-        colour = surface.channels["image"].float().movedim(-1, 0)
+        color = surface.channels["image"].float().movedim(-1, 0)
         Y = harmonics_of(surface.normals)[..., :harmonics].movedim(-1, 0)
-        C, (h, w) = len(colour), inside.shape
+        C, (h, w) = len(color), inside.shape
         pictured = _blurred_inside(picture.radiance.movedim(-1, 0), inside)
-        basis = _blurred_inside((colour[:, None] * Y).flatten(0, 1), inside).reshape(C, harmonics, h, w)
+        basis = _blurred_inside((color[:, None] * Y).flatten(0, 1), inside).reshape(C, harmonics, h, w)
         # The scale is about the slope of the display's curve, by which noise and errors are uniform.
         y = pictured[:, inside]
         scale = (y + 0.02 + 0.1 * y.mean()).clamp(min=1e-3).rsqrt()
@@ -98,11 +98,11 @@ class FittedLight:
     def change(self) -> float:
         """Return the relative change of the mesh's colours by the light: 0 where one number multiplies all of them."""
         inside = self.surface.inside
-        colour = self.surface.channels["image"].float()[inside]
+        color = self.surface.channels["image"].float()[inside]
         irradiance = harmonics_of(self.surface.normals[inside])[..., : self.coefficients.shape[1]] @ self.coefficients.T
-        lit = colour * irradiance
-        gain = (lit * colour).sum() / colour.square().sum().clamp(min=1e-30)
-        return float((lit - gain * colour).abs().mean() / (gain * colour).abs().mean().clamp(min=1e-30))
+        lit = color * irradiance
+        gain = (lit * color).sum() / color.square().sum().clamp(min=1e-30)
+        return float((lit - gain * color).abs().mean() / (gain * color).abs().mean().clamp(min=1e-30))
 
     def difference(self, light: Tensor) -> Tensor:
         """Return the differences (N,) between the picture and the surface in another light (C, n), scaled like `residual`."""
@@ -124,11 +124,11 @@ class FittedLight:
         (x, y), n = surface.flow().unbind(-1), surface.normals[inside]
         turned = surface.motion.of_directions(n.double()).float()
         slopes_of_light = _x_first(harmonics_jvp(n, turned))[..., : self.coefficients.shape[1]]
-        colour = surface.channels["image"].float()[inside].T
+        color = surface.channels["image"].float()[inside].T
         curvature, gradient = torch.zeros(D, D), torch.zeros(D)
         for c, light in enumerate(self.coefficients):
             moved = x * self._slopes[0, c] + y * self._slopes[1, c]
-            J = torch.cat([(colour[c] * (slopes_of_light @ light) - moved) * self._scale[c], self._basis[c]])
+            J = torch.cat([(color[c] * (slopes_of_light @ light) - moved) * self._scale[c], self._basis[c]])
             A, b = (J * self.robust) @ J.T, (J * self.robust) @ self.residual[c]
             A[D:, D:] += torch.diag(self._ridge[c])
             b[D:] += self._ridge[c] * light

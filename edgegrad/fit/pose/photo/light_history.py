@@ -67,8 +67,8 @@ class LightHistory:
             return views
         world = camera.world_to_camera[:3, :3].double().T @ views.rotations
         Y = harmonics_of(torch.einsum("nij,nhwj->nhwi", world.float(), views.normals))[..., : self.light.shape[1]]
-        radiance = srgb_to_linear(views.colours) * (Y @ self.light.T)
-        return replace(views, colours=linear_to_srgb(radiance.clamp(0.0, 1.0)))
+        radiance = srgb_to_linear(views.colors) * (Y @ self.light.T)
+        return replace(views, colors=linear_to_srgb(radiance.clamp(0.0, 1.0)))
 
     def _knows(self, lit: FittedLight) -> bool:
         return self.light is not None and self.light.shape == lit.coefficients.shape

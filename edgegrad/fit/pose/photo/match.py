@@ -122,8 +122,8 @@ class Mips:
         target = shot.target.float()
         mask = target[..., -1:].clamp(0.0, 1.0) if self.masked else None
         radiance = (target if mask is None else target[..., :-1]).clamp(0.0, 1.0)
-        colours = linear_to_srgb(radiance if mask is None else radiance * (mask > 0.0))
-        self.picture = colours if mask is None else torch.cat([colours, mask], -1)
+        colors = linear_to_srgb(radiance if mask is None else radiance * (mask > 0.0))
+        self.picture = colors if mask is None else torch.cat([colors, mask], -1)
         self.size = shot.camera.size
         self.factor = 1.0 if self.masked else min(1.0, finest / (SMALLEST_SIZE * min(self.size)))
         self._levels: dict[int, Tensor] = {}
@@ -200,13 +200,13 @@ def _errors(views: TemplateViews) -> Score:
     """Return a score by the negative mean squared difference of views and picture inside, pixel by pixel."""
     inside = torch.where(views.alpha > 0.5, views.alpha, torch.zeros_like(views.alpha))
     area = inside.sum((1, 2)).clamp(min=1.0)[:, None, None]
-    weighted = (inside[..., None] * views.colours).movedim(-1, 1)
-    own = (weighted * views.colours.movedim(-1, 1)).sum((1, 2, 3))[:, None, None]
+    weighted = (inside[..., None] * views.colors).movedim(-1, 1)
+    own = (weighted * views.colors.movedim(-1, 1)).sum((1, 2, 3))[:, None, None]
 
     def score(picture: Tensor, pixels: float) -> Tensor:
-        colours = picture[:-1]
-        squares = F.conv2d(colours.square().sum(0)[None, None], inside[:, None], stride=STRIDE)[0]
-        return -(squares - 2.0 * F.conv2d(colours[None], weighted, stride=STRIDE)[0] + own) / area
+        colors = picture[:-1]
+        squares = F.conv2d(colors.square().sum(0)[None, None], inside[:, None], stride=STRIDE)[0]
+        return -(squares - 2.0 * F.conv2d(colors[None], weighted, stride=STRIDE)[0] + own) / area
 
     return score
 

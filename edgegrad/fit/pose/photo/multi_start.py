@@ -44,9 +44,9 @@ class MultiStartSearch:
         self.log, self._search = log, search
         one = search(start, log)
         self.enough, self.planned = one.enough, one.planned
-        self.colours_first = isinstance(one, PhotoSearch) and one.colours_first
+        self.colors_first = isinstance(one, PhotoSearch) and one.colors_first
         self.best, self.loss, self.converged, self.edge_support = start, math.nan, False, math.nan
-        self.curvature: Tensor | None = None
+        self.information: Tensor | None = None
         self.ambiguous: list[Pose] = []
         self.history: list[Step] = []
         self.after_step: Callable[[], Any] = lambda: None
@@ -65,15 +65,15 @@ class MultiStartSearch:
                 break
         if not self.history and failed is not None:
             raise failed
-        if self.colours_first and self.converged:
+        if self.colors_first and self.converged:
             # From so near, unlit colours may be compared, which is more precise where they fit.
             self._followed(self.best, True)
 
-    def _followed(self, pose: Pose, colours_first: bool = False) -> ColorSearch | PhotoSearch:
+    def _followed(self, pose: Pose, colors_first: bool = False) -> ColorSearch | PhotoSearch:
         """Refine a start; it is the answer if it is better than those before."""
         found = self._search(pose, self.log)
         if isinstance(found, PhotoSearch):
-            found.colours_first = colours_first
+            found.colors_first = colors_first
         before = list(self.history)
         first = not before
 
@@ -89,7 +89,7 @@ class MultiStartSearch:
             before = [step._replace(best=False) for step in before]
             self.history = [*before, *found.history]
             self.best, self.loss, self.edge_support = found.best, found.loss, found.edge_support
-            self.converged, self.curvature = found.converged, found.curvature
+            self.converged, self.information = found.converged, found.information
         else:
             self.history = [*before, *(step._replace(best=False) for step in found.history)]
         return found
@@ -122,7 +122,7 @@ class MultiStartSearch:
             move = level.step(normal)
             if move is None:
                 break
-            pose = self.task.moved(pose, level.plain.dofs, move)
+            pose = self.task.moved(pose, level.pyramid_level.dofs, move)
         return level.edge_support(pose, self.seed), pose
 
 

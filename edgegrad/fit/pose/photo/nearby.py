@@ -45,7 +45,7 @@ def turns() -> list[tuple[list[int], Tensor]]:
 def comparable(task: PoseTask, start: Pose) -> bool:
     """Return whether nearby() applies: with colours, without a mask, at the mesh's own size, and in perspective."""
     masked = "alpha" in task.aovs and not task.clutter
-    if masked or task.colourless:
+    if masked or task.colorless:
         return False
     return task.shots[0].camera.projection == "perspective" and abs(float(start.scale) - 1.0) < SCALE_TOLERANCE
 

@@ -28,7 +28,7 @@ def overlay(task: PoseTask, level: PyramidLevel, pose: Pose) -> list[Tensor]:
         with torch.no_grad():
             channels = render_aovs(moved, camera, AOVS, level.spp, 0)
             alpha = channels["alpha"].float()
-            image = shot.target * alpha if task.colourless else _lit(task, level, pose, channels, len(found))
+            image = shot.target * alpha if task.colorless else _lit(task, level, pose, channels, len(found))
         image = image + (1.0 - alpha) * BACKGROUND_BRIGHTNESS * shot.target
         found.append(draw_contour(image, alpha))
     return found

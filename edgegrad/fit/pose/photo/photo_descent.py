@@ -17,6 +17,7 @@ from ..pose import Pose
 from ..replay_log import DescentState, ReplayLog
 from ..result import Step
 from ..task import PoseTask
+from ..uncertainty import information_of
 from .level import PhotoLevel, photo_levels
 from .occluders import FULLY_VISIBLE, occluder_weights, visible_share, weighted
 
@@ -52,7 +53,7 @@ class PhotoDescent:
         self.levels = photo_levels(task, start, depths, max_size, spp, seed)
         self.max_size, self.spp, self.steps, self.tolerance, self.seed = max_size, spp, steps, tolerance, seed
         self.best, self.loss, self.converged, self.edge_support = start, math.nan, False, math.nan
-        self.curvature: Tensor | None = None  # JᵀJ at the answer
+        self.information: Tensor | None = None  # inverse covariance of the answer
         self.history: list[Step] = []
         self.log = log or ReplayLog()
         self.after_step: Callable[[], Any] = lambda: None
@@ -103,12 +104,12 @@ class PhotoDescent:
                 break
             if level.last and len(state.steps) > FULL_LENGTH_STEPS:
                 move = 0.5 * move  # Full steps would oscillate, as weights are solved anew at each.
-            far = float(move.abs().max()) >= self.tolerance * level.plain.coarseness
+            far = float(move.abs().max()) >= self.tolerance * level.pyramid_level.coarseness
             short = not far or float(move @ normal.curvature @ move) < SHORT_STEP_NATS
-            step = Step(level.size, loss, state.pose, True, norms_of(level.plain.dofs, normal.gradient))
+            step = Step(level.size, loss, state.pose, True, norms_of(level.pyramid_level.dofs, normal.gradient))
             steps = (*state.steps, step)
             state = state._replace(
-                pose=self.task.moved(state.pose, level.plain.dofs, move), here=state.pose, lowest=loss, short=short,
+                pose=self.task.moved(state.pose, level.pyramid_level.dofs, move), here=state.pose, lowest=loss, short=short,
                 done=short or len(steps) >= self._most(level), steps=steps,
             )  # fmt: skip
             state = state._replace(done=state.done or until(state.pose))
@@ -118,7 +119,9 @@ class PhotoDescent:
         return state.pose, state.short
 
     def _most(self, level: PhotoLevel) -> int:
-        return most_steps(self.steps, level.last, level.plain.coarseness == self.levels[0].plain.coarseness)
+        return most_steps(
+            self.steps, level.last, level.pyramid_level.coarseness == self.levels[0].pyramid_level.coarseness
+        )
 
     def _note(self, step: Step) -> None:
         if not self._answered:
@@ -134,8 +137,9 @@ class PhotoDescent:
         return PhotoCandidate(share, pose, short)
 
     def _take(self, end: PhotoCandidate) -> None:
-        self.loss, *curvature = self.log.replay(lambda: self._at(end.pose))
-        self.curvature = torch.tensor(curvature, dtype=torch.float64).reshape((len(self.task.dofs),) * 2)
+        self.loss, *rows = self.log.replay(lambda: self._at(end.pose))
+        curvature = torch.tensor(rows, dtype=torch.float64)
+        self.information = information_of(curvature.reshape((len(self.task.dofs),) * 2))
         self.edge_support, self.best, self._answered = end.edge_support, end.pose, True
         self.converged = end.short and end.edge_support >= self.enough
 
@@ -164,7 +168,7 @@ class PhotoDescent:
 
 def enough_support(task: PoseTask) -> float:
     """Return the least edge support of a right pose."""
-    return CONTOUR_SUPPORT if task.colourless else PHOTO_SUPPORT
+    return CONTOUR_SUPPORT if task.colorless else PHOTO_SUPPORT
 
 
 def most_steps(steps: int, last: bool, coarsest: bool) -> int:

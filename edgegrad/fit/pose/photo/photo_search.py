@@ -17,7 +17,7 @@ from ..pose import Pose, angle
 from ..replay_log import ReplayLog
 from ..result import Step
 from ..task import PoseTask, PyramidLevel
-from ..uncertainty import CORRELATION_LENGTH, Uncertainty
+from ..uncertainty import CORRELATION_LENGTH, Uncertainty, information_of
 from .level import PhotoLevel, photo_levels
 from .nearby import comparable, nearby, turns
 from .occluders import OCCLUDER_SIDES, at_one_side, occluder_weights, visible_share, weighted
@@ -53,23 +53,23 @@ class PhotoSearch(PhotoDescent):
         super().__init__(task, start, depths, max_size, spp, steps, tolerance, seed, log)
         self.further = further
         # Before a uniform background, unlit colours are compared first.
-        self.colours_first = not task.clutter and "alpha" not in task.aovs and all(depth is None for depth in depths)
+        self.colors_first = not task.clutter and "alpha" not in task.aovs and all(depth is None for depth in depths)
         self.ambiguous: list[Pose] = []  # poses that may be the answer, too
         self._judged_poses: list[Pose] = []  # ends of the first descent
 
     def run(self) -> None:
         """Search; raise ValueError when nothing in the pictures depends on the pose."""
-        if self.colours_first:
-            self._colours_first()
+        if self.colors_first:
+            self._colors_first()
         else:
             self._photograph_first()
         self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
 
-    def _colours_first(self) -> None:
+    def _colors_first(self) -> None:
         """Search by unlit colours, and by the terms of photographs where these do not fit."""
-        colours = self._by_colours(self.start, self.task.pyramid(self.start, self.max_size, self.spp), self.further)
-        self._adopt(colours)
-        if colours.edge_support >= colours.enough or not self.further:
+        colors = self._by_colors(self.start, self.task.pyramid(self.start, self.max_size, self.spp), self.further)
+        self._adopt(colors)
+        if colors.edge_support >= colors.enough or not self.further:
             return
         begins = len(self.history)
         best = self._photograph()
@@ -86,18 +86,18 @@ class PhotoSearch(PhotoDescent):
         """Search by the terms of photographs; colours refine an unlit result, or search a mask where the terms find
         nothing."""
         task, best = self.task, self._photograph()
-        if best.edge_support >= self.enough and not task.colourless and self._is_unlit(best.pose):
-            colours = self._by_colours(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-2:], False)
-            better = colours.converged and angle(colours.best.R, best.pose.R) < SAME_POSE_ANGLE
+        if best.edge_support >= self.enough and not task.colorless and self._is_unlit(best.pose):
+            colors = self._by_colors(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-2:], False)
+            better = colors.converged and angle(colors.best.R, best.pose.R) < SAME_POSE_ANGLE
         elif best.edge_support < self.enough and not task.clutter and self.further:
-            colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), True)
-            better = colours.converged
+            colors = self._by_colors(self.start, task.pyramid(self.start, self.max_size, self.spp), True)
+            better = colors.converged
         else:
             return
         if better:
-            self._adopt(colours)
+            self._adopt(colors)
         else:
-            self._forget(slice(len(self.history) - len(colours.history) + 1, None))
+            self._forget(slice(len(self.history) - len(colors.history) + 1, None))
 
     def _photograph(self) -> PhotoCandidate:
         """Return the best candidate by the terms of photographs."""
@@ -112,7 +112,7 @@ class PhotoSearch(PhotoDescent):
         start = self._judge(self.start, stays)
         best = max(found, start, key=lambda end: end.edge_support)
         self._judged_poses = [found.pose, start.pose]
-        if not self.colours_first:
+        if not self.colors_first:
             self._take(best)
         if self.further and best.edge_support < self.enough:
             best = self._from_occluders(best, begins)
@@ -132,7 +132,7 @@ class PhotoSearch(PhotoDescent):
                 again = self._from_occluders(best, begins)
                 best = best if again is best else self._refine_surrounded(again)
         alone = self.further and all(depth is None for depth in self.depths)
-        if alone and (self.task.colourless or self._vague(best.pose)):
+        if alone and (self.task.colorless or self._vague(best.pose)):
             best = self._resolve_ambiguity(best, begins)
         return best
 
@@ -155,7 +155,7 @@ class PhotoSearch(PhotoDescent):
     def _of_turned(self) -> list[PhotoLevel]:
         """Return the levels for starts rotated aside. With colours they begin on the coarsest level, which shows the light. A
         contour shows so little there that different starts would meet."""
-        return self.levels[1:] if self.task.colourless else self.levels
+        return self.levels[1:] if self.task.colorless else self.levels
 
     def likeliest(self, pose: Pose, short: bool) -> tuple[PhotoCandidate | None, list[Pose]]:
         """Compare a pose that was found otherwise with ambiguous ones; `short` as of its last step. Return the one that makes
@@ -175,19 +175,19 @@ class PhotoSearch(PhotoDescent):
         """Return the most likely of ambiguous poses. From afar, a mirror-symmetric object has the contour that it has behind a
         mirror, so one contour in two poses. A bottle that shows hardly more than its bottom, a disc of one colour, is
         ambiguous in many."""
-        plain = self.task.colourless
+        colorless = self.task.colorless
         first, *finer = self._of_turned()
-        turned = [self.task.moved(self.start if plain else best.pose, *turn) for turn in turns()]
+        turned = [self.task.moved(self.start if colorless else best.pose, *turn) for turn in turns()]
         before = len(self.history)
         self._answered = True
         here, *ends = (self._follow(first, pose)[0] for pose in [best.pose, *turned])
         costs = self.log.replay(lambda: first.negative_log_likelihoods([here, *ends], self.seed))
         sure, doubt = (
             AMBIGUITY_NATS * CORRELATION_LENGTH**2,
-            (CONTOUR_AMBIGUITY_NATS if plain else AMBIGUITY_NATS) * CORRELATION_LENGTH**2,
+            (CONTOUR_AMBIGUITY_NATS if colorless else AMBIGUITY_NATS) * CORRELATION_LENGTH**2,
         )
         order = sorted(range(len(ends)), key=lambda k: costs[1 + k])
-        if not plain:  # Colours that separate poses in so few pixels do so in more.
+        if not colorless:  # Colours that separate poses in so few pixels do so in more.
             order = [k for k in order if costs[1 + k] - costs[0] < sure]
         found = [best]
         level = self._unoccluded_level(best)
@@ -203,7 +203,7 @@ class PhotoSearch(PhotoDescent):
         costs = self.log.replay(lambda: level.negative_log_likelihoods([end.pose for end in found], self.seed))
         k = min((k for k, end in enumerate(found) if end.edge_support >= self.enough), key=costs.__getitem__, default=0)
         # Taking one that is hardly likelier would make answers depend on the start.
-        won = costs[0] - costs[k] > sure and (plain or found[k].edge_support > best.edge_support)
+        won = costs[0] - costs[k] > sure and (colorless or found[k].edge_support > best.edge_support)
         answer, cost = (found[k], costs[k]) if won else (best, costs[0])
         self.ambiguous = [
             end.pose for end, other in zip(found, costs, strict=True) if end is not answer and other - cost < doubt
@@ -212,7 +212,7 @@ class PhotoSearch(PhotoDescent):
             self._forget(slice(before, None))
             return best
         self._forget(slice(begins, len(self.history)))
-        if not self.colours_first:
+        if not self.colors_first:
             self._take(answer)
         return self._refine_surrounded(answer)
 
@@ -225,7 +225,7 @@ class PhotoSearch(PhotoDescent):
         short = False
         for level in levels:
             pose, short = self._follow(level, pose, there)
-            if there(pose) or (not self.task.colourless and angle(pose.R, other.R) < DISTINCT_ANGLE):
+            if there(pose) or (not self.task.colorless and angle(pose.R, other.R) < DISTINCT_ANGLE):
                 return None
         return pose, short
 
@@ -236,7 +236,7 @@ class PhotoSearch(PhotoDescent):
 
     def _degrees(self, pose: Pose) -> float:
         curvature = self.levels[-1].equations(pose, self.seed)[0].curvature
-        return Uncertainty.from_curvature(self.task, pose, curvature, self.task.dofs, None).degrees
+        return Uncertainty.from_information(self.task, pose, information_of(curvature), self.task.dofs, None).degrees
 
     def _from_occluders(self, best: PhotoCandidate, begins: int) -> PhotoCandidate:
         """Refine with possible occluders at one side left out, until the pictures surely show an end's edges."""
@@ -306,13 +306,13 @@ class PhotoSearch(PhotoDescent):
             torch.ones(picture.size) for picture in last.pictures
         ]
         # On the last level steps are small and may stop early. From nearer, those of the level before lead on by colours inside.
-        levels = [last] * LAST_LEVEL_ROUNDS if self.task.colourless else [coarser, *[last] * LAST_LEVEL_ROUNDS]
+        levels = [last] * LAST_LEVEL_ROUNDS if self.task.colorless else [coarser, *[last] * LAST_LEVEL_ROUNDS]
         found = self._unoccluded(best.pose, weights, levels)
         if found.edge_support < self.enough:
             self._forget(slice(before, None))
             return best
         self.levels = [*self.levels[:-1], last]
-        if not self.colours_first:
+        if not self.colors_first:
             self._take(found)
         return found
 
@@ -329,7 +329,7 @@ class PhotoSearch(PhotoDescent):
         seen = self.levels[-1].comparisons(pose, self.seed)
         return max(math.inf if one.lit is None else one.lit.change() for one in seen)
 
-    def _by_colours(self, start: Pose, levels: list[PyramidLevel], further: bool) -> ColorSearch:
+    def _by_colors(self, start: Pose, levels: list[PyramidLevel], further: bool) -> ColorSearch:
         """Search by unlit colours from a start, with its steps added to the history."""
         search = ColorSearch(self.task, levels, start, self.steps, self.tolerance, self.seed, self.log, further)
         before = list(self.history)
@@ -347,7 +347,7 @@ class PhotoSearch(PhotoDescent):
 
     def _adopt(self, search: ColorSearch) -> None:
         self.best, self.loss, self._answered = search.best, search.loss, True
-        self.edge_support, self.converged, self.curvature = search.edge_support, search.converged, search.curvature
+        self.edge_support, self.converged, self.information = search.edge_support, search.converged, search.information
 
     def first_end(self) -> float:
         """Return the share of the render's edges that the pictures show where the start alone leads."""

@@ -17,7 +17,7 @@ from ..color_search import distinct, norms_of
 from ..pose import Pose
 from ..result import MIN_VISIBLE_SHARE, Step
 from ..task import PoseTask
-from ..uncertainty import Uncertainty
+from ..uncertainty import Uncertainty, information_of
 from .joint_level import JointLevel, joint_levels, without_fronts
 from .level import MAX_PHOTO_STEP
 from .nearby import turns
@@ -65,15 +65,17 @@ class PosesSearch:
         found = zip(self.short, self.edge_support, self.needed, self.visible, strict=True)
         return [short and share >= needed and seen >= MIN_VISIBLE_SHARE for short, share, needed, seen in found]
 
-    def known(self, k: int) -> Tensor | None:
-        """Return JᵀJ (n, n) of one object's entries, with the others' unknown as they are: the Schur complement."""
+    def information(self, k: int) -> Tensor | None:
+        """Return the inverse covariance (n, n) of one object's entries, with the others' unknown as they are: by the Schur
+        complement of JᵀJ."""
         if self.curvature is None:
             return None
         own = self.levels[-1].parts()[k]
         others = torch.ones(len(self.curvature), dtype=torch.bool)
         others[own] = False
         between, rest = self.curvature[own][:, others], self.curvature[others][:, others]
-        return self.curvature[own, own] - between @ torch.linalg.pinv(rest, rtol=1e-9, hermitian=True) @ between.T
+        by_others = between @ torch.linalg.pinv(rest, rtol=1e-9, hermitian=True) @ between.T
+        return information_of(self.curvature[own, own] - by_others)
 
     def run(self) -> None:
         """Search; raise ValueError when nothing in the pictures depends on the poses."""
@@ -99,10 +101,10 @@ class PosesSearch:
 
     def _vague(self, k: int) -> bool:
         """Return whether the pictures show an object's rotation so little that it may be ambiguous."""
-        task, curvature = self.tasks[k], self.known(k)
-        if task.colourless or curvature is None:
+        task, information = self.tasks[k], self.information(k)
+        if task.colorless or information is None:
             return True
-        return Uncertainty.from_curvature(task, self.best[k], curvature, task.dofs, None).degrees > SHARP_DEGREES
+        return Uncertainty.from_information(task, self.best[k], information, task.dofs, None).degrees > SHARP_DEGREES
 
     def _resolve_ambiguity(self, k: int) -> bool:
         """Return whether another pose of one object makes the pictures likelier, and take it then. It is compared where no
@@ -174,10 +176,10 @@ class PosesSearch:
                 move = 0.5 * move  # Full steps would oscillate, as weights are solved anew at each.
             first = 0
             for k in moving:
-                dofs = level.objects[k].plain.dofs
+                dofs = level.objects[k].pyramid_level.dofs
                 own = slice(first, first := first + len(dofs))
                 step = move[own] * min(1.0, MAX_PHOTO_STEP / float(move[own].abs().max().clamp(min=1e-30)))
-                far = float(step.abs().max()) >= self.tolerance * level.objects[k].plain.coarseness
+                far = float(step.abs().max()) >= self.tolerance * level.objects[k].pyramid_level.coarseness
                 short[k] = not far or float(step @ normal.curvature[own, own] @ step) < SHORT_STEP_NATS
                 norms = norms_of(dofs, normal.gradient[own])
                 self.history[k].append(Step(level.size, loss, self.best[k], True, norms))
@@ -186,7 +188,7 @@ class PosesSearch:
             self.after_step()
 
     def _most(self, level: JointLevel) -> int:
-        coarsest = level.objects[0].plain.coarseness == self.levels[0].objects[0].plain.coarseness
+        coarsest = level.objects[0].pyramid_level.coarseness == self.levels[0].objects[0].pyramid_level.coarseness
         return most_steps(self.steps, level.last, coarsest)
 
     def _judge(self, level: JointLevel) -> None:

@@ -46,10 +46,8 @@ class SurfaceInterior:
         if camera.K.dtype != torch.float64:
             camera = camera.to(torch.float64)
         along = torch.eye(3, dtype=torch.float64)
-        slopes = torch.stack(
-            [_difference(lambda h, e=e: camera.project(points + h * e)) for e in along], -1
-        )  # (N, 2, 3)
-        found = torch.einsum("nij,dnj->dni", slopes, self.motion.of_points(points))
+        slopes = [_difference(lambda h, e=e: camera.project(points + h * e)) for e in along]
+        found = torch.einsum("nij,dnj->dni", torch.stack(slopes, -1), self.motion.of_points(points))
         if self.motion.K is not None or self.motion.distortion is not None:
             lens = [
                 _difference(lambda h, k=k: self._moved(camera, k, h).project(points)) for k in range(len(self.motion))

@@ -32,7 +32,7 @@ class TemplateViews:
     rotations: Tensor  # (n, 3, 3) float64, mesh to camera
     across: int  # pixels, the diagonal of the object's box
     alpha: Tensor  # (n, T, T)
-    colours: Tensor  # (n, T, T, C), sRGB values; 1 where the mesh has no colours
+    colors: Tensor  # (n, T, T, C), sRGB values; 1 where the mesh has no colours
     normals: Tensor  # (n, T, T, 3), in mesh axes
 
     @property
@@ -56,18 +56,18 @@ class TemplateViews:
         world[:, :3, 3] = world.new_tensor([0.0, 0.0, depth]) - rotations @ task.center
         cameras = Camera(world, K.repeat(len(rotations), 1, 1), (side, side), projection=camera.projection)
         scene, names = task.scene, ["alpha", "normal"]
-        plain = task.colourless or task.aovs == ("alpha",)
-        if plain:
+        shape_only = task.colorless or task.aovs == ("alpha",)
+        if shape_only:
             scene = Scene([Mesh(mesh.verts, mesh.faces) for mesh in scene.meshes])
         with torch.no_grad():
-            seen = render_aovs(scene, cameras, names if plain else [*names, "image"], VIEW_SPP, seed)
+            seen = render_aovs(scene, cameras, names if shape_only else [*names, "image"], VIEW_SPP, seed)
         alpha = seen["alpha"].float()
         normals = F.normalize(seen["normal"].float(), dim=-1, eps=1e-6)
         channels = task.shots[0].target.shape[-1] - ("alpha" in task.aovs and not task.clutter)
-        colours = torch.ones(*alpha.shape[:3], channels)
-        if not plain:
-            colours = linear_to_srgb((seen["image"].float() / alpha.clamp(min=1e-3)).clamp(0.0, 1.0))
-        return TemplateViews(rotations, pixels, alpha[..., 0], colours, normals)
+        colors = torch.ones(*alpha.shape[:3], channels)
+        if not shape_only:
+            colors = linear_to_srgb((seen["image"].float() / alpha.clamp(min=1e-3)).clamp(0.0, 1.0))
+        return TemplateViews(rotations, pixels, alpha[..., 0], colors, normals)
 
 
 def across(task: PoseTask, camera: Camera, depth: float) -> float:

@@ -34,8 +34,8 @@ class Templates:
         """`rare` weights the ratio to the picture's colours against that to one colour. `shown` (n, T, T) is 0 where views
         are not compared."""
         self.rare = rare
-        alpha, colours, normals = views.alpha, views.colours, views.normals
-        self.C = colours.shape[-1]
+        alpha, colors, normals = views.alpha, views.colors, views.normals
+        self.C = colors.shape[-1]
         self.alpha = alpha
         self.inside = torch.where(alpha > 0.5, alpha, torch.zeros_like(alpha))
         near = F.max_pool2d((alpha > 0.02).float()[:, None], 2 * views.ring + 1, 1, views.ring)[:, 0]
@@ -43,7 +43,7 @@ class Templates:
         if shown is not None:
             self.inside, self.around = shown * self.inside, shown * self.around
         Y = torch.cat([torch.ones_like(normals[..., :1]), normals], -1)
-        basis = colours[..., None] * Y[..., None, :]  # (n, T, T, C, 4)
+        basis = colors[..., None] * Y[..., None, :]  # (n, T, T, C, 4)
         weighted = basis * self.inside[..., None, None]
         A = torch.einsum("nijck,nijcl->nckl", weighted, basis)
         self.inverse = torch.linalg.inv(_with_prior(A.double())).float()  # (n, 4C, 4C)
@@ -53,18 +53,18 @@ class Templates:
         """Return log likelihood ratios (n, h, w), of a picture (C + 1, H, W) whose last channel is surprise()."""
         parts = []
         sides = torch.stack([self.inside, self.around], 1)
-        colours, surprise = picture[:-1], picture[-1]
+        colors, surprise = picture[:-1], picture[-1]
         for at in range(0, len(self.inside), 2 * VIEWS_PER_BATCH):
             rows = slice(at, at + 2 * VIEWS_PER_BATCH)
             n = len(self.inside[rows])
             b, sums = [], []
             for c in range(self.C):
                 both = torch.cat([self.filters[rows, c], sides[rows]], 1).flatten(0, 1)[:, None]
-                out = F.conv2d(colours[None, c : c + 1], both, stride=stride)[0]
+                out = F.conv2d(colors[None, c : c + 1], both, stride=stride)[0]
                 out = out.reshape(n, 6, *out.shape[1:])
                 b.append(out[:, :4])
                 sums.append(out[:, 4:])
-            squares = F.conv2d(colours.square().sum(0)[None, None], sides[rows].flatten(0, 1)[:, None], stride=stride)
+            squares = F.conv2d(colors.square().sum(0)[None, None], sides[rows].flatten(0, 1)[:, None], stride=stride)
             squares = squares[0].reshape(n, 2, *squares.shape[2:])
             rare = F.conv2d(surprise[None, None], self.inside[rows, None], stride=stride)[0]
             parts.append(self._ratios(torch.cat(b, 1), torch.stack(sums, 2), squares, rare, rows))
@@ -77,13 +77,13 @@ class Templates:
         parts = []
         for at in range(0, len(crops), VIEWS_PER_BATCH):
             rows = slice(at, at + VIEWS_PER_BATCH)
-            colours, last = crops[rows, :-1], crops[rows, -1:]
+            colors, last = crops[rows, :-1], crops[rows, -1:]
             sides = torch.stack([self.inside[rows], self.around[rows]], 1)
             n, k = len(sides), crops.shape[-1] - sides.shape[-1] + 1
             filters = torch.cat([self.filters[rows], sides[:, None].expand(-1, self.C, -1, -1, -1)], 2)
-            out = _one_by_one(colours.flatten(0, 1), filters.flatten(0, 1)).reshape(n, self.C, 6, k, k)
+            out = _one_by_one(colors.flatten(0, 1), filters.flatten(0, 1)).reshape(n, self.C, 6, k, k)
             b, sums = out[:, :, :4].reshape(n, 4 * self.C, k, k), out[:, :, 4:].transpose(1, 2)
-            squares = _one_by_one(colours.square().sum(1), sides)
+            squares = _one_by_one(colors.square().sum(1), sides)
             if masked:  # Σ(m − α)² = Σm² − 2Σmα + Σα²
                 alpha = self.alpha[rows, None]
                 of_masks = _one_by_one(last[:, 0].square(), torch.ones_like(alpha))
