@@ -1,4 +1,4 @@
-"""A seven-joint arm of boxes and cylinders, as URDF: what examples/robot.py looks at when it is given none."""
+"""Used by robot.py where it is given no robot: a seven-joint arm of boxes and cylinders, as URDF."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A figure of twenty joints, whose limbs are flattened ellipsoids that bend smoothly where they meet."""
+"""Used by body.py: a figure of twenty joints, whose limbs are flattened ellipsoids that bend smoothly where they meet."""
 
 from __future__ import annotations
 

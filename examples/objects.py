@@ -1,4 +1,4 @@
-"""What the examples of fits look at: an object that needs no file, and cameras around it."""
+"""Used by other examples: a painted stone that needs no file, and cameras around it."""
 
 from __future__ import annotations
 

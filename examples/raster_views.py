@@ -1,4 +1,4 @@
-"""What the examples of edgegrad.raster share: matrices to clip space, rotations, a cube, and how they descend."""
+"""Used by the other raster_*.py: matrices to clip space, rotations, a cube, and how they descend."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """fit_pose(): the pose of a known mesh in one or several pictures.
 
-The loss is the squared difference between blurred pictures and renders, on an image pyramid from coarse to fine; what covers
-the object hardly counts. Each Gauss-Newton step rotates the object about its centre, shifts it in units of its size, and
-changes logarithms of scale and focal length.
+An image pyramid is searched from coarse to fine. Colours as they are, or the mask of a plain mesh, are compared by a robust
+squared difference of blurred pictures and renders (color_search.py); photographs by a sum of likelihoods (photo/level.py). In
+both, what covers the object hardly counts. Each Gauss-Newton step rotates the object about its centre, shifts it in units of
+its size, and changes logarithms of scale and focal length.
 """
 
 from __future__ import annotations
@@ -119,10 +120,11 @@ def fit_pose(
 
     Something unknown may cover about a quarter of the object; fit_poses() is for meshes that cover one another. The picture
     may be blurred by up to 1.4 pixels, and compressed: renders get the same blur. The start is refined first. The fit is
-    `converged` if its last step was short and the pictures show at least 60 % of the render's edges (`explained`). Where they
-    do not, it searches for better poses further off, which takes a few times as long, less where nothing in the picture
-    matches the object. Where they do, but the object is covered or of another colour, it searches nearby, in about the same
-    time again. Another pose is the answer only if its loss is lower than that of `init` in the final comparison, and the
+    `converged` if its last step was short and the pictures show enough of the render's edges (`explained`): 60 % where
+    its colours as they are, or the mask of a plain mesh, were compared; 65 % by the terms for photographs; 85 % by these terms
+    where the mesh is plain, or where its colours were compared first and did not fit. Where the pictures show less, it searches for better poses further off, which
+    takes a few times as long, less where nothing in the picture matches the object. Where they show enough, but the object is
+    covered or of another colour, it searches nearby, in about the same time again. Another pose is the answer only if its loss is lower than that of `init` in the final comparison, and the
     picture shows its edges as well. `uncertainty` says how exactly the pictures show the pose: a rotation known less exactly
     than to 5° (of a plain mesh 2°), or a place than to 5 % of the object's size, is not `converged`, and `reason` names the
     direction; a continuous one of the `symmetries` counts as known. A plain mesh has its contour alone: it always takes other
