@@ -108,8 +108,8 @@ def fit_pose(
                 shows 85 % of the render's edges. Around `init` they are rotated by up to 45°; without it they are rotated in
                 all ways, at the place that `init` has for None. "global" searches for the object in the whole first picture,
                 seen by a perspective or orthographic camera, from all sides and at sizes from 0.25 to 1.25 of the picture's
-                shorter side, in 20 … 40 s of processor time, or in the mask, in 4 … 10 s; `init` is None then. 1: the start alone,
-                and what `search` adds; more starts ignore `search`
+                shorter side, in 20 … 40 s of processor time, or in the mask, in 4 … 10 s; `init` is None then. 1: the start
+                alone, and what `search` adds; more starts ignore `search`
     progress    show a bar with the loss on standard error
     callback    called after each step with the best fit so far
     checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
