@@ -12,9 +12,9 @@ import argparse
 import time
 
 import torch
-from test_fit import START, bracket, camera, errors
-from test_fit_photo import photograph
-from test_fit_region import RADII, VIEW, vase
+from brackets import START, bracket, camera, errors
+from photographs import photograph
+from vases import RADII, VIEW, vase
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses

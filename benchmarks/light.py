@@ -105,7 +105,7 @@ class ShadowBoundaries(_Image):
     def render(self) -> Tensor:
         image = self._values()
         begin = time.perf_counter()
-        found = self._frame.attached(image, self._shadows())
+        found = self._context.attached(image, self._shadows())
         self.seconds = time.perf_counter() - begin
         return found
 

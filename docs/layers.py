@@ -13,14 +13,8 @@ from pathlib import Path
 import grimp
 
 FOLDER = Path(__file__).parent
-LEFT_OUT = {
-    "image",
-    "io",
-    "lights",
-    "notebook",
-    "__main__",
-    "_core",
-}  # names for users alone, which nothing inside imports
+# Names for users alone, which nothing inside imports.
+LEFT_OUT = {"image", "io", "lights", "notebook", "__main__", "_core"}
 INK, BLUE, GREY = "#222222", "#1f6fb2", "#b9bec6"
 
 
@@ -82,7 +76,7 @@ def draw(file: Path) -> None:
         for other in needs:
             (x0, y0), (x1, y1) = place[name], place[other]
             arrow = {"arrowstyle": "-|>", "color": GREY, "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0}
-            axis.annotate("", (x1, y1 + 0.27), (x0, y0 - 0.27), arrowprops=arrow)
+            axis.annotate("", (x1, y1 + 0.27), (x0, y0 - 0.27), arrowprops=arrow, zorder=1)  # behind boxes
     for name, (x, y) in place.items():
         package = (FOLDER.parent / "edgegrad" / name).is_dir()
         width = 0.14 * len(name) + 0.35

@@ -1,8 +1,8 @@
-"""The pose of a body of twenty joints, from four masks.
+"""Find the pose of a body of twenty joints from four masks.
 
     python examples/body.py [--degrees 40] [--size 192] [--seed 0] [--tries 40] [--view] [--out body.png]
 
-It starts at rest. Errors are those of rotations, and of the directions in which limbs point: a twist of a limb about its own
+It starts at rest. Errors are those of rotations, and of the directions in which limbs point: a rotation of a limb about its own
 axis hardly changes its outline.
 """
 
@@ -27,14 +27,14 @@ LIMIT = 0.75  # radians, of each component of a rotation
 
 
 class Errors(NamedTuple):
-    """Degrees, of each joint."""
+    """Degrees of each joint."""
 
     rotation: Tensor  # about its own axes
     direction: Tensor  # in the world
 
     @staticmethod
     def of(rig: eg.Rig, found: Tensor, truth: Tensor) -> Errors:
-        """Of rotation vectors (20, 3)."""
+        """Return the errors of rotation vectors (20, 3)."""
         R, S = roma.rotvec_to_rotmat(found), roma.rotvec_to_rotmat(truth)
         along = torch.tensor(figure.BONES_ALONG, dtype=torch.float64)[..., None]
         a, b = ((rig.joints.world(turns)[:, :3, :3] @ along)[..., 0] for turns in (R, S))
@@ -49,7 +49,7 @@ class Errors(NamedTuple):
 def trial(
     seed: int, degrees: float = 40.0, size: int = SIZE, **options: object
 ) -> tuple[eg.Rig, Tensor, list[Tensor], RigFit]:
-    """The rig, its true pose, its masks, and what is found."""
+    """Return the rig, its true pose, its masks, and what is found."""
     rig = figure.figure(colored=True).with_limits(rotations=(-LIMIT, LIMIT))
     cameras, truth = figure.cameras(size), figure.pose(seed, degrees)
     masks = [eg.render_aovs(rig.posed(truth), camera, ["alpha"], spp=64, seed=5)["alpha"] for camera in cameras]
@@ -57,7 +57,7 @@ def trial(
 
 
 def pictures(rig: eg.Rig, truth: Tensor, fit: RigFit, size: int) -> list[dict[str, Tensor]]:
-    """Of two cameras: the true pose, where the fit starts, what it finds."""
+    """Return pictures of two cameras: the true pose, where the fit starts, what it finds."""
     shown = {"target": rig.posed(truth), "start": rig.posed(), "fit": fit.posed()}
     white = torch.ones(3)
     return [
@@ -74,19 +74,19 @@ def main() -> None:
     parser.add_argument("--tries", type=int, default=40)
     parser.add_argument("--view", action="store_true", help="in a browser")
     parser.add_argument("--out", type=Path, default=Path("body.png"))
-    told = parser.parse_args()
+    options = parser.parse_args()
     with contextlib.ExitStack() as stack:
-        view = stack.enter_context(eg.viewer()) if told.view else None
+        view = stack.enter_context(eg.viewer()) if options.view else None
         if view is not None:
             print(view.url, flush=True)
         began = time.perf_counter()
-        rig, truth, _, fit = trial(told.seed, told.degrees, told.size, tries=told.tries, callback=view)
+        rig, truth, _, fit = trial(options.seed, options.degrees, options.size, tries=options.tries, callback=view)
         print(f"{fit.reason} after {time.perf_counter() - began:.0f} s")
         print("start:", Errors.of(rig, torch.zeros_like(truth), truth))
         print("fit:  ", Errors.of(rig, fit.values["rotations"], truth))
-        rows = [torch.cat(list(row.values()), 1) for row in pictures(rig, truth, fit, max(told.size, 256))]
-        eg.write_image(told.out, torch.cat(rows, 0))
-        print(f"wrote {told.out}: true pose, start, fit")
+        rows = [torch.cat(list(row.values()), 1) for row in pictures(rig, truth, fit, max(options.size, 256))]
+        eg.write_image(options.out, torch.cat(rows, 0))
+        print(f"wrote {options.out}: true pose, start, fit")
         if view is not None:
             view.show(fit)
             view.wait()

@@ -1,4 +1,4 @@
-"""The colours of a room's corner from two pictures of it, with light that goes to and fro, and without.
+"""Find the colours of a room's corner from two pictures of it, with indirect light and without.
 
     python examples/corner.py [--size 64] [--out corner.png]
 
@@ -51,7 +51,7 @@ def pictures(colors: dict[str, Tensor], size: int, bounces: int, spp: int = 256)
 
 
 def fit(seen: list[Tensor], bounces: int, steps: int = 30) -> Fit:
-    """From grey walls."""
+    """Start from grey walls."""
     size = len(seen[0])
     sought = {name: Parameter(0.03, torch.full((3,), 0.5), low=0.0, high=1.0) for name in WALLS}
     render = {"bounces": bounces}
@@ -59,7 +59,7 @@ def fit(seen: list[Tensor], bounces: int, steps: int = 30) -> Fit:
 
 
 def errors(found: Fit) -> dict[str, float]:
-    """Of each wall, the largest of its channels' relative errors."""
+    """Return of each wall the largest of its channels' relative errors."""
     return {name: float((found.values[name] / color - 1).abs().max()) for name, color in TRUTH.items()}
 
 

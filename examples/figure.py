@@ -38,7 +38,7 @@ HEIGHT = 2.0
 
 
 def limb(start: Tensor, end: Tensor, width: float, thick: float, n: int) -> tuple[Tensor, Tensor]:
-    """Vertices and faces of an ellipsoid from joint to end, its width across."""
+    """Return vertices and faces of an ellipsoid from joint to end, with its width across."""
     theta = torch.arange(1, n) * math.pi / n
     phi = torch.arange(2 * n) * math.pi / n
     sine, cosine = theta.sin()[:, None], theta.cos()[:, None].expand(-1, 2 * n)
@@ -61,7 +61,7 @@ def limb(start: Tensor, end: Tensor, width: float, thick: float, n: int) -> tupl
 
 
 def figure(fine: int = 6, colored: bool = False) -> eg.Rig:
-    """Some 120 vertices a limb at 6. Where a limb meets its parent's, its vertices hang on both."""
+    """Return a figure of some 120 vertices a limb at 6. Where a limb meets its parent's, its vertices hang on both."""
     verts, faces, weights, colors, count = [], [], [], [], 0
     g = torch.Generator().manual_seed(3)
     for k, (_, parent, start, end, width, thick) in enumerate(BONES):
@@ -86,7 +86,7 @@ def figure(fine: int = 6, colored: bool = False) -> eg.Rig:
 
 
 def cameras(size: int, count: int = 4) -> list[eg.Camera]:
-    """Around it."""
+    """Return cameras around the figure."""
     found = []
     for k in range(count):
         angle = 0.4 + math.tau * k / count
@@ -96,7 +96,7 @@ def cameras(size: int, count: int = 4) -> list[eg.Camera]:
 
 
 def pose(seed: int, most: float = 40.0) -> Tensor:
-    """(20, 3) rotation vectors of up to so many degrees about random axes."""
+    """Return rotation vectors (20, 3) of up to so many degrees about random axes."""
     g = torch.Generator().manual_seed(seed)
     axes = torch.randn(len(BONES), 3, generator=g, dtype=torch.float64)
     angle = math.radians(most) * torch.rand(len(BONES), 1, generator=g, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Where a picture was taken, and with what focal length: both from one picture of a known object.
+"""Find where a picture was taken, and with what focal length, from one picture of a known object.
 
     python examples/focal.py [MESH] [--starts 10] [--size 256] [--out focal.png]
 
@@ -22,7 +22,7 @@ TURN, SHIFT, ZOOM = 8.0, 0.08, 0.15  # degrees, object sizes, part of the focal 
 
 
 def trial(mesh: eg.Mesh, seed: int, size: int = 256) -> tuple[float, float, CameraFit]:
-    """Percent that the focal length is off, at the start and at the end, and the fit."""
+    """Return by how many percent the focal length is off, at the start and at the end, and the fit."""
     g = torch.Generator().manual_seed(seed)
     true = objects.around(mesh, 20, size, distance=0.85)[seed % 20]  # so near that perspective shows
     picture = eg.render(eg.Scene([mesh], BACKGROUND), true, spp=64, seed=10_000)

@@ -1,4 +1,4 @@
-"""A texture and the light on it from pictures: the shader is nine spherical harmonics of the normal times the texture.
+"""Find a texture and the light on it from pictures: the shader is nine spherical harmonics of the normal times the texture.
 
     python examples/harmonics.py [--out harmonics.png]
 
@@ -21,7 +21,7 @@ SIZE = 96
 
 
 def globe(rows: int = 24, columns: int = 48) -> eg.Mesh:
-    """A sphere with texture coordinates, whose seam has two of them for one vertex."""
+    """Return a sphere with texture coordinates, whose seam has two of them for one vertex."""
     i, j = torch.arange(rows + 1), torch.arange(columns + 1)
     phi, theta = 2 * math.pi * j / columns, math.pi * i / rows
     unit = torch.stack(
@@ -42,7 +42,7 @@ def globe(rows: int = 24, columns: int = 48) -> eg.Mesh:
 
 
 def harmonics(n: Tensor) -> Tensor:
-    """(N, 9) the real spherical harmonics of unit vectors (N, 3), to degree two, without their constants."""
+    """Return the real spherical harmonics (N, 9) of unit vectors (N, 3), to degree two, without their constants."""
     x, y, z = n.unbind(1)
     return torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], 1)
 
@@ -52,7 +52,7 @@ def shader(texture: Tensor, light: Tensor) -> eg.shader.Shader:
 
 
 def fit(steps: int = 150) -> tuple[list[Tensor], float, float]:
-    """Pictures (target, start, end), and the root mean square error of the image before and after."""
+    """Return pictures (target, start, end), and the root mean square error of the image before and after."""
     torch.manual_seed(0)
     mesh = globe()
     cameras = eg.Camera.look_at((0.0, 0.8, 3.2), (0.0, 0.0, 0.0), size=(SIZE, SIZE))
@@ -63,7 +63,7 @@ def fit(steps: int = 150) -> tuple[list[Tensor], float, float]:
     )
 
     def views(texture: Tensor, light: Tensor, seed: int, spp: int) -> Tensor:
-        """From six sides: the globe turns under the light."""
+        """Return views from six sides: the globe rotates under the light."""
         turned = []
         for k in range(6):
             c, s = math.cos(math.pi * k / 3), math.sin(math.pi * k / 3)

@@ -1,4 +1,4 @@
-"""A shape from many views, shared out among processes and machines by torch.distributed.
+"""Find a shape from many views, which torch.distributed shares among processes and machines.
 
     export TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1  # see joined()
     torchrun --standalone --nproc-per-node 2 --max-restarts 3 examples/many_views.py [--views 64] [--batch 16]
@@ -6,7 +6,7 @@
 A sphere becomes a knobbly stone. In each step DistributedDataParallel gives every process some views to render and adds up their
 gradients. Each view of each step has a seed of its own, so the result does not depend on the number of processes, but for the
 order in which numbers are summed. The state is saved every few steps: when a worker dies, torchrun starts all of them again
-and they go on from there, perhaps fewer. docs/many-machines.md tells how to run it on many machines.
+and they go on from there, perhaps fewer. docs/many-machines.md says how to run it on many machines.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Loss(torch.nn.Module):
         return eg.Mesh(self.smooth(self.coordinates), self.faces)
 
     def forward(self, views: list[int], step: int, count: float) -> Tensor:
-        """The sum over some views, divided by `count`."""
+        """Return the sum over some views, divided by `count`."""
         mesh, cameras = shape.lit(self.mesh()), self.pictures.cameras
         total = torch.zeros((), dtype=torch.float64)
         for view in views:
@@ -91,7 +91,7 @@ class Loss(torch.nn.Module):
 
 
 def views_of(step: int, task: Task) -> list[int]:
-    """The views of a step: by turns, in an order that is drawn anew for each round. The same in every process."""
+    """Return the views of a step, which take turns in an order drawn anew for each round, the same in every process."""
     found = []
     for k in range(step * task.batch, (step + 1) * task.batch):
         generator = torch.Generator().manual_seed(k // task.views)
@@ -100,7 +100,7 @@ def views_of(step: int, task: Task) -> list[int]:
 
 
 def gradient(loss: torch.nn.Module, step: int, task: Task) -> float:
-    """Leaves the gradient of a step's mean loss in the parameters of every process; that loss."""
+    """Leave the gradient of a step's mean loss in the parameters of every process; return that loss."""
     rank, processes = _place()
     if task.batch < processes:
         raise ValueError(f"batch: expected a view for each of {processes} processes, got {task.batch}; raise --batch")
@@ -118,7 +118,8 @@ def gradient(loss: torch.nn.Module, step: int, task: Task) -> float:
 def fit(
     task: Task, checkpoint: Path, every: int = 20, callback: Callable[[int, float], Any] | None = None
 ) -> tuple[eg.Mesh, Speed]:
-    """The mesh, and how fast views were rendered. Goes on from `checkpoint`, if there is one, which must be of the same task."""
+    """Return the mesh, and how fast views were rendered. Resume from `checkpoint`, if there is one, which must be of
+    the same task."""
     module = Loss(Pictures(task), task)
     loss = DistributedDataParallel(module) if dist.is_initialized() else module
     values = dict(module.named_parameters())
@@ -151,12 +152,13 @@ def fit(
 
 
 def _place() -> tuple[int, int]:
-    """Which process this is, and of how many."""
+    """Return which process this is, and of how many."""
     return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
 
 
 def _shared(read: Callable[[], Any]) -> Any:
-    """What the first process reads, or why it cannot, for all: so they agree, wherever the file is."""
+    """Return what the first process reads to all, or raise in all why it cannot: so they agree, wherever the file
+    is."""
     box: list[Any] = [None]
     if _place()[0] == 0:
         try:
@@ -202,7 +204,7 @@ def main() -> None:
 
 @contextmanager
 def joined() -> Iterator[None]:
-    """Among the processes that torchrun started, which tells them addresses and ranks; alone without it."""
+    """Join the processes that torchrun started, which gives them addresses and ranks; do without it alone."""
     if not dist.is_torchelastic_launched():
         yield
         return

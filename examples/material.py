@@ -1,4 +1,4 @@
-"""What a thing is made of: roughness, metallic and base colour, from 8 pictures of it under a sky that is known.
+"""Find roughness, metallic and base colour of a thing from 8 pictures of it under a known sky.
 
     python examples/material.py [MESH] [--size 128] [--out material.png]
 
@@ -31,7 +31,7 @@ VIEWS = 8
 
 
 def sky() -> eg.Environment:
-    """Brighter above than below, with three lights."""
+    """Return a sky that is brighter above than below, with three lights."""
     image = torch.linspace(0.9, 0.15, 64)[:, None, None] * torch.tensor([0.9, 1.0, 1.15]).expand(64, 128, 3)
     for row, column, size, radiance in ((12, 20, 9, 6.0), (20, 84, 7, 9.0), (34, 52, 8, 4.0)):
         image[row : row + size, column : column + size] = radiance
@@ -70,14 +70,14 @@ def pictures(scene: eg.Scene, cameras: list[eg.Camera]) -> list[Tensor]:
 
 
 def half(truth: Made) -> Made:
-    """Grey, half rough and half a metal."""
+    """Return a grey that is half rough and half a metal."""
     return Made(*(torch.full_like(value, 0.5) for value in truth))
 
 
 def fit(
     shape: eg.Mesh, truth: Made, size: int = 128, start: Made | None = None, rate: float = 0.02, **options: Any
 ) -> tuple[Fit, Made]:
-    """From half() or another start, with learning rates of 0.02 of colours, and of the two numbers as given."""
+    """Start from half() or another start, with learning rates of 0.02 of colours, and of the two numbers as given."""
     cameras = objects.around(shape, VIEWS, size)
     sought = {
         name: Parameter(0.02 if name == "base" else rate, value, low=0.0, high=1.0)
@@ -94,7 +94,7 @@ def resized(image: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def fit_textured(shape: eg.Mesh, truth: Made, size: int = 128, steps: tuple[int, int] = (300, 150)) -> tuple[Fit, Made]:
-    """Coarse, then fine."""
+    """Fit coarse textures, then fine ones."""
     options: dict[str, Any] = {"spp": 4, "views_per_step": 2, "tolerance": 0.0}
     rows, columns, _ = truth.base.shape
     start = half(truth)

@@ -1,10 +1,10 @@
-"""The light from all around, from pictures of a ball of polished metal that mirrors it.
+"""Find the light from all around by pictures of a ball of polished metal that mirrors it.
 
     python examples/mirror.py [--out mirror.png]
 
 render() has such a material of its own, `eg.Material(0.95, metallic=1.0, roughness=0.2)`. Here the shader is one of PyTorch,
-for a metal that it defines itself: it is given points of the light where so smooth a metal looks, each with the density of its
-choice.
+for a metal that it defines itself. It is given points of the light that so smooth a metal mirrors, each with the density by
+which it was drawn.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SMOOTH = 6e-3  # how much a rough environment costs: hardly any light comes from
 
 
 def metal(hits: eg.Hits) -> Tensor:
-    """The metal in the light of the scene."""
+    """Return the radiance of the metal in the light of the scene."""
     (light,) = hits.lights
     points = hits.light_points(light, by=eg.lights.points_by_material)
     n, l = hits.shading_normal, light.incident(points, hits.position)
@@ -37,7 +37,8 @@ def metal(hits: eg.Hits) -> Tensor:
 
 
 def reflected(n: Tensor, v: Tensor, l: Tensor) -> Tensor:
-    """(N, 1): the microfacets of GGX (Walter et al. 2007), masked and shadowed (Heitz 2014), with Schlick's Fresnel term."""
+    """Return (N, 1): the microfacets of GGX (Walter et al. 2007), masked and shadowed (Heitz 2014), with Schlick's
+    Fresnel term."""
     nv, nl = (n * v).sum(1, keepdim=True).clamp(min=1e-3), (n * l).sum(1, keepdim=True).clamp(min=1e-3)
     m = normalize(v + l, dim=1)
     sine = torch.linalg.cross(n, m).square().sum(1, keepdim=True)  # 1 − cos² would round it away
@@ -47,12 +48,12 @@ def reflected(n: Tensor, v: Tensor, l: Tensor) -> Tensor:
 
 
 def slope_mask(cosine: Tensor) -> Tensor:
-    """Smith's Λ of the GGX distribution (Heitz 2014, eq. 72)."""
+    """Return Smith's Λ of the GGX distribution (Heitz 2014, eq. 72)."""
     return ((1 + ALPHA**2 * (1 / cosine**2 - 1)).sqrt() - 1) / 2
 
 
 def sky() -> Tensor:
-    """(ROWS, COLUMNS, 3): blue over brown, a sun, and two lights."""
+    """Return a sky (ROWS, COLUMNS, 3): blue over brown, a sun, and two lights."""
     y, x = torch.meshgrid((torch.arange(ROWS) + 0.5) / ROWS, (torch.arange(COLUMNS) + 0.5) / COLUMNS, indexing="ij")
     x, y = x[..., None], y[..., None]
     above = torch.sigmoid(24 * (0.52 + 0.05 * torch.sin(6 * math.pi * x) - y))
@@ -63,12 +64,12 @@ def sky() -> Tensor:
 
 
 def roughness(image: Tensor) -> Tensor:
-    """The mean square of what neighbouring texels differ by."""
+    """Return the mean square of differences of neighbouring texels."""
     return image.diff(dim=0).square().mean() + (image - image.roll(1, 1)).square().mean()
 
 
 def fit(steps: int = 200, size: int = SIZE) -> tuple[list[Tensor], Tensor]:
-    """Pictures of the ball (target, end), and the environment that was found."""
+    """Return pictures of the ball (target, end), and the environment that was found."""
     made = trimesh.creation.icosphere(4)
     material = eg.Material(torch.full((3,), BASE), metallic=1.0, roughness=ALPHA**0.5)  # by which points are drawn
     verts, faces = torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces)
@@ -101,7 +102,7 @@ def fit(steps: int = 200, size: int = SIZE) -> tuple[list[Tensor], Tensor]:
 
 
 def error(found: Tensor) -> float:
-    """Root mean square over the directions, over that of the environment."""
+    """Return the root mean square over the directions, over that of the environment."""
     height = torch.sin((torch.arange(ROWS) + 0.5) * math.pi / ROWS)[:, None, None]
     return (((found - sky()) ** 2 * height).sum() / (sky() ** 2 * height).sum()).sqrt().item()
 

@@ -1,4 +1,4 @@
-"""A network as a shader, and a shape under it: a glossy torus whose look and thickness are both unknown.
+"""A network as a shader, and a shape under it: a glossy torus whose appearance and thickness are both unknown.
 
     python examples/network.py [--out network.png]
 
@@ -24,7 +24,7 @@ TRUE_TUBE, FIRST_TUBE = 0.30, 0.22
 
 
 def torus(tube: Tensor) -> eg.Mesh:
-    """Around the z axis, with the radius 0.7; `tube` is that of its tube."""
+    """Return a torus around the z axis, with the radius 0.7; `tube` is that of its tube."""
     made = trimesh.creation.torus(0.7, 0.1, major_sections=48, minor_sections=24)
     surface = torch.tensor(made.vertices, dtype=torch.float32)
     middle = torch.nn.functional.pad(torch.nn.functional.normalize(surface[:, :2], dim=1) * 0.7, (0, 1))
@@ -32,7 +32,7 @@ def torus(tube: Tensor) -> eg.Mesh:
 
 
 def glossy(hits: eg.Hits) -> Tensor:
-    """Paint with a highlight (Blinn 1977)."""
+    """Return the radiance of paint with a highlight (Blinn 1977)."""
     light = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.7]), dim=0)
     half = torch.nn.functional.normalize(hits.view + light, dim=1)
     matt = (hits.shading_normal @ light).clamp(min=0)[:, None]
@@ -41,7 +41,7 @@ def glossy(hits: eg.Hits) -> Tensor:
     return paint * (0.25 + 0.75 * matt) + 0.5 * shine
 
 
-class Look(torch.nn.Module):
+class Paint(torch.nn.Module):
     def __init__(self, width: int = 64) -> None:
         super().__init__()
         sizes = [9, width, width, 3]
@@ -53,7 +53,7 @@ class Look(torch.nn.Module):
 
 
 def fit(steps: int = 200) -> tuple[list[Tensor], float]:
-    """Pictures (target, start, end) and the thickness that was found."""
+    """Return pictures (target, start, end) and the thickness that was found."""
     torch.manual_seed(0)
     cameras = [
         eg.Camera.look_at(
@@ -66,12 +66,12 @@ def fit(steps: int = 200) -> tuple[list[Tensor], float]:
     ]
     with torch.no_grad():
         targets = [eg.render(torus(torch.tensor(TRUE_TUBE)), c, 64, 10_000, shader=glossy) for c in cameras]
-    look, tube = Look(), torch.tensor(FIRST_TUBE, requires_grad=True)
-    optimizer = torch.optim.Adam([{"params": look.parameters(), "lr": 5e-3}, {"params": [tube], "lr": 3e-3}])
+    paint, tube = Paint(), torch.tensor(FIRST_TUBE, requires_grad=True)
+    optimizer = torch.optim.Adam([{"params": paint.parameters(), "lr": 5e-3}, {"params": [tube], "lr": 3e-3}])
     pictures = [targets[0]]
     for step in tqdm(range(steps), desc="network"):
         k = 0 if step in (0, steps - 1) else step % len(cameras)
-        image = eg.render(torus(tube), cameras[k], 8, step, shader=look)
+        image = eg.render(torus(tube), cameras[k], 8, step, shader=paint)
         if step in (0, steps - 1):
             pictures.append(image.detach())
         optimizer.zero_grad()

@@ -3,7 +3,7 @@
     python examples/pose.py [MESH] [--case plain|covered|cut-out|unknown|masks] [--starts 100] [--size 256] [--out pose.png]
 
 plain     one picture, the colour behind the object known
-covered   a quarter of the object is behind a striped board that nobody speaks of
+covered   a quarter of the object is behind a striped board that the fit does not know
 cut-out   the same, with a mask of what is seen of the object
 unknown   before a background of noise that is not known, no mask
 masks     no colours: masks alone, from 8 views
@@ -30,7 +30,7 @@ GOOD = {"plain": 0.5, "covered": 1.0, "cut-out": 1.0, "unknown": 1.0, "masks": 0
 
 
 def board(alpha: Tensor, generator: torch.Generator) -> Tensor:
-    """(H, W, 1): 1 where a half plane, from a random side, covers a quarter of the object."""
+    """Return (H, W, 1): 1 where a half plane, from a random side, covers a quarter of the object."""
     H, W = alpha.shape[:2]
     angle = float(torch.rand((), generator=generator)) * math.tau
     y, x = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
@@ -40,7 +40,7 @@ def board(alpha: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def scene(mesh: eg.Mesh, case: str, generator: torch.Generator, size: int = SIZE) -> tuple[eg.Mesh, dict]:
-    """The mesh turned at random, and what fit_pose is told."""
+    """Return the mesh in a random rotation, and arguments of fit_pose."""
     low, high = mesh.verts.double().aminmax(dim=0)
     center = (low + high) / 2
     R = random_rotation(generator, math.pi)
@@ -66,22 +66,22 @@ def scene(mesh: eg.Mesh, case: str, generator: torch.Generator, size: int = SIZE
 
 
 def random_rotation(generator: torch.Generator, most: float) -> Tensor:
-    """About a random axis by up to so many radians."""
+    """Return a rotation about a random axis by up to so many radians."""
     axis = torch.randn(3, generator=generator, dtype=torch.float64)
     return roma.rotvec_to_rotmat(most * torch.rand((), generator=generator) * axis / axis.norm())
 
 
 def trial(mesh: eg.Mesh, case: str, seed: int, size: int = SIZE) -> tuple[float, float, PoseFit]:
-    """Degrees off at the start and at the end, and the fit; the true pose is the identity."""
+    """Return degrees off at the start and at the end, and the fit; the true pose is the identity."""
     generator = torch.Generator().manual_seed(seed)
-    turned, told = scene(mesh, case, generator, size)
+    turned, given = scene(mesh, case, generator, size)
     low, high = turned.verts.double().aminmax(dim=0)
     center, diagonal = (low + high) / 2, float((high - low).norm())
     start = torch.eye(4, dtype=torch.float64)
     R = random_rotation(generator, math.radians(TURN))
     off = torch.rand(3, generator=generator, dtype=torch.float64) * 2.0 - 1.0
     start[:3, :3], start[:3, 3] = R, center - R @ center + SHIFT * diagonal * off / math.sqrt(3.0)
-    fit = fit_pose(turned, init=start, seed=seed, progress=False, **told)
+    fit = fit_pose(turned, init=start, seed=seed, progress=False, **given)
     return degrees(R), degrees(fit.R), fit
 
 

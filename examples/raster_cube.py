@@ -1,4 +1,4 @@
-"""The corners and the colours of a cube, from pictures of 4 to 16 pixels, by rasterize, interpolate and antialias.
+"""Find the corners and the colours of a cube from pictures of 4 to 16 pixels, by rasterize, interpolate and antialias.
 
     python examples/raster_cube.py [--size 16] [--steps 3000] [--exact] [--seed 0]
 
@@ -25,7 +25,7 @@ class Errors(NamedTuple):
 
 
 def pictures(verts: Tensor, colors: Tensor, R: Tensor, size: int, exact: bool) -> Tensor:
-    """(B, size, size, 3)"""
+    """Return pictures (B, size, size, 3)."""
     _, tri, side = cube()
     pos = in_clip_space(verts, R, 3.5, perspective(2.2))
     rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (size, size))
@@ -34,7 +34,7 @@ def pictures(verts: Tensor, colors: Tensor, R: Tensor, size: int, exact: bool) -
 
 
 def fit(size: int = 16, steps: int = 3000, exact: bool = False, seed: int = 0) -> tuple[Errors, Errors]:
-    """The errors before and after."""
+    """Return the errors before and after."""
     generator = torch.Generator().manual_seed(seed)
     truth, _, _ = cube()
     true_colors = torch.rand(6, 3, generator=generator)

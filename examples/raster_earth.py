@@ -1,4 +1,4 @@
-"""The texture of a globe from pictures in random poses and at random distances, with mipmaps and without.
+"""Find the texture of a globe from pictures in random poses and at random distances, with mipmaps and without.
 
     python examples/raster_earth.py [--steps 1000] [--size 128] [--out textures.png]
 
@@ -23,7 +23,7 @@ FINER = 8
 
 
 def globe(rings: int = 32, sectors: int = 64) -> tuple[Tensor, Tensor, Tensor]:
-    """Vertices of a sphere, their texture coordinates, and triangles; the seam has vertices of its own."""
+    """Return vertices of a sphere, their texture coordinates, and triangles; the seam has vertices of its own."""
     v, u = torch.meshgrid(torch.linspace(0, 1, rings + 1), torch.linspace(0, 1, sectors + 1), indexing="ij")
     up, around = math.pi * v, math.tau * u
     verts = torch.stack([up.sin() * around.cos(), -up.cos(), -up.sin() * around.sin()], 2)
@@ -34,7 +34,7 @@ def globe(rings: int = 32, sectors: int = 64) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def world(generator: torch.Generator) -> Tensor:
-    """(1, h, w, 3): coasts and hills of noise at all scales, with a grid of fine lines."""
+    """Return (1, h, w, 3): coasts and hills of noise at all scales, with a grid of fine lines."""
     h, w = TEXTURE
     height = torch.zeros(1, 1, h, w)
     for k in range(2, 8):
@@ -56,7 +56,7 @@ class Globe:
         self.verts, self.uv, self.tri = globe()
 
     def picture(self, texture: Tensor, R: Tensor, distance: Tensor, size: int, mipmaps: bool) -> Tensor:
-        """(B, size, size, 3)"""
+        """Return pictures (B, size, size, 3)."""
         pos = in_clip_space(self.verts, R, distance, perspective(far=60.0))
         rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos, self.tri, (size, size))
         uv, uv_da = dr.interpolate(self.uv[None], rast, self.tri, rast_db, "all")
@@ -65,14 +65,14 @@ class Globe:
 
 
 def psnr(found: Tensor, truth: Tensor) -> float:
-    """Weighed by the area that texels have on the globe."""
+    """Return the ratio, weighted by the area that texels have on the globe."""
     h = truth.shape[1]
     area = ((torch.arange(h) + 0.5) * math.pi / h).sin()[None, :, None, None]
     return -10 * math.log10(float(((found.clamp(0, 1) - truth).square() * area).mean() / area.mean()))
 
 
 def fit(mipmaps: bool, steps: int = 1000, size: int = 128, seed: int = 0) -> tuple[Tensor, float]:
-    """The texture (1, h, w, 3) and its peak signal-to-noise ratio, dB."""
+    """Return the texture (1, h, w, 3) and its peak signal-to-noise ratio, dB."""
     generator = torch.Generator().manual_seed(seed)
     truth, of = world(generator), Globe()
     texture = torch.full_like(truth, 0.2).requires_grad_()

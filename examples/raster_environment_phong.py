@@ -1,4 +1,4 @@
-"""The environment that a shiny ball mirrors and the ball's Phong highlight, from pictures in random poses.
+"""Find the environment that a shiny ball mirrors, and the ball's Phong highlight, from pictures in random poses.
 
     python examples/raster_environment_phong.py [--steps 1000] [--size 128] [--out environment.png]
 
@@ -24,14 +24,14 @@ SIDE = 32  # texels along an edge of the cube map
 LIGHT = torch.tensor([0.0, 0.0, 1.0])  # where it is, as the eye sees it
 
 
-class Look(NamedTuple):
+class Appearance(NamedTuple):
     environment: Tensor  # (1, 6, SIDE, SIDE, 3)
     color: Tensor  # (3,)
     log_exponent: Tensor
 
 
-def truth(generator: torch.Generator) -> Look:
-    """A sky over ground, with lights of all colours."""
+def truth(generator: torch.Generator) -> Appearance:
+    """Return a sky over ground, with lights of all colours."""
     center = (torch.arange(SIDE) + 0.5) / SIDE * 2 - 1
     t, s = torch.meshgrid(center, center, indexing="ij")
     one = torch.ones_like(s)
@@ -41,25 +41,25 @@ def truth(generator: torch.Generator) -> Look:
     sky = torch.where(up > 0, torch.tensor([0.3, 0.5, 0.8]) + 0.3 * up, torch.tensor([0.35, 0.25, 0.15]))
     emitters = torch.nn.functional.normalize(torch.randn(12, 3, generator=generator), dim=1)
     glow = torch.exp(40 * (direction @ emitters.T - 1)) @ torch.rand(12, 3, generator=generator)
-    return Look((sky + glow)[None], torch.tensor([0.6, 0.5, 0.3]), torch.tensor(math.log(25.0)))
+    return Appearance((sky + glow)[None], torch.tensor([0.6, 0.5, 0.3]), torch.tensor(math.log(25.0)))
 
 
 class Ball:
     def __init__(self) -> None:
         self.verts, _, self.tri = globe()
 
-    def picture(self, look: Look, R: Tensor, size: int) -> Tensor:
-        """(B, size, size, 3): the eye turns around the ball."""
+    def picture(self, ball: Appearance, R: Tensor, size: int) -> Tensor:
+        """Return pictures (B, size, size, 3), whose eye moves around the ball."""
         pos = in_clip_space(self.verts, R, 3.0, perspective())
         eye = 3.0 * R[:, 2]  # of which R makes (0, 0, 3)
         rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos, self.tri, (size, size))
         view = self.verts - eye[:, None]
         mirrored = view - 2 * (view * self.verts).sum(2, keepdim=True) * self.verts  # a unit sphere is its own normal
         mirrored, mirrored_da = dr.interpolate(mirrored, rast, self.tri, rast_db, "all")
-        image = dr.texture(look.environment, mirrored, mirrored_da, boundary_mode="cube")
+        image = dr.texture(ball.environment, mirrored, mirrored_da, boundary_mode="cube")
         to_light = torch.einsum("bij,i->bj", R, LIGHT)[:, None, None]
         cosine = (torch.nn.functional.normalize(mirrored, dim=3) * to_light).sum(3, keepdim=True)
-        highlight = look.color * cosine.clamp(min=1e-4) ** look.log_exponent.exp()
+        highlight = ball.color * cosine.clamp(min=1e-4) ** ball.log_exponent.exp()
         return torch.where(rast[..., 3:] > 0, image + highlight, 0.0)
 
 
@@ -69,12 +69,12 @@ class Errors(NamedTuple):
     exponent: float  # relative
 
 
-def fit(steps: int = 1000, size: int = 128, seed: int = 0) -> tuple[Look, Errors, Errors]:
-    """What was found, with the errors before and after."""
+def fit(steps: int = 1000, size: int = 128, seed: int = 0) -> tuple[Appearance, Errors, Errors]:
+    """Return what was found, with the errors before and after."""
     generator = torch.Generator().manual_seed(seed)
     true, of = truth(generator), Ball()
-    found = Look(torch.full_like(true.environment, 0.5), torch.full((3,), 0.3), torch.tensor(math.log(10.0)))
-    found = Look(*(part.requires_grad_() for part in found))
+    found = Appearance(torch.full_like(true.environment, 0.5), torch.full((3,), 0.3), torch.tensor(math.log(10.0)))
+    found = Appearance(*(part.requires_grad_() for part in found))
 
     def errors() -> Errors:
         with torch.no_grad():
@@ -91,7 +91,7 @@ def fit(steps: int = 1000, size: int = 128, seed: int = 0) -> tuple[Look, Errors
         return (of.picture(found, R, size) - target).square().mean()
 
     descend(optimizer, loss, steps, 0.02, "environment")
-    return Look(*(part.detach() for part in found)), before, errors()
+    return Appearance(*(part.detach() for part in found)), before, errors()
 
 
 if __name__ == "__main__":
@@ -100,8 +100,8 @@ if __name__ == "__main__":
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--out")
     options = parser.parse_args()
-    look, *both = fit(options.steps, options.size)
+    ball, *both = fit(options.steps, options.size)
     for name, off in zip(("before", "after"), both, strict=True):
         print(f"{name:7s} environment {off.environment:.3f}   colour {off.color:.4f}   exponent {off.exponent:+.2%}")
     if options.out:
-        eg.write_image(options.out, torch.cat(list(look.environment[0]), 1))
+        eg.write_image(options.out, torch.cat(list(ball.environment[0]), 1))

@@ -1,4 +1,4 @@
-"""The pose of a cube with sides of six colours, from one picture: first by trying, then by gradients.
+"""Find the pose of a cube with sides of six colours from one picture: first by trying, then by gradients.
 
     python examples/raster_pose.py [--trials 20] [--size 256]
 
@@ -25,7 +25,7 @@ COLORS = torch.tensor(
 
 
 def picture(q: Tensor, size: int) -> Tensor:
-    """(B, size, size, 3) of quaternions (B, 4)."""
+    """Return pictures (B, size, size, 3) of quaternions (B, 4)."""
     verts, tri, side = cube()
     pos = in_clip_space(verts, of_quaternions(q), 6.0, perspective())
     rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (size, size))
@@ -34,7 +34,8 @@ def picture(q: Tensor, size: int) -> Tensor:
 
 
 def difference(image: Tensor, target: Tensor) -> Tensor:
-    """(B,) of pictures at four scales: coarse ones have a slope where fine ones no longer meet."""
+    """Return the differences (B,) of pictures at four scales: coarse ones have a slope where fine ones no longer
+    meet."""
     total = torch.zeros(len(image))
     for _ in range(4):
         total = total + (image - target).square().mean((1, 2, 3))
@@ -50,13 +51,13 @@ def degrees_apart(a: Tensor, b: Tensor) -> float:
 
 
 def product(p: Tensor, q: Tensor) -> Tensor:
-    """Of quaternions (B, 4): first q, then p."""
+    """Return the product of quaternions (B, 4): first q, then p."""
     scalar = p[:, :1] * q[:, :1] - (p[:, 1:] * q[:, 1:]).sum(1, keepdim=True)
     return torch.cat([scalar, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + torch.linalg.cross(p[:, 1:], q[:, 1:])], 1)
 
 
 def fit(seed: int, steps: int = 400, size: int = 256) -> tuple[float, float, float]:
-    """Degrees that the start, the best that was tried, and the last pose are off."""
+    """Return by how many degrees the start, the best that was tried, and the last pose are off."""
     generator = torch.Generator().manual_seed(seed)
     truth, best = (torch.randn(1, 4, generator=generator) for _ in range(2))
     start = degrees_apart(best[0], truth[0])

@@ -15,7 +15,7 @@ import edgegrad.raster as dr
 
 
 def picture(size: int = 256) -> Tensor:
-    """(H, W, 3), row 0 at the bottom."""
+    """Return (H, W, 3), row 0 at the bottom."""
     pos = torch.tensor([[[-0.8, -0.8, 0, 1], [0.8, -0.8, 0, 1], [0, 0.8, 0, 1]]])
     tri = torch.tensor([[0, 1, 2]], dtype=torch.int32)
     rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (size, size))

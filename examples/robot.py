@@ -1,8 +1,8 @@
-"""Where a camera stands, from masks of a robot whose joint angles are known: hand–eye calibration without a board.
+"""Find where a camera stands by masks of a robot whose joint angles are known: hand–eye calibration without a board.
 
     python examples/robot.py [ARM.urdf] [--postures 8] [--size 256] [--seed 0] [--out robot.png]
 
-Without a file, of a seven-joint arm that it writes. One camera at rest sees the arm in some postures. Its pose is found by
+Without a file it writes a seven-joint arm. One camera at rest sees the arm in some postures. Its pose is found by
 Gauss-Newton from where it was thought to be: derivatives of the masks by the pose, in forward mode.
 """
 
@@ -34,7 +34,7 @@ def camera(size: int) -> eg.Camera:
 
 
 def postures(robot: eg.Rig, count: int, seed: int) -> Tensor:
-    """(count, m) angles, well within the limits."""
+    """Return angles (count, m), well within the limits."""
     control, generator = robot.controls["angles"], torch.Generator().manual_seed(seed)
     share = torch.rand(count, len(control.rest), generator=generator, dtype=F64)
     low, high = control.low.clamp(min=-2.0), control.high.clamp(max=2.0)
@@ -49,14 +49,14 @@ def masks(scenes: list[eg.Scene], seen_by: eg.Camera, spp: int, seed: int) -> li
 
 
 def moved(start: eg.Camera, twist: Tensor) -> eg.Camera:
-    """Turned and shifted in its own coordinates: radians, metres."""
+    """Return the camera rotated and shifted in its own coordinates, by radians and metres."""
     motion = torch.eye(4, dtype=F64)
     motion[:3, :3], motion[:3, 3] = roma.rotvec_to_rotmat(twist[:3]), twist[3:]
     return start.replace(world_to_camera=motion @ start.world_to_camera)
 
 
 def errors(found: eg.Camera, truth: eg.Camera) -> tuple[float, float]:
-    """Millimetres between the eyes, and degrees."""
+    """Return millimetres between the eyes, and degrees."""
     A, B = found.world_to_camera, truth.world_to_camera
     eyes = [-(W[:3, :3].T @ W[:3, 3]) for W in (A, B)]
     return 1000.0 * float((eyes[0] - eyes[1]).norm()), math.degrees(
@@ -67,7 +67,8 @@ def errors(found: eg.Camera, truth: eg.Camera) -> tuple[float, float]:
 def fit(
     scenes: list[eg.Scene], targets: list[Tensor], start: eg.Camera, steps: int = STEPS, spp: int = 16
 ) -> eg.Camera:
-    """(JᵀJ + λ diag JᵀJ) δ = −Jᵀr (Levenberg and Marquardt), from masks at a quarter of the size, a half and the whole."""
+    """Solve (JᵀJ + λ diag JᵀJ) δ = −Jᵀr (Levenberg and Marquardt), from masks at a quarter of the size, a half and the
+    whole."""
     best = start
     for level, factor in enumerate((0.25, 0.5, 1.0)):
         size = max(16, round(start.size[0] * factor)), max(16, round(start.size[1] * factor))
@@ -96,7 +97,7 @@ def step_of(JTJ: Tensor, JTr: Tensor, damping: float) -> Tensor:
 def normal_equations(
     scenes: list[eg.Scene], targets: list[Tensor], seen_by: eg.Camera, spp: int, seed: int
 ) -> tuple[float, Tensor, Tensor]:
-    """Σ r², JᵀJ and Jᵀr of the masks by a turn and a shift of the camera, about its eye and in its axes."""
+    """Return Σ r², JᵀJ and Jᵀr of the masks by a rotation and a shift of the camera, about its eye and in its axes."""
     pose = seen_by.world_to_camera
     tangents = torch.zeros(6, 4, 4, dtype=F64)  # of exp(δ) W by δ at 0
     for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
@@ -114,7 +115,7 @@ def normal_equations(
 def trial(
     robot: eg.Rig, count: int, size: int, seed: int
 ) -> tuple[eg.Camera, eg.Camera, eg.Camera, list[eg.Scene], list[Tensor]]:
-    """Truth, start and fit, the scenes and their masks."""
+    """Return truth, start and fit, the scenes and their masks."""
     truth = camera(size)
     scenes = robot.posed(angles=postures(robot, count, seed))
     targets = masks(scenes, truth, 64, 5000)

@@ -1,4 +1,4 @@
-"""A shape from its shadow alone: the pictures show nothing but the ground, under lights from several directions.
+"""Find a shape from its shadow alone: the pictures show nothing but the ground, under lights from several directions.
 
     python examples/shadow.py [--out shadow.png]
 
@@ -34,7 +34,7 @@ class Shape:
         self.degree = degree.to(self.directions)[:, None]
 
     def truth(self) -> Tensor:
-        """(V,) the distances that are looked for: bumps on an egg."""
+        """Return the distances (V,) that are to be found: bumps on an egg."""
         x, y, z = self.directions.unbind(1)
         return 0.55 + 0.16 * x + 0.1 * torch.sin(3 * torch.atan2(y, x)) * (1 - z * z) - 0.12 * z * z
 
@@ -43,21 +43,21 @@ class Shape:
         return eg.Mesh(verts, self.faces, material=eg.Material(base_color=torch.tensor([0.7, 0.7, 0.7])))
 
     def roughness(self, distance: Tensor) -> Tensor:
-        """The mean square of how far vertices stand from the mean of their neighbours."""
+        """Return the mean square distance of vertices from the mean of their neighbours."""
         a, b = self.edges.unbind(1)
         total = torch.zeros_like(distance).index_add(0, a, distance[b]).index_add(0, b, distance[a])
         return (total / self.degree[:, 0] - distance).square().mean()
 
 
 def ground() -> eg.Mesh:
-    """z = 0, white."""
+    """Return the white plane z = 0."""
     corners = torch.tensor([[-6.0, -6.0, 0.0], [6.0, -6.0, 0.0], [6.0, 6.0, 0.0], [-6.0, 6.0, 0.0]])
     white = eg.Material(base_color=torch.tensor([0.8, 0.8, 0.8]))
     return eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=white)
 
 
 def lights(count: int = 12) -> list[eg.DirectionalLight]:
-    """Around the axis, some high, some low."""
+    """Return lights around the axis, some high, some low."""
     found = []
     for k in range(count):
         azimuth, elevation = 2 * math.pi * k / count + 0.2, math.radians((80.0, 55.0, 38.0)[k % 3])
@@ -68,7 +68,7 @@ def lights(count: int = 12) -> list[eg.DirectionalLight]:
 
 
 def fit(steps: int = 240, size: int = SIZE) -> tuple[list[Tensor], Shape, Tensor]:
-    """Pictures of one light's shadow (target, start, end), the shape, and the distances (V,) that were found."""
+    """Return pictures of one light's shadow (target, start, end), the shape, and the distances (V,) that were found."""
     shape, suns = Shape(), lights()
     # From under the shape, which is behind the camera, straight down.
     camera = eg.Camera.look_at((0.0, 0.0, 0.55), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 155.0, (size, size))
@@ -97,7 +97,7 @@ def fit(steps: int = 240, size: int = SIZE) -> tuple[list[Tensor], Shape, Tensor
 
 
 def look(shape: Shape, distance: Tensor) -> Tensor:
-    """A picture of the shape itself, which the fit never sees."""
+    """Return a picture of the shape itself, which the fit never sees."""
     camera = eg.Camera.look_at((1.6, -2.4, 2.6), (0.0, 0.0, HEIGHT), (0.0, 0.0, 1.0), 34.0, (SIZE, SIZE))
     sky = torch.zeros(9, 3).index_fill(0, torch.tensor(0), 1.5)
     suns = [eg.DirectionalLight(torch.tensor([-1.0, 0.6, -1.0]), 2.5), eg.SphericalHarmonics(sky)]

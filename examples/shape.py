@@ -3,7 +3,7 @@
     python examples/shape.py [MESH] [--views 16] [--size 256] [--given pictures] [--out shape.png]
 
 The mesh, any file that load_mesh reads, or a knobbly stone, is seen under a soft light, whose colour at a point depends on its
-normal alone; the fit is told this light, the cameras, pictures and masks. Or it is told masks alone (--given masks), and depths
+normal alone; the fit knows this light, the cameras, pictures and masks. Or it gets masks alone (--given masks), and depths
 (--given depths), or depths as a sensor gives them (--given sensor): with noise of 0.2 % of the diagonal, a tenth of the pixels
 missing, and at the contour mixed with a wall behind; its masks are whole pixels. Printed is the Chamfer distance: the mean
 distance of points on one surface to the other, both ways.
@@ -35,7 +35,7 @@ def lit(mesh: eg.Mesh) -> eg.Mesh:
 
 
 def stone(subdivisions: int = 6) -> eg.Mesh:
-    """81,920 faces with bumps of two sizes."""
+    """Return 81,920 faces with bumps of two sizes."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     n = torch.tensor(ball.vertices)
     g = torch.Generator().manual_seed(1)
@@ -49,7 +49,7 @@ NOISE, MISSING, WALL = 0.002, 0.1, 2.2  # of the sensor; noise and the wall's de
 
 
 def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures", **options: Any) -> Fit:
-    """From a sphere around the middle of the mesh's box, 0.35 of its diagonal in radius."""
+    """Start from a sphere around the middle of the mesh's box, 0.35 of its diagonal in radius."""
     cameras = objects.around(mesh, views, size, distance=1.35)
     seen = [
         eg.render_aovs(lit(mesh), c, ["image", "alpha", "depth"], spp=64, seed=10_000 + k)
@@ -73,7 +73,7 @@ def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures"
 
 
 def sensed(seen: list[dict[str, torch.Tensor]], diagonal: float) -> list[torch.Tensor]:
-    """Depths as a sensor gives them."""
+    """Return depths as a sensor gives them."""
     g = torch.Generator().manual_seed(3)
     depths = []
     for found in seen:
@@ -85,7 +85,7 @@ def sensed(seen: list[dict[str, torch.Tensor]], diagonal: float) -> list[torch.T
 
 
 def chamfer(a: eg.Mesh, b: eg.Mesh, count: int = 100_000) -> float:
-    """Percent of the diagonal of b's box."""
+    """Return percent of the diagonal of b's box."""
 
     def points(mesh: eg.Mesh) -> Any:
         surface = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)

@@ -2,7 +2,7 @@
 
     python examples/simplify.py [MESH] [--faces 300] [--steps 100] [--out simple.glb]
 
-Needs fast-simplification (`pip install fast-simplification`). Printed is the mean difference of pictures from new sides, in
+It needs fast-simplification (`pip install fast-simplification`). It prints the mean difference of pictures from new sides, in
 percent.
 """
 
@@ -23,7 +23,7 @@ SIZE = 128
 
 
 class Differences(NamedTuple):
-    """Of pictures, in percent of white."""
+    """Mean differences of pictures, in percent of white."""
 
     simplified: float
     baked: float  # with a texture
@@ -43,7 +43,7 @@ def textured(mesh: eg.Mesh, source: eg.Mesh, texels: int = 256) -> eg.Mesh:
 
 
 def simplify(mesh: eg.Mesh, faces: int = 300, steps: int = 100) -> tuple[eg.Mesh, Differences]:
-    """The mesh found, and how far pictures of three stages are off."""
+    """Return the mesh found, and how far pictures of three stages are off."""
     mesh = lit(mesh)
     cameras = objects.around(mesh, 16, SIZE)
     images = [eg.render(mesh, camera, spp=64, seed=k) for k, camera in enumerate(cameras)]

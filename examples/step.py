@@ -1,8 +1,8 @@
-"""Where paint ends: the place and the size of a disc and the width of stripes on a sphere, from one picture.
+"""Find the place and the size of a disc, and the width of stripes, on a sphere from one picture.
 
     python examples/step.py [--out step.png]
 
-The shader declares its steps by hits.where() and hits.floor(), so their borders have gradients. With torch.where() and
+The shader declares its discontinuities by hits.where() and hits.floor(), so their borders have gradients. With torch.where() and
 torch.floor() the image is the same, and the gradient of all four numbers is zero.
 """
 
@@ -40,7 +40,7 @@ TRUTH = Paint(torch.tensor([0.15, 0.1]), torch.tensor(0.45), torch.tensor(0.21))
 
 
 def fit(steps: int = 120) -> tuple[list[Tensor], Paint]:
-    """Pictures (target, start, end), and what was found."""
+    """Return pictures (target, start, end), and what was found."""
     made = trimesh.creation.icosphere(4)
     mesh = eg.Mesh(torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces))
     camera = eg.Camera.look_at((0.0, 0.0, 4.0), (0.0, 0.0, 0.0), fov_y=32.0, size=(SIZE, SIZE))

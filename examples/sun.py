@@ -1,4 +1,4 @@
-"""Where the sun stands, and how an object lies: both at once from one picture of the object and its shadow.
+"""Find where the sun stands, and how an object lies, from one picture of the object and its shadow.
 
     python examples/sun.py [--out sun.png]
 
@@ -22,7 +22,7 @@ SIZE = 96
 
 
 def knot(along: int = 160, around: int = 20) -> eg.Mesh:
-    """A trefoil knot with stripes, its normals interpolated."""
+    """Return a trefoil knot with stripes and interpolated normals."""
     t = 2 * math.pi * torch.arange(along) / along
     curve = 0.28 * torch.stack([t.sin() + 2 * (2 * t).sin(), t.cos() - 2 * (2 * t).cos(), -1.2 * (3 * t).sin()], 1)
     tangent = torch.nn.functional.normalize(curve.roll(-1, 0) - curve.roll(1, 0), dim=1)
@@ -55,7 +55,7 @@ def knot(along: int = 160, around: int = 20) -> eg.Mesh:
 
 
 def ground() -> eg.Mesh:
-    """A checkerboard, z = 0."""
+    """Return a checkerboard at z = 0."""
     corners = torch.tensor([[-4.0, -4.0, 0.0], [4.0, -4.0, 0.0], [4.0, 4.0, 0.0], [-4.0, 4.0, 0.0]])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     board = 0.42 + 0.1 * ((torch.arange(8)[:, None] + torch.arange(8)) % 2)[..., None] * torch.ones(3)
@@ -64,7 +64,7 @@ def ground() -> eg.Mesh:
 
 
 class Guess(NamedTuple):
-    """What is looked for."""
+    """What is to be found."""
 
     turn: Tensor  # (3,) radians about an axis
     shift: Tensor  # (3,)
@@ -86,7 +86,7 @@ class Guess(NamedTuple):
         )
 
     def errors(self, truth: Guess) -> tuple[float, float, float]:
-        """Degrees of the sun, degrees of the pose, distance."""
+        """Return degrees of the sun, degrees of the pose, distance."""
         here, there = (Guess(*(part.double() for part in guess)) for guess in (self, truth))
         a, b = (torch.nn.functional.normalize(guess.sun, dim=0) for guess in (here, there))
         # By sines, which show small angles: |a − b| = 2 sin(θ / 2), and the Frobenius norm of R − Q is √8 sin(θ / 2).
@@ -104,13 +104,13 @@ def view(size: int) -> eg.Camera:
 
 
 def picture(guess: Guess, camera: eg.Camera, seed: int, seeds: int = 16) -> Tensor:
-    """A mean over seeds: a face is shaded at few points of a pixel, however many samples it has."""
+    """Return a mean over seeds, since a face is shaded at few points of a pixel, however many samples it has."""
     with torch.no_grad():
         return torch.stack([eg.render(guess.scene(), camera, 16, seed + i) for i in range(seeds)]).mean(0)
 
 
 def fit(target: Tensor, camera: eg.Camera, steps: int = 150) -> Guess:
-    """What was found, from START."""
+    """Return what was found, from START."""
     found = Guess(*(value.clone().requires_grad_() for value in START))
     rates = Guess(0.015, 0.015, 0.03)  # pyright: ignore[reportArgumentType]
     optimizer = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(found, rates, strict=True)])

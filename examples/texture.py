@@ -1,8 +1,8 @@
-"""The texture of a known shape from 8 pictures of it, judged by a view that was not among them.
+"""Find the texture of a known shape from 8 pictures of it, judged by a view that was not among them.
 
     python examples/texture.py [MESH] [--size 256] [--out texture.png]
 
-The mesh, any file with a texture that load_mesh reads, or a painted stone, is rendered; the fit is told its shape, the cameras
+The mesh, any file with a texture that load_mesh reads, or a painted stone, is rendered; the fit gets its shape, the cameras
 and the pictures.
 """
 
@@ -26,7 +26,7 @@ def fit(mesh: eg.Mesh, size: int = 256, texels: int = 256, **options: Any) -> Fi
 
 
 def held_out(mesh: eg.Mesh, found: eg.Mesh, size: int = 256) -> float:
-    """PSNR in dB, of radiance in 0 … 1, in a view between those of the fit."""
+    """Return the PSNR in dB, of radiance in 0 … 1, in a view between those of the fit."""
     camera = objects.around(mesh, 13, size)[5]
     a, b = (eg.render(m, camera, spp=256, seed=s).clamp(0.0, 1.0) for m, s in ((mesh, 1), (found, 2)))
     return -10.0 * math.log10(float((a - b).square().mean()))

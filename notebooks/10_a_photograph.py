@@ -39,9 +39,9 @@ def outlined(alpha, image, color=(1.0, 0.8, 0.0)):
 
 
 # %% [markdown]
-# ## What is sought
+# ## What is unknown
 #
-# Profiles are turned about the z axis. The saucer's radius is the unit of length, for a photograph does not tell sizes.
+# Profiles are rotated about the z axis. The saucer's radius is the unit of length, since a photograph does not show sizes.
 # Four numbers are free: how high the saucer's rim lies; the radius of the cup's rim, its height and its foot.
 
 # %%
@@ -168,12 +168,12 @@ show(
 )
 
 # %% [markdown]
-# *What to see:* handle and spoon lie painted on the saucer, for the model lacks them, and behind the cup nothing is known.
+# *What to see:* handle and spoon lie painted on the saucer, since the model lacks them, and behind the cup nothing is known.
 #
-# ## What one photograph does not tell
+# ## What one photograph does not show
 #
 # - **Size**: all lengths are in radii of the saucer.
-# - **The turn about the axis** of a solid of revolution: that of the pose is where it started.
+# - **The rotation about the axis** of a solid of revolution: that of the pose is where it started.
 # - **What the outline does not touch**: the cup's foot, the level of the coffee, the saucer's underside.
 # - **The lens**: with another focal length all else changes a little, and the outline hardly. This can be measured: the same
 #   fit with a lens that is 1.3 times as long, from as much farther away.
@@ -197,4 +197,4 @@ for length, one in ((focal, fit), (1.3 * focal, other)):
 assert fit.converged
 rim, height = (float(number) for number in fit.values["cup"][:2])
 assert abs(rim - 0.48) < 0.03 and abs(height - 0.93) < 0.06
-assert abs(other.explained - fit.explained) < 0.1  # so the outline does not tell the two apart
+assert abs(other.explained - fit.explained) < 0.1  # so the outline does not separate the two

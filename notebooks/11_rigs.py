@@ -56,7 +56,7 @@ bends = {
 show(**{name: eg.render(eg.Scene(rig.posed(bend), background=WHITE), camera, 32) for name, bend in bends.items()})
 
 # %% [markdown]
-# *What to see:* limbs stay whole where they bend, for their vertices hang on both bones.
+# *What to see:* limbs stay whole where they bend, since their vertices hang on both bones.
 #
 # ## Gradients
 #
@@ -81,7 +81,7 @@ print(f"gradient {angle.grad:.1f}, finite difference {slope:.1f} pixels per radi
 # %% [markdown]
 # ## A pose from four silhouettes
 #
-# Each joint is turned by up to 40° about a random axis. From rest, `fit_rig` goes from coarse pictures to fine ones. A
+# Each joint is rotated by up to 40° about a random axis. From rest, `fit_rig` goes from coarse pictures to fine ones. A
 # silhouette does not say which limb it shows, so a descent may end with a leg in the other's place: limbs are drawn anew
 # where pixels are off, until the masks are explained.
 

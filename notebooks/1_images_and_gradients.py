@@ -27,7 +27,7 @@ def show(axis, image, title="", **options):
 # %% [markdown]
 # ## One triangle
 #
-# A mesh is vertices and faces; here with a colour at each vertex, interpolated in between. A camera looks at it.
+# A mesh has vertices and faces, here with a colour at each vertex, interpolated in between. A camera looks at it.
 # `eg.render` gives linear radiance, a tensor (height, width, channels).
 
 # %%
@@ -47,7 +47,7 @@ print(image.shape, image.dtype)
 # change:
 #
 # $$\frac{\partial I}{\partial\theta} =
-# \underbrace{\int_{\text{pixel}} \frac{\partial L}{\partial\theta}\, dx}_{\text{interior: colours slide}}
+# \underbrace{\int_{\text{pixel}} \frac{\partial L}{\partial\theta}\, dx}_{\text{interior: colours change}}
 # \;+\; \underbrace{\int_{\text{edges in the pixel}} \Delta L \; (v \cdot n)\, dl}_{\text{boundary: edges move}}$$
 #
 # Inside a face the colours change smoothly; automatic differentiation of the shading finds that. At an edge the
@@ -87,8 +87,8 @@ plt.tight_layout()
 #
 # ## The gradient, three ways
 #
-# A loss that looks at the image: $\ell = \sum_q w_q I_q$ with fixed weights $w$. Its gradient for all nine coordinates
-# of the triangle,
+# Take a loss of the image, $\ell = \sum_q w_q I_q$ with fixed weights $w$. Its gradient by all nine coordinates of the
+# triangle is computed
 #
 # - by the interior alone (`visibility=False`), which is what automatic differentiation of a ray caster gives,
 # - by interior and edges (the default),
@@ -165,7 +165,7 @@ plt.tight_layout()
 
 # %% [markdown]
 # *What to see:* red pixels brighten, blue ones darken. Outlines stand out, inner and outer: there background and torus
-# change places. When the torus turns about its axis its outline stays where it is, and only colours slide.
+# change places. When the torus rotates about its axis its outline stays where it is, and only colours change.
 #
 # Forward and reverse mode are the same matrix $J$, from two sides: $\langle v, J u\rangle = \langle J^T v, u\rangle$
 # for any image $v$ and direction $u$, up to the noise of their samples. `torch.func.jvp` and `jacfwd` go through
@@ -181,8 +181,8 @@ print(f"forward {forward:.1f}, reverse {reverse:.1f}")
 # %% [markdown]
 # ## The gradient by place
 #
-# Before any parameter, a loss has a wish for each place of the image: where what is seen there should go.
-# `eg.screen_gradient` gives it, for $\ell = \sum (I - I^*)^2$ with a target $I^*$ in which the torus was turned and
+# Before any parameter, a loss has a gradient at each place of the image: where what is seen there should go.
+# `eg.screen_gradient` gives it, for $\ell = \sum (I - I^*)^2$ with a target $I^*$ in which the torus was rotated and
 # shifted.
 
 # %%

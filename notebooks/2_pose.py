@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 2. A pose from one picture
 #
-# Where is a known object, and how is it turned? Render it where it might be, compare with the picture, and follow the
-# gradient. Here first by hand in a dozen lines, then by `fit_pose`, which starts from further away and lets something
-# stand before the object.
+# Where is a known object, and how is it rotated? Render it where it might be, compare with the picture, and follow the
+# gradient. This notebook does so by hand in a dozen lines, and then by `fit_pose`, which starts from further away and
+# lets something stand before the object.
 
 # %%
 import math
@@ -56,8 +56,8 @@ with torch.no_grad():
 show(picture=target, start=start, difference=0.5 + target - start)
 
 # %% [markdown]
-# *What to see:* inside, colours differ; along the rim, stone and background have changed places. There the boundary
-# term works, and much of what tells the pose is there.
+# *What to see:* inside, colours differ; along the outline, stone and background have changed places. There the
+# boundary term works, and much of what shows the pose is there.
 #
 # ## The slope of the loss
 #
@@ -118,7 +118,7 @@ print(
 #
 # ## By hand
 #
-# A rotation vector, a translation, and Adam. Each step has a seed of its own, so that the error of few samples averages
+# Adam finds a rotation vector and a translation. Each step has a seed of its own, so that the error of few samples averages
 # out.
 
 # %%
@@ -145,7 +145,7 @@ by_hand = turned[-1]
 print(f"rotation off by {by_hand:.3f}°, translation by {(t.detach() - true_t).norm():.4f}")
 
 # %% [markdown]
-# *What to see:* the loss ends at the noise of four samples a pixel, and goes no lower. The pose goes on improving, for
+# *What to see:* the loss ends at the noise of four samples a pixel, and goes no lower. The pose goes on improving, since
 # the gradient is right on average.
 #
 # ## In one call
@@ -166,7 +166,7 @@ fit.plot()
 #
 # ## Something stands before it
 #
-# A striped board covers a part of the stone, and nobody tells the fit. A squared loss would follow the board.
+# A striped board covers a part of the stone, which the fit does not know. A squared loss would follow the board.
 # `fit_pose` counts a pixel that is far off no more than one that is a tenth of the picture's range off.
 
 # %%

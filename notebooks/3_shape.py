@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 3. A shape from several views
 #
-# Every vertex is a parameter: a sphere becomes a stone from a few pictures. Why the plain gradient makes thorns, how
-# smooth coordinates help, and how `fit_shape` goes from coarse to fine.
+# Every vertex is a parameter: a sphere becomes a stone from a few pictures. This notebook shows why the plain gradient
+# makes thorns, how smooth coordinates help, and how `fit_shape` goes from coarse to fine.
 
 # %%
 import math
@@ -32,8 +32,8 @@ def show(images, titles=None, rows=1):
 # %% [markdown]
 # ## The stone, and what is known of it
 #
-# Eight views, with masks. The light is soft, so that a point's colour depends on its normal alone: $L = a + B\,n$. The
-# fit is told this light and the cameras, not the shape.
+# There are eight views, with masks. The light is soft, so that a point's colour depends on its normal alone:
+# $L = a + B\,n$. The fit knows this light and the cameras, but not the shape.
 
 # %%
 fine = trimesh.creation.icosphere(subdivisions=5)
@@ -66,8 +66,8 @@ sphere = eg.Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(
 # %% [markdown]
 # ## The gradient of the vertices
 #
-# Of the mean squared difference of images, over all views. First the check: stretch the sphere a little along its axes,
-# and compare with finite differences.
+# The loss is the mean squared difference of images, over all views. First its gradient is checked: stretch the sphere a
+# little along its axes, and compare with finite differences.
 
 # %%
 batch = eg.Camera.stack(cameras)
@@ -117,8 +117,8 @@ show([*pictures, images[2]], ["sphere", "a step by the gradient", "a smoothed st
 #
 # ## From coarse to fine
 #
-# `fit_shape` descends in these coordinates, then remeshes to smaller triangles of even size, and goes on. Beside it the
-# same number of steps by plain Adam on the finest mesh.
+# `fit_shape` descends in these coordinates, then remeshes to smaller triangles of even size, and goes on. For
+# comparison, plain Adam takes the same number of steps on the finest mesh.
 
 # %%
 found = fit_shape(
@@ -143,7 +143,7 @@ show(
 # The fit says `loss still falling`: more steps, or a third level, would sharpen the bumps.
 #
 # *What to see:* from a view that no picture shows, `fit_shape` has the stone and its bumps. Plain Adam comes near too,
-# but left a tangle on top: where triangles have turned over there is no way back.
+# but left a tangle on top: where triangles are flipped there is no way back.
 
 # %%
 

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 4. Cameras and lenses
 #
-# What kinds of camera there are, how an image changes with the lens, and how focal length, pose and distortion are
-# found from one picture.
+# This notebook shows the kinds of camera, how an image changes with the lens, and how focal length, pose and distortion
+# are found from one picture.
 
 # %%
 import math
@@ -57,7 +57,7 @@ town = eg.Scene(meshes, background=torch.tensor([0.55, 0.7, 0.9]))
 # | | $(x, y) = K\,(m, 1)$ with |
 # |---|---|
 # | perspective | $m = (q_x/q_z,\; q_y/q_z)$ |
-# | with distortion | the same, bent: $m\,(1 + k_1 r^2 + k_2 r^4 + \dots)$, $r = |m|$ (Brown–Conrady, as OpenCV) |
+# | with distortion | the same, distorted: $m\,(1 + k_1 r^2 + k_2 r^4 + \dots)$, $r = |m|$ (Brown–Conrady, as OpenCV) |
 # | fisheye | $|m|$ is the angle to the axis, up to all around |
 # | panorama | longitude and latitude |
 # | orthographic | $m = (q_x, q_y)$ |
@@ -82,23 +82,23 @@ with torch.no_grad():
 
 # %% [markdown]
 # *What to see:* straight edges stay straight in the perspective, bulge through the distorting lens, and become curves
-# in fisheye and panorama. In the orthographic picture parallel edges stay parallel. Edges are curves in the image where
-# the lens bends them, and edgegrad samples those curves, not their chords.
+# in fisheye and panorama. In the orthographic picture parallel edges stay parallel. Where the lens makes edges curves in
+# the image, edgegrad samples those curves, not their chords.
 #
 # ## How an image changes with the lens
 #
 # `eg.jvp` gives every pixel's derivative by the focal length and by the first coefficient of distortion, in one pass;
-# beside them, the same by finite differences.
+# next to them are the same by finite differences.
 
 # %%
 lens = views["barrel distortion"]
 zoom = torch.diag(torch.tensor([1.0, 1.0, 0.0]))  # of fx and fy, a pixel each
-bend = torch.tensor([1.0, 0.0, 0.0, 0.0])
+k1 = torch.tensor([1.0, 0.0, 0.0, 0.0])
 tangents = {
     lens.K: torch.stack([zoom, torch.zeros(3, 3)]),
-    lens.distortion: torch.stack([torch.zeros(4), bend]),
+    lens.distortion: torch.stack([torch.zeros(4), k1]),
 }
-_, (by_focal, by_bend) = eg.jvp(town, lens, tangents, spp=64)
+_, (by_focal, by_k1) = eg.jvp(town, lens, tangents, spp=64)
 
 
 def difference(h, **fields):
@@ -109,9 +109,9 @@ def difference(h, **fields):
     return (high - low) / (2 * h)
 
 
-focal_fd, bend_fd = difference(0.5, K=zoom), difference(0.01, distortion=bend)
+focal_fd, k1_fd = difference(0.5, K=zoom), difference(0.01, distortion=k1)
 signed = {"by the focal length": 2 * by_focal, "by finite differences": 2 * focal_fd}
-signed |= {"by distortion k1": by_bend / 8, "by finite differences ": bend_fd / 8}
+signed |= {"by distortion k1": by_k1 / 8, "by finite differences ": k1_fd / 8}
 show({name: values.sum(-1) for name, values in signed.items()}, cmap="RdBu_r", vmin=-1, vmax=1)
 
 
@@ -125,7 +125,7 @@ def ratio(a, b):
     return ((blocks(a) * blocks(b)).sum() / blocks(b).square().sum()).item()
 
 
-ratios = ratio(by_focal, focal_fd), ratio(by_bend, bend_fd)
+ratios = ratio(by_focal, focal_fd), ratio(by_k1, k1_fd)
 print(f"gradient over finite difference: focal length {ratios[0]:.3f}, k1 {ratios[1]:.3f}")
 
 # %% [markdown]
@@ -160,8 +160,8 @@ fit.plot()
 
 # %% [markdown]
 # *What to see:* left to right the picture, the start, the fit, and the difference, brightened: noise at edges is left.
-# The coefficients share the work: a little less $k_1$ and more $k_2$ bend this picture alike. Perspective tells focal
-# length from distance here, for the town is deep; of a flat or distant object one picture cannot.
+# The coefficients share the work: a little less $k_1$ and more $k_2$ distort this picture alike. Perspective separates
+# focal length from distance here, since the town is deep; of a flat or distant object one picture cannot.
 #
 # Cameras of other libraries come in by `Camera.from_opencv`, `from_colmap`, `from_opengl`, `from_pytorch3d`,
 # `from_projection`, and whole reconstructions by `eg.load_cameras`.

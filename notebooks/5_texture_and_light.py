@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 5. Texture, light, and the gradient of a shadow
 #
-# What colours a surface has, how it is lit, and where shadows lie: all of it is found from pictures. The border of a
-# shadow is an edge too, and moves with caster, receiver and light.
+# The colours of a surface, its light, and its shadows are all found from pictures. The border of a shadow is an edge,
+# too, and moves with caster, receiver and light.
 
 # %%
 import math
@@ -38,7 +38,7 @@ def show(signed=(), vmax=2.0, **images):
 # %% [markdown]
 # ## A texture from six pictures
 #
-# A torus with texture coordinates, painted with blotches. `fit_texture` is told the shape, cameras and pictures.
+# A torus with texture coordinates, painted with blotches. `fit_texture` gets the shape, cameras and pictures.
 
 # %%
 rings, sides = 48, 24
@@ -74,14 +74,14 @@ show(a_new_view=held_out[0], with_the_texture_found=held_out[1])
 print(f"{fit.seconds:.0f} s; {psnr:.1f} dB in a view that was not among the six")
 
 # %% [markdown]
-# *What to see:* no difference. Where no camera looks, texels take the colours of their surroundings, for the texture
-# that is sought is the sum of an image pyramid, whose coarse levels reach there.
+# *What to see:* no difference. Where no camera looks, texels take the colours of their surroundings, since the
+# texture is found as the sum of an image pyramid, whose coarse levels reach there.
 #
 # ## Lights
 #
-# A mesh with a `Material` is lit by the lights of its scene and casts shadows. A point gives hard borders; a panel soft
-# ones; a sky, an image of all directions, hardly any. Of a light with an extent a point is drawn for each point that is
-# shaded: more `light_samples`, less noise.
+# A mesh with a `Material` is lit by the lights of its scene and casts shadows. A point light gives hard borders, a
+# panel soft ones, and a sky, an image of all directions, hardly any. For each shaded point, a point of an extended light
+# is drawn; more `light_samples` mean less noise.
 
 # %%
 shape = trimesh.creation.torus(0.6, 0.22, major_sections=64, minor_sections=32)
@@ -97,7 +97,7 @@ ground = eg.Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=gray)
 camera = eg.Camera.look_at((0.9, -3.4, 2.6), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0), 40.0, (80, 80))
 
 position = torch.tensor([1.3, -0.9, 3.2])
-lamp = eg.PointLight(position, 25.0)
+light = eg.PointLight(position, 25.0)
 vector = torch.tensor
 panel = eg.AreaLight.rectangle(position, vector([0.6, 0.0, 0.2]), vector([0.0, 0.5, 0.1]), 16.0)
 height = torch.linspace(1, -1, 16)[:, None, None].expand(16, 32, 3)
@@ -111,8 +111,8 @@ def picture(material, light, **options):
 
 
 show(
-    point=picture(matt, lamp),
-    point_on_plastic=picture(plastic, lamp),
+    point=picture(matt, light),
+    point_on_plastic=picture(plastic, light),
     panel=picture(matt, panel, light_samples=8),
     sky=picture(matt, sky, light_samples=64),
 )
@@ -123,8 +123,8 @@ show(
 #
 # ## The gradient of a shadow
 #
-# How each pixel changes as the lamp moves to the right: `eg.jvp`, beside the same without the boundary term, and a
-# finite difference of two pictures.
+# `eg.jvp` shows how each pixel changes as the light moves to the right. Next to it are the same without the boundary
+# term, and a finite difference of two pictures.
 
 # %%
 right = torch.tensor([1.0, 0.0, 0.0])
@@ -145,7 +145,7 @@ high, low = (mean(lambda seed, s=s: eg.render(lit(position + s * step * right), 
 difference = (high - low) / (2 * step)
 show(
     ("derivative", "without_boundaries", "finite_difference"),
-    image=picture(matt, lamp),
+    image=picture(matt, light),
     derivative=whole,
     without_boundaries=inside,
     finite_difference=difference,
@@ -165,13 +165,13 @@ def ratio(a, b):
 print(f"over the finite difference: {ratio(whole, difference):.3f}, without boundaries {ratio(inside, difference):.3f}")
 
 # %% [markdown]
-# *What to see:* as the lamp goes right, the shadow goes left. On its border it is all or nothing: blue on the left,
+# *What to see:* as the light goes right, the shadow goes left. On its border it is all or nothing: blue on the left,
 # where shadow comes, red on the right, where light comes. Without the boundary term only the shading's slow change is
 # left.
 #
-# ## Where the lamp is
+# ## Where the light is
 #
-# From one picture: where the lamp stands, and how high the ring hangs.
+# One picture shows where the light stands, and how high the ring hangs.
 
 # %%
 truth = position, torch.tensor(0.0)
@@ -186,7 +186,9 @@ for seed in range(80):
     optimizer.step()
     schedule.step()
 off = [(p.detach() - truth[0]).norm().item() for p in (start[0], place)]
-print(f"the lamp is off by {off[0]:.2f} at the start, {off[1]:.3f} at the end; the ring is {lift.item():+.3f} too high")
+print(
+    f"the light is off by {off[0]:.2f} at the start, {off[1]:.3f} at the end; the ring is {lift.item():+.3f} too high"
+)
 show(
     target=target,
     start=mean(lambda seed: eg.render(lit(*start), camera, 8, seed)),
@@ -200,8 +202,8 @@ show(
 #
 # ## What a ball is made of
 #
-# Base colour, metallic and roughness of one ball, from four pictures of it under a sky that is known. What the ball
-# mirrors tells how rough it is; what it mirrors at its rim, how much of a metal.
+# Base colour, metallic and roughness of one ball are found from four pictures of it under a known sky. What the ball
+# mirrors shows how rough it is; what it mirrors at its outline, how much of a metal.
 
 # %%
 ball = trimesh.creation.icosphere(subdivisions=3)
@@ -241,8 +243,8 @@ plt.tight_layout()
 #
 # ## Walls that light one another
 #
-# Where three walls meet, each sends light to the other two. The colours of a room's corner from two pictures, by
-# Gauss–Newton: once in direct light alone, once with light that goes on from wall to wall, `bounces=3`.
+# Where three walls meet, each sends light to the other two. Gauss–Newton finds the colours of a room's corner from
+# two pictures: once in direct light alone, once with indirect light from wall to wall, `bounces=3`.
 
 # %%
 colors = {"floor": vector([0.75, 0.75, 0.75]), "left": vector([0.7, 0.2, 0.15]), "right": vector([0.25, 0.35, 0.7])}

@@ -2,8 +2,8 @@
 # # 6. A shader of your own
 #
 # A shader is a function from points on surfaces to radiance, in PyTorch: a formula, a network, a table. Whatever it
-# uses gets its gradient. Silhouettes around it have right gradients without the shader's help, and steps within it too,
-# where it says that they are there.
+# uses gets its gradient. Silhouettes around it have right gradients without the shader's help, and so have discontinuities
+# within it that it declares.
 
 # %%
 import math
@@ -75,8 +75,8 @@ with torch.no_grad():
 # ## Silhouettes for nothing
 #
 # How does the image's sum change as the tube grows? The shader knows nothing of silhouettes. The renderer evaluates it
-# on both sides of each edge and adds the boundary term. Beside it: the gradient without that term, and finite
-# differences.
+# on both sides of each edge and adds the boundary term. Next to it are the gradient without that term, and
+# finite differences.
 
 # %%
 
@@ -97,7 +97,7 @@ grow, grow_inside = slope(), slope(visibility=False)
 print(f"gradient {grow:.0f}, finite difference {grow_fd:.0f}, without the boundary term {grow_inside:.0f}")
 
 # %% [markdown]
-# ## Steps within a face
+# ## Discontinuities within a face
 #
 # Stripes are edges that no mesh has. Where a shader jumps it says so: `hits.where(s, a, b)` is `a` where $s > 0$ and
 # `b` elsewhere, and the border $s = 0$ has a gradient. In `torch.where` torch finds no gradient at all.
@@ -141,12 +141,12 @@ print(f"turning the stripes: gradient {turn:.1f}, finite difference {turn_fd:.1f
 print(f"with torch.where {turned(0, where=torch.where):.1f}")
 
 # %% [markdown]
-# *What to see:* with `hits.where` the borders are smooth too, for pixels that they run through are shaded at more
-# points. The gradients tell more: that of `torch.where` is zero.
+# *What to see:* with `hits.where` the borders are smooth, too, since pixels that they run through are shaded at more
+# points. The gradients differ more: that of `torch.where` is zero.
 #
 # ## A network, and a shape under it
 #
-# A torus whose look and thickness are both unknown, from six pictures of the glossy one. The network takes a point, its
+# The appearance and the thickness of a torus are found from six pictures of the glossy one. The network takes a point, its
 # normal and the direction to the eye, and gives a colour. Its weights have gradients by torch; the thickness has its
 # own mainly from the silhouettes.
 
@@ -156,7 +156,7 @@ layers = [torch.nn.Linear(9, 48), torch.nn.SiLU(), torch.nn.Linear(48, 48), torc
 network = torch.nn.Sequential(*layers, torch.nn.Softplus())
 
 
-def look(hits):
+def paint(hits):
     return network(torch.cat([hits.position, hits.shading_normal, hits.view], 1))
 
 
@@ -167,16 +167,16 @@ cameras = [
 ]
 with torch.no_grad():
     targets = [eg.render(mesh, c, 64, 1000, shader=glossy) for c in cameras]
-    before = eg.render(torus(0.22), cameras[0], 64, shader=look)
+    before = eg.render(torus(0.22), cameras[0], 64, shader=paint)
 tube = torch.tensor(0.22, requires_grad=True)
 optimizer = torch.optim.Adam([{"params": network.parameters(), "lr": 5e-3}, {"params": [tube], "lr": 3e-3}])
 for step in range(150):
     k = step % len(cameras)
     optimizer.zero_grad()
-    (eg.render(torus(tube), cameras[k], 8, step, shader=look) - targets[k]).square().mean().backward()
+    (eg.render(torus(tube), cameras[k], 8, step, shader=paint) - targets[k]).square().mean().backward()
     optimizer.step()
 with torch.no_grad():
-    show(target=targets[0], start=before, found=eg.render(torus(tube), cameras[0], 64, shader=look))
+    show(target=targets[0], start=before, found=eg.render(torus(tube), cameras[0], 64, shader=paint))
 print(f"radius of the tube: 0.22 at the start, {tube.item():.4f} found, 0.3 in truth")
 
 # %% [markdown]
@@ -203,5 +203,5 @@ print(primary, edges, f"gradient {by_parts:.0f}", sep="\n")
 
 # %%
 assert abs(grow / grow_fd - 1) < 0.03 and abs(grow_inside / grow_fd - 1) > 0.3, "silhouettes around a shader"
-assert abs(turn / turn_fd - 1) < 0.03, "steps within it"
+assert abs(turn / turn_fd - 1) < 0.03, "discontinuities within it"
 assert abs(by_parts / grow_fd - 1) < 0.03, "the same by parts"

@@ -2,8 +2,8 @@
 # # 7. Error against run time
 #
 # A gradient from samples has an error. More samples, less error, more time. How much of one for how much of the other?
-# First by hand on a triangle, whose exact gradient is known; then a small version of `python -m benchmarks.error_time`,
-# beside finite differences, and Mitsuba 3 where it is installed.
+# This notebook measures it by hand on a triangle, whose exact gradient is known. Then it runs a small version of
+# `python -m benchmarks.error_time`, next to finite differences, and Mitsuba 3 where it is installed.
 
 # %%
 import contextlib
@@ -26,9 +26,9 @@ from benchmarks.error_time.run import error_time
 # %% [markdown]
 # ## The exact gradient
 #
-# Of a few flat triangles, the image has a formula: what is visible of a face in a pixel is a polygon, and radiance is
-# integrated over it. All in float64, and automatic differentiation of the formula is the exact gradient, boundary term
-# included.
+# The image of a few flat triangles has a formula: what is visible of a face in a pixel is a polygon, and radiance is
+# integrated over it. All is in float64, and automatic differentiation of the formula is the exact gradient, boundary
+# term included.
 
 # %%
 verts = torch.tensor([[-0.8, -0.6, 0.2], [0.9, -0.4, -0.3], [0.1, 0.8, 0.1]], dtype=torch.float64)
@@ -66,7 +66,7 @@ def error(surface, edge, seeds=16):
 # %% [markdown]
 # ## More samples
 #
-# Surface samples and edge samples are counted apart. Here each is varied with the other one large.
+# Surface samples and edge samples are counted separately. Here each is varied with the other one large.
 
 # %%
 counts = [64, 256, 1024, 4096, 16384]
@@ -106,7 +106,7 @@ print(f"without the boundary term: {(inside - exact).norm() / exact.norm():.0%} 
 # %% [markdown]
 # ## The report, in small
 #
-# Three scenes, several methods, a few numbers of samples each. The time is that of a whole step: update, image,
+# It has three scenes, several methods, and a few numbers of samples each. The time is that of a whole step: update, image,
 # backward pass. The error is that of the derivatives by a translation of the whole scene. Finite differences take
 # twelve images for translation and rotation; the other methods give the gradient of every vertex besides.
 

@@ -25,7 +25,7 @@ from edgegrad.image import linear_to_srgb
 #
 # A sphere is stretched and sheared by a matrix $A$, to be found from eight views. Three things are worth a look:
 #
-# - the module holds what is sought, and its `forward` renders this process's views;
+# - the module holds the parameters, and its `forward` renders this process's views;
 # - each view has a seed of its own at each step, whoever renders it: so the samples, and the gradient, are the same
 #   with any number of processes;
 # - all views count alike, so each process must have as many. DDP averages the gradients while `backward` still runs.

@@ -38,7 +38,7 @@ using Tangents = Slots<const double>;
 // Describes one parameter. A new differentiable parameter is a member above, a row here, and the code that computes it.
 template <class T>
 struct GradientSlot {
-    const char* name;  // It names the array in edgegrad/kernel/request.py.
+    const char* name;  // name of the array in edgegrad/kernel/request.py
     double* Gradients::* to;
     const double* Tangents::* from;
     int64_t (*size)(const SceneView<T>& scene, int64_t pixels);

@@ -19,7 +19,7 @@ namespace edgegrad {
 
 // Selects the recording accumulation (accumulation.h).
 struct Record {
-    bool intrinsics = true;  // It keeps derivatives with respect to them; otherwise their arrays are empty.
+    bool intrinsics = true;  // whether to keep derivatives with respect to them; otherwise their arrays are empty
 };
 
 constexpr int intrinsics_width = 6 + most_coefficients;  // K comes in rows, then the distortion.
@@ -46,7 +46,7 @@ struct RayRecords {
 
 // Holds samples on curves. A sample on two curves at once has an entry for each that moves.
 struct CurveRecords {
-    static constexpr int surfaces = 3;  // It is the maximum.
+    static constexpr int surfaces = 3;  // maximum
     std::vector<double> x;              // (S, 2) pixel position
     std::vector<int32_t> face;          // (S, 3) surfaces; −1: the background, −2: none
     std::vector<double> b;              // (S, 3, 2) last two barycentrics on them

@@ -29,9 +29,8 @@ struct Curve {
 
     bool is_crease() const { return minus.face >= 0 && plus.face >= 0; }
 
-    Vec2 low() const {
-        return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)};
-    }  // low() and high() are corners of its box.
+    // low() and high() return corners of its box.
+    Vec2 low() const { return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)}; }
     Vec2 high() const { return {std::max(x0.x, x1.x), std::max(x0.y, x1.y)}; }
     double nearest_depth() const { return std::min((1 - t0) * a.z + t0 * b.z, (1 - t1) * a.z + t1 * b.z); }
 

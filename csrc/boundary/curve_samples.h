@@ -60,8 +60,8 @@ class CurveSamples {
 
     // Returns whether only transparent faces occlude the point: `hit` and others behind it.
     bool is_seen_through(int32_t hit, typename Source::Sample& sample) const {
-        constexpr size_t most =
-            7;  // transparent layers that an image composes before another surface (edgegrad/points/blend.py)
+        // An image composes this many transparent layers before another surface (edgegrad/points/blend.py).
+        constexpr size_t most = 7;
         const auto own = sample.ignored;
         std::vector<int32_t> ignored(own.begin(), own.end());
         std::sort(ignored.begin(), ignored.end());

@@ -14,7 +14,7 @@ namespace edgegrad {
 //
 //     m = g n + (2 p1 n.x n.y + p2 (s + 2 n.x²), p1 (s + 2 n.y²) + 2 p2 n.x n.y)
 struct BrownConrady {
-    static constexpr int coefficients = 8;  // They are in OpenCV's order, whose shorter lists are prefixes.
+    static constexpr int coefficients = 8;  // in OpenCV's order, whose shorter lists are prefixes
     double k1, k2, p1, p2, k3, k4, k5, k6;
 
     explicit BrownConrady(const double* c)

@@ -56,7 +56,7 @@ class LensViews {
 };
 
 LensViews& lens_views() {
-    static auto* views = new LensViews;  // It is never freed, as threads may outlive the end of main().
+    static auto* views = new LensViews;  // never freed, as threads may outlive the end of main()
     return *views;
 }
 

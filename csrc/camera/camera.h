@@ -47,13 +47,13 @@ struct Camera {
     Mat3 rotation{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
     Mat3 R;
     Vec3 t;
-    double k[6];  // These are the upper two rows of K: x = k0 n.x + k1 n.y + k2, y = k3 n.x + k4 n.y + k5.
+    double k[6];  // upper two rows of K: x = k0 n.x + k1 n.y + k2, y = k3 n.x + k4 n.y + k5
     bool perspective;
     int width, height;
     Mat3 R_inverse;
     double k_det;
-    double k_inverse[4];     // It inverts the 2 × 2 part of K, row by row.
-    double pixels_per_unit;  // It is the most pixels per unit of normalised image coordinates.
+    double k_inverse[4];     // inverts the 2 × 2 part of K, row by row
+    double pixels_per_unit;  // most pixels per unit of normalised image coordinates
     AnyLens lens;
     LensView lens_view;
 

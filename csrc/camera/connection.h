@@ -11,9 +11,9 @@
 namespace edgegrad {
 
 struct CameraConnection {
-    Vec2 x;             // It is the pixel position.
-    double area_scale;  // It is the image's area, px², per unit area of the surface.
-    double spread[4];   // They are the changes of the barycentrics along the two sides per pixel to the right and down.
+    Vec2 x;             // pixel position
+    double area_scale;  // image's area, px², per unit area of the surface
+    double spread[4];   // changes of the barycentrics along the two sides per pixel to the right and down
 };
 
 class CameraConnections {

@@ -75,7 +75,7 @@ Box2 CubeFace::angles(Box2 n) const {
 }
 
 std::optional<Box2> CubeFace::box(Vec2 from, Vec2 to) const {
-    constexpr double rounding = 1e-12;  // This is generous.
+    constexpr double rounding = 1e-12;  // generous
     Box2 out = Box2::empty();
     const auto slope = [](double angle) {
         return angle >= 0.5 * M_PI ? infinite : angle <= -0.5 * M_PI ? -infinite : std::tan(angle);

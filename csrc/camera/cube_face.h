@@ -26,7 +26,7 @@ Box2 sector_box(double inner, double outer, double from, double to);
 // Describes one cube face. Directions d have a longitude λ = atan2(d.x, d.z) and a latitude φ = atan2(d.y, hypot(d.x,
 // d.z)). Two faces look at the poles, where only d.y is not zero.
 struct CubeFace {
-    Mat3 rotation{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};  // It rotates directions to this face's frame.
+    Mat3 rotation{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};  // rotates directions to this face's frame
     // Says whether all of its borders belong to it, or only that at the least n.x.
     bool closed = false;
 

@@ -37,7 +37,7 @@ class DepthBound {
     const Camera* camera_ = nullptr;
     bool tilted_ = false;
     double farthest_ = 0;
-    Vec3 plane_;  // It is that affine function of h = (n, 1).
+    Vec3 plane_;  // affine function of h = (n, 1) that bounds it
 };
 
 // Returns the depth as a float, rounded up.

@@ -47,7 +47,7 @@ Mat2 Equirectangular::jacobian(Vec2 n) const {
     const double sign = branch_.over % 2 ? -1 : 1;
     const Vec3 longitude = (1 / h2) * Vec3{d.z, 0, -d.x},
                latitude = (sign / all) * Vec3{-d.y * d.x / h, h, -d.y * d.z / h};
-    const Vec3 along[2] = {cube_face_.rotation.row[0], cube_face_.rotation.row[1]};  // It is ∂d/∂n.
+    const Vec3 along[2] = {cube_face_.rotation.row[0], cube_face_.rotation.row[1]};  // ∂d/∂n
     double a[2][2];
     for (int i = 0; i < 2; ++i) a[0][i] = dot(longitude, along[i]), a[1][i] = dot(latitude, along[i]);
     const auto row = [&](int r, int i) { return k_[3 * r] * a[0][i] + k_[3 * r + 1] * a[1][i]; };
@@ -75,9 +75,9 @@ constexpr double small_step = 0.06;
 
 // Holds the direction at a pixel's centre, around which the samples' directions are expanded in series.
 struct PixelExpansion {
-    double to_angles[4];    // It maps m − m0 to angles.
-    Vec2 m0, sine, cosine;  // They belong to both angles at m0.
-    Vec2 from, to;          // They bound this position's angles, relative to those at m0.
+    double to_angles[4];    // maps m − m0 to angles
+    Vec2 m0, sine, cosine;  // of both angles at m0
+    Vec2 from, to;          // bounds of this position's angles, relative to those at m0
     CubeFace cube_face;
 };
 
@@ -178,7 +178,7 @@ Box2 Equirectangular::angles(const double* K, Box2 x) {
 }
 
 std::optional<Box2> Equirectangular::cube_face_box(Box2 x) const {
-    constexpr double rounding = 1e-12;  // It is a generous bound for angles.
+    constexpr double rounding = 1e-12;  // generous bound for angles
     const Box2 seen = angles(k_, x);
     // These are λ and φ of what is seen.
     Vec2 from{std::max(seen.low.x - M_PI * branch_.across, -M_PI), seen.low.y - M_PI * branch_.over};

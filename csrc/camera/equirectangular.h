@@ -24,11 +24,11 @@ namespace edgegrad {
 // K takes the place of coefficients. The camera's own K only scales the undistorted image, so that m = x / scale.
 class Equirectangular {
    public:
-    static constexpr int coefficients = 6;  // These are the upper two rows of K.
+    static constexpr int coefficients = 6;  // upper two rows of K
     // Selects one of these positions by (i, j), and the angles (λ', φ') that this lens serves: below `to`, and not
     // below `from`.
     struct Branch {
-        int across = 0, over = 0;  // They are j and i.
+        int across = 0, over = 0;  // j and i
         Vec2 from{-infinite, -infinite}, to{infinite, infinite};
     };
 

@@ -26,7 +26,7 @@ template <class L>
 concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_bar) {
     { L::coefficients } -> std::convertible_to<int>;
     { lens.distort(n) } -> std::same_as<Vec2>;
-    { lens.jacobian(n) } -> std::same_as<Mat2>;  // It returns ∂m/∂n.
+    { lens.jacobian(n) } -> std::same_as<Mat2>;  // returns ∂m/∂n
     lens.distort_vjp(n, n, n_bar, coefficients_bar);
 };
 
@@ -93,14 +93,14 @@ class RadialInverse;
 struct LensDisc {
     // It is the least |n| with det ∂m/∂n ≤ 0, or greatest_radius.
     double fold = std::numeric_limits<double>::infinity();
-    double reach = fold;  // It bounds |m| within the disc.
+    double reach = fold;  // bounds |m| within the disc
     // It tabulates the inverse of the lens's radial part (radial_inverse.h); it may be null.
     std::shared_ptr<const RadialInverse> inverse = {};
 };
 LensDisc disc_of(const AnyLens& lens);
 // Returns the n with |n| = fold of least det ∂m/∂n, among those that determined the fold.
 Vec2 folding_place(const BrownConrady& lens, const LensDisc& disc);
-constexpr double greatest_radius = 30;  // This is 88° from the axis; lenses that show more see through cube faces.
+constexpr double greatest_radius = 30;  // 88° from the axis; lenses that show more see through cube faces
 
 // Returns the r in [0, fold] that the radial part of a lens maps to m, or the fold.
 double undistorted_radius(const AnyLens& lens, double fold, double m);

@@ -26,8 +26,8 @@ class LensBoundary {
     explicit LensBoundary(const Camera& camera);
 
     struct Point {
-        Vec2 x, tangent;  // They are px and dx/dθ.
-        Vec2 n;           // It is the last visible n, in normalised image coordinates.
+        Vec2 x, tangent;  // px and dx/dθ
+        Vec2 n;           // last visible n, in normalised image coordinates
     };
     // Returns none where another sub-camera shows the point.
     std::optional<Point> at(double angle) const;
@@ -49,10 +49,10 @@ class LensBoundary {
     void velocity_vjp(const Point& p, Vec2 bar, IntrinsicsGrad& intrinsics) const;
 
    private:
-    Point curve_at(double angle) const;  // It leaves n unset.
+    Point curve_at(double angle) const;  // leaves n unset
 
     const Camera& camera_;
-    Vec2 half_;  // It is half the size of the whole curve's box.
+    Vec2 half_;  // half the size of the whole curve's box
     // It is ∂ρ/∂c, unless that is zero or does not matter.
     std::optional<std::array<double, most_coefficients>> fold_by_;
 };

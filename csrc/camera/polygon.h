@@ -22,7 +22,7 @@ struct VisiblePolygon {
     bool starred = false;
     double area = 0;     // px²
     double longest = 0;  // px
-    double nearest = 0;  // It is a depth.
+    double nearest = 0;  // depth
     Vec2 low, high;
 
     // Sets the polygon of the face with the vertices v. Returns false when nothing is visible.

@@ -18,7 +18,7 @@ namespace edgegrad {
 // The ray is taken out of the products, so that the face's part is computed once for all of its samples. Edges instead
 // of positions relative to the eye limit the loss to distance / size times the spacing of doubles.
 struct FaceMap {
-    Vec3 column[3];  // These are the columns of M.
+    Vec3 column[3];  // columns of M
 
     Vec3 times(Vec2 n) const { return n.x * column[0] + n.y * column[1] + column[2]; }
     Vec3 row(double Vec3::* r) const { return {column[0].*r, column[1].*r, column[2].*r}; }

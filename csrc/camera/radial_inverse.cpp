@@ -14,7 +14,7 @@ RadialInverse::RadialInverse(const AnyLens& lens, double fold, double farthest) 
     const auto place = [&](int cell, double t) { return std::sqrt((cell + 0.5 * (t + 1)) / cells_per_square_); };
     const auto h = [&](double m) { return undistorted_radius(lens, fold, m) / m; };
     std::array<double, terms> node;
-    for (int j = 0; j < terms; ++j) node[j] = std::cos(M_PI * (j + 0.5) / terms);  // These are Chebyshev's nodes.
+    for (int j = 0; j < terms; ++j) node[j] = std::cos(M_PI * (j + 0.5) / terms);  // Chebyshev's nodes
     rows_.back().fill(nan);
     for (int cell = 0; cell < cells; ++cell) {
         auto& row = rows_[cell];

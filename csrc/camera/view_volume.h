@@ -16,8 +16,8 @@ namespace edgegrad {
 struct ViewVolume {
     Vec3 normal[4];
     double offset[4];
-    Vec2 low, high;   // They bound the rectangle.
-    double least[4];  // It bounds the distance to each plane: zero, or more where the plane belongs to a neighbour.
+    Vec2 low, high;   // bounds of the rectangle
+    double least[4];  // lower bound of the distance to each plane: zero, or more where the plane belongs to a neighbour
 
     ViewVolume(const Camera& c, double margin) : low{-margin, -margin}, high{c.width + margin, c.height + margin} {
         if (!c.is_undistorted()) low = c.lens_view.low, high = c.lens_view.high;

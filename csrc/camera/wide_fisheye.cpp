@@ -102,7 +102,7 @@ Mat2 WideFisheye::jacobian(Vec2 n) const {
         return scaled((fisheye_.slope_at_angle(p.angle) * angle_dot) * p.along +
                       (fisheye_.at_angle(p.angle) / p.sine) * (across - outwards * p.along));
     };
-    const Vec2 x = column(cube_face_.rotation.row[0]), y = column(cube_face_.rotation.row[1]);  // It is ∂d/∂n.
+    const Vec2 x = column(cube_face_.rotation.row[0]), y = column(cube_face_.rotation.row[1]);  // ∂d/∂n
     return {x.x, y.x, x.y, y.y};
 }
 
@@ -178,7 +178,7 @@ std::optional<Box2> WideFisheye::cube_face_box(Box2 x) const {
     }
     if (around) nearest = 0;
     if (!(nearest < reach_)) return {};
-    constexpr double rounding = 1e-12;  // It is a generous bound for angles.
+    constexpr double rounding = 1e-12;  // generous bound for angles
     Vec2 from{first + before, angle_below(nearest) - 0.5 * M_PI}, to{first + after, angle_above(farthest) - 0.5 * M_PI};
     if (around || from.x <= -M_PI || to.x >= M_PI) from.x = -M_PI, to.x = M_PI;
     return cube_face_.box({from.x - rounding, from.y - rounding}, {to.x + rounding, to.y + rounding});

@@ -31,13 +31,13 @@ class WideFisheye {
 
     Vec2 scale() const { return scale_; }
     const CubeFace& cube_face() const { return cube_face_; }
-    Mat3 rotation() const;                                   // It rotates from the camera's frame to the face's.
+    Mat3 rotation() const;                                   // rotates from the camera's frame to the face's
     double lens_boundary() const { return lens_boundary_; }  // radians
     // Returns whether the antipode of the axis lies ahead, around which areas grow as 1 / distance.
     bool has_pole() const { return cube_face_.rotation.row[2].y > 0; }
 
     Vec2 distort(Vec2 n) const;
-    Mat2 jacobian(Vec2 n) const;  // It is zero beyond the lens boundary.
+    Mat2 jacobian(Vec2 n) const;  // zero beyond the lens boundary
     void distort_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const;
 
     // These do what those of Equirectangular do.
@@ -57,14 +57,14 @@ class WideFisheye {
 
    private:
     struct Polar {
-        double angle;  // It is the angle to the axis.
-        double sine;   // It is the sine times the length of d.
-        Vec2 along;    // It is m / |m|, or zero on the axis.
+        double angle;  // angle to the axis
+        double sine;   // sine times the length of d
+        Vec2 along;    // m / |m|, or zero on the axis
     };
     static Polar polar(Vec3 d);
     static Vec3 direction_of(double angle, Vec2 along);
     Vec2 m_of_pixel(Vec2 x) const;
-    Vec2 scaled(Vec2 m) const;  // It returns K m over the scale.
+    Vec2 scaled(Vec2 m) const;  // returns K m over the scale
     // These return the angle at which |m| is m, or the lens boundary beyond, and quick bounds below and above it.
     double angle(double m) const;
     double angle_below(double m) const;
@@ -74,8 +74,8 @@ class WideFisheye {
     Fisheye fisheye_;
     CubeFace cube_face_;
     Vec2 scale_;
-    double lens_boundary_, reach_;                       // They are θ and θ' at the boundary.
-    std::shared_ptr<const std::vector<double>> angles_;  // They are taken at equal steps of |m| up to the reach.
+    double lens_boundary_, reach_;                       // θ and θ' at the boundary
+    std::shared_ptr<const std::vector<double>> angles_;  // taken at equal steps of |m| up to the reach
 };
 
 }  // namespace edgegrad

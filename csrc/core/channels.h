@@ -26,7 +26,4 @@ auto dispatch_channels(int channels, bool attributes, F f) {
     }
 }
 
-// Applies X to each N, for explicit instantiations.
-#define EDGEGRAD_FOR_CHANNELS(X) X(0) X(1) X(3) X(4) X(-4)
-
 }  // namespace edgegrad

@@ -106,7 +106,7 @@ inline Vec3 transposed_times(const Mat3& m, Vec3 v) { return v.x * m.row[0] + v.
 
 inline Mat3 inverse(const Mat3& m) {
     const Vec3 a = m.row[0], b = m.row[1], c = m.row[2];
-    const Vec3 bc = cross(b, c), ca = cross(c, a), ab = cross(a, b);  // They are the columns of the adjugate.
+    const Vec3 bc = cross(b, c), ca = cross(c, a), ab = cross(a, b);  // columns of the adjugate
     const double s = 1.0 / dot(a, bc);
     return {{{s * bc.x, s * ca.x, s * ab.x}, {s * bc.y, s * ca.y, s * ab.y}, {s * bc.z, s * ca.z, s * ab.z}}};
 }

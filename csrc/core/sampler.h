@@ -27,8 +27,44 @@ class Hash {
 };
 inline uint64_t hash(uint64_t seed, uint64_t a, uint64_t b = 0) { return Hash(seed, a)(b); }
 
-// Separates the hashes of the gradient's samples from those of the image's pixels, as their second argument.
+// Separates the hashes of the gradient's samples from those of the image's pixels, as their third argument.
 constexpr uint64_t gradient_stream = 1;
+
+// Numbers of random sequences, one for each quantity that the gradient draws. Estimates that share one are correlated.
+enum class Stream : uint64_t {
+    surface_faces = 1,
+    surface_points = 2,
+    surface_pixels = 4,
+    surface_pixel_choice = 5,
+    primary_curves = 3,
+    intersections = 12,
+    discontinuity_columns = 6,
+    discontinuity_rows = 24,
+    discontinuities = 7,
+    shadow_light_parts = 8,
+    shadow_rays = 9,
+    shadow_pilots = 10,
+    shadow_places = 11,
+    shadow_alpha_edges = 13,
+    shadow_alpha_light_parts = 25,
+    indirect_shadow_rays = 26,
+    indirect_shadow_pilots = 27,
+    indirect_shadow_places = 28,
+    edge_line_places = 14,
+    edge_line_paths = 15,
+    edge_lines = 16,
+    edge_line_pilot_places = 17,
+    edge_line_pilots = 18,
+    edge_line_pilot_paths = 19,
+    edge_line_alpha_edges = 29,
+    surface_edge_intersections = 20,
+    surface_edge_places = 21,
+    surface_edge_rays = 22,
+    surface_edge_paths = 23,
+    surface_edge_alpha_edges = 30,
+};
+
+inline uint64_t seed_of(uint64_t seed, Stream stream) { return hash(seed, uint64_t(stream), gradient_stream); }
 
 // Returns the middle of one of 2⁵² equal cells of (0, 1). The bits become the fraction of a number between 1 and 2.
 inline double to_unit(uint64_t bits) {

@@ -54,8 +54,8 @@ class DiscontinuityLines {
    public:
     explicit DiscontinuityLines(const BackwardView<T>& view)
         : view_(view),
-          shift_{to_unit(hash(view.options.seed, 5, gradient_stream)),
-                 to_unit(hash(view.options.seed, 6, gradient_stream))} {
+          shift_{to_unit(seed_of(view.options.seed, Stream::discontinuity_rows)),
+                 to_unit(seed_of(view.options.seed, Stream::discontinuity_columns))} {
         const SceneView<T>& scene = view.scene;
         const auto parts = view.team.map_blocks(scene.n_faces, [&](int64_t first, int64_t last) {
             std::vector<LinedFace> part;
@@ -125,7 +125,7 @@ void add_discontinuities(const BackwardView<T>& view, const Accumulation& accumu
     profile.discontinuity_lines = lines.count();
     profile.discontinuity[0] += watch.lap();
     if (view.options.dry || lines.count() == 0) return;
-    const uint64_t seed = hash(view.options.seed, 7, gradient_stream);
+    const uint64_t seed = seed_of(view.options.seed, Stream::discontinuities);
     view.scatter.add(lines.count(), to, profile.discontinuity, [&](int64_t first, int64_t last, LocalGradients& grad) {
         DiscontinuitySource<T> source(view);
         const std::unique_ptr<CurveAccumulation> to_chunk = accumulate_curves(view, accumulation, grad);

@@ -48,8 +48,8 @@ class SampleBudget {
     };
     static constexpr Cost plain{3.9, 7.0}, shaded{9, 18};
     static constexpr double share_of_image = 1;
-    static constexpr int64_t least_samples =
-        1 << 14;  // takes some milliseconds, so that small images and few rays lose nothing
+    // These samples take some milliseconds, so that small images and few rays lose nothing.
+    static constexpr int64_t least_samples = 1 << 14;
     const Cost cost_;
     double rays_ = 0;
 };

@@ -56,13 +56,13 @@ class Filter {
     bool is_box() const { return kind_ == FilterKind::box; }
 
    private:
-    static constexpr double sigma = 0.5;                   // It is in pixels.
-    static constexpr double inside = 0.99730020393673979;  // It is the part of a Gaussian within 3 σ: erf(3 / √2).
+    static constexpr double sigma = 0.5;                   // px
+    static constexpr double inside = 0.99730020393673979;  // part of a Gaussian within 3 σ: erf(3 / √2)
     FilterKind kind_;
 };
 
 struct ImageOptions {
-    int spp;  // It counts samples per pixel.
+    int spp;  // number of samples per pixel
     Filter filter;
     uint64_t seed;
 };

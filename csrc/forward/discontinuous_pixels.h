@@ -18,8 +18,8 @@
 
 namespace edgegrad {
 
-constexpr int most_again = 8;   // It limits the factor on the points per face and pixel where it is shaded again.
-constexpr int share_again = 4;  // It limits the factor on the points of the first pass, in total.
+constexpr int most_again = 8;   // limit of the factor on the points per face and pixel where it is shaded again
+constexpr int share_again = 4;  // limit of the factor on the points of the first pass, in total
 // Path tracing follows many paths per pixel. These are its factors on the points per face, and on the camera's rays.
 constexpr int points_again = 2, rays_again = 4;
 
@@ -140,7 +140,7 @@ class NearestTexels {
     struct Texels {
         int32_t mesh = -1;
         bool several = false;  // Points in the pixel see different texels.
-        uint64_t value = 0;    // It is a hash.
+        uint64_t value = 0;    // hash
     };
 
     static std::vector<const Source*> nearest(const LitMesh& mesh) {

@@ -61,7 +61,7 @@ class EnvironmentGuide {
    private:
     static constexpr int64_t rows = 12, columns = 24;
     static constexpr double prior_points = 4;      // This many points represent the mean of all.
-    static constexpr double least_density = 0.02;  // It is relative to the mean.
+    static constexpr double least_density = 0.02;  // relative to the mean
     static constexpr double unit = 1 << 20;
 
     size_t cell(int64_t texel) const {

@@ -274,7 +274,7 @@ class PixelRow {
     const std::deque<SubCameraRays>& sub_cameras_;
     const SubCameraRays* sub_camera_;  // The rays pass through this sub-camera.
     const int spp_;
-    const double radius_;  // It is the filter's radius.
+    const double radius_;  // filter's radius
     ThreadTeam& team_;
     T* const image_;  // (H, W, C)
     const HitBuffers<T>& out_;
@@ -285,13 +285,13 @@ class PixelRow {
         int column, n;
     };
     CameraRays rays_;
-    PixelRun runs_[RayBatch::size];  // They map rays to pixels.
+    PixelRun runs_[RayBatch::size];  // map rays to pixels
     int n_runs_ = 0;
     unsigned traced_ = 0;
     Shaded kept_[n_kept];
-    int x0_ = 0, y_ = 0;  // They are the first pixel of the row.
+    int x0_ = 0, y_ = 0;  // first pixel of the row
     int hits_[tile];
-    int32_t first_[tile], last_[tile];  // They are faces.
+    int32_t first_[tile], last_[tile];  // faces
     double farthest_[tile];
     std::vector<double> sum_, radiance_;
 };

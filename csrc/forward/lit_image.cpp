@@ -24,7 +24,7 @@ struct RowInput {
     const LitOptions& options;
     int width, points;
     uint64_t seed;
-    const uint8_t* only;  // It selects pixels; null: all.
+    const uint8_t* only;  // selects pixels; null: all
     LitImage<T>& to;
     DiscontinuousPixels* discontinuous;  // Null means not wanted.
     EnvironmentGuide* guide;             // Null means not wanted.
@@ -98,15 +98,15 @@ class LitRow : public RowVisitor {
     std::vector<LightSample> lights_;
     std::shared_ptr<ShadeBuffers> buffers_;
     std::shared_ptr<Paths> paths_;  // Null means direct light alone.
-    std::vector<double> sums_;      // They are the row's.
+    std::vector<double> sums_;      // sums of the row
     bool filtered_;
-    uint64_t among_ = 0;  // It is the index of the current hit among those of its pixel.
+    uint64_t among_ = 0;  // index of the current hit among those of its pixel
     std::vector<int64_t> face_, seed_;
     std::vector<double> b_, spread_, radiance_;
     std::vector<int8_t> seen_;
 };
 
-constexpr uint64_t pilot_stream = 0x70696c6f74;  // It separates the pilot's random numbers.
+constexpr uint64_t pilot_stream = 0x70696c6f74;  // separates the pilot's random numbers
 
 // Selects every second pixel of every second row, or fewer in large images.
 std::vector<uint8_t> sparse_pixels(const Camera& camera) {

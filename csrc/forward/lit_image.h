@@ -13,8 +13,8 @@ namespace edgegrad {
 // Controls sampling. The random numbers of a pixel do not depend on what others see, so images of slightly different
 // scenes differ slightly.
 struct LitSampling {
-    int points;            // It counts the shaded points per face and pixel.
-    uint64_t seed, again;  // They serve the first pass, and pixels that are shaded again.
+    int points;            // number of shaded points per face and pixel
+    uint64_t seed, again;  // for the first pass, and for pixels that are shaded again
 };
 
 // Holds the radiance (H · W, C) without the background, and whether some point needs each light's shadow.

@@ -93,7 +93,7 @@ void each_intersection(const MovingHits& hits, const Pose<S>& pose, const Moving
 // Holds the gradients of one chunk of hits.
 struct ChunkOfHits {
     RowBuffer verts;
-    double pose[12] = {};  // They are R in rows, then t.
+    double pose[12] = {};  // R in rows, then t
 };
 
 }  // namespace

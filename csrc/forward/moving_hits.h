@@ -22,7 +22,7 @@ struct MovingHits {
     const int64_t* face;   // (N,)
     int64_t size;
     bool perspective;
-    int rays = 1;  // It counts the rays per face.
+    int rays = 1;  // number of rays per face
 };
 
 // Writes barycentrics (N, rays, 3). Degenerate or edge-on faces get those of the first corner, without derivatives.

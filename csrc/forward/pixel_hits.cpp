@@ -23,7 +23,7 @@ Spread spread_at(const Camera& camera, const FaceMap& map, Vec2 n) {
         barycentrics(map, n + aside * by_pixel, ahead), barycentrics(map, n - aside * by_pixel, behind);
         return Barycentrics{(ahead.u - behind.u) / (2 * aside), (ahead.v - behind.v) / (2 * aside)};
     };
-    const Vec2 x = pixel_vjp(camera, n, {1, 0}), y = pixel_vjp(camera, n, {0, 1});  // They are rows of ∂n/∂x.
+    const Vec2 x = pixel_vjp(camera, n, {1, 0}), y = pixel_vjp(camera, n, {0, 1});  // rows of ∂n/∂x
     return {difference({x.x, y.x}), difference({x.y, y.y})};
 }
 
@@ -211,16 +211,16 @@ class HitRow {
         int x, n;
     };
     CameraRays rays_;
-    PixelRun runs_[RayBatch::size];  // They map rays to pixels.
+    PixelRun runs_[RayBatch::size];  // map rays to pixels
     int n_runs_ = 0;
     std::vector<Pixel> row_;
     int y_ = 0;
-    size_t expected_ = 0;  // It estimates the hits in the next row.
+    size_t expected_ = 0;  // estimate of the hits in the next row
     KeptFace kept_[n_kept];
     std::vector<Group> groups_;
-    int count_ = 0;             // It counts the groups in use.
-    int x_ = -1, samples_ = 0;  // They are the current pixel, and the number of its samples so far.
-    Hash key_{0, 0};            // It belongs to the pixel's samples.
+    int count_ = 0;             // number of groups in use
+    int x_ = -1, samples_ = 0;  // current pixel, and the number of its samples so far
+    Hash key_{0, 0};            // of the pixel's samples
 };
 
 // Keeps the hits of all rows.

@@ -22,10 +22,10 @@ struct Spread {
 
 struct PixelHit {
     int32_t pixel, face;
-    Barycentrics b;  // They locate the hit on the face.
-    Vec2 x;          // It is the pixel position.
-    double weight;   // It is the fraction of the pixel's samples.
-    Spread spread;   // It is set on request.
+    Barycentrics b;  // place of the hit on the face
+    Vec2 x;          // pixel position
+    double weight;   // fraction of the pixel's samples
+    Spread spread;   // set on request
 };
 
 // Holds arrays with one entry or row per hit.
@@ -42,7 +42,7 @@ struct PixelChoice {
     int first, end;
     int most = 1;                   // This many samples per pixel and face represent all of them.
     const uint8_t* only = nullptr;  // (H, W) selects pixels; null: all.
-    bool spread = false;            // It requests the spread.
+    bool spread = false;            // requests the spread
 };
 
 // Receives the hits of rows, one row after another. Hits of one pixel are consecutive, but may come in several parts

@@ -24,7 +24,7 @@ struct SubCameraRays {
     std::variant<std::monostate, AlphaMasks<float>, AlphaMasks<double>> alpha_masks;
     const CameraFrame frame;
     const PixelRays pixel_rays;
-    const Vec2 reach;  // It is the filter's reach around a pixel, in normalised image coordinates.
+    const Vec2 reach;  // filter's reach around a pixel, in normalised image coordinates
 
    private:
     template <class T>

@@ -135,7 +135,7 @@ template <class T>
 void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systematic& systematic,
                          const SurfaceMeasure<T>& surface, const Accumulation& accumulation, GradientSink& to,
                          double (&seconds)[2]) {
-    const ShiftedSequence sequence(hash(view.options.seed, 2, gradient_stream));
+    const ShiftedSequence sequence(seed_of(view.options.seed, Stream::surface_points));
     const auto cell = [&](int64_t f) { return cell_of(view, view.scene.faces[3 * f]); };
     const OrderedDraws draws(systematic, n, {view.scene.n_faces}, cell, view.team);
     view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, LocalGradients& grad) {
@@ -245,7 +245,7 @@ void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64
     profile.surface_samples = surface.pixel_samples() + n;
     if (o.dry) return;
     if (surface.pixel_samples() > 0) {
-        PixelSamples samples{surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
+        PixelSamples samples{surface.pixels, surface.pixel_spp, seed_of(o.seed, Stream::surface_pixels),
                              surface.by_pixels.data(), surface.pixel_share};
         if (view.detailed) samples.beyond = surface.beyond, samples.by_importance = true;
         add_pixel_samples(view, samples, accumulation, to, profile.surface);
@@ -253,7 +253,7 @@ void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64
     if (n == 0) return;
     Systematic systematic(surface.of_face, view.team);
     if (!(systematic.total() > 0)) return;
-    systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
+    systematic.draw(n, to_unit(seed_of(o.seed, Stream::surface_faces)));
     add_surface_samples(view, n, systematic, surface, accumulation, to, profile.surface);
 }
 

@@ -380,7 +380,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     if (view.detailed) {
         const double each = out.scale(o.surface_samples) * lit_pixel;
         out.pixel_spp = int(std::clamp(std::round(each), 1.0, 0x1p20)), out.pixel_share = std::min(each, 1.0);
-        thin_out(out.pixels, out.pixel_share, to_unit(hash(o.seed, 5, gradient_stream)));
+        thin_out(out.pixels, out.pixel_share, to_unit(seed_of(o.seed, Stream::surface_pixel_choice)));
     } else if (!out.pixels.empty())
         out.pixel_spp = int(std::clamp(
             std::round(out.scale(o.surface_samples) * out.of_pixels / double(out.pixels.size())), 1.0, 0x1p20));

@@ -106,22 +106,22 @@ class Coincidence {
         return c;
     }
 
-    // Starts a sample of `own` at its point t, seen at x.
-    void start(const CoincidentCurve& own, Vec2 x, double t) {
+    // Starts a sample of `own` at its point t, seen at u in the undistorted image.
+    void start(const CoincidentCurve& own, Vec2 u, double t) {
         own_ = {&own, t, (1 - t) * own.curve.a + t * own.curve.b};
-        x_ = x;
+        u_ = u;
         for (int k = 0; k < 2; ++k) first_[k] = {}, several_[k] = false, before_[k] = own_.side(k).face >= 0;
     }
 
-    // Adds another curve that passes through x. Returns false once the gradient goes to others, whatever follows.
+    // Adds another curve that passes through u. Returns false once the gradient goes to others, whatever follows.
     bool add(const CoincidentCurve& other, double t) {
-        const CurveAtPoint place{&other, t, (1 - t) * other.curve.a + t * other.curve.b};
+        const CurveAtPoint at{&other, t, (1 - t) * other.curve.a + t * other.curve.b};
         for (int k = 0; k < 2; ++k) {
             if (other.side[k].face < 0) continue;
             several_[k] |= first_[k].curve != nullptr;
-            if (first_[k].curve && !lies_before(place, first_[k], k)) continue;
-            first_[k] = place;
-            before_[k] = before_[k] && lies_before(own_, place, k);
+            if (first_[k].curve && !lies_before(at, first_[k], k)) continue;
+            first_[k] = at;
+            before_[k] = before_[k] && lies_before(own_, at, k);
         }
         return before_[0] || before_[1];
     }
@@ -177,7 +177,7 @@ class Coincidence {
     }
 
    private:
-    // A CurveAtPoint is a curve at the point where it passes through x.
+    // A CurveAtPoint is a curve at the point where it passes through u.
     struct CurveAtPoint {
         const CoincidentCurve* curve = nullptr;
         double t = 0;
@@ -231,13 +231,13 @@ class Coincidence {
         return {{vertex(view_.scene, h, h.first()), vertex(view_.scene, h, h.second())}, p.t, p.point};
     }
 
-    // Finds where the ray through x leaves a face that it runs along, starting at the curve itself. Sets the point and
+    // Finds where the ray through u leaves a face that it runs along, starting at the curve itself. Sets the point and
     // the corners of the side on which it leaves.
     bool other_side(const HalfEdge& h, EdgePoint& end, int (&corner)[2]) const {
         const Vec2 along = own_.curve->curve.tangent();
-        const auto beyond = [&](Vec3 q) {  // position along the line relative to x; affine in q
+        const auto beyond = [&](Vec3 q) {  // position along the line relative to u; affine in q
             const Vec3 o = homogeneous(q);
-            return along.x * (o.x - o.z * x_.x) + along.y * (o.y - o.z * x_.y);
+            return along.x * (o.x - o.z * u_.x) + along.y * (o.y - o.z * u_.y);
         };
         corner[1] = (h.corner + 2) % 3;
         const Vec3 o = opposite_corner(h);
@@ -259,7 +259,7 @@ class Coincidence {
     CurveAtPoint own_, first_[2];  // front-most of the others, on either side
     bool several_[2] = {};
     bool before_[2] = {};  // whether the curve's own face lies before that one
-    Vec2 x_;
+    Vec2 u_;
 };
 
 }  // namespace edgegrad

@@ -24,7 +24,7 @@ struct CreaseFace {
     enum State : uint8_t { unknown, turned, hidden, clear, seen };
     float value;       // faces with different values differ along their common edge; NaN: unknown
     float pixels;      // measure of a crease next to a hidden or turned face, without the adjoint
-    float importance;  // mean |Ã| in its box
+    float importance;  // mean |A| in its box
     State state;
 
     bool is_hidden() const { return state == turned || state == hidden; }

@@ -105,11 +105,10 @@ class CreaseVisibility {
     static constexpr int most_points = int(std::size(ray_positions));
     static int points(const Curve& c) { return c.length < 4 ? few_points : most_points; }
 
-    // These least fractions of samples hold where nothing may divide a crease, or something may but rays miss it.
-    static constexpr double few = CreaseSamples::visible, near_silhouettes = 1.0 / 128, near_other_parts = 1.0 / 32,
-                            near_missed =
-                                1.0 /
-                                8;  // faces near which rays missed: something may intersect there, or be alpha-tested
+    // These least fractions of samples hold where nothing may divide a crease, or something may but rays miss it. Near
+    // missed faces something may intersect, or be alpha-tested.
+    static constexpr double few = CreaseSamples::visible, near_silhouettes = 1.0 / 128, near_other_parts = 1.0 / 32;
+    static constexpr double near_missed = 1.0 / 8;
 
     // Fewer than 16 rays per pixel miss more of the places where parts meet and faces are divided.
     double by_evidence(double least) const { return OcclusionHint::factor(least, view_.image.spp); }

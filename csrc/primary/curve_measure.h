@@ -13,7 +13,7 @@
 
 namespace edgegrad {
 
-// Curves lie end to end by length · (mean |Ã| near them) · (estimated jump). The measure is reduced where they are most
+// Curves lie end to end by length · (mean |A| near them) · (estimated jump). The measure is reduced where they are most
 // likely occluded, or where a control (crease_control.h) covers nearly all.
 struct CurvesFound {
     double pixels = 0;                // measure without the adjoint, which sets the default number of samples

@@ -1,6 +1,10 @@
-// This file holds the curve source of silhouettes, open borders and creases. The radiance of an incident face is known
-// exactly at the edge. The ray through the edge point ignores the faces of that edge, and finds what lies behind or
-// occludes it.
+// This file holds the curve source of silhouettes, open borders and creases.
+//
+// An edge (a, b) contributes ∫ Ã (L₋ − L₊) (δx ∧ τ) ds to ∂loss/∂Φ, with τ = dx/ds. The point at the fraction s of its
+// image is p = (1 − t) a + t b. It moves by δx = ∂x/∂p ((1 − t) δa + t δb) + ∂x/∂K δK in the image.
+//
+// The radiance of an incident face is known exactly at the edge. The ray through the edge point ignores the faces of
+// that edge, and finds what lies behind or occludes it.
 //
 // Where other curves coincide with this one in the image (coincident_segments.h), the ray runs along the borders of
 // their faces. Rounding would decide which of these it meets, so they are tested in double precision. A face whose

@@ -79,7 +79,7 @@ Array<Intersection> draw_intersections(const BackwardView<T>& view) {
     });
     return view.geometry.intersections().drawn(
         {view.scene.faces, view.scene.n_faces, view.scene.verts, *view.scene.spacing, view.geometry.topology()}, share,
-        hash(view.options.seed, 12, gradient_stream), view.team);
+        seed_of(view.options.seed, Stream::intersections), view.team);
 }
 
 // Appends the intersection lines where the adjoint is not zero to `out.intersection`. Their known jumps compare them

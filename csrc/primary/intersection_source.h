@@ -33,9 +33,8 @@ struct IntersectionCurve {
     Vec2 x0, x1;            // pixel positions of the ends
     double length = 0;      // px
 
-    Vec2 low() const {
-        return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)};
-    }  // low() and high() are corners of its box.
+    // low() and high() return corners of its box.
+    Vec2 low() const { return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)}; }
     Vec2 high() const { return {std::max(x0.x, x1.x), std::max(x0.y, x1.y)}; }
     double nearest_depth() const { return std::min(a.z, b.z); }
 };

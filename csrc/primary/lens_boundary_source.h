@@ -20,7 +20,7 @@ namespace edgegrad {
 
 struct LensBoundaryArc {
     LensBoundary::Arc arc;
-    double length, measure;  // px; and px times the mean |Ã| near it
+    double length, measure;  // px; and px times the mean |A| near it
 };
 
 // LensBoundaryCurve divides the lens boundary into arcs of a few pixels, where the adjoint is not zero.

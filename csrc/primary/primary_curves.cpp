@@ -167,7 +167,7 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     Stopwatch watch;
     Systematic systematic(curves.measure, view.team);
     if (!(systematic.total() > 0)) return;
-    systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
+    systematic.draw(n, to_unit(seed_of(view.options.seed, Stream::primary_curves)));
     const OrderedDraws draws = ordered(view, curves, systematic, n);
     const bool hidden = any_visible(view, curves, draws);  // whether creases between hidden faces count after all
     curves.add_segments(view, systematic, hidden);

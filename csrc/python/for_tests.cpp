@@ -304,7 +304,7 @@ NB_MODULE(_core_tests, p) {
         std::copy(measure.begin(), measure.end(), ends.begin());
         Systematic systematic(ends, team);
         systematic.draw(n, shift);
-        std::vector<std::tuple<int64_t, double>> out;  // Its entries are primitive and weight.
+        std::vector<std::tuple<int64_t, double>> out;  // primitive and weight
         for (int64_t i = 0; i < n; ++i) {
             const int64_t k = systematic.primitive(systematic.position(i));
             out.emplace_back(k, systematic.weight(k));

@@ -13,6 +13,7 @@
 #include <utility>
 
 #include "python/shaped.h"
+#include "shading/lit/light_sample.h"
 #include "shading/lit/mesh_light_sampling.h"
 
 using namespace nanobind::literals;
@@ -250,6 +251,11 @@ void bind_lit_arrays(nb::module_& m) {
     m.attr("FAINTEST_NORMAL") = faintest_normal;
     m.attr("MOST_BOUNCES") = most_bounces;
     m.attr("MOST_EMISSIVE_FACES") = EmissiveFaceTree::most_faces;
+    m.attr("CANDIDATES_FOR_ONE") = candidates_for_one;
+    m.attr("WIDEST_LOBE") = widest_lobe;
+    m.attr("SET_SIZE") = AntitheticSet::most;
+    m.attr("SETS_FOR_ONE") = sets_for_one;
+    m.attr("MOST_SETS_FOR_ONE") = most_sets_for_one;
     nb::class_<SourceArrays>(m, "LitSource")
         .def(nb::new_(&make_source), "kind"_a, "value"_a = no_table, "factor"_a = no_table, "uvs"_a = no_table,
              "uv_faces"_a.noconvert() = nb::none(), "height"_a = 0, "width"_a = 0,

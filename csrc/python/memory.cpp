@@ -33,12 +33,12 @@ using Bytes = std::map<std::string, int64_t>;
 // Holds the sizes of a scene's arrays, of one camera's image, and the number of threads.
 struct PassSize {
     int64_t verts, faces, colors, uvs, texels, alphas, pixels;
-    int radiance, vertex_attributes, face_attributes;  // They are widths.
-    int channels, number;                              // They are the image's channels, and the bytes of one number.
+    int radiance, vertex_attributes, face_attributes;  // widths
+    int channels, number;                              // image's channels, and the bytes of one number
     bool textured;
-    bool jumps;  // It says whether adjacent faces may differ where they meet.
+    bool jumps;  // whether adjacent faces may differ where they meet
     int threads;
-    int sides;  // It counts the camera's sides (sub_cameras.h).
+    int sides;  // number of the camera's sides (sub_cameras.h)
 
     // Returns the number of edges of a closed mesh.
     int64_t edges() const { return 3 * faces / 2; }

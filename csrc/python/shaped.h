@@ -15,7 +15,7 @@ namespace nb = nanobind;
 // Returns a vector or an Array as an array of this shape, without a copy.
 template <class Values>
 nb::object shaped(Values&& values, const std::vector<size_t>& shape) {
-    static_assert(!std::is_reference_v<Values>);  // It is moved from.
+    static_assert(!std::is_reference_v<Values>);  // Values are moved from.
     using X = std::remove_pointer_t<decltype(values.data())>;
     auto* kept = new Values(std::move(values));
     const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<Values*>(p); });

@@ -74,7 +74,7 @@ void run_unlocked(int threads, const std::function<void(ThreadTeam&)>& f) {
         ThreadTeam team(threads, ask);
         team.run([&] { f(team); });
     } catch (const Interrupted&) {
-        throw nb::python_error();  // It is the handler's error.
+        throw nb::python_error();  // raises the handler's error
     }
 }
 

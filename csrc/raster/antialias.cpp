@@ -12,7 +12,7 @@ namespace {
 
 // Holds a side of a triangle as a line n · p = 0 of the image.
 struct SideLine {
-    Vec3 a, b, n;  // Their components are x, y, w.
+    Vec3 a, b, n;  // components x, y, w
 
     template <class T>
     SideLine(const Triangles<T>& mesh, int64_t item, int64_t half_edge) {
@@ -51,7 +51,7 @@ std::vector<uint8_t> silhouettes(const Triangles<T>& mesh, const EdgeGroups& edg
 
 // Holds two neighbours in the image, along x (axis 0) or y (axis 1).
 struct Neighbours {
-    int64_t column, row;  // They locate the near pixel.
+    int64_t column, row;  // near pixel
     int axis;
     int step;  // 1 means that the far one is to the right or above.
 

@@ -25,10 +25,10 @@ struct EdgeGroups {
 
 // Describes a silhouette between the centres of two pixels.
 struct SilhouetteCrossing {
-    int64_t near, far;  // They are the pixel whose triangle ends, and the other.
+    int64_t near, far;  // pixel whose triangle ends, and the other
     int32_t triangle;   // This triangle ends.
     int8_t side, axis;  // The side is opposite to this corner; the pixels lie along x (0) or y (1).
-    double share;       // It is d: how far the triangle reaches from near to far, 0 to 1.
+    double share;       // d: how far the triangle reaches from near to far, 0 to 1
 };
 
 // Finds the crossings, image by image.

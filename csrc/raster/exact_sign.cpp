@@ -5,7 +5,7 @@ namespace edgegrad {
 namespace {
 
 struct DoubleDouble {
-    double high, low;  // Their sum is exact.
+    double high, low;  // parts of an exact sum
 };
 DoubleDouble two_sum(double a, double b) {
     const double s = a + b, bb = s - a;

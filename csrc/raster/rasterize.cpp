@@ -15,10 +15,10 @@ namespace {
 
 // Holds a triangle in one image.
 struct Facet {
-    Vec3 corner[3];     // Their components are x, y, w.
-    double depth[3];    // It is z.
-    ImageLine side[3];  // They are opposite to the corners.
-    double facing;      // It is the sign of the corners' determinant; 0: edge-on or degenerate.
+    Vec3 corner[3];     // components x, y, w
+    double depth[3];    // z
+    ImageLine side[3];  // opposite to the corners
+    double facing;      // sign of the corners' determinant; 0: edge-on or degenerate
 
     template <class T>
     Facet(const Triangles<T>& mesh, int64_t item, int64_t triangle) {
@@ -163,9 +163,9 @@ void find_nearest(const Triangles<T>& mesh, const Frames& frames, const Window& 
 // Holds u and v at a pixel, their changes one pixel to the right and up, and intermediate results.
 struct PixelBarycentrics {
     double sum, u, v;
-    double dx, dy;  // They are the size of a pixel.
+    double dx, dy;  // size of a pixel
     double u_x, u_y, v_x, v_y;
-    Vec3 total;  // It is the sum of the sides' lines; its product with the centre is `sum`.
+    Vec3 total;  // sum of the sides' lines; its product with the centre is `sum`
 
     PixelBarycentrics(const Facet& f, const Weights& w, const Frames& frames)
         : sum(w.sum()), u(w.e[0] / sum), v(w.e[1] / sum), dx(2 / double(frames.width)), dy(2 / double(frames.height)) {

@@ -98,12 +98,12 @@ void coordinates_vjp(const TextureInput<T>& in, const std::vector<TexelGrid>& gr
     const PixelLookUp<T> at(in, pixel);
     if (at.valid() && in.look_up != LookUp::nearest) {
         Vec2 place_bar;
-        double value[2] = {};  // They are bar · what each level shows.
+        double value[2] = {};  // bar · what each level shows
         int index = 0;
         at.level().each([&](int level, double weight) {
             const TexelGrid& grid = grids[level];
             const BorderedFootprint f = at.linear(grid);
-            double s[4] = {};  // It is bar · texel.
+            double s[4] = {};  // bar · texel
             for (int k = 0; k < 4; ++k) {
                 if (f.texel[k] < 0) continue;
                 const T* texel = in.texels + f.texel[k] * C;

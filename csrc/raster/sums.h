@@ -15,9 +15,9 @@ namespace edgegrad {
 
 // Selects rows of some images.
 struct Share {
-    int64_t item, end_item;  // They are images; several images have all their rows.
+    int64_t item, end_item;  // images; several images have all their rows
     int64_t row, end_row;
-    int64_t first_target, targets;  // They are the rows of numbers to which they may add.
+    int64_t first_target, targets;  // rows of numbers to which they may add
 
     // Calls visit(item, row) for each row.
     template <class Visit>

@@ -52,8 +52,8 @@ struct TexturePlace {
 // Holds up to four texels, −1 where there is none. Where three sides of a cube meet, the missing texel is the mean of
 // the other three, seen from any side.
 struct BorderedFootprint : Footprint {
-    Vec2 moves;       // They are 0 along axes where the coordinate is clamped, otherwise 1.
-    int corner = -1;  // It is the missing texel of the four.
+    Vec2 moves;       // 0 along axes where the coordinate is clamped, otherwise 1
+    int corner = -1;  // missing texel of the four
 
     // Returns the weight of a texel that is there.
     double weight(int i) const {

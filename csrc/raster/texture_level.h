@@ -63,7 +63,7 @@ inline void texels_a_pixel_vjp(const TextureCoordinates& uv, const TextureShape&
     const SideAxes& axes = side_axes[place.side];
     const double size = std::fabs(uv.at[axes.major]), scale = 0.5 * w / size, s = 2 * place.s - 1, r = 2 * place.t - 1;
     const double s_bar[2] = {scale * bar.xx, scale * bar.xy}, t_bar[2] = {scale * bar.yx, scale * bar.yy};
-    double by_s = 0, by_t = 0;  // They are cotangents of 2 s − 1 and 2 t − 1.
+    double by_s = 0, by_t = 0;  // cotangents of 2 s − 1 and 2 t − 1
     for (int k = 0; k < 2; ++k) {
         const double m = axes.sign * uv.by_pixel[2 * axes.major + k];
         d[2 * axes.s + k] += axes.s_sign * s_bar[k], d[2 * axes.t + k] += axes.t_sign * t_bar[k];
@@ -81,8 +81,8 @@ inline void texels_a_pixel_vjp(const TextureCoordinates& uv, const TextureShape&
 // larger eigenvalue of JᵀJ, or −∞ where J is zero.
 struct LongAxis {
     double level;
-    Vec2 direction;  // It is the unit eigenvector.
-    double square;   // It is the eigenvalue.
+    Vec2 direction;  // unit eigenvector
+    double square;   // eigenvalue
 
     explicit LongAxis(const Mat2& j) {
         const double a = j.xx * j.xx + j.yx * j.yx, b = j.xx * j.xy + j.yx * j.yy, c = j.xy * j.xy + j.yy * j.yy;

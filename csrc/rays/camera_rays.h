@@ -47,7 +47,7 @@ class CameraFrame {
     const RayCaster& caster_;
     const AlphaTest* alpha_test_;
     RayFrame frame_;
-    Vec3 axis_x_, axis_y_, axis_z_;  // They are the camera's axes in world coordinates, times any scale.
+    Vec3 axis_x_, axis_y_, axis_z_;  // camera's axes in world coordinates, times any scale
     Vec3 eye_;
     bool perspective_, far_, undistorted_;
 };

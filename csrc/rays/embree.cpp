@@ -103,7 +103,7 @@ constexpr char worker_name[] = "embree";
 bool a_worker_is_awake() {
     std::error_code error;
     for (const auto& task : std::filesystem::directory_iterator("/proc/self/task", error)) {
-        std::string line;  // It has the form: number (name) state ….
+        std::string line;  // form: number (name) state …
         std::getline(std::ifstream(task.path() / "stat"), line);
         const size_t name = line.find('('), state = line.rfind(')') + 2;
         if (name == std::string::npos || state >= line.size()) continue;

@@ -32,7 +32,7 @@ struct FilterArguments {
     int* valid;
     void* geometryUserPtr;
     RayQueryContext* context;
-    void* ray;  // It is a structure of arrays of length N, in the order of RayPacket.
+    void* ray;  // structure of arrays of length N, in the order of RayPacket
     void* hit;
     unsigned N;
 };

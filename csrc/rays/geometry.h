@@ -18,9 +18,9 @@ struct GeometryWanted {
 
 // Says what it had to do.
 struct GeometryWork {
-    bool rays = false;           // It built or updated the ray structure.
-    bool edges = false;          // It found or welded the edges.
-    bool intersections = false;  // It found the intersections of faces.
+    bool rays = false;           // whether it built or updated the ray structure
+    bool edges = false;          // whether it found or welded the edges
+    bool intersections = false;  // whether it found the intersections of faces
 };
 
 class Geometry {
@@ -44,8 +44,8 @@ class Geometry {
     std::unique_ptr<ConnectedParts> parts_;
     std::unique_ptr<Intersections> intersections_;  // Null means not found yet at the current positions.
     FaceOrder order_;                               // The intersections were found in this order.
-    Spacing spacing_;                               // It decides which vertices are welded.
-    bool welded_ = false;                           // It refers to the current positions.
+    Spacing spacing_;                               // decides which vertices are welded
+    bool welded_ = false;                           // whether it refers to the current positions
 };
 
 // Returns the geometry of these faces at these positions, with what is wanted. It reuses geometry in memory: unchanged

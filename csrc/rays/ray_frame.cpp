@@ -27,7 +27,7 @@ RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
     struct Block {
         Vec3 sum;
         double weight = 0;
-        int64_t faces = 0, powers = 0;  // They count faces with a side, and sum log₂ of the sides' squares.
+        int64_t faces = 0, powers = 0;  // number of faces with a side, and sum of log₂ of the sides' squares
     };
     const auto of_faces = team.map_blocks(n_faces, [&](int64_t first, int64_t last) {
         Block block;
@@ -66,7 +66,7 @@ RayFrame frame_of(const PlacedTriangles& triangles, ThreadTeam& team) {
     unit = std::sqrt(*std::max_element(farthest.begin(), farthest.end())), radius = 1;
     if (!(unit > 0)) unit = 1;  // The scene is a single point.
     if (!all.faces) return frame;
-    constexpr int ordinary_span = 20, most_span = 70, most_of_radius = 36;  // They are powers of two.
+    constexpr int ordinary_span = 20, most_span = 70, most_of_radius = 36;  // powers of two
     const double size = double(all.powers) / (2 * double(all.faces)), span = std::log2(unit) - size;
     if (span > most_span) {
         char text[256];

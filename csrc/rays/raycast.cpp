@@ -97,10 +97,10 @@ struct ValidLanes {
 struct RejectContext {
     // It is first, so that a pointer to it is a pointer to this.
     RayQueryContext query;
-    const RayCaster::Ignored* ignored;                       // It is indexed by ray, or null.
-    bool (*meets)(const void* data, int ray, int32_t face);  // It may be null.
+    const RayCaster::Ignored* ignored;                       // indexed by ray, or null
+    bool (*meets)(const void* data, int ray, int32_t face);  // may be null
     const void* data;
-    int first = 0;  // It is the index of the packet's first ray in the batch.
+    int first = 0;  // index of the packet's first ray in the batch
 };
 
 void reject(const FilterArguments* a) {

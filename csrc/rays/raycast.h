@@ -78,7 +78,7 @@ class RayCaster {
     std::vector<float> positions_;
     void *scene_ = nullptr, *geometry_ = nullptr;
     bool committed_ = false;
-    std::atomic<bool> stop_{false};  // It asks a build to end.
+    std::atomic<bool> stop_{false};  // request to end a build
 };
 
 template <class Meets>

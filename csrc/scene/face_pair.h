@@ -20,12 +20,12 @@ namespace edgegrad {
 
 // Holds a face in the world, and what its pairs need.
 struct PlacedFace {
-    const int32_t* vertex;  // It has 3 elements.
+    const int32_t* vertex;  // 3 elements
     Vec3 p[3];
-    Vec3 e1, e2, normal;  // They are not normalised.
+    Vec3 e1, e2, normal;  // not normalised
     double normal_length;
-    double coordinate;  // It is the largest of the face's coordinates.
-    double spacing;     // It is the relative spacing of the input's numbers.
+    double coordinate;  // largest of the face's coordinates
+    double spacing;     // relative spacing of the input's numbers
 
     void set(const double* verts, const int32_t* v, double spacing_) {
         vertex = v, spacing = spacing_, coordinate = 0;
@@ -42,7 +42,7 @@ struct PlacedFace {
 
 class FacePair {
    public:
-    Vec3 a, b;  // They are the ends of the segment.
+    Vec3 a, b;  // ends of the segment
 
     // `along` means that a side of one face lies in the other one, with that face on one side of it.
     enum class Kind { none, through, along };
@@ -130,8 +130,8 @@ class FacePair {
         return begin < end;
     }
 
-    bool shared_[2][3];      // They mark vertices of the other face.
-    double distance_[2][3];  // They are distances of the vertices from the other face's plane.
+    bool shared_[2][3];      // marks of vertices of the other face
+    double distance_[2][3];  // distances of the vertices from the other face's plane
 };
 
 }  // namespace edgegrad

@@ -30,7 +30,7 @@ struct CornerLanes {
 
 // Sets float boxes that contain the double ones. A float lies within half a spacing of its double.
 EDGEGRAD_VECTORIZED void set_boxes(const CornerLanes& l, BoxGroup& boxes) {
-    constexpr double most = 0x1p127;  // It is the range of floats.
+    constexpr double most = 0x1p127;  // range of floats
     for (int k = 0; k < 3; ++k) {
         EDGEGRAD_ROLLED
         for (int i = 0; i < BoxGroup::size; ++i) {
@@ -229,7 +229,7 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, c
         int32_t face;
         uint64_t code;
     };
-    std::vector<int32_t> size(n_faces, 0);  // It counts the faces of surfaces.
+    std::vector<int32_t> size(n_faces, 0);  // number of faces of each surface
     for (int64_t f = 0; f < n_faces; ++f) ++size[topology.surface(int32_t(f))];
     std::vector<Key> keys(n_faces);
     team.parallel_for_blocks(n_faces, [&](int64_t, int64_t first, int64_t last) {

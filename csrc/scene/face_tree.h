@@ -20,7 +20,7 @@ namespace edgegrad {
 // Orders faces so that neighbours are close in space.
 struct FaceOrder {
     std::vector<int32_t> face;
-    double spread = 0;  // It was the mean size of a leaf's box relative to the box of all when the order was made.
+    double spread = 0;  // mean size of a leaf's box relative to the box of all when the order was made
 };
 
 struct FaceBox {
@@ -55,17 +55,17 @@ struct BoxGroup {
 
 // Holds the plane of a face for comparison with its neighbours.
 struct FacePlane {
-    const int32_t* vertex;  // It has the 3 vertices of the face.
+    const int32_t* vertex;  // 3 vertices of the face
     Vec3 origin, normal;
     double normal_length;
-    double coordinate;  // It is the largest of the face's coordinates.
+    double coordinate;  // largest of the face's coordinates
 };
 
 // Holds the corners of eight faces relative to one of them, so that floats represent them well.
 struct CornerGroup {
     static constexpr int size = BoxGroup::size;
     Vec3 origin;
-    float reach;              // It is the largest of the numbers in p.
+    float reach;              // largest of the numbers in p
     float p[3][3][size];      // Indices are corner and axis.
     int32_t vertex[3][size];  // −1 means that there is no face.
 
@@ -128,7 +128,7 @@ class FaceTree {
     template <class Box, class Found>
     bool visit(int level, int64_t i, const Box& box, int64_t first, int32_t but, Found& found) const {
         const BoxGroup& group = levels_[level][i];
-        const int64_t span = int64_t(1) << 3 * (level - 1);  // It counts the leaves in one of the group's boxes.
+        const int64_t span = int64_t(1) << 3 * (level - 1);  // number of leaves in one of the group's boxes
         for (unsigned hits = group.overlapping(box); hits; hits &= hits - 1) {
             const int64_t child = BoxGroup::size * i + std::countr_zero(hits);
             if ((child + 1) * span <= first || (but >= 0 && surface_[level - 1][child] == but)) continue;
@@ -139,8 +139,8 @@ class FaceTree {
 
     const std::vector<int32_t>* face_ = nullptr;
     Array<CornerGroup> corners_{0};        // Each leaf has a group.
-    std::vector<Array<BoxGroup>> levels_;  // They are those of faces, of leaves, …; the last level has one group.
-    std::vector<Array<int32_t>> surface_;  // They are those of leaves, of groups of leaves, ….
+    std::vector<Array<BoxGroup>> levels_;  // groups of faces, of leaves, …; the last level has one group
+    std::vector<Array<int32_t>> surface_;  // surfaces of leaves, of groups of leaves, ….
 };
 
 }  // namespace edgegrad

@@ -11,7 +11,7 @@ namespace edgegrad {
 
 namespace {
 
-constexpr int64_t most_leaves = 64, least_leaves = 8;  // They bound the leaves of a prism.
+constexpr int64_t most_leaves = 64, least_leaves = 8;  // bounds of the leaves of a prism
 constexpr float slab = 0.25;                           // It extends beyond its faces this far, relative to its base.
 // Its faces cover at least this part of its base, or it would reach far beyond them.
 constexpr double least_part = 0.1;
@@ -247,7 +247,7 @@ class PrismTest {
     const FaceTree& tree_;
     const std::vector<uint8_t>& closed_;
     Vec3 origin_, axis_[3];
-    double area_;  // It is the area of its own faces over the base.
+    double area_;  // area of its own faces over the base
     Prism prism_;
 };
 

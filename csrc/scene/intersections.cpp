@@ -19,7 +19,7 @@ namespace {
 // Records a side of the face `ending` that lies in the face `through`, with `ending` on one side of it.
 struct AlongEdge {
     int32_t through, ending;
-    int32_t edge[2];  // They are vertices, ascending.
+    int32_t edge[2];  // vertices, ascending
     bool before;
     bool drawn;  // Otherwise it is only known to exist.
     Vec3 a, b;
@@ -51,7 +51,7 @@ struct DrawnPairs {
     std::vector<uint8_t> faces_of_leaf;
     const float* share = nullptr;   // (F,) probability of each face
     const float* copies = nullptr;  // (F,) 1 over the number of copies of each face
-    double leaves = 1;              // It is the probability of a pair of leaves.
+    double leaves = 1;              // probability of a pair of leaves
     uint64_t seed = 0;
 
     bool all() const { return faces_of_leaf.empty(); }
@@ -165,14 +165,14 @@ class FacePairFinder {
     const DrawnPairs& drawn_;
     const double coarsest_;
     int64_t leaf_ = -1;
-    PlacedFace placed_[FaceTree::leaf_size];  // They are its faces.
-    FacePlane plane_[FaceTree::leaf_size];    // They are the planes of its faces.
+    PlacedFace placed_[FaceTree::leaf_size];  // its faces
+    FacePlane plane_[FaceTree::leaf_size];    // planes of its faces
 };
 
 // Lists the faces at some edges, by the edges' vertices.
 using FacesAtEdges = std::map<std::array<int32_t, 2>, std::vector<int32_t>>;
 void find_faces(FacesAtEdges& at, const PlacedFaces& faces) {
-    std::vector<uint8_t> wanted;  // It marks vertices.
+    std::vector<uint8_t> wanted;  // marks vertices
     for (const auto& [edge, none] : at) {
         wanted.resize(std::max<size_t>(wanted.size(), edge[1] + 1), 0);
         wanted[edge[0]] = wanted[edge[1]] = 1;
@@ -296,7 +296,7 @@ Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, 
     for (const auto& part : parts) n += part.size();
     Array<Intersection> all{int64_t(n)};
     if (n == 0) return all;
-    std::vector<uint32_t> end(n_faces, 0);  // It is the end of each face's range in `all`.
+    std::vector<uint32_t> end(n_faces, 0);  // end of each face's range in `all`
     const auto each = [&](auto body) {
         team.parallel_for(int64_t(parts.size()), [&](int64_t k) {
             for (const Intersection& i : parts[k]) body(std::atomic_ref(end[i.face[0]]), i);

@@ -15,7 +15,7 @@
 namespace edgegrad {
 
 struct Intersection {
-    int32_t face[2];  // They ascend.
+    int32_t face[2];  // ascending
     // A surface may pass through a face exactly along an edge: face[ending] ends there, and `next` continues on the
     // other side. Motion one way lets one of them pass through, motion the other way the other; each counts half.
     int32_t next = -1;
@@ -23,7 +23,7 @@ struct Intersection {
     // The fraction of the gradient that goes to this pair, because copies of faces have the same segment. It exceeds 1
     // if the pair also represents others that were not drawn.
     double weight = 1;
-    Vec3 a, b;  // They are the ends of the shared segment, in the world.
+    Vec3 a, b;  // ends of the shared segment, in the world
 };
 
 // Holds faces (F, 3) at positions (V, 3), with their edges.

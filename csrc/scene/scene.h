@@ -27,14 +27,14 @@ struct Spacing {
 
 // Lists what a face shows besides its radiance (shading/attributes.h), in the order of the channels.
 struct Attributes {
-    bool alpha = false;              // It is 1 wherever a face is seen.
+    bool alpha = false;              // 1 wherever a face is seen
     const double* vertex = nullptr;  // (V, vertex_width) values at the vertices
     int vertex_width = 0;
-    int unit = -1;                 // It is the first of three columns of `vertex` with a unit direction, −1: none.
+    int unit = -1;                 // first of three columns of `vertex` with a unit direction, −1: none
     const double* face = nullptr;  // (F, face_width) values of whole faces
-    int face_width = 0;            // It is at most most_of_face.
-    bool barycentrics = false;     // It adds 3 channels.
-    bool uv = false;               // It adds 2 channels, if all faces have texture coordinates.
+    int face_width = 0;            // at most most_of_face
+    bool barycentrics = false;     // adds 3 channels
+    bool uv = false;               // adds 2 channels, if all faces have texture coordinates
 
     static constexpr int most_of_face = 4;
 
@@ -72,10 +72,10 @@ struct SceneView {
     const int32_t* face_texture;  // (F,) row of textures, −1 for none; null when the scene has no texture
     const T* background;          // (C,) or (H, W, C)
     bool background_is_image;
-    int channels;  // It is C of the image: R of radiance, then the attributes.
+    int channels;  // C of the image: R of radiance, then the attributes
     const Spacing* spacing;
     Attributes attributes = {};
-    int radiance = channels;              // It is R.
+    int radiance = channels;              // R
     const int32_t* uv_corners = corners;  // (F, 3) rows of uvs, for faces that have any
     AlphaMaskArrays<T> alpha_masks = {};
 

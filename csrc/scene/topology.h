@@ -18,8 +18,8 @@ namespace edgegrad {
 // Holds a face at an edge, and which of its sides (corner i to corner i + 1) lies on the edge.
 struct HalfEdge {
     int32_t face;
-    int8_t corner;   // It is the face's corner where the side begins.
-    bool backwards;  // It is relative to the edge's direction, that of its first half-edge.
+    int8_t corner;   // face's corner where the side begins
+    bool backwards;  // relative to the edge's direction, that of its first half-edge
 
     // It is the face's corner at the edge's start.
     int first() const { return backwards ? (corner + 1) % 3 : corner; }
@@ -84,13 +84,13 @@ class Topology {
     int64_t n_faces_, n_verts_;
     // It maps each vertex to the first one at its position; if empty, vertices are distinct.
     std::vector<int32_t> welded_;
-    std::vector<int32_t> candidates_;  // They are vertices on borders by index.
+    std::vector<int32_t> candidates_;  // vertices on borders by index
     std::vector<int64_t> offset_;
     std::vector<HalfEdge> half_edge_;
     std::vector<int32_t> face_;
-    std::vector<uint8_t> joins_two_;           // It is indexed by edge.
-    std::vector<uint8_t> has_all_neighbours_;  // It is indexed by face.
-    std::vector<int32_t> surface_;             // It is indexed by face.
+    std::vector<uint8_t> joins_two_;           // indexed by edge
+    std::vector<uint8_t> has_all_neighbours_;  // indexed by face
+    std::vector<int32_t> surface_;             // indexed by face
 };
 
 }  // namespace edgegrad

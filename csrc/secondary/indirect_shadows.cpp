@@ -75,7 +75,11 @@ template <class T>
 void add_indirect_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
                           int64_t samples, GradientSink& to) {
     if (samples == 0) return;
-    ShadowSampler<T> sampler(view, casters, light, {.pilots = 15, .places = 16, .rays = 14}, samples);
+    ShadowSampler<T> sampler(view, casters, light,
+                             {.pilots = Stream::indirect_shadow_pilots,
+                              .places = Stream::indirect_shadow_places,
+                              .rays = Stream::indirect_shadow_rays},
+                             samples);
     const auto pilot = [&](const ShadowPoint& point, double weight) {
         const BorderOnFace<T> on(view.scene, light, point);
         const double cosine = std::fabs(dot(on.g, on.border.d)) / length(on.border.d);

@@ -40,11 +40,11 @@ class LineEnds {
 
     // Returns (N, channels): the light that passes between each pair (transfer.h). Seeds count from `first` on.
     template <class T>
-    std::vector<double> sent(const LineLight<T>& scene, uint64_t stream, int64_t first, Paths& paths) const {
+    std::vector<double> sent(const LineLight<T>& scene, Stream stream, int64_t first, Paths& paths) const {
         const int C = scene.lit.lit.channels;
         std::vector<double> out(size() * C);
         std::vector<int64_t> seed;
-        const uint64_t numbers = hash(scene.view.options.seed, stream, gradient_stream) << 32;
+        const uint64_t numbers = seed_of(scene.view.options.seed, stream) << 32;
         for (int64_t i = 0; i < size(); ++i) seed.push_back(int64_t(numbers | uint32_t(first + i)));
         for (int64_t i = 0; i < size(); i += shaded_at_once) {
             const LitLines some{std::min(shaded_at_once, size() - i),
@@ -86,8 +86,8 @@ class LineEnds {
 // Evaluates the samples of records from `begin` on. Their first two surfaces are receiver and reflector; their first
 // factor is the weight. Writes how much the image jumps, or the light that reaches the receiver and its direction.
 template <class T>
-void light_reflectors(const LineLight<T>& light, const std::vector<CurveRecords>& records, size_t begin,
-                      uint64_t stream, SecondaryEdgeSamples& out) {
+void light_reflectors(const LineLight<T>& light, const std::vector<CurveRecords>& records, size_t begin, Stream stream,
+                      SecondaryEdgeSamples& out) {
     std::vector<int64_t> first(records.size() + 1, 0);
     for (size_t k = begin; k < records.size(); ++k) first[k + 1] = first[k] + records[k].size();
     out.jump.resize(records.size()), out.origin.resize(records.size());

@@ -34,14 +34,15 @@ class EdgeLineSampler {
           pilots_(std::clamp(n / samples_of_pilot, fewest_pilots, most_pilots)),
           pooled_(light.view.geometry.parts()),
           mirrors_(light.lit.lit, light.is_seen()),
-          alpha_edges_(AlphaEdgeFinder<T>(light.casters).find(seed_of(13), light.view.team)) {}
+          alpha_edges_(AlphaEdgeFinder<T>(light.casters).find(seed(Stream::edge_line_alpha_edges), light.view.team)) {}
 
     bool is_empty() const { return pieces() == 0; }
 
     // Fills pooled_ and sets its means.
     template <class Receiver>
     void cast_pilots(const Receiver& receiver) {
-        const SystematicPlaces places(measure(), pilots_, to_unit(seed_of(17)), light_.view.team);
+        const SystematicPlaces places(measure(), pilots_, to_unit(seed(Stream::edge_line_pilot_places)),
+                                      light_.view.team);
         std::vector<PilotStatistics> found((places.size() + pilots_of_block - 1) / pilots_of_block);
         const int C = light_.lit.lit.channels;
         light_.view.team.parallel_for_with_state(
@@ -53,7 +54,8 @@ class EdgeLineSampler {
                 const int64_t first = block * pilots_of_block, last = std::min(first + pilots_of_block, places.size());
                 receiver.cast_pilots(
                     [&](auto body) {
-                        trace(places, 18, first, last, body, [&](int64_t cell) { own.lines.push_back(cell); });
+                        trace(places, Stream::edge_line_pilots, first, last, body,
+                              [&](int64_t cell) { own.lines.push_back(cell); });
                     },
                     [&](const EdgeLine& line, double size) {
                         if (!(size > 0)) return;
@@ -61,7 +63,7 @@ class EdgeLineSampler {
                         ends.add(0, line.receiver, line.at.u, line.at.v);
                         ends.add(1, line.reflector, line.radiance_at.u, line.radiance_at.v);
                     });
-                const std::vector<double> sent = ends.sent(light_, 19, 2 * first, paths);
+                const std::vector<double> sent = ends.sent(light_, Stream::edge_line_pilot_paths, 2 * first, paths);
                 for (size_t i = 0; i < own.value.size(); ++i) {
                     double most = 0;
                     for (int c = 0; c < C; ++c) most = std::max(most, std::fabs(sent[i * C + c]));
@@ -76,14 +78,14 @@ class EdgeLineSampler {
     }
 
     int64_t lay_out(int64_t n) {
-        places_.emplace(measure(), n, to_unit(seed_of(14)), light_.view.team);
+        places_.emplace(measure(), n, to_unit(seed(Stream::edge_line_places)), light_.view.team);
         return places_->size();
     }
 
     // Calls body(line, weight) for both ways along the lines.
     template <class Body>
     void trace(int64_t first, int64_t last, Body body) const {
-        trace(*places_, 16, first, last, body, [](int64_t) {});
+        trace(*places_, Stream::edge_lines, first, last, body, [](int64_t) {});
     }
 
    private:
@@ -92,7 +94,7 @@ class EdgeLineSampler {
         std::vector<double> value;
     };
 
-    uint64_t seed_of(uint64_t stream) const { return hash(light_.view.options.seed, stream, gradient_stream); }
+    uint64_t seed(Stream stream) const { return seed_of(light_.view.options.seed, stream); }
     const Topology& topology() const { return light_.view.geometry.topology(); }
     int64_t pieces() const { return topology().n_edges() + int64_t(alpha_edges_.size()); }
     EdgeLines<T> lines() const { return {light_.casters, topology(), alpha_edges_, pooled_, means_, mirrors_}; }
@@ -110,16 +112,16 @@ class EdgeLineSampler {
     // Calls body(line, weight) for both ways along the lines of places, and drawn(cell) with the cell of PooledLines of
     // each.
     template <class Body, class Drawn>
-    void trace(const SystematicPlaces& places, uint64_t stream, int64_t first, int64_t last, Body body,
+    void trace(const SystematicPlaces& places, Stream stream, int64_t first, int64_t last, Body body,
                Drawn drawn) const {
-        const uint64_t seed = seed_of(stream);
-        const ShiftedSequence sequence(seed);
+        const uint64_t random = seed(stream);
+        const ShiftedSequence sequence(random);
         EdgeLines<T> edge = lines();
         TracedEdgeLines<T> traced(light_.view, light_.casters, alpha_edges_);
         int64_t current = -1;
         places.each(first, last, [&](int64_t i, int64_t piece, double along, double weight) {
             if (piece != current) edge.set(current = piece);
-            const auto [t, w, area] = edge.at(along, sequence(uint64_t(i)), to_unit(hash(seed, 1, uint64_t(i))));
+            const auto [t, w, area] = edge.at(along, sequence(uint64_t(i)), to_unit(hash(random, 1, uint64_t(i))));
             const int64_t cell = edge.cell(w);
             drawn(cell);
             if (area == 0) return;
@@ -199,7 +201,7 @@ void add_secondary_edges(const BackwardView<T>& view, const SceneView<T>& caster
             },
             [&](const EdgeLine& line, double weight) { return weight * length(normal_of(view, line)); }));
     }
-    light_reflectors(light, to.records->curves, before, 15, out);
+    light_reflectors(light, to.records->curves, before, Stream::edge_line_paths, out);
 }
 
 template void add_secondary_edges(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, int64_t,

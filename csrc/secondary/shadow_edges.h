@@ -227,7 +227,7 @@ class ShadowEdgeFinder {
     void add(int64_t e, int64_t parts_tested, EdgeWedge<T>& wedge, std::vector<ShadowPiece>& out) const {
         const HalfEdge& h = view_.geometry.topology().half_edges(e)[0];
         const Vec3 a = corner(view_.scene, h.face, h.first()), b = corner(view_.scene, h.face, h.second());
-        const double shift = to_unit(hash(hash(view_.options.seed, 8, gradient_stream), e));
+        const double shift = to_unit(hash(seed_of(view_.options.seed, Stream::shadow_light_parts), e));
         const double step = double(light_.count) / double(parts_tested);
         for (int64_t i = 0; i < parts_tested; ++i) {
             const int64_t part = std::min(int64_t((double(i) + shift) * step), light_.count - 1);
@@ -248,7 +248,7 @@ class ShadowEdgeFinder {
     std::vector<std::vector<ShadowPiece>> of_alpha_edges(int64_t tests) const {
         const int64_t parts_tested =
             std::clamp<int64_t>(tests / std::max<int64_t>(int64_t(alpha_edges_.size()), 1), 1, light_.count);
-        const Hash random(hash(view_.options.seed, 12, gradient_stream), 0);
+        const Hash random(seed_of(view_.options.seed, Stream::shadow_alpha_light_parts), 0);
         const double step = double(light_.count) / double(parts_tested);
         return view_.team.map_blocks(int64_t(alpha_edges_.size()), [&](int64_t begin, int64_t end) {
             EdgeWedge<T> wedge(view_, casters_, faces_, alpha_edges_);

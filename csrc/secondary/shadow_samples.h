@@ -232,9 +232,8 @@ inline Array<double> density_of(const std::vector<ShadowStatistics>& of_interval
 template <class T>
 class ShadowSampler {
    public:
-    // Streams are numbers of independent random sequences.
     struct Streams {
-        uint64_t pilots, places, rays;
+        Stream pilots, places, rays;
     };
     // `expected` is the approximate number of samples.
     ShadowSampler(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, Streams streams,
@@ -242,7 +241,8 @@ class ShadowSampler {
         : streams_(streams),
           intervals_(std::clamp(expected / samples_of_interval, fewest_intervals, most_intervals)),
           faces_(view.scene, light, view.team),
-          alpha_edges_(AlphaEdgeFinder<T>(casters).find(hash(view.options.seed, 13, gradient_stream), view.team)),
+          alpha_edges_(
+              AlphaEdgeFinder<T>(casters).find(seed_of(view.options.seed, Stream::shadow_alpha_edges), view.team)),
           pieces_(find(view, casters, light), view.team),
           scene_{view, casters, light, faces_, alpha_edges_, pieces_},
           of_interval_(intervals_) {}
@@ -260,7 +260,7 @@ class ShadowSampler {
     // Casts pilots in each interval.
     template <class Receiver>
     void cast_pilots(const Receiver& receiver) {
-        const uint64_t seed = seed_of(streams_.pilots);
+        const uint64_t seed = seed_of(scene_.view.options.seed, streams_.pilots);
         scene_.view.team.parallel_for((intervals_ + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
             const int64_t first = block * intervals_of_block, last = std::min(first + intervals_of_block, intervals_);
             const auto trace = [&](auto body) {
@@ -284,13 +284,14 @@ class ShadowSampler {
         samples_of_place_ = extended ? antithetic_samples : 1;
         const int64_t places = (n + samples_of_place_ - 1) / samples_of_place_;
         density_ = density_of(of_interval_);
-        places_.emplace(pieces_, density_, places, extended, seed_of(streams_.places), scene_.view.team);
+        places_.emplace(pieces_, density_, places, extended, seed_of(scene_.view.options.seed, streams_.places),
+                        scene_.view.team);
         return places;
     }
 
     template <class Body>
     void trace(int64_t first, int64_t last, Body body) const {
-        ShadowChunk chunk(scene_, seed_of(streams_.rays), body);
+        ShadowChunk chunk(scene_, seed_of(scene_.view.options.seed, streams_.rays), body);
         ShadowPositions place(*places_);
         for (int64_t i = first; i < last; ++i) {
             const auto [position, interval, weight] = place(i);
@@ -300,7 +301,6 @@ class ShadowSampler {
     }
 
    private:
-    uint64_t seed_of(uint64_t stream) const { return hash(scene_.view.options.seed, stream, gradient_stream); }
     std::vector<ShadowPiece> find(const BackwardView<T>& view, const SceneView<T>& casters,
                                   const LightParts& light) const {
         std::vector<ShadowPiece> found =

@@ -45,10 +45,12 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
                  const Record& record, GradientSink& to) {
     // A light with an extent gets all samples, because each of its points casts its own shadow.
     const int64_t most = default_secondary_samples(view);
-    ShadowSampler<T> sampler(view, casters, light, {.pilots = 10, .places = 11, .rays = 9},
-                             samples >= 0     ? samples
-                             : light.extended ? most
-                                              : 0);
+    ShadowSampler<T> sampler(
+        view, casters, light,
+        {.pilots = Stream::shadow_pilots, .places = Stream::shadow_places, .rays = Stream::shadow_rays},
+        samples >= 0     ? samples
+        : light.extended ? most
+                         : 0);
     const CurvesInView receiver(
         view, ShadowSource<T>(view, light.infinite), record,
         [&](const auto& source, const auto& sample) { return pilot_at(view, light, source, sample); });

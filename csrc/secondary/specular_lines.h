@@ -131,8 +131,8 @@ class SpecularLines {
 
    private:
     static constexpr double most_share = 0.5;
-    static constexpr double weight_outside =
-        0.1;  // relative weight of a mirror that does not contain y, or of a line outside the lune
+    // This is the relative weight of a mirror that does not contain y, or of a line outside the lune.
+    static constexpr double weight_outside = 0.1;
 
     struct FaceLobe {
         Vec3 n;  // normal of the face, on the side of p

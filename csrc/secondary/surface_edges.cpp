@@ -76,11 +76,11 @@ class SurfaceEdges {
         const uint64_t seed = view.options.seed;
         if (moving.crossings) {
             const Intersections& found = view.geometry.intersections();
-            if (found.are_drawn()) drawn_ = draw_all(found, hash(seed, 20, gradient_stream));
+            if (found.are_drawn()) drawn_ = draw_all(found, seed_of(seed, Stream::surface_edge_intersections));
             crossings_ = found.are_drawn() ? &drawn_ : &found.all();
         }
         if (moving.alpha_edges)
-            alpha_edges_ = AlphaEdgeFinder<T>(casters).find(hash(seed, 13, gradient_stream), view.team);
+            alpha_edges_ = AlphaEdgeFinder<T>(casters).find(seed_of(seed, Stream::surface_edge_alpha_edges), view.team);
     }
 
     int64_t size() const { return int64_t(crossings_->size() + alpha_edges_.size()); }
@@ -274,14 +274,14 @@ class SurfaceEdgeSampler {
     template <class Receiver>
     void cast_pilots(const Receiver&) {}
     int64_t lay_out(int64_t n) {
-        places_.emplace(edges_.measure(), std::max(n / places_of_samples, fewest_places), to_unit(seed_of(21)),
-                        light_.view.team);
+        places_.emplace(edges_.measure(), std::max(n / places_of_samples, fewest_places),
+                        to_unit(seed(Stream::surface_edge_places)), light_.view.team);
         return places_->size();
     }
 
     template <class Body>
     void trace(int64_t first, int64_t last, Body body) const {
-        const ShiftedSequence sequence(seed_of(22));
+        const ShiftedSequence sequence(seed(Stream::surface_edge_rays));
         SurfaceEdgeRays rays(light_, edges_);
         places_->each(first, last, [&](int64_t i, int64_t piece, double t, double weight) {
             rays.trace(piece, t, sequence(uint64_t(i)), weight, body);
@@ -289,7 +289,7 @@ class SurfaceEdgeSampler {
     }
 
    private:
-    uint64_t seed_of(uint64_t stream) const { return hash(light_.view.options.seed, stream, gradient_stream); }
+    uint64_t seed(Stream stream) const { return seed_of(light_.view.options.seed, stream); }
 
     const LineLight<T>& light_;
     const SurfaceEdges<T> edges_;
@@ -309,7 +309,7 @@ void add_surface_edges(const BackwardView<T>& view, const SceneView<T>& casters,
         [](const LitPoint& point, double weight, CurveRecords& records) { point.append_to(records, weight); });
     const size_t before = to.records->curves.size();
     record_secondary(view, sampler, receiver, [&] { return n; }, to);
-    light_reflectors(light, to.records->curves, before, 23, out);
+    light_reflectors(light, to.records->curves, before, Stream::surface_edge_paths, out);
 }
 
 template void add_surface_edges(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, MovingEdges,

@@ -205,9 +205,8 @@ class TracedEdgeLines {
         const Vec3 q = corner(scene, face, 0), e1 = corner(scene, face, 1) - q, e2 = corner(scene, face, 2) - q;
         const Vec3 m = cross(e1, e2), across = unit(cross(m, o.tangent));
         const double side = dot(cross(o.tangent, o.line.w), across) > 0 ? 1 : -1;
-        constexpr double little = 1e-5,
-                         roundings =
-                             64;  // fraction of the edge's length; number of input roundings, for rays to lights
+        constexpr double little = 1e-5;   // fraction of the edge's length
+        constexpr double roundings = 64;  // number of input roundings, for rays to lights
         const double aside = little * length(o.tangent) + roundings * spacing_at(o, face) * extent(face);
         const Vec3 there = o.p + (side * aside) * across - q;
         const double scale = 1 / dot(m, m);

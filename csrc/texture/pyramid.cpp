@@ -12,7 +12,7 @@ namespace {
 
 struct TexelRange {
     int64_t first, end;
-    double share;  // It is the weight of one of them.
+    double share;  // weight of one of them
 };
 // Returns which of `of` texels in a row each of `count` texels over the same length meets. A coarser texel meets the
 // finer ones of its mean, and a finer one the coarser ones that contain it.
@@ -28,8 +28,8 @@ std::vector<TexelRange> texel_ranges(int64_t count, int64_t of) {
 // Describes how one level lies on the next finer one.
 struct Halving {
     TexelGrid fine, coarse;
-    std::vector<TexelRange> down, across;       // They belong to the coarser rows and columns.
-    std::vector<TexelRange> of_row, of_column;  // They belong to the finer ones.
+    std::vector<TexelRange> down, across;       // for the coarser rows and columns
+    std::vector<TexelRange> of_row, of_column;  // for the finer ones
 
     explicit Halving(const TexelGrid& fine_)
         : fine(fine_),

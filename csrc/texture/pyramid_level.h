@@ -8,7 +8,7 @@ namespace edgegrad {
 template <class S>
 struct PyramidLevel {
     int fine = 0;
-    S share = 0;  // It is the weight of the next coarser level.
+    S share = 0;  // weight of the next coarser level
     // Says whether it lies between two levels. Otherwise it is the finest or the coarsest one, without a derivative.
     bool is_between = false;
 

@@ -31,7 +31,7 @@ constexpr int64_t level_size(int64_t n, int level) { return std::max(int64_t(1),
 
 // Locates the texels of a texture.
 struct TexelGrid {
-    int64_t first;  // It is the row of the first texel among all texels.
+    int64_t first;  // row of the first texel among all texels
     int64_t height, width;
     Sampler sampler = {};
 
@@ -75,7 +75,7 @@ S bilinear_weight(int i, S a, S b) {
 // Holds the four texels around a point, and the fractions that give their weights.
 struct Footprint {
     int64_t texel[4];
-    double a, b;  // They are fractions to the right and down.
+    double a, b;  // fractions to the right and down
 
     double weight(int i) const { return bilinear_weight(i, a, b); }
 
@@ -150,7 +150,7 @@ void eval(const Texture<T>& t, const Footprint& f, int channels, double* out) {
 template <int N, class T>
 Vec2 eval_vjp(const Texture<T>& t, const Footprint& f, int channels, const double* bar) {
     const int C = N ? N : channels;
-    double s[4] = {};  // It is bar · texel.
+    double s[4] = {};  // bar · texel
     for (int i = 0; i < 4; ++i)
         for (int c = 0; c < C; ++c) s[i] += bar[c] * t.texels[f.texel[i] * C + c];
     const Vec2 slopes = f.slopes(s);

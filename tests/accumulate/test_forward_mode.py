@@ -9,27 +9,23 @@ import torch
 from combinations import diagonal
 from finite_differences import Estimate, estimate
 from oracles.exact import exact_image
-from scenes import cube, front_camera, icosphere, one_triangle, smooth_adjoint, smooth_colors
+from scenes import cube, icosphere, smooth_adjoint, smooth_colors
+from threads import check_threads
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch_scenes import ADJOINT, BACKGROUND, CAMERA, F64, MESH, SIZE, TRIANGLE
 
 import edgegrad as eg
 from edgegrad.kernel import memory, operators
 
 pytestmark = pytest.mark.watched
 
-F64 = torch.float64
-SIZE = 20
-TRIANGLE = one_triangle()
-MESH, BACKGROUND = TRIANGLE.meshes[0], TRIANGLE.background
-CAMERA = front_camera(SIZE)
 ORTHOGRAPHIC = eg.Camera.orthographic((0.4, 0.3, 4.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.6, (SIZE, SIZE)).to(F64)
-BENT = CAMERA.replace(distortion=torch.tensor([-0.15, 0.05, 0.01, -0.02, 0.02], dtype=F64))
-ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
+DISTORTED = CAMERA.replace(distortion=torch.tensor([-0.15, 0.05, 0.01, -0.02, 0.02], dtype=F64))
 
 
 def panorama() -> eg.Camera:
-    """With what CAMERA sees behind it, across the seam; the middle of the image is turned to there."""
+    """Return a panorama that has what CAMERA sees behind it, across the seam: the middle of its image is turned there."""
     M = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=F64)) @ CAMERA.world_to_camera
     f = 0.8 * float(CAMERA.K[0, 0])
     K = torch.tensor([[f, 0.3, SIZE / 2 - math.pi * f + 1.3], [0.0, f, SIZE / 2 + 0.2], [0.0, 0.0, 1.0]], dtype=F64)
@@ -57,7 +53,7 @@ def mixed_scene() -> eg.Scene:
 
 
 def smooth_direction(x: Tensor) -> Tensor:
-    """Of an array, one that does not cancel out in sums."""
+    """Return a direction for an array that does not cancel out in sums."""
     n = torch.arange(x.numel(), dtype=F64).reshape(x.shape)
     return 1 + 0.5 * torch.sin(0.7 * n)
 
@@ -114,21 +110,15 @@ def crossing_scene() -> eg.Scene:
         pytest.param(mixed_scene, CAMERA, "box", marks=pytest.mark.unwatched),
         (mixed_scene, ORTHOGRAPHIC, "gaussian"),
         (mixed_scene, CAMERA.crop(3, 2, 12, 14), "tent"),
-        pytest.param(crossing_scene, CAMERA, "tent", marks=pytest.mark.unwatched),
-        pytest.param(crossing_scene, ORTHOGRAPHIC, "box", marks=pytest.mark.unwatched),
-        pytest.param(crossing_scene, BENT, "gaussian", marks=pytest.mark.unwatched),
+        pytest.param(crossing_scene, DISTORTED, "gaussian", marks=pytest.mark.unwatched),
         (crossing_scene, PANORAMA, "box"),
-        pytest.param(mixed_scene, PANORAMA, "tent", marks=pytest.mark.unwatched),
     ],
     ids=[
         "perspective box",
         "orthographic gaussian",
         "crop tent",
-        "crossing perspective",
-        "crossing orthographic",
-        "bent",
+        "crossing distorted",
         "crossing panorama",
-        "panorama",
     ],
 )
 def test_forward_is_the_adjoint_of_reverse(scene, camera, filter):
@@ -197,9 +187,9 @@ def test_all_directions_take_one_pass(monkeypatch):
 
     jvp_kernel = operators.jvp_kernel
     monkeypatch.setattr(operators, "jvp_kernel", watched)
-    eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(40, 3, 3, dtype=F64)}, 4)
+    eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(12, 3, 3, dtype=F64)}, 4)
     torch.func.jacfwd(lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4))(torch.zeros(3, dtype=F64))
-    assert calls == [40, 3]
+    assert calls == [12, 3]
 
 
 def test_more_directions_than_memory(monkeypatch):
@@ -246,20 +236,10 @@ def test_types():
     assert eg.screen_gradient(scene, camera, ADJOINT.float()).dtype == torch.float32
 
 
-@pytest.mark.parametrize("call", ["jvp", "screen"])
-def test_same_bits_at_any_number_of_threads(call):
-    scene, threads = mixed_scene(), torch.get_num_threads()
-    found = []
-    for count in (1, 3):
-        torch.set_num_threads(count)
-        try:
-            if call == "jvp":
-                found.append(eg.jvp(scene, CAMERA, {x: u[None] for x, u in inputs(scene, CAMERA)["verts"]}, 4)[1])
-            else:
-                found.append(eg.screen_gradient(scene, CAMERA, ADJOINT))
-        finally:
-            torch.set_num_threads(threads)
-    assert found[0].any() and torch.equal(*found)
+def test_same_bits_at_any_number_of_threads():
+    scene = mixed_scene()
+    tangents = {x: u[None] for x, u in inputs(scene, CAMERA)["verts"]}
+    check_threads(lambda: [eg.jvp(scene, CAMERA, tangents, 4)[1], eg.screen_gradient(scene, CAMERA, ADJOINT)])
 
 
 @pytest.mark.parametrize(
@@ -288,10 +268,10 @@ def test_tangents_that_do_not_fit(tangents, message):
 @pytest.mark.unwatched
 @pytest.mark.parametrize(
     ("camera", "scene", "filter"),
-    diagonal([CAMERA, ORTHOGRAPHIC, BENT, PANORAMA], [mixed_scene, crossing_scene], ["gaussian", "box"]),
+    diagonal([CAMERA, ORTHOGRAPHIC, DISTORTED, PANORAMA], [mixed_scene, crossing_scene], ["gaussian", "box"]),
 )
 def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter):
-    """By (1, 0) and (0, 1) px, as the principal point does."""
+    """The image moves by (1, 0) and (0, 1) px, as the principal point does."""
     scene = scene()
     K = camera.K.clone().requires_grad_()
     adjoint, samples = ADJOINT + 0.4, {"surface_samples": 12_000, "edge_samples": 12_000}
@@ -305,7 +285,7 @@ def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter
 
 
 def test_screen_gradient_lies_where_things_are():
-    """Of two objects apart, each has in its pixels what moving it alone gives; none is where the loss does not look."""
+    """Each of two objects apart has in its pixels what moving it alone gives. There is none where the adjoint is zero."""
     left, right = (cube(0.5).transformed(t=torch.tensor([x, 0.0, 0.0], dtype=F64)) for x in (-0.7, 0.7))
     scene = eg.Scene([left, right])
     pixels = float(ORTHOGRAPHIC.K[0, 0])

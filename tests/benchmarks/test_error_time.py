@@ -12,7 +12,7 @@ from PIL import Image
 from trimesh.creation import icosphere
 
 import edgegrad as eg
-from benchmarks import mitsuba, scenes
+from benchmarks import mitsuba, mitsuba_scene, scenes
 from benchmarks.command import INTERRUPTED
 from benchmarks.error_time import references
 from benchmarks.error_time import run as module
@@ -198,11 +198,10 @@ def test_sweep_stops_where_the_next_point_would_cost_too_much():
     assert module._expected([(1, 2.0), (4, 2.3)], 16) == pytest.approx(3.5)  # mostly a cost that does not grow
 
 
-@pytest.mark.parametrize(
-    "scene", [name if name == "lit-area" else pytest.param(name, marks=pytest.mark.slow) for name in scenes.LIT]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", scenes.LIT)
 def test_lit_scenes(scene, tmp_path):
-    """From a reference that is computed anew. Their terms are not timed alone."""
+    """The reference is computed anew. Their terms are not timed alone."""
     document, _ = error_time(tmp_path, [scene], ["edgegrad", "boundary"], size=16, seeds=2, limit=60.0, quick=True)
     of_scene = document["scenes"][scene]
     assert "not timed apart" in of_scene["left_out"]["boundary"]
@@ -316,9 +315,9 @@ def open_ball():
 
 
 def test_what_mitsuba_gets_is_the_same_view(open_ball):
-    scene, camera, scale = mitsuba._resized(open_ball.scene, open_ball.camera)
-    assert scene.meshes[0].verts.norm(dim=1).max() == pytest.approx(mitsuba.RADIUS)
-    assert scale == pytest.approx(mitsuba.RADIUS / 0.05, rel=0.2)
+    scene, camera, scale = mitsuba_scene.resized(open_ball.scene, open_ball.camera)
+    assert scene.meshes[0].verts.norm(dim=1).max() == pytest.approx(mitsuba_scene.RADIUS)
+    assert scale == pytest.approx(mitsuba_scene.RADIUS / 0.05, rel=0.2)
     points = [
         view.project(s.meshes[0].verts.double()) for s, view in ((scene, camera), (open_ball.scene, open_ball.camera))
     ]
@@ -326,7 +325,7 @@ def test_what_mitsuba_gets_is_the_same_view(open_ball):
 
 
 def test_mitsuba_gets_the_same_sky() -> None:
-    """By its rows, the first and the last of which are at the poles; as one finds by asking its `envmap`, where it is there."""
+    """The first and the last row are at the poles, as one finds by asking Mitsuba's `envmap`, where it is there."""
     image = torch.rand((5, 8, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     theirs, ours = mitsuba.sky_image(image), eg.Environment(image)
     theta = math.pi * (torch.arange(40, dtype=torch.float64) + 0.3) / 40

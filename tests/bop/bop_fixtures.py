@@ -16,5 +16,5 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path) -> Path:
-    """To be changed or malformed."""
+    """Return a copy of the data set, to be changed."""
     return Path(shutil.copytree(made, tmp_path / "data"))

@@ -22,7 +22,7 @@ PALETTE = eg.image.srgb_to_linear((eg.image.linear_to_srgb(PALETTE) * 255).round
 
 
 def pose(turn: tuple[float, ...], shift: tuple[float, ...]) -> torch.Tensor:
-    """Of a rotation vector in radians, and mm."""
+    """Return a pose of a rotation vector in radians, and a shift in mm."""
     vector = torch.tensor(turn, dtype=torch.float64)
     M = torch.eye(4, dtype=torch.float64)
     M[:3, :3] = about(vector / vector.norm(), vector.norm()[None])[0]
@@ -31,7 +31,8 @@ def pose(turn: tuple[float, ...], shift: tuple[float, ...]) -> torch.Tensor:
 
 
 def meshes() -> dict[int, eg.Mesh]:
-    """In mm. 1: each side another colour; 5: opposite sides alike, so three half turns."""
+    """Return meshes in mm. The sides of object 1 have different colours; opposite sides of object 5 are alike, so it
+    has three half turns."""
     found = {}
     for obj_id, sides in ((1, (60.0, 90.0, 40.0)), (5, (50.0, 70.0, 30.0))):
         box = trimesh.creation.box(sides)
@@ -63,7 +64,7 @@ def make(folder: Path, scene_id: int = 3) -> Path:
 
 
 def estimates(moved: torch.Tensor | None = None) -> list[bop.Estimate]:
-    """The true poses, each followed by a motion in the camera's axes."""
+    """Return the true poses, each followed by a motion in the camera's axes."""
     moved = torch.eye(4, dtype=torch.float64) if moved is None else moved
     return [
         bop.Estimate(3, im_id, obj_id, 0.9 - 0.1 * i, moved @ truth, 1.5)

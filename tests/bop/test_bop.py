@@ -83,7 +83,7 @@ def test_covered_instances_have_visible_masks_and_shares(tmp_path: Path) -> None
     bop.write_models(tmp_path, plate)
     bop.write_scene(tmp_path, 1, [bop.Shot(camera(), [(2, far), (2, near)])], plate, split="val", spp=1)
     frame = bop.Dataset(tmp_path).frame(1, 0)
-    # 40 / 400 · 120 = 12 px to each side of the middle, at 48; the near one's right rim is at -10 / 300 · 120 = -4 px.
+    # 40 / 400 · 120 = 12 px to each side of the middle, at 48; the near one's right border is at -10 / 300 · 120 = -4 px.
     assert frame.truths[0].visible == pytest.approx(16 / 24) and frame.truths[1].visible == 1.0
     assert int(frame.mask(0).sum()) == 24 * 12 and int(frame.mask_visible(0).sum()) == 16 * 12
     assert frame.depth()[36, 48] == 400.0 and frame.depth()[36, 40] == 300.0 and frame.depth()[0, 0] == 0.0
@@ -216,7 +216,7 @@ QUICK = ("--steps", 12, "--unconverged")
 
 
 def pose_off(truth: torch.Tensor) -> torch.Tensor:
-    """Turn about the object's own origin, and shift."""
+    """Return a pose after a rotation about the object's own origin and a shift."""
     found = SHIFT @ truth
     found[:3, :3] = TURN[:3, :3] @ truth[:3, :3]
     return found
@@ -256,9 +256,9 @@ def test_command_line_writes_errors_and_refined_poses(folder: Path, capsys: pyte
 
 def test_refine_keeps_poses_whose_fit_fails(made: Path) -> None:
     data = bop.Dataset(made)
-    beside = bop.Estimate(3, 0, 1, 1.0, pose((0.1, 0, 0), (5000.0, 0.0, 400.0)))
-    found = bop.refine(data, beside)
-    assert found.kept and found.fit is None and "does not show" in found.why and found.estimate is beside
+    off_image = bop.Estimate(3, 0, 1, 1.0, pose((0.1, 0, 0), (5000.0, 0.0, 400.0)))
+    found = bop.refine(data, off_image)
+    assert found.kept and found.fit is None and "does not show" in found.why and found.estimate is off_image
     start = replace(estimates()[0], pose=pose_off(TRUTHS[0][0][1]))
     early = bop.refine(data, start, size=32, steps=1)
     assert early.kept and early.estimate is start and "steps ran out" in early.why

@@ -83,7 +83,7 @@ def test_depth_is_that_of_the_plane() -> None:
             z = float(n @ a / (n @ ray))
             p = z * ray
             sides = [float(n @ torch.linalg.cross(v - u, p - u)) for u, v in ((a, b), (b, c), (c, a))]
-            if abs(min(sides)) / float(n.norm()) ** 2 > 1e-3:  # not right at the rim
+            if abs(min(sides)) / float(n.norm()) ** 2 > 1e-3:  # not right at the border
                 seen += min(sides) > 0
                 assert float(depth[y, x]) == pytest.approx(z if min(sides) > 0 else 0.0, rel=1e-6)
     assert seen > 80
@@ -172,7 +172,7 @@ def test_recalls_by_exact_numbers(made: Path) -> None:
     pixels = np.linalg.norm(flat[:, 0] - flat[:, 1], axis=1).max()
     assert row.errors.mspd == pytest.approx(pixels, rel=1e-6)
     assert one.ar_mspd == pytest.approx(sum(5 * k > pixels * 640 / 96 for k in range(1, 11)) / 10)
-    # VSD: taus up to 0.2 find no pixel right; beyond, what is wrong are the rims, where the sides are steep.
+    # VSD: taus up to 0.2 find no pixel right; beyond, what is wrong are the borders, where the sides are steep.
     assert min(row.errors.vsd[:4]) == 1.0 and max(row.errors.vsd[5:]) < 0.3
     assert one.ar_vsd == pytest.approx(sum(e < 0.05 * k - 1e-9 for e in row.errors.vsd for k in range(1, 11)) / 100)
 

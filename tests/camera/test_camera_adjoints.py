@@ -59,7 +59,7 @@ def test_project_vjp(lens, q):
 
 @lenses
 def test_normalised_vjp(lens):
-    """In K and the distortion; a pixel position is where one looks, and has no derivative."""
+    """K and the distortion have derivatives; a pixel position is given, and has none."""
     x = np.array([11.3, 40.2])
     perspective, name, distortion = LENSES[lens]
 
@@ -73,16 +73,16 @@ def test_normalised_vjp(lens):
 
 
 @lenses
-def test_bend_jvp_and_area_scale(lens):
-    """Of the straight image, against differences of the positions in the image."""
+def test_distortion_jvp_and_area_scale(lens):
+    """Compare derivatives by the undistorted image with differences of the positions in the image."""
     perspective, name, distortion = LENSES[lens]
     camera, pinhole = kernel_camera(K6, perspective, name, distortion), kernel_camera(K6, perspective)
     u = np.array(parts.project(pinhole, [0.2, -0.3, 0.9]))
 
-    def bent(u):
+    def distorted_position(u):
         return np.array(parts.distort(camera, u, [0.0, 0.0])[0])
 
-    J = np.stack([(bent(u + h) - bent(u - h)) / 2e-4 for h in 1e-4 * np.eye(2)], 1)
+    J = np.stack([(distorted_position(u + h) - distorted_position(u - h)) / 2e-4 for h in 1e-4 * np.eye(2)], 1)
     tangent = np.array([0.7, -1.9])
     _, area_scale, along = parts.distort(camera, u, tangent)
     np.testing.assert_allclose(along, J @ tangent, rtol=1e-7)
@@ -189,7 +189,7 @@ def test_inside_keeps_what_is_inside():
 
 
 @pytest.mark.parametrize("u, v", [(-0.1, 0.4), (0.3, -1e9), (0.8, 0.9), (1e300, 1e-3), (-1.0, -1.0), (2.0, -0.5)])
-def test_inside_moves_to_the_rim(u, v):
+def test_inside_moves_to_the_border(u, v):
     a, b = parts.inside(u, v)
     assert a >= 0 and b >= 0 and a + b <= 1 + 1e-15
-    assert min(a, b, 1 - a - b) <= 1e-15  # on the rim, to rounding
+    assert min(a, b, 1 - a - b) <= 1e-15  # on the border, to rounding

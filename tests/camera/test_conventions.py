@@ -81,7 +81,7 @@ def test_a_batch_is_a_sequence() -> None:
 
 
 def frustum(near: float, far: float, left: float, right: float, bottom: float, top: float) -> Tensor:
-    """As documented of glFrustum."""
+    """Return the matrix that glFrustum documents."""
     w, h, d = right - left, top - bottom, far - near
     return torch.tensor(
         [
@@ -93,7 +93,7 @@ def frustum(near: float, far: float, left: float, right: float, bottom: float, t
 
 
 def ortho(near: float, far: float, left: float, right: float, bottom: float, top: float) -> Tensor:
-    """As documented of glOrtho."""
+    """Return the matrix that glOrtho documents."""
     w, h, d = right - left, top - bottom, far - near
     return torch.tensor(
         [
@@ -179,7 +179,7 @@ def test_from_colmap(model: str) -> None:
         agree(camera.project(POINTS), torch.from_numpy(expected), 1e-8)
 
 
-def test_colmap_faults() -> None:
+def test_bad_colmap_parameters() -> None:
     with pytest.raises(ValueError, match=r"model: expected one of SIMPLE_PINHOLE, .* got 'FOV'; undistort"):
         eg.Camera.from_colmap(R, SHIFT, "FOV", [1.0] * 5, SIZE)
     with pytest.raises(ValueError, match=r"params: expected shape \(4,\), got \(3,\); these are what PINHOLE has"):
@@ -193,7 +193,7 @@ def test_opencv_pixel_centres() -> None:
 
 
 def test_opencv_rotation_vectors() -> None:
-    """As cv2.Rodrigues has them, in any shape, with the derivative of the matrix."""
+    """Rotations of any shape are those of cv2.Rodrigues, and so is the derivative of the matrix."""
     K = np.array([[60.0, 0, 30], [0, 55, 25], [0, 0, 1]])
     rvec = np.array([0.3, -0.2, 2.9])
     wanted, by_vector = cv2.Rodrigues(rvec)  # (3, 9): of the rows' numbers

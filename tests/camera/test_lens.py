@@ -1,10 +1,8 @@
-"""Lenses that bend straight lines: positions against OpenCV, gradients against finite differences of the image."""
+"""Lenses that distort: positions against OpenCV, gradients against finite differences of the image."""
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from around import area, check_area
-from combinations import diagonal
-from finite_differences import Case, finite_difference, gradient, loss, right_ratio, rotation
+from finite_differences import loss, rotation
 from kernel_parts import parts
-from scenes import icosphere, smooth_adjoint
+from lens_cases import DISTORTION, F64, SIZE, camera, check_gradient, colored_sphere, scene
+from scenes import smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
@@ -24,24 +22,7 @@ from edgegrad.camera.lens import distort
 from edgegrad.kernel.operators import kernel_camera
 from edgegrad.kernel.request import pack_camera
 
-F64 = torch.float64
-DISTORTION = {
-    "four": [-0.25, 0.08, 0.01, -0.02],
-    "five": [-0.25, 0.08, 0.01, -0.02, 0.03],
-    "eight": [0.3, 0.05, 0.01, -0.02, 0.02, 0.4, 0.1, 0.03],
-    "fisheye": [-0.05, 0.04, -0.02, 0.01],
-}
 lenses = pytest.mark.parametrize("lens", DISTORTION)
-SIZE = (40, 48)
-
-
-def camera(lens: str, skew: float = 1.5, size: tuple[int, int] = SIZE) -> eg.Camera:
-    """A camera whose corners look 40° aside."""
-    H, W = size
-    K = torch.tensor([[0.94 * W, skew, 0.5 * W - 0.5], [0.0, 1.24 * H, 0.49 * H - 0.5], [0.0, 0.0, 1.0]], dtype=F64)
-    make = eg.Camera.fisheye if lens == "fisheye" else eg.Camera.from_opencv
-    R = rotation((0.0, 0.6, 0.8), torch.tensor(0.4, dtype=F64))
-    return make(R, torch.tensor([0.1, -0.05, 3.0], dtype=F64), K, size, torch.tensor(DISTORTION[lens], dtype=F64))
 
 
 # -- positions ----------------------------------------------------------------------------------------------------------
@@ -82,7 +63,7 @@ def test_position_gradient(lens: str) -> None:
 
 @lenses
 def test_boxes_hold_what_they_say(lens: str) -> None:
-    """All of a box of the straight image is seen in the box that the kernel names, also where that reaches far outside."""
+    """All of a box of the undistorted image is seen in the box that the kernel names, also where that reaches far outside."""
     kernel = kernel_camera(pack_camera(camera(lens)))
     rng = np.random.default_rng(1)
     for _ in range(200):
@@ -97,13 +78,6 @@ def test_boxes_hold_what_they_say(lens: str) -> None:
 # -- images -------------------------------------------------------------------------------------------------------------
 
 
-def test_no_distortion_is_a_pinhole() -> None:
-    """Coefficients of zero: every pixel is right; the last digits may differ."""
-    mesh, view = colored_sphere(), camera("four").replace(distortion=None)
-    zero = view.replace(distortion=torch.zeros(5, dtype=F64))
-    torch.testing.assert_close(eg.render(mesh, zero, 64), eg.render(mesh, view, 64), rtol=0, atol=1e-9)
-
-
 TRIANGLE = torch.tensor([[-0.6, -0.5, 0.3], [0.8, -0.2, -0.6], [-0.1, 0.7, 0.2]], dtype=F64)
 
 
@@ -111,8 +85,8 @@ TRIANGLE = torch.tensor([[-0.6, -0.5, 0.3], [0.8, -0.2, -0.6], [-0.1, 0.7, 0.2]]
 def test_area_of_a_triangle(lens: str) -> None:
     view = camera(lens)
     check_area(view, TRIANGLE)
-    straight = area(view.replace(distortion=None, projection="perspective"), TRIANGLE)
-    assert abs(float(straight / area(view, TRIANGLE)) - 1) > 0.01, "a pinhole would pass as well"
+    undistorted_area = area(view.replace(distortion=None, projection="perspective"), TRIANGLE)
+    assert abs(float(undistorted_area / area(view, TRIANGLE)) - 1) > 0.01, "a pinhole would pass as well"
 
 
 @pytest.mark.filterwarnings("ignore:distortion")
@@ -126,9 +100,8 @@ def test_area_in_a_wide_fisheye(degrees: int) -> None:
     check_area(view, ahead @ turn.mT)
 
 
-@pytest.mark.slow
 @lenses
-def test_wall(lens: str) -> None:
+def test_interior_derivatives_of_a_wall(lens: str) -> None:
     """A triangle that fills the view has an interior term alone: against quadrature in double, differentiated by autograd."""
     view = camera(lens)
     wall = scene("interior").meshes[0]
@@ -140,118 +113,33 @@ def test_wall(lens: str) -> None:
     grid = 6
     x, y = ((torch.arange(n * grid, dtype=F64) + 0.5) / grid for n in (W, H))
     points = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
-    n = straightened(view, points)
+    n = undistorted(view, points)
     q = verts @ M[:3, :3].mT + M[:3, 3]
     b = torch.linalg.solve(q.mT, torch.cat([n, torch.ones_like(n[:, :1])], 1).mT).mT
     assert bool((b > 0).all()), "it must fill the view"
     radiance = (b / b.sum(1, keepdim=True)) @ wall.colors
     expected = radiance.reshape(H, grid, W, grid, 3).mean((1, 3))
-    image = eg.render(wall.replace(verts=verts), view, 1024, surface_samples=100_000)
-    torch.testing.assert_close(image, expected, rtol=0, atol=2e-3)
+    image = eg.render(wall.replace(verts=verts), view, 64, surface_samples=100_000)
+    torch.testing.assert_close(image, expected, rtol=0, atol=5e-3)
     adjoint = smooth_adjoint(H, W, 3)
     truth, found = (torch.autograd.grad((value * adjoint).sum(), leaves) for value in (expected, image))
     for name, a, b in zip(("verts", "world_to_camera", "K", "distortion"), truth, found, strict=True):
         torch.testing.assert_close(b, a, rtol=5e-3, atol=5e-3 * float(a.abs().max()), msg=lambda m, n=name: f"{n}: {m}")
 
 
-def straightened(view: eg.Camera, x: Tensor) -> Tensor:
+def undistorted(view: eg.Camera, x: Tensor) -> Tensor:
     """n (N, 2) of what is seen at the pixels x (N, 2): Newton's method, its last step differentiable."""
     m = torch.linalg.solve(view.K[:2, :2], (x - view.K[:2, 2])[..., None])[..., 0]
     n = m.detach()
     for _ in range(30):
         n = n.detach().requires_grad_()
-        bent = distort(view.projection, torch.cat([n, torch.ones_like(n[:, :1])], 1), view.coefficients)
-        rows = [torch.autograd.grad(bent[:, i].sum(), n, retain_graph=True)[0] for i in (0, 1)]
-        n = n.detach() + torch.linalg.solve(torch.stack(rows, 1), (m - bent)[..., None])[..., 0]
+        distorted = distort(view.projection, torch.cat([n, torch.ones_like(n[:, :1])], 1), view.coefficients)
+        rows = [torch.autograd.grad(distorted[:, i].sum(), n, retain_graph=True)[0] for i in (0, 1)]
+        n = n.detach() + torch.linalg.solve(torch.stack(rows, 1), (m - distorted)[..., None])[..., 0]
     return n
 
 
-def colored_sphere(dx: Tensor | float = 0.0, one_colour: bool = False) -> eg.Mesh:
-    sphere = icosphere(2)
-    shift = torch.as_tensor(dx, dtype=F64) * torch.tensor([1.0, 0.0, 0.0], dtype=F64)
-    verts = sphere.verts * torch.tensor([1.0, 0.8, 0.9], dtype=F64) + shift
-    colors = None if one_colour else torch.rand(verts.shape, generator=torch.Generator().manual_seed(1), dtype=F64)
-    return eg.Mesh(verts, sphere.faces, colors=colors)
-
-
-# -- gradients ----------------------------------------------------------------------------------------------------------
-
-
-def scene(kind: str, dx: Tensor | float = 0.0) -> eg.Scene:
-    """boundary: one colour, before an image; interior: a triangle beyond the whole view; both: a sphere before that."""
-    background = torch.tensor([0.1, 0.3, 0.2], dtype=F64)
-    if kind == "boundary":
-        return eg.Scene([colored_sphere(dx, one_colour=True)], background)
-    shift = torch.as_tensor(dx, dtype=F64) * torch.tensor([0.0, 1.0, 0.5], dtype=F64)
-    corners = torch.tensor([[-19.0, -11.0, 1.5], [19.0, -12.5, 2.5], [1.0, 19.0, 2.0]], dtype=F64) + shift
-    colors = torch.tensor([[0.0, 1.0, 0.3], [1.0, 0.2, 0.6], [0.4, 0.5, 1.0]], dtype=F64)
-    wall = eg.Mesh(corners, torch.tensor([[0, 1, 2]]), colors=colors)
-    return eg.Scene([wall] if kind == "interior" else [colored_sphere(dx), wall], background)
-
-
-def moved(kind: str, view: eg.Camera, what: str) -> Case:
-    """A case in which one number of vertices, pose, K or distortion moves."""
-
-    def vertices(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        return scene(kind, theta), view
-
-    def pose(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        M = view.world_to_camera
-        R = rotation((0.0, 0.8, 0.6), theta) @ M[:3, :3]
-        t = M[:3, 3] + theta * torch.tensor([0.5, 0.0, 0.2], dtype=F64)
-        return scene(kind), view.replace(world_to_camera=torch.cat([torch.cat([R, t[:, None]], 1), M[3:]]))
-
-    def intrinsics(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        change = torch.zeros((3, 3), dtype=F64)
-        change[int(what[1]), int(what[2])] = view.size[1] if what[2] != "2" else 0.5 * view.size[1]
-        return scene(kind), view.replace(K=view.K + theta * change)
-
-    def distortion(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        change = torch.zeros_like(view.coefficients)
-        # Those of a fisheye multiply powers of the angle, 0.7 at the corners: steps that move edges about as far have less noise.
-        change[int(what[1:])] = 0.65 ** (-2 * int(what[1:])) if view.lens == "fisheye" else 1.0
-        return scene(kind), view.replace(distortion=view.coefficients + theta * change)
-
-    makers: dict[str, Callable[[Tensor], tuple[eg.Scene, eg.Camera]]] = {"vertices": vertices, "pose": pose}
-    return makers.get(what) or (intrinsics if what[0] == "K" else distortion)
-
-
-# Steps move edges by less than a tenth of a pixel, and errors of second order are a thousandth.
-STEP = {"vertices": 0.005, "pose": 0.002, "K": 0.002, "d": 0.005}
-# Of these the derivative is as small as chance, by symmetry or since terms cancel.
-FAINT = 0.02
-
-
-def check_gradient(
-    kind: str, view: eg.Camera, what: str, spp: int = 1024, seeds: int = 4, most_noise: float = 0.01
-) -> None:
-    case, step = moved(kind, view, what), STEP[what if what in STEP else what[0]]
-    fd = finite_difference(case, step, spp, seeds)
-    found = gradient(case, 4, surface_samples=50_000, edge_samples=25_000)
-    size = gradient_size(case)
-    if abs(fd.mean) < FAINT * size:
-        assert abs(found.mean - fd.mean) < 0.01 * size
-    elif most_noise == 0.01:
-        right_ratio(fd, found)
-    else:
-        noise = math.hypot(fd.error, found.error) / abs(fd.mean)
-        assert noise < most_noise, f"{what}: too noisy to decide: {fd}, {found}"
-        assert abs(found.mean / fd.mean - 1) <= 0.02 + 3 * noise, f"{what}: finite difference {fd}, gradient {found}"
-
-
-def gradient_size(case: Case) -> float:
-    """Of what the derivative is a sum: |adjoint| · |image| change, about."""
-    high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256) for h in (0.01, -0.01))
-    return float((high - low).abs().sum()) / 0.02
-
-
 WHAT = ["vertices", "pose", "K00", "K11", "K01", "K02", "K12"]
-
-
-@pytest.mark.parametrize(("lens", "what"), diagonal(list(DISTORTION), ["d0", "vertices", "K00"]))
-def test_gradient(lens: str, what: str) -> None:
-    """Of a crop that reaches beyond the image, where the lens bends most."""
-    check_gradient("both", camera(lens).crop(-5, 15, 25, 30), what, spp=3072 if what == "K00" else 1024)
 
 
 @pytest.mark.slow
@@ -261,99 +149,10 @@ def test_gradient(lens: str, what: str) -> None:
 def test_every_gradient(lens: str, kind: str, crop: bool) -> None:
     view = camera(lens, size=(80, 96))
     if crop:
-        view = view.crop(-10, 30, 50, 60)  # reaches beyond the image, where the lens bends most
+        view = view.crop(-10, 30, 50, 60)  # reaches beyond the image, where the lens distorts most
     for what in [*WHAT, *(f"d{i}" for i in range(len(DISTORTION[lens])))]:
         # Coefficients of high powers move little, so differences say less of them; test_area_of_a_triangle is exact.
         check_gradient(kind, view, what, spp=4096, seeds=8, most_noise=0.05)
-
-
-# -- where a lens ends --------------------------------------------------------------------------------------------------
-
-
-FOLD = 1 / math.sqrt(3 * 0.3)  # of r (1 − 0.3 r²)
-
-
-def folding_camera() -> eg.Camera:
-    """Its fold lies at 46°, within the image: m = ⅔ FOLD there, 0.7 of the image's half width."""
-    K = torch.tensor([[24.0, 0.0, 23.5], [0.0, 24.0, 19.5], [0.0, 0.0, 1.0]], dtype=F64)
-    t = torch.tensor([0.0, 0.0, 3.0], dtype=F64)
-    return eg.Camera.from_opencv(torch.eye(3, dtype=F64), t, K, SIZE, torch.tensor([-0.3, 0.0, 0.0, 0.0], dtype=F64))
-
-
-def test_beyond_a_fold_there_is_background() -> None:
-    wall = scene("interior").meshes[0]
-    wall = wall.replace(verts=10 * wall.verts, colors=torch.ones((3, 3), dtype=F64))
-    with pytest.warns(UserWarning, match=rf"radius {FOLD:.4g} .* {math.degrees(math.atan(FOLD)):.4g}°"):
-        image = eg.render(eg.Scene([wall], torch.zeros(3, dtype=F64)), folding_camera(), 256)
-    area = float(image[..., 0].sum())
-    assert area == pytest.approx(math.pi * (24 * FOLD * 2 / 3) ** 2, rel=2e-3)
-
-
-@pytest.mark.filterwarnings("ignore:distortion")
-@pytest.mark.parametrize("what", ["vertices", pytest.param("pose", marks=pytest.mark.slow)])
-def test_gradient_before_a_fold(what: str) -> None:
-    """The sphere passes the fold: what of it lies beyond is not seen, and has no gradient."""
-    view = folding_camera()
-    M = view.world_to_camera.clone()
-    M[0, 3], M[2, 3] = 1.4, 2.0
-    check_gradient("boundary", view.replace(world_to_camera=M), what, spp=4096 if what == "pose" else 640)
-
-
-def test_a_telephoto_lens_may_fold_near_its_axis() -> None:
-    """r (1 + k1 r² + k2 r⁴) is greatest at a thousandth, and rises again soon after."""
-    k1, k2 = 1e6, -1e12
-    fold = math.sqrt((3 * k1 + math.sqrt(9 * k1**2 - 20 * k2)) / (-10 * k2))
-    K = torch.tensor([[24e3, 0, 24], [0, 24e3, 24], [0, 0, 1]], dtype=F64)
-    distortion = torch.tensor([k1, k2, 0, 0], dtype=F64)
-    view = eg.Camera.from_opencv(torch.eye(3, dtype=F64), torch.zeros(3, dtype=F64), K, (48, 48), distortion)
-    with pytest.warns(UserWarning, match=rf"radius {fold:.4g} "):
-        eg.render(colored_sphere(), view, 1)
-
-
-@pytest.mark.parametrize("gap", [1e-3, 1e-6, -1e-3, -1e-6])
-def test_a_rational_lens_may_fold_in_a_narrow_ring(gap: float) -> None:
-    """A pole at r = 1.2 and a zero next to it, apart from which the lens is nearly a pinhole: the slope's numerator by NumPy."""
-    A, B = np.polynomial.Polynomial([1, -1 / (1.44 * (1 + gap))]), np.polynomial.Polynomial([1, -1 / 1.44])
-    s = np.polynomial.Polynomial([0, 1])
-    slope = A * B + 2 * s * (A.deriv() * B - A * B.deriv())
-    turns = [x.real for p in (A, B, slope) for x in p.roots() if abs(x.imag) < 1e-9 and x.real > 0]
-    K = torch.tensor([[12.0, 0, 24], [0, 12, 24], [0, 0, 1]], dtype=F64)
-    distortion = torch.tensor([A.coef[1], 0, 0, 0, 0, B.coef[1], 0, 0], dtype=F64)
-    view = eg.Camera.from_opencv(torch.eye(3, dtype=F64), torch.zeros(3, dtype=F64), K, (48, 48), distortion)
-    kernel = kernel_camera(pack_camera(view))
-    assert math.tan(kernel.end) == pytest.approx(math.sqrt(min(turns)), rel=1e-9)
-
-
-def test_the_warning_comes_once_a_line_and_points_there() -> None:
-    """Through operators, modules and whatever else lies between: fits that move the distortion are not told at each step."""
-    view, sphere = folding_camera(), colored_sphere()
-    d = view.coefficients.clone().requires_grad_()
-
-    class Renders(torch.nn.Module):
-        def forward(self, view: eg.Camera) -> Tensor:
-            return eg.render(sphere, view, 1)  # the first line
-
-    def sample(view: eg.Camera) -> Tensor:
-        return eg.render(sphere, view, 1, shader=lambda hits: hits.normal)  # the second
-
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("default")
-        for step in range(3):
-            bent = view.replace(distortion=d * (1 - 0.01 * step))
-            Renders()(bent).sum().backward(retain_graph=True)
-            sample(bent).sum().backward()
-    first = Renders.forward.__code__.co_firstlineno
-    assert [w.filename for w in told] == [__file__] * 2
-    assert [w.lineno for w in told] == [first + 1, sample.__code__.co_firstlineno + 1]
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        for part in (1.0, 0.9):
-            Renders()(view.replace(distortion=part * view.coefficients))
-    assert [f"radius {FOLD / math.sqrt(part):.4g} " in str(w.message) for w, part in zip(told, (1, 0.9), strict=True)]
-
-
-def test_no_warning_where_the_fold_lies_outside() -> None:
-    eg.render(colored_sphere(), camera("four"), 1)  # pytest turns warnings into errors
 
 
 # -- cameras ------------------------------------------------------------------------------------------------------------
@@ -486,7 +285,7 @@ def test_threads_that_change_lenses_find_their_own() -> None:
 
 @pytest.mark.parametrize("spp", [1, 16])
 def test_a_lens_of_zeros_renders_as_its_pinhole(spp: int) -> None:
-    """The same bits, of images and of gradients that leave the coefficients alone."""
+    """Images have the same bits, and so have gradients that leave the coefficients alone."""
     mesh, view = colored_sphere(), camera("four").replace(distortion=None)
     zero = view.replace(distortion=torch.zeros(5, dtype=F64))
     adjoint = smooth_adjoint(*SIZE, 3)
@@ -500,7 +299,7 @@ def test_a_lens_of_zeros_renders_as_its_pinhole(spp: int) -> None:
         assert torch.equal(found, right)
 
 
-@pytest.mark.parametrize("index", range(4))
+@pytest.mark.parametrize("index", [0, 2])
 def test_gradient_by_coefficients_of_zero(index: int) -> None:
     """It is that of coefficients next to zero, through which no image is taken for a pinhole's; in forward mode, too."""
     mesh, view = colored_sphere(0.3), camera("four").replace(distortion=None)
@@ -516,13 +315,13 @@ def test_gradient_by_coefficients_of_zero(index: int) -> None:
         return float(torch.autograd.grad(loss_at(t), t)[0])
 
     one = torch.ones((), dtype=F64)
-    beside = gradient_at(1e-9)
-    assert gradient_at(0.0) == pytest.approx(beside, rel=0.01)
-    assert float(torch.func.jvp(loss_at, (0 * one,), (one,))[1]) == pytest.approx(beside, rel=0.01)
+    near_zero = gradient_at(1e-9)
+    assert gradient_at(0.0) == pytest.approx(near_zero, rel=0.01)
+    assert float(torch.func.jvp(loss_at, (0 * one,), (one,))[1]) == pytest.approx(near_zero, rel=0.01)
 
 
 @lenses
-def test_pixels_that_are_left_out_show_nothing(lens: str) -> None:
+def test_pixels_without_rays_show_nothing(lens: str) -> None:
     """Only pixels near the mesh get rays; a far wall behind it makes that all pixels, and hides nothing of the mesh."""
     view = camera(lens)
     mesh = colored_sphere(0.4)

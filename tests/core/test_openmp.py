@@ -92,18 +92,18 @@ def lines_of(code: str, **variables: str) -> list[str]:
 
 @functools.cache
 def whole() -> list[str]:
-    """What a process prints that imports torch first, and forks."""
+    """Return what a process prints that imports torch first, and forks."""
     return lines_of(RENDER.format(imports=ORDERS["torch first"]) + FORK + DYNAMIC)
 
 
 @functools.cache
 def limited() -> list[str]:
-    """What a process prints that imports edgegrad first, and has one thread next to the calling one."""
+    """Return what a process prints that imports edgegrad first, and has one thread next to the calling one."""
     return lines_of(RENDER.format(imports=ORDERS["edgegrad first"]), OMP_THREAD_LIMIT="2")
 
 
 def test_one_runtime():
-    """Also in a forked child. A second one would keep threads of its own next to torch's."""
+    """A forked child has the same one. A second runtime would keep threads of its own next to torch's."""
     _, _, parent, own, *child, _ = whole()
     assert parent == own and child == [parent, own]
     assert Path(own).name.startswith(("libgomp", "libomp", "libiomp"))

@@ -1,4 +1,4 @@
-"""What older processors run, here where newer ones do: rays in packets of 8, not 16, give the same image and gradient."""
+"""Rays in packets of 8, which older processors run, give the image and gradient of packets of 16."""
 
 from __future__ import annotations
 

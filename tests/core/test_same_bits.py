@@ -1,25 +1,15 @@
-"""The same bits: at any number of threads, whatever came before, for each seed."""
+"""Bits do not depend on the number of threads nor on what came before, but on the seed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 import torch
-from scenes import cube, front_camera, icosphere
+from scenes import cube, front_camera, icosphere, soup
+from threads import check_threads
 from torch_scenes import CAMERA, F32, F64, TRIANGLE, image_and_gradients, mixed_scene, same_bits
 
 import edgegrad as eg
 from edgegrad.library import core
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
 
 REPEATABLE = {
     "mixed": lambda: (mixed_scene(), CAMERA),
@@ -29,21 +19,15 @@ REPEATABLE = {
 }
 
 
-def soup(mesh: eg.Mesh) -> eg.Mesh:
-    """Each face with vertices of its own."""
-    corners = mesh.faces.reshape(-1)
-    return eg.Mesh(mesh.verts[corners], torch.arange(len(corners)).reshape(-1, 3), colors=mesh.colors[corners])
-
-
 @pytest.mark.parametrize("case", REPEATABLE)
-def test_same_bits_at_any_number_of_threads(case, threads):
+def test_same_bits_at_any_number_of_threads(case):
     scene, camera = REPEATABLE[case]()
-    results = []
-    for n in (1, 2, 3):
-        threads(n)
+
+    def compute() -> list[torch.Tensor]:
         core.clear_geometry()
-        results.append(image_and_gradients(scene, camera, seed=11))
-    assert same_bits(results[0], results[1]) and same_bits(results[0], results[2])
+        return image_and_gradients(scene, camera, seed=11)
+
+    check_threads(compute, (1, 2, 3))
 
 
 @pytest.mark.parametrize("case", REPEATABLE)
@@ -75,16 +59,6 @@ def test_same_bits_after_the_same_positions_in_another_precision():
         core.clear_geometry()
         image_and_gradients(eg.Scene(first), CAMERA)
         assert same_bits(image_and_gradients(eg.Scene(second), CAMERA), expected)
-
-
-def test_same_bits_from_several_python_threads():
-    """The interpreter's lock is released meanwhile, and they share what is kept."""
-    scene, camera = REPEATABLE["mixed"]()
-    moves = [torch.tensor([0.05 * i, 0.0, 0.0], dtype=F64) for i in range(4)]
-    expected = [image_and_gradients(scene.transformed(t=t), camera) for t in moves]
-    with ThreadPoolExecutor(4) as pool:
-        futures = [pool.submit(image_and_gradients, scene.transformed(t=t), camera) for t in moves * 5]
-    assert all(same_bits(future.result(), expected[i % 4]) for i, future in enumerate(futures))
 
 
 def test_seeds():

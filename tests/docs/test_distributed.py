@@ -1,4 +1,4 @@
-"""Views shared out among processes: the same gradients, and the same result after a worker was killed."""
+"""Views are distributed among processes: gradients are the same, and so is the result after a worker was killed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import psutil
 import pytest
 import torch
 import torch.distributed as dist
-from test_examples import FOLDER, example
+from example_modules import FOLDER, example
 from torch import Tensor
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
@@ -33,7 +33,7 @@ forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="workers are forked, 
 
 @pytest.fixture(autouse=True)
 def _on_this_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Processes meet on the loopback interface."""
+    """Let processes meet on the loopback interface."""
     monkeypatch.setenv("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1")
     if sys.platform == "linux":
         monkeypatch.setenv("GLOO_SOCKET_IFNAME", "lo")
@@ -43,7 +43,7 @@ def _on_this_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @contextmanager
 def signals_kept() -> Iterator[None]:
-    """With the handlers of signals as they were: those of torchrun stay otherwise."""
+    """Restore the handlers of signals, which torchrun would leave replaced."""
     names = [name for name in ("SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT") if hasattr(signal, name)]
     before = {name: signal.getsignal(getattr(signal, name)) for name in names}
     try:
@@ -54,7 +54,7 @@ def signals_kept() -> Iterator[None]:
 
 
 def launched(count: int, work: Callable[..., Any], *args: Any, restarts: int = 0) -> Any:
-    """What the first of some processes returns, started as torchrun does."""
+    """Return the result of the first of some processes, which start as torchrun starts them."""
     config = LaunchConfig(
         min_nodes=1, max_nodes=1, nproc_per_node=count, max_restarts=restarts, rdzv_backend="c10d",
         rdzv_endpoint="127.0.0.1:0", local_addr="127.0.0.1", run_id="test", start_method="fork", monitor_interval=0.1,
@@ -71,7 +71,7 @@ def gradient_of(step: int) -> Tensor:
 
 
 def result_of(checkpoint: str, killed: int = -1) -> Tensor:
-    """With a worker that kills itself in a step of its first life."""
+    """Return the result of a fit whose worker kills itself in a step of its first life."""
 
     def die(step: int, loss: float) -> None:
         if step == killed and dist.get_rank() == 1 and os.environ["TORCHELASTIC_RESTART_COUNT"] == "0":
@@ -79,6 +79,11 @@ def result_of(checkpoint: str, killed: int = -1) -> Tensor:
 
     with many_views.joined():
         return many_views.fit(TASK, Path(checkpoint), every=2, callback=die)[0].verts
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Tensor:
+    return result_of(str(tmp_path_factory.mktemp("fit") / "one.pt"))
 
 
 def apart(a: Tensor, b: Tensor) -> float:
@@ -95,8 +100,7 @@ def test_gradients_are_those_of_one_process(count: int) -> None:
 
 @forks
 @pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_a_killed_worker_is_started_again(count: int, tmp_path: Path) -> None:
-    undisturbed = result_of(str(tmp_path / "one.pt"))
+def test_a_killed_worker_is_started_again(count: int, tmp_path: Path, undisturbed: Tensor) -> None:
     found = launched(count, result_of, str(tmp_path / "many.pt"), 4, restarts=1)
     assert apart(found, undisturbed) < 1e-6
     with pytest.raises(ChildFailedError):  # without restarts it ends there
@@ -104,7 +108,7 @@ def test_a_killed_worker_is_started_again(count: int, tmp_path: Path) -> None:
     assert torch.load(tmp_path / "none.pt")["state"]["step"] == 4
 
 
-def test_a_fit_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, undisturbed: Tensor) -> None:
     def stop(step: int, loss: float) -> None:
         if step == 4:
             raise KeyboardInterrupt
@@ -114,7 +118,7 @@ def test_a_fit_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     steps = []
     mesh, _ = many_views.fit(TASK, tmp_path / "fit.pt", every=2, callback=lambda step, _: steps.append(step))
     assert steps == [4, 5]
-    assert torch.equal(mesh.verts, result_of(str(tmp_path / "other.pt")))
+    assert torch.equal(mesh.verts, undisturbed)
 
 
 def test_a_checkpoint_of_another_task(tmp_path: Path) -> None:
@@ -139,7 +143,7 @@ def test_each_round_sees_all_views_once() -> None:
 @forks
 @pytest.mark.slow
 def test_torchrun(tmp_path: Path) -> None:
-    """The command of the docs; a worker is killed from outside once there is a checkpoint."""
+    """The command is that of the docs. A worker is killed from outside once there is a checkpoint."""
     task = TASK._replace(steps=400)
     options = [f"--{name}={value}" for name, value in task._asdict().items()]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "--max-restarts=1"]

@@ -21,6 +21,7 @@ from typing import get_args, get_type_hints
 import matplotlib
 import pytest
 import torch
+from doc_pages import FENCE, FOLDER
 from torch import Tensor
 
 import edgegrad
@@ -30,16 +31,14 @@ import edgegrad.raster
 
 pytestmark = pytest.mark.unsanitized
 
-FOLDER = Path(__file__).parents[2] / "docs"
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
 LONG = ("how-to/shape-from-depth.md", "how-to/bop.md", "how-to/training-loop.md")
-FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-−+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 TOLERANCE = 0.2
 
 
 def same(said: str, printed: str) -> bool:
-    """Whether words are equal, spaces and numbers aside, and numbers close."""
+    """Return whether words are equal, spaces and numbers aside, and numbers close."""
     words = [" ".join(NUMBER.sub("#", text).split()) for text in (said, printed)]
     values = [[float(n.replace(",", "").replace("−", "-")) for n in NUMBER.findall(text)] for text in (said, printed)]
     close = (abs(a - b) <= TOLERANCE * max(abs(a), abs(b)) for a, b in zip(*values, strict=True))
@@ -77,7 +76,7 @@ def test_readme_is_short() -> None:
 
 
 def test_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From top to bottom, with a small model and its picture in place of the reader's, and few steps."""
+    """A small model and its picture stand for the reader's, with few steps."""
     monkeypatch.chdir(tmp_path)
     corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [0, 0, 1]])
     faces = torch.tensor([[0, 1, 3], [1, 2, 3], [2, 0, 3], [2, 1, 0]])
@@ -99,7 +98,7 @@ def test_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_equations_are_typeset() -> None:
-    """None stands as characters in code: integrals, sums and partial derivatives are between dollar signs."""
+    """No integral, sum or partial derivative is written as code."""
     for page in FOLDER.rglob("*.md"):
         text = FENCE.sub("", page.read_text(encoding="utf-8"))
         code = re.findall(r"`[^`\n]+`|^    \S.*$", text, re.MULTILINE)
@@ -125,7 +124,7 @@ def resolves(name: str) -> bool:
 
 
 def test_pages_are_found_from_the_first() -> None:
-    """Each is in a table of contents, also those that a pattern stands for."""
+    """Each page is in a table of contents, perhaps by a pattern."""
     listed = []
     for index in FOLDER.rglob("*.md"):
         for entries in re.findall(
@@ -140,7 +139,7 @@ def test_pages_are_found_from_the_first() -> None:
 
 
 def tensors_of(kind: type) -> str:
-    """The fields of a dataclass that may be fitted, as a cell of a table: tensors of floating-point numbers."""
+    """Return the fields of a dataclass that may be fitted, floating-point tensors, as a cell of a table."""
     hints = get_type_hints(kind)
     fields = [field.name for field in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
     may_hold = {name: (hints[name], *get_args(hints[name])) for name in fields}
@@ -148,13 +147,13 @@ def tensors_of(kind: type) -> str:
 
 
 def textures_of(kind: type) -> list[str]:
-    """The fields of a dataclass that may hold a Texture."""
+    """Return the fields of a dataclass that may hold a Texture."""
     hints = get_type_hints(kind)
     return [name for name, hint in hints.items() if edgegrad.Texture in (hint, *get_args(hint))]
 
 
 def test_names_of_parameters_are_those_of_the_classes() -> None:
-    """The table of docs/fits.md, which can be copied from the message of a failure."""
+    """The table of docs/fits.md can be copied from the message of a failure."""
     lights = (
         edgegrad.PointLight, edgegrad.SpotLight, edgegrad.DirectionalLight, edgegrad.Environment,
         edgegrad.SphericalHarmonics,

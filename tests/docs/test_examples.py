@@ -2,28 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
-
-FOLDER = Path(__file__).parents[2] / "examples"
-sys.path.append(str(FOLDER))  # where they find one another
-
-
-def example(name: str, size: int | None = None) -> ModuleType:
-    """The example's module, with pictures of `size` pixels in place of its own."""
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    if size is not None:
-        assert size < module.SIZE
-        vars(module)["SIZE"] = size
-    return module
+from example_modules import FOLDER, example
 
 
 def test_a_texture_and_its_light() -> None:
@@ -40,7 +23,7 @@ def test_a_network_and_the_shape_under_it() -> None:
 
 
 @pytest.mark.slow
-def test_steps() -> None:
+def test_declared_discontinuities() -> None:
     step = example("step", size=64)
     _, found = step.fit(steps=50)
     assert torch.allclose(found.centre, step.TRUTH.centre, atol=0.02)
@@ -129,7 +112,7 @@ def test_a_material_under_a_known_sky() -> None:
 
 @pytest.mark.slow
 def test_a_pose_of_a_body_from_masks() -> None:
-    """From where a descent alone ends with a leg in the other's place."""
+    """A descent alone ends with a leg in the other's place."""
     body = example("body")
     rig, truth, _, fit = body.trial(0, progress=False)
     rotation, direction = body.Errors.of(rig, fit.values["rotations"], truth)
@@ -230,7 +213,7 @@ def test_a_mesh_of_few_faces_with_a_texture() -> None:
 
 
 @pytest.mark.slow
-def test_colors_in_light_that_goes_to_and_fro() -> None:
+def test_colors_in_indirect_light() -> None:
     corner = example("corner")
     seen = corner.pictures(corner.TRUTH, 32, 8)
     direct, all_light = (max(corner.errors(corner.fit(seen, bounces)).values()) for bounces in (1, 4))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_docs import FENCE, FOLDER
+from doc_pages import FENCE, FOLDER
 from torch import Tensor
 
 import edgegrad as eg
@@ -26,7 +26,7 @@ ALBEDO = [0.8, 0.6, 0.4]
 
 @pytest.fixture(scope="module")
 def page() -> dict[str, Any]:
-    """What the code of the page defines."""
+    """Return what the code of the page defines."""
     names: dict[str, Any] = {}
     text = (Path(FOLDER) / "how-to/mitsuba.md").read_text(encoding="utf-8")
     with contextlib.redirect_stdout(io.StringIO()):
@@ -45,13 +45,13 @@ def mi() -> Any:
 
 
 def quad(half: float, height: float = 0.0) -> eg.Mesh:
-    """Seen from above."""
+    """Return a square that is seen from above."""
     corners = [[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]]
     return eg.Mesh(torch.tensor(corners), torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
 
 def theirs(mi: Any, fov: dict[str, Any], bsdf: dict[str, Any], emitter: dict[str, Any], spp: int, depth: int) -> Tensor:
-    """Mitsuba's image of a floor, a plate above it and a light."""
+    """Return Mitsuba's image of a floor, a plate above it and a light."""
     T = mi.ScalarTransform4f
     height, width = SIZE
     film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
@@ -67,7 +67,7 @@ def theirs(mi: Any, fov: dict[str, Any], bsdf: dict[str, Any], emitter: dict[str
 
 
 def agree(found: Tensor, expected: Tensor, noise: float) -> None:
-    """Pixel by pixel up to noise, and the mean within 1 %."""
+    """Check images pixel by pixel up to noise, and their means within 1 %."""
     assert found.mean() == pytest.approx(float(expected.mean()), rel=0.01)
     assert float((found - expected).square().mean().sqrt()) < noise * float(expected.mean())
 
@@ -77,13 +77,13 @@ def rgb(values: list[float]) -> dict[str, Any]:
 
 
 def sky() -> Tensor:
-    """(h, w, 3): neither even nor symmetric."""
+    """Return an image (h, w, 3) that is neither even nor symmetric."""
     draw = torch.Generator().manual_seed(3)
     return (0.2 + torch.rand((4, 6, 3), generator=draw)).clone()
 
 
 def case(mi: Any, page: dict[str, Any], name: str) -> tuple[dict[str, Any], Any, dict[str, Any], eg.Material]:
-    """Mitsuba's light, edgegrad's, Mitsuba's material and edgegrad's."""
+    """Return Mitsuba's light, edgegrad's, Mitsuba's material and edgegrad's."""
     T = mi.ScalarTransform4f
     bsdf, material = {"type": "diffuse", "reflectance": rgb(ALBEDO)}, eg.Material(torch.tensor(ALBEDO))
     point = {"type": "point", "position": [0.8, 0.5, 2.0], "intensity": rgb([9 * c for c in COLOR])}
@@ -151,7 +151,7 @@ def test_bounces(mi: Any, page: dict[str, Any]) -> None:
 
 
 def test_an_envmap_is_turned_by_half_a_turn(page: dict[str, Any]) -> None:
-    """Also where Mitsuba is missing: diag(−1, 1, −1) after the rotation of `to_world`."""
+    """The rotation is diag(−1, 1, −1) after that of `to_world`. The test needs no Mitsuba."""
     half, quarter = torch.diag(torch.tensor([-1.0, 1.0, -1.0])), torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     to_world = torch.eye(4)
     to_world[:3, :3] = quarter

@@ -23,12 +23,12 @@ FOLDER = Path(__file__).parents[2] / "notebooks"
 NAMES = sorted(path.stem for path in FOLDER.glob("[0-9]*_*.py"))
 QUICK = "1_images_and_gradients"
 LARGEST = 300_000  # bytes
-# What tells on whose machine the outputs were made.
+# Such paths would show on whose machine the outputs were made.
 PLACES = re.compile(r"/(home|root|tmp|usr|opt|mnt|work|Users)/|site-packages|[A-Z]:\\")
 
 
 def maker() -> ModuleType:
-    """notebooks/make.py"""
+    """Return the module notebooks/make.py."""
     spec = importlib.util.spec_from_file_location("make", FOLDER / "make.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -79,7 +79,7 @@ def run(name: str) -> None:
 
 
 def test_the_quick_one_runs() -> None:
-    """Its cells, here: Jupyter's own process would import torch anew, which takes longer than they do."""
+    """Its cells run in this process: Jupyter's own would import torch anew, which takes longer than they do."""
     matplotlib.use("agg")
     cells = jupytext.read(FOLDER / f"{QUICK}.py").cells
     try:
@@ -98,7 +98,7 @@ def test_runs(name: str) -> None:
 
 @pytest.mark.slow
 def test_a_wrong_gradient_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The checks are checked: with a gradient 5 % too large where it is compared, the first notebook stops."""
+    """With a gradient 5 % too large where it is compared, the first notebook stops."""
     make = maker()
     source = (FOLDER / f"{QUICK}.py").read_text(encoding="utf-8")
     wrong = source.replace("    return leaf.grad\n", "    return 1.05 * leaf.grad\n")

@@ -44,7 +44,7 @@ class Xml:
         return f"{prefix}:{local}" if prefix else local
 
     def element(self, tag: str, attributes: dict[str, Any], inside: str = "") -> str:
-        """Attributes in any order; those without a prefix have no namespace."""
+        """Return an element with attributes in any order. Attributes without a prefix have no namespace."""
         pairs = [
             (self.name(key) if ":" in key and key[:5] != "xmlns" else key, value) for key, value in attributes.items()
         ]
@@ -71,7 +71,7 @@ def reference(xml: Xml, tag: str, one: Reference, part: int, paths: list[str]) -
 def mesh_3mf(
     xml: Xml, random: np.random.Generator, palettes: np.ndarray | None
 ) -> tuple[str, dict[str, Any], ExpectedMesh]:
-    """The mesh, attributes of its object, and what it shows."""
+    """Return the mesh, attributes of its object, and what it shows."""
     points = random.integers(-40, 41, (int(random.integers(3, 7)), 3)) / 8
     faces = np.stack([random.permutation(len(points))[:3] for _ in range(int(random.integers(1, 4)))])
     attributes, colors, of_faces = {}, None, [{} for _ in faces]

@@ -8,7 +8,7 @@ import numpy as np
 
 
 class ExpectedMesh(NamedTuple):
-    """A mesh of a file in its place: F triangles by the values at their corners, in float64."""
+    """A mesh of a file in its place: the values at the corners of F triangles, in float64."""
 
     corners: np.ndarray  # (F, 3, 3), in the world
     colors: np.ndarray | None = None  # (F, 3, 3), linear

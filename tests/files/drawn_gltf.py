@@ -19,7 +19,7 @@ NAMES = ("a", "a", "world", "", "ä∆ \\", 'b/"c"')
 
 
 def rotation(x: float, y: float, z: float, w: float) -> np.ndarray:
-    """(3, 3) of a unit quaternion."""
+    """Return the matrix (3, 3) of a unit quaternion."""
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -37,7 +37,7 @@ class Storage:
         self.accessors: list[dict] = []
 
     def view(self, content: bytes, **more: Any) -> int:
-        """In any of the buffers, behind bytes that nobody asks for."""
+        """Add a view of any of the buffers, after bytes that nothing uses."""
         number = int(self.random.integers(len(self.buffers)))
         buffer = self.buffers[number]
         buffer += self.random.bytes(-len(buffer) % 4 + 4 * int(self.random.integers(3)))
@@ -59,7 +59,8 @@ class Storage:
         return self.accessor(rows, False, bufferView=self.view(rows.tobytes()))
 
     def attributes(self, given: dict[str, tuple[np.ndarray, bool]]) -> dict[str, int]:
-        """Interleaved in one view, or each in its own, in rows of four bytes and more; some sparse."""
+        """Add attributes, interleaved in one view or each in its own, in rows of multiples of four bytes; some are
+        sparse."""
         groups = [list(given)] if one_of(self.random, False, True) else [[name] for name in given]
         found = {}
         for group in groups:
@@ -107,7 +108,7 @@ class Storage:
         }  # fmt: skip
 
     def lists(self, glb: bool) -> tuple[dict[str, list], bytes | None, dict[str, bytes]]:
-        """The entries of the file, the chunk of a GLB, and files next to it."""
+        """Return the entries of the file, the chunk of a GLB, and files next to it."""
         files, entries, chunk = {}, [], None
         for number, buffer in enumerate(self.buffers):
             entry: dict = {"byteLength": len(buffer)}
@@ -123,7 +124,7 @@ class Storage:
 
 
 def numbers(random: np.random.Generator, shape: tuple, types: tuple[str, ...]) -> tuple[Any, bool, np.ndarray]:
-    """Rows of one of the types, a capital of which says normalised; and what they mean."""
+    """Return rows of one of the types, whose capital letter means normalised; and what they mean."""
     kind = one_of(random, *types)
     if kind == "f4":
         rows = (random.integers(0, 65, shape) / 64).astype("<f4")
@@ -135,7 +136,7 @@ def numbers(random: np.random.Generator, shape: tuple, types: tuple[str, ...]) -
 
 
 def topology(random: np.random.Generator) -> tuple[dict[str, int], np.ndarray | None, int, np.ndarray]:
-    """The mode, indices or None, the number of vertices, and the triangles."""
+    """Return the mode, indices or None, the number of vertices, and the triangles."""
     mode = one_of(random, None, 4, 5, 6)
     count = int(random.integers(3, 9))
     flat = np.arange(count)
@@ -186,7 +187,7 @@ def primitive(random: np.random.Generator, storage: Storage, quantized: bool) ->
 
 
 def node(random: np.random.Generator) -> tuple[dict, np.ndarray]:
-    """Shifted, turned and scaled, perhaps mirrored, by parts or by a matrix."""
+    """Return a node that is shifted, rotated and scaled, perhaps mirrored, by parts or by a matrix; and its matrix."""
     quaternion = random.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
     shift, scale = random.integers(-8, 9, 3) / 4, random.choice([-2.0, -0.5, 0.5, 1.0, 2.0], 3)

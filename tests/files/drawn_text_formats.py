@@ -20,14 +20,16 @@ class Shape(NamedTuple):
 
 
 EIGHTHS = st.integers(-64, 64).map(lambda n: n / 8)  # exact in any type of floating point, and as a decimal
-NAMES = st.sampled_from(["a", "Würfel", "solid part", "x#1", "vertex", "endsolid f", "o", "two  words", "é"])
+NAMES = st.sampled_from(
+    ["a", "Würfel", "solid part", "x#1", "vertex", "endsolid", "endsolid f", "facet", "o", "two  words", "é"]
+)
 COLORS = st.tuples(*[st.integers(0, 255)] * 3)
 COMMENTS = st.sampled_from(["", "# José", "#f 1 2 3", "#", "# mtllib no.mtl"])
 
 
 @st.composite
 def shapes(draw: Any) -> Shape:
-    """Faces of three to seven corners, each in its order or turned over, from any of them on."""
+    """Draw faces of three to seven corners, in their order or reversed, from any corner on."""
     n = draw(st.integers(3, 9))
     t = np.arange(n) / 4
     plane = np.stack([t, t**2, np.zeros(n)], 1)[:, list(draw(st.permutations([0, 1, 2])))]
@@ -52,7 +54,7 @@ def fans(faces: list[list[Any]]) -> list[list[Any]]:
 
 
 def stripped(strips: list[list[int]]) -> list[list[int]]:
-    """Triangles of strips, every other one turned round, without those that are none."""
+    """Return the triangles of strips, every other one reversed, without degenerate ones."""
     found = []
     for strip in strips:
         for i in range(len(strip) - 2):
@@ -63,7 +65,7 @@ def stripped(strips: list[list[int]]) -> list[list[int]]:
 
 
 def number(draw: Any, value: float) -> str:
-    """A decimal as some program or other writes it."""
+    """Return a decimal as some program or other writes it."""
     plain = repr(float(value))
     forms = [
         plain,
@@ -86,12 +88,12 @@ def numbers(draw: Any, values: Any) -> str:
 
 def encoded(draw: Any, lines: list[str]) -> bytes:
     text = draw(st.sampled_from(["\n", "\r\n", "\r"])).join(lines) + draw(st.sampled_from(["", "\n", "\n\n"]))
-    return text.encode(draw(st.sampled_from(["utf-8", "latin-1"])))
+    return text.encode(draw(st.sampled_from(["utf-8", "latin-1", "utf-8-sig", "utf-16"])))
 
 
 @st.composite
 def obj_files(draw: Any) -> DrawnFile:
-    """Lines in any order that the format allows, with materials, objects, and corners of all four kinds."""
+    """Draw lines in any order that the format allows, with materials, objects, and corners of all four kinds."""
     verts, faces = draw(shapes())
     colors = draw(st.one_of(st.none(), st.lists(COLORS, min_size=len(verts), max_size=len(verts))))
     uvs = [[draw(EIGHTHS), draw(EIGHTHS)] for _ in range(draw(st.integers(1, 4)))]
@@ -185,7 +187,7 @@ COLOR_NAMES = [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffu
 
 @st.composite
 def ply_files(draw: Any) -> DrawnFile:
-    """Properties and elements in any order, of any type and name, among others that nobody reads."""
+    """Draw properties and elements in any order, of any type and name, among others that nobody reads."""
     verts, faces = draw(shapes())
     n, f = len(verts), len(faces)
     order = draw(st.sampled_from(["", "<", ">"]))
@@ -221,8 +223,9 @@ def ply_files(draw: Any) -> DrawnFile:
     if on is not None:
         count = n if on == "vertex" else f
         rows = np.array(draw(st.lists(COLORS, min_size=count, max_size=count)))
-        kind, scale = draw(st.sampled_from([("uchar", 1), ("uint8", 1), ("int", 1), ("short", 1), ("ushort", 257),
-                                            ("float", 1 / 255), ("double", 1 / 255)]))  # fmt: skip
+        rows[0, 0] = max(rows[0, 0], 2)  # or numbers up to 255 would be 0 and 1 alone
+        kind, scale = draw(st.sampled_from([("uchar", 1), ("uint8", 1), ("int", 1), ("short", 1), ("ushort", 257), ("uint", 257),
+                                            ("float", 1 / 255), ("double", 1 / 255), ("double", 1)]))  # fmt: skip
         names = draw(st.sampled_from(COLOR_NAMES))
         (vertex if on == "vertex" else face).append(
             [(kind, name, (rows[:, i] * scale).tolist()) for i, name in enumerate(names)]
@@ -235,7 +238,7 @@ def ply_files(draw: Any) -> DrawnFile:
             appearance = np.repeat(shade.repeat(many, 0)[:, None], 3, 1)
 
     def others(count: int) -> list[list[tuple[str, str, list]]]:
-        """A number and a list that nothing reads."""
+        """Draw a number and a list that nothing reads."""
         found = [[("int", "label", [draw(st.integers(-5, 5)) for _ in range(count)])]] if draw(st.booleans()) else []
         if draw(st.booleans()):
             rows = [draw(st.lists(EIGHTHS, max_size=3)) for _ in range(count)]
@@ -287,7 +290,7 @@ def ply_files(draw: Any) -> DrawnFile:
 
 @st.composite
 def stl_files(draw: Any) -> DrawnFile:
-    """Binary, or text of several solids in capitals or not, whose names may be keywords."""
+    """Draw a binary file, or a text of several solids in capitals or not, whose names may be keywords."""
     if draw(st.booleans()):
         verts, faces = draw(shapes())
         corners = verts[np.array(fans(faces))].astype("<f4")
@@ -317,7 +320,7 @@ def stl_files(draw: Any) -> DrawnFile:
 
 @st.composite
 def off_files(draw: Any) -> DrawnFile:
-    """With normals, colours and texture coordinates of vertices, or colours of faces."""
+    """Draw normals, colours and texture coordinates of vertices, or colours of faces."""
     verts, faces = draw(shapes())
     triangles = np.array(fans(faces))
     rows: list[list] = verts.tolist()

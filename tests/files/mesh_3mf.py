@@ -16,7 +16,7 @@ MODEL = (
 
 @cache
 def bomb(megabytes: int) -> bytes:
-    """A 3MF of a few kilobytes that holds so many spaces."""
+    """Return a 3MF of a few kilobytes that holds so many spaces."""
     head, tail = MODEL.split("</resources>")
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/3dmodel.model", "w") as model:
@@ -27,8 +27,8 @@ def bomb(megabytes: int) -> bytes:
     return stream.getvalue()
 
 
-def model(changes: dict[str, str] | None = None, extra: dict[str, str] | None = None) -> bytes:
-    """A 3MF with its text changed, and with more files."""
+def triangle_3mf(changes: dict[str, str] | None = None, extra: dict[str, str] | None = None) -> bytes:
+    """Return a 3MF of a triangle with its text changed, and with more files."""
     text = MODEL
     for old, new in (changes or {}).items():
         assert old in text
@@ -41,7 +41,7 @@ def model(changes: dict[str, str] | None = None, extra: dict[str, str] | None = 
 
 
 def nested(depth: int) -> dict[str, str]:
-    """Objects of two components each, the one below: 2^depth triangles."""
+    """Return changes that make objects of two components each, the one below: 2^depth triangles."""
     objects = "".join(
         f'<object id="{i}"><components><component objectid="{i - 1}"/>'
         f'<component objectid="{i - 1}" transform="1 0 0 0 1 0 0 0 1 0 0 {2.0**i}"/></components></object>'
@@ -51,7 +51,7 @@ def nested(depth: int) -> dict[str, str]:
 
 
 def chain(depth: int) -> dict[str, str]:
-    """Objects of one component each, the one below."""
+    """Return changes that make objects of one component each, the one below."""
     objects = "".join(
         f'<object id="{i}"><components><component objectid="{i - 1}"/></components></object>'
         for i in range(2, depth + 1)

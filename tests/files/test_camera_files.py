@@ -1,4 +1,4 @@
-"""Cameras of COLMAP, NeRF and our own files: where points land, by those libraries themselves where they are installed."""
+"""Cameras of COLMAP, NeRF and edgegrad's own files land points where those libraries do, where they are installed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ H, W = SIZE
 
 @pytest.fixture
 def reconstruction(tmp_path: Path):
-    """Two images in a folder as COLMAP lays it out, its text written by hand; and pycolmap."""
+    """Return pycolmap, and a folder of two images as COLMAP lays it out, with its text written by hand."""
     pycolmap = pytest.importorskip("pycolmap", reason="COLMAP itself is what is compared with")
     folder = tmp_path / "sparse" / "0"
     folder.mkdir(parents=True)
@@ -62,7 +62,7 @@ def test_colmap(reconstruction, tmp_path, binary) -> None:
     assert views["b.png"].camera.size == SIZE and eg.load_cameras(folder)["a.png"].camera.K.dtype == torch.float32
 
 
-def test_colmap_faults(reconstruction, tmp_path) -> None:
+def test_bad_colmap_parameters(reconstruction, tmp_path) -> None:
     _, folder = reconstruction
     text = (folder / "images.txt").read_text()
     (folder / "images.txt").write_text(text.replace("1 a.png", "2 a.png"))

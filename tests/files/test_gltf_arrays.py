@@ -42,7 +42,7 @@ def draco(colors):
 
 
 def compressed(blob, count=4, required=True, **changes):
-    """The square in a blob alone, colours too."""
+    """Return a GLB whose square lies in a Draco blob alone, with colours."""
     listed = {"extensionsUsed": [DRACO], **({"extensionsRequired": [DRACO]} if required else {})}
     given = {"bufferView": 0, "attributes": {"POSITION": 1, "COLOR_0": 0}} | changes
     accessors = [
@@ -137,7 +137,7 @@ def test_meshopt_with_a_fallback_is_read(tmp_path):
 
 
 def test_zeros_and_what_lies_sparsely_on_them(tmp_path):
-    """Without a view all is zero, by the format; rows are then given one by one."""
+    """Without a view all values are zero, as the format says. Rows are then given one by one."""
     where, values = np.array([1, 2, 3], "u1"), np.array(SQUARE[1:], "<f4")
     sparse = {"count": 3, "indices": {"bufferView": 0, "componentType": 5121}, "values": {"bufferView": 1}}
     faces = np.array(TRIANGLES, "u1").reshape(-1)
@@ -180,7 +180,7 @@ def test_later_versions(tmp_path):
 
 
 def test_invisible_nodes_are_not_there(tmp_path):
-    """Nor what lies below them; their cameras are."""
+    """Nodes below an invisible one are not there either, but their cameras are."""
     hidden = {"KHR_node_visibility": {"visible": False}}
     light = {"KHR_lights_punctual": {"light": 0}}
     nodes = [
@@ -226,7 +226,8 @@ def test_a_file_without_scenes_shows_all_its_nodes(tmp_path):
     ],
 )
 def test_cones_that_are_none_are_clamped(tmp_path, cone, shown):
-    """To cosines that differ by 0.001, as in the formula of KHR_lights_punctual, and to at most a right angle."""
+    """Their cosines differ by 0.001 at least, as in the formula of KHR_lights_punctual, and angles are right ones at
+    most."""
     angles = dict(zip(("innerConeAngle", "outerConeAngle"), cone, strict=True))
     node = {"mesh": 0, "extensions": {"KHR_lights_punctual": {"light": 0}}}
     path = file(tmp_path, nodes=[node], lights=[{"type": "spot", "name": "emitter", "spot": angles}])
@@ -254,7 +255,7 @@ def test_cones_that_are_none_are_clamped(tmp_path, cone, shown):
     ],
 )
 def test_a_lost_image_is_blamed_itself(tmp_path, texture, image, fault):
-    """The first of two is whole."""
+    """The first of two images is whole."""
     given = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}, "emissiveTexture": {"index": 1}}
     path = file(tmp_path, given | {"emissiveFactor": [1, 1, 1]}, [TEXELS, TEXELS])
 
@@ -275,7 +276,7 @@ def attribute(name, array):
 
 
 def extended(kind):
-    """The first of a list, which is made where there is none."""
+    """Return a change that extends the first entry of a list, which is made where there is none."""
 
     def change(tree):
         tree[kind] = tree.get(kind) or [{}]
@@ -312,7 +313,7 @@ def extended(kind):
         ),
     ],
 )  # fmt: skip
-def test_one_thing_too_many_is_named(tmp_path, change, said, also_unlit):
+def test_one_unread_thing_is_named(tmp_path, change, said, also_unlit):
     path = file(tmp_path, {"pbrMetallicRoughness": {}, "extensions": {}}, uvs=(CORNERS,), samplers=[{}])
     path.write_bytes(changed(change, path.read_bytes()))
     for lit in (True, False):
@@ -324,7 +325,8 @@ def test_one_thing_too_many_is_named(tmp_path, change, said, also_unlit):
 
 
 def test_what_changes_no_picture_is_not_named(tmp_path):
-    """Extras, all that the format itself has, weights, texture coordinates of a material, copies in other formats."""
+    """The file has extras, all that the format itself has, weights, further texture coordinates, and copies in other
+    formats."""
     normal = {"index": 0, "texCoord": 1, "extras": {"a": 1}}
     given = {
         "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},

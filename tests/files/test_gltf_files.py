@@ -1,13 +1,13 @@
 """Meshes from glTF and GLB files, which are made here and compared number by number."""
 
+import base64
 import io
 import json
-import struct
 
 import numpy as np
 import pytest
 import torch
-from mesh_files import SQUARE, TEXELS, linear, saved, square_glb, texel_at
+from mesh_files import SQUARE, TEXELS, TRIANGLES, gltf_tree, linear, saved, square_glb, texel_at
 from PIL import Image
 
 import edgegrad as eg
@@ -52,7 +52,7 @@ def png_with_alpha(alpha):
 
 
 def alpha_mask_glb(alpha, sampler=None, **material):
-    """The textured square with an alpha in its texture."""
+    """Return the textured square with an alpha in its texture."""
     base = {"baseColorTexture": {"index": 0}, **material.pop("base", {})}
     more = {} if sampler is None else {"samplers": [sampler]}
     return square_glb(
@@ -104,7 +104,7 @@ def test_gltf_masks_without_alpha_in_a_texture(tmp_path):
 
 @pytest.mark.parametrize("type_", ["<f4", "<u1", "<u2"])
 def test_gltf_masks_by_alpha_of_vertices(tmp_path, type_):
-    """Alpha rises from 0 to 1 from left to right; times 0.8 it is above a half right of 5/8."""
+    """Alpha rises from 0 to 1 from left to right. Times 0.8 it exceeds a half right of 5/8."""
     scale = 1 if type_ == "<f4" else np.iinfo(type_).max
     colors = (np.array([[1, 1, 1, x] for x, _, _ in SQUARE]) * scale).astype(type_)
     K = torch.tensor([[32.0, 0, 0], [0, 32, 0], [0, 0, 1]])
@@ -196,20 +196,19 @@ def test_merging_welds_across_parts(tmp_path):
     assert load_mesh(tmp_path / "boxes.glb").verts.shape == (12, 3)
 
 
-def test_gltf_with_files_beside_it(tmp_path):
+def test_gltf_with_separate_files(tmp_path):
     whole = square_glb(
         {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}},
         uv=True,
         images=[{"uri": "my%20skin.png"}],
         textures=[{"source": 0}],
     )
-    size = struct.unpack("<I", whole[12:16])[0]
-    tree = json.loads(whole[20 : 20 + size])
+    tree = gltf_tree(whole)
     tree["buffers"][0]["uri"] = "data.bin"
     (tmp_path / "s.gltf").write_text(json.dumps(tree))
     with pytest.raises(FileNotFoundError, match=r"s\.gltf: names 'data\.bin'"):
         load_mesh(tmp_path / "s.gltf")
-    (tmp_path / "data.bin").write_bytes(whole[28 + size :])
+    (tmp_path / "data.bin").write_bytes(whole[-tree["buffers"][0]["byteLength"] :])
     with pytest.raises(FileNotFoundError, match=r"s\.gltf: names 'my%20skin\.png'"):
         load_mesh(tmp_path / "s.gltf")
     Image.fromarray(TEXELS).save(tmp_path / "my skin.png")
@@ -220,8 +219,8 @@ def test_gltf_with_files_beside_it(tmp_path):
         load_mesh(tmp_path / "s.gltf")
 
 
-def test_gltf_vertex_colours_beside_a_texture(tmp_path):
-    """Multiplied where they are all one. Others need a lit mesh, or the texture left out."""
+def test_gltf_vertex_colours_with_a_texture(tmp_path):
+    """They are multiplied where they are all equal. Others need a lit mesh, or no texture."""
     base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.5, 1.0, 0.2, 1.0]}
     given = dict(uv=True, extra=[saved("PNG")], textures=[{"source": 0}], images=[{"bufferView": 4}])
     file, colors = tmp_path / "t.glb", np.array([[0.5, 0.25, 1.0, 1.0]] * 4, "<f4")
@@ -243,3 +242,27 @@ def test_gltf_vertex_colours_beside_a_texture(tmp_path):
     save(colors, extensions={"KHR_materials_unlit": {}})
     with pytest.raises(ValueError, match=r"got both.*; load it with materials=False"):
         load_mesh(file, lit=True)
+
+
+def test_glb_by_the_name_of_gltf_and_the_other_way_round(tmp_path):
+    whole = square_glb()
+    (tmp_path / "a.gltf").write_bytes(whole)
+    tree = gltf_tree(whole)
+    chunk = whole[-tree["buffers"][0]["byteLength"] :]
+    tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(chunk).decode()
+    (tmp_path / "b.glb").write_text("\n " + json.dumps(tree))
+    for name in ("a.gltf", "b.glb"):
+        mesh = load_mesh(tmp_path / name)
+        assert mesh.verts.tolist() == SQUARE and mesh.faces.tolist() == TRIANGLES
+
+
+def test_metallic_roughness_is_shown_where_specular_glossiness_is_given_too(tmp_path):
+    gloss = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0, 1, 0, 1]}}
+    base = {"baseColorFactor": [1.0, 0.5, 0.25, 1.0]}
+    used = {"extensionsUsed": list(gloss)}
+    (tmp_path / "a.glb").write_bytes(square_glb({"extensions": gloss, "pbrMetallicRoughness": base}, **used))
+    with pytest.warns(UserWarning, match=r"SpecularGlossiness \(shown in the metallic-roughness material beside it\)"):
+        assert load_mesh(tmp_path / "a.glb").face_colors[0].tolist() == [1.0, 0.5, 0.25]
+    (tmp_path / "a.glb").write_bytes(square_glb({"extensions": gloss}, **used))
+    with pytest.raises(ValueError, match="expected a metallic-roughness material, got specular-glossiness alone"):
+        load_mesh(tmp_path / "a.glb")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from lit_gltf import TURN, file, loaded
+from lit_gltf import CAMERAS, TURN, file, loaded
 from mesh_files import SQUARE, TRIANGLES, changed, glb
 
 import edgegrad as eg
@@ -24,7 +24,7 @@ def test_normals_follow_their_nodes(tmp_path, scale):
 
 
 def test_normals_that_differ_at_a_vertex(tmp_path):
-    """Two triangles that share an edge, with vertices and normals of their own: positions are welded, normals are not."""
+    """Two triangles share an edge and have vertices and normals of their own. Positions are welded, normals are not."""
     corners = np.array(SQUARE, "<f4")[np.array(TRIANGLES).reshape(-1)]
     normals = np.array([[0, 0, 1]] * 3 + [[0, 0.6, 0.8]] * 3, "<f4")
     tree = {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
@@ -84,7 +84,7 @@ def test_lights_stand_where_their_nodes_do(tmp_path):
     ],
 )
 def test_light_faults(tmp_path, light, fault):
-    """One that cannot be read is left out, and named; the others are read."""
+    """A light that cannot be read is left out and named. The others are read."""
     nodes = [{"mesh": 0}, *({"extensions": {"KHR_lights_punctual": {"light": k}}} for k in (0, 1))]
     path = file(tmp_path, nodes=nodes, roots=[0, 1, 2], lights=[light, {"type": "point", "intensity": 3.0}])
     with pytest.warns(UserWarning, match=rf"a\.glb: .*light .* \(left out: {fault}"):
@@ -117,12 +117,6 @@ def test_what_lies_below_a_camera_is_read(tmp_path):
     nodes = [{"camera": 0, "translation": [0, 0, 5], "children": [1]}, {"mesh": 0}]
     scene = eg.load_scene(file(tmp_path, nodes=nodes, roots=[0], cameras=cameras))
     np.testing.assert_allclose(scene.meshes[0].verts[:, 2], 5.0)
-
-
-CAMERAS = [
-    {"type": "perspective", "perspective": {"yfov": 0.8, "aspectRatio": 3.0, "znear": 0.1}},
-    {"type": "orthographic", "orthographic": {"xmag": 1.0, "ymag": 2.0, "znear": 0.1, "zfar": 10.0}},
-]
 
 
 def test_cameras(tmp_path):

@@ -223,7 +223,7 @@ def test_material_faults(tmp_path):
         eg.load_scene(path, lit=True)
 
 
-def test_what_is_not_supported_is_said_once_by_name(tmp_path):
+def test_unsupported_features_are_named_once(tmp_path):
     given = {
         "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
         "occlusionTexture": {"index": 0},

@@ -1,4 +1,4 @@
-"""Images in and out: the sRGB curve, every kind of file, and faults by name."""
+"""Images are read and written by the sRGB curve, in every kind of file, and errors name the file."""
 
 import os
 
@@ -7,9 +7,10 @@ import OpenImageIO as oiio
 import pytest
 import tifffile
 import torch
-from mesh_files import linear
+from mesh_files import TEXTURED, linear, saved, square_glb, write
 from PIL import Image
 
+import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 
 pytestmark = pytest.mark.unsanitized
@@ -33,7 +34,7 @@ def test_srgb_curve_has_finite_gradients_at_zero():
 
 
 def test_webp_is_read(tmp_path):
-    """As it was stored, with its alpha; one that ends early is no image."""
+    """It has the stored values and their alpha. A file that ends early is no image."""
     pixels = np.random.default_rng(0).integers(40, 256, (20, 30, 4)).astype(np.uint8)
     file = tmp_path / "a.webp"
     Image.fromarray(pixels).save(file, lossless=True, exact=True)
@@ -93,7 +94,7 @@ def test_alpha_is_kept_apart(tmp_path):
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float16, np.float32])
 @pytest.mark.parametrize("planes", ["contig", "separate"])
 def test_colours_of_a_tiff_are_not_multiplied_by_alpha(tmp_path, dtype, planes):
-    """By the definition of associated alpha in TIFF 6.0: what is stored is the stored colour times alpha."""
+    """TIFF 6.0 defines associated alpha: a file holds the colour times alpha."""
     one = 1.0 if np.dtype(dtype).kind == "f" else float(np.iinfo(dtype).max)
     half = round(one / 2) / one if one > 1 else 0.5
     straight = np.array([[[1.0, 0, 0, half], [0.2, 0.6, 1, 0.8]], [[0, 0, 0, 0], [0.5, 0.25, 0.75, 1]]])
@@ -130,21 +131,6 @@ def test_an_exr_stays_multiplied_and_alpha_alone_is_an_image(tmp_path):
     assert output.open(str(tmp_path / "b.exr"), spec) and output.write_image(np.array([[[0.25], [0.5]]], np.float32))
     output.close()
     assert read_image(tmp_path / "b.exr").tolist() == [[[0.25], [0.5]]]
-
-
-def test_kinds_of_png(tmp_path):
-    stored = np.random.default_rng(2).integers(0, 256, (4, 5, 3), dtype=np.uint8)
-    palette = Image.fromarray(stored).convert("P")
-    palette.save(tmp_path / "palette.png")
-    expected = linear(np.asarray(palette.convert("RGB")))
-    np.testing.assert_allclose(read_image(tmp_path / "palette.png").numpy(), expected, atol=1e-6)
-    Image.fromarray(stored[..., 0]).save(tmp_path / "grey.png")
-    np.testing.assert_allclose(read_image(tmp_path / "grey.png").numpy(), linear(stored[..., :1]), atol=1e-6)
-    deep = np.random.default_rng(3).integers(0, 65536, (4, 5), dtype=np.uint16)
-    Image.fromarray(deep).save(tmp_path / "deep.png")
-    np.testing.assert_allclose(read_image(tmp_path / "deep.png")[..., 0].numpy(), linear(deep / 257.0), atol=1e-6)
-    Image.fromarray(stored[..., 0] > 128).save(tmp_path / "bits.png")
-    np.testing.assert_array_equal(read_image(tmp_path / "bits.png")[..., 0].numpy(), stored[..., 0] > 128)
 
 
 def test_cmyk_jpeg_and_exif_orientation(tmp_path):
@@ -194,7 +180,7 @@ def test_write_image_takes_what_a_loop_has_at_hand(tmp_path):
 
 
 def test_curves_of_cameras(tmp_path):
-    """Exponents, tables for all channels or for each, and functions, against the formula for each value."""
+    """Exponents, tables and functions agree with the formula for each value."""
     codes = np.arange(256, dtype=np.uint8)
     stored = np.stack([codes, codes[::-1], np.full(256, 100, np.uint8)], -1)[None]
     path = tmp_path / "a.png"
@@ -320,3 +306,34 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no space"):
         write_image(path, torch.ones(2, 2, 3))
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+STORED = np.random.default_rng(5).integers(0, 256, (4, 5, 4), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    "mode, channels",
+    [("1", 1), ("L", 1), ("LA", 2), ("P", 3), ("RGB", 3), ("RGBA", 4), ("I;16", 1)],
+)
+def test_modes_of_png_and_tiff(tmp_path, mode, channels):
+    """As textures they lose their alpha."""
+    if mode == "I;16":
+        image = Image.fromarray(np.random.default_rng(6).integers(0, 65536, (4, 5), dtype=np.uint16))
+        values = np.asarray(image)[..., None] / 257.0
+    else:
+        image = Image.fromarray(STORED).convert("RGB").convert(mode) if mode != "RGBA" else Image.fromarray(STORED)
+        if mode == "LA":
+            image.putalpha(Image.fromarray(STORED[..., 3]))
+        values = np.asarray(image.convert({"P": "RGB", "1": "L"}.get(mode, mode)), np.float64).reshape(4, 5, -1)
+    colors = channels - (channels in (2, 4))
+    expected = np.concatenate([linear(values[..., :colors]), values[..., colors:] / 255.0], -1)
+    for suffix in ("png", "tif"):
+        image.save(tmp_path / f"a.{suffix}")
+        found = eg.read_image(tmp_path / f"a.{suffix}")
+        assert found.shape == (4, 5, channels)
+        # Pillow writes the 16-bit palette of a TIFF as 256 times the byte, not 257.
+        loose = mode == "P" and suffix == "tif"
+        np.testing.assert_allclose(found.numpy(), expected, atol=0.01 if loose else 1e-6)
+    material = {"images": [{"bufferView": 3}], "textures": [{"source": 0}], "extra": [saved("PNG", image)]}
+    mesh = eg.load_mesh(write(tmp_path, "a.glb", square_glb(TEXTURED, uv=True, **material)))
+    np.testing.assert_allclose(mesh.texture.numpy(), np.broadcast_to(expected[..., :colors], (4, 5, 3)), atol=1e-6)

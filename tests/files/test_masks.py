@@ -1,4 +1,4 @@
-"""Masks: the coverage of every kind of file, against the numbers that were written to it."""
+"""Masks are the coverage that was written, in every kind of file."""
 
 import io
 from pathlib import Path
@@ -124,7 +124,7 @@ def test_several_labels_are_named_and_chosen(tmp_path: Path, name: str, dtype: t
 
 
 def regions(*numbers: int) -> np.ndarray:
-    """The last on a disc, the others in bands."""
+    """Return labels in bands, and the last one on a disc."""
     y, x = np.mgrid[:48, :64]
     image = np.array(numbers[:-1])[y * (len(numbers) - 1) // 48]
     image[(x - 30) ** 2 + (y - 25) ** 2 < 150] = numbers[-1]
@@ -146,7 +146,7 @@ def regions(*numbers: int) -> np.ndarray:
 )
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_labels_that_reach_beyond_an_eighth_of_white(tmp_path: Path, numbers: tuple[int, ...], dtype: type) -> None:
-    """Of Cityscapes, COCO, ADE, and a void of 255."""
+    """The labels are those of Cityscapes, COCO and ADE, and a void of 255."""
     labels = regions(*numbers)
     stored = (labels * (1 if dtype is np.uint8 else 257)).astype(dtype)
     Image.fromarray(stored).save(tmp_path / "a.png")
@@ -255,7 +255,7 @@ def test_palettes(tmp_path: Path) -> None:
     palette(two, (0, 0, 0), (0, 0, 0), (128, 0, 0)).save(path)  # a second black is a label
     with pytest.raises(ValueError, match=r"got the labels 0, 1, 2; choose"):
         eg.read_mask(path)
-    palette(LABELS, *[(0, 0, 0)] * 8).save(path)  # labels that no colour tells apart
+    palette(LABELS, *[(0, 0, 0)] * 8).save(path)  # labels that no colour separates
     agree(path, LABELS == 3, 3)
     Image.fromarray(LABELS == 1).save(path)
     agree(path, LABELS == 1, 1)

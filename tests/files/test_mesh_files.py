@@ -41,7 +41,7 @@ def test_vertices_stay_welded_at_a_texture_seam_and_a_crease(tmp_path):
 
 @pytest.mark.parametrize("bad", [None, "nan", "1e10"])
 def test_texture_coordinates_without_a_texture(tmp_path, bad):
-    """For a texture to come; and those that no texture can have are no fault of a file without one."""
+    """They are kept for a later texture. Unusable ones are no fault of a file without a texture."""
     path = write_obj(tmp_path)
     plain = path.read_text().replace("mtllib quad.mtl\n", "").replace("usemtl skin\n", "")
     path.write_text(plain if bad is None else re.sub(r"(?m)^vt \S+", f"vt {bad}", plain, count=1))
@@ -68,15 +68,6 @@ def test_obj_texture_given_by_hand(tmp_path):
         load_mesh(tmp_path / "plain.obj", texture=tmp_path / "skin.png")
 
 
-def test_obj_vertex_colours_are_srgb(tmp_path):
-    for name, scale in (("unit.obj", 255.0), ("byte.obj", 1.0)):
-        rows = "".join(f"v {x} {y} {z} {128 / scale} {255 / scale} 0\n" for x, y, z in SQUARE)
-        (tmp_path / name).write_text(rows + "f 1 2 3 4\n")
-        mesh = load_mesh(tmp_path / name)
-        assert mesh.faces.shape == (2, 3)
-        np.testing.assert_allclose(mesh.colors.numpy(), np.tile(linear([128, 255, 0]), (4, 1)), atol=1e-6)
-
-
 def test_obj_parts(tmp_path):
     body = (
         "# mtllib nowhere.mtl\n  mtllib\tquad.mtl\no left\nv 0 0 0\nv 1 0 0 # a comment\nv 0 1 0\nusemtl red\nf 1 2 3\n"
@@ -89,12 +80,6 @@ def test_obj_parts(tmp_path):
     whole = load_mesh(path)
     assert whole.face_colors.tolist() == [[0.5, 0, 0], [0, 0.25, 0]] and whole.verts.shape == (6, 3)
     assert len(load_scene(path, materials=False).meshes) == 2 and load_mesh(path, materials=False).channels is None
-
-
-def test_obj_polygons_negative_indices_and_unused_vertices(tmp_path):
-    body = "v 9 9 9\nv 0 0 0\nv 2 0 0\nv 3 1 0\nv 1 2 0\nv -1 1 0\nf -5 -4 -3 -2 -1\n"
-    mesh = load_mesh(write_obj(tmp_path, body=body))
-    assert mesh.verts.shape == (5, 3) and mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
 
 
 def test_textured_obj_and_glb_made_by_trimesh_agree(tmp_path):
@@ -111,18 +96,6 @@ def test_textured_obj_and_glb_made_by_trimesh_agree(tmp_path):
         for vertex, texel in enumerate([(1, 0), (1, 1), (0, 1), (0, 0)]):
             face, corner = next((f, c) for f in range(2) for c in range(3) if TRIANGLES[f][c] == vertex)
             np.testing.assert_allclose(texel_at(mesh, face, corner), linear(TEXELS[texel]), atol=1e-6)
-
-
-@pytest.mark.parametrize("binary", [False, True])
-def test_ply_colours(tmp_path, binary):
-    colors = [[0, 1, 10], [11, 128, 255], [200, 100, 50], [3, 2, 1]]
-    (tmp_path / "v.ply").write_bytes(ply(SQUARE, TRIANGLES, vertex_colors=colors, binary=binary))
-    np.testing.assert_allclose(load_mesh(tmp_path / "v.ply").colors.numpy(), linear(colors), atol=1e-7)
-    (tmp_path / "f.ply").write_bytes(ply(SQUARE, TRIANGLES, face_colors=colors[:2], binary=binary))
-    np.testing.assert_allclose(load_mesh(tmp_path / "f.ply").face_colors.numpy(), linear(colors[:2]), atol=1e-7)
-    (tmp_path / "q.ply").write_bytes(ply(SQUARE, [[0, 1, 2, 3]], face_colors=colors[:1], binary=binary))
-    quad = load_mesh(tmp_path / "q.ply")
-    np.testing.assert_allclose(quad.face_colors.numpy(), linear([colors[0]] * 2), atol=1e-7)
 
 
 def test_ply_copies_with_different_colours_are_welded(tmp_path):

@@ -1,4 +1,4 @@
-"""Faces with any number of corners, in every format that has them, by the area that they cover."""
+"""Faces with any number of corners cover their area, in every format that has them."""
 
 import math
 import sys
@@ -20,19 +20,19 @@ SPIRAL = [[0, 0], [5, 0], [5, 5], [0, 5], [0, 2], [3, 2], [3, 3], [1, 3], [1, 4]
 
 
 def area(polygon):
-    """The shoelace formula."""
+    """Return the area by the shoelace formula."""
     x, y = np.array(polygon, np.float64).T
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def covered(mesh):
-    """The areas of all triangles, with the sign of the side that they are seen from along -z."""
+    """Return the areas of all triangles as vectors, whose sign is that of the side seen along −z."""
     a, b, c = mesh.verts[mesh.faces].double().unbind(1)
     return 0.5 * torch.linalg.cross(b - a, c - a)
 
 
 def written(folder, kind, polygons):
-    """A file of flat polygons, each with vertices of its own."""
+    """Write a file of flat polygons, each with vertices of its own."""
     verts = [[*p, 0.0] for polygon in polygons for p in polygon]
     starts = np.cumsum([0] + [len(p) for p in polygons])
     faces = [list(range(start, start + len(p))) for start, p in zip(starts, polygons, strict=False)]
@@ -50,7 +50,8 @@ def written(folder, kind, polygons):
 
 @pytest.mark.parametrize("kind", ["obj", "ply", "off"])
 def test_concave_faces_cover_their_area(tmp_path, kind):
-    """From every corner, seen from both sides, and mixed with triangles and convex faces, which stay fans."""
+    """Faces begin at every corner, have both orientations, and stand among triangles and convex faces, which stay
+    fans."""
     turned = [np.roll(shape, n, axis=0).tolist() for shape in (C, ARROW, SPIRAL) for n in range(len(shape))]
     turned += [polygon[::-1] for polygon in turned]
     for polygon in turned:
@@ -70,7 +71,7 @@ def test_the_silhouette_of_a_c(tmp_path):
 
 
 def test_in_any_plane_of_space(tmp_path):
-    """Turned about an axis that lies along none of the file's."""
+    """The plane is rotated about an axis that is none of the file's."""
     axis = np.array([1.0, 2.0, 3.0]) / math.sqrt(14.0)
     cross = np.cross(np.eye(3), axis)
     for angle in np.linspace(0.1, 6.2, 7):
@@ -84,7 +85,7 @@ def test_in_any_plane_of_space(tmp_path):
 
 
 def test_the_side_of_a_face_does_not_depend_on_earcut(tmp_path, monkeypatch):
-    """Which promises none."""
+    """earcut promises no orientation."""
     split = mapbox_earcut.triangulate_float64
     monkeypatch.setattr(
         mapbox_earcut, "triangulate_float64", lambda *given: split(*given).reshape(-1, 3)[:, ::-1].reshape(-1)
@@ -111,14 +112,14 @@ def test_texture_coordinates_follow_their_corners(tmp_path):
         [[0, 0], [4, 0], [4, 4], [2, -2], [0, 4]],
     ],
 )
-def test_faces_that_cross_themselves_are_said(tmp_path, polygon):
+def test_faces_that_cross_themselves_are_named(tmp_path, polygon):
     path = written(tmp_path, "obj", [ARROW, polygon, polygon])
     with pytest.warns(UserWarning, match="2 faces that cross themselves, the first of them face 1, counted from 0"):
         assert len(eg.load_mesh(path).faces) >= 4
 
 
 def test_corners_of_180_degrees_and_bent_quads_stay_fans(tmp_path):
-    """None is concave but for the last digit, which a file rounds."""
+    """No corner is concave but for the last digit, which a file rounds."""
     flat = [[0, 0], [1, 1e-9], [2, 0], [2, 2], [1, 2 - 1e-9], [0, 2]]
     assert eg.load_mesh(written(tmp_path, "obj", [flat])).faces.tolist() == [[0, i, i + 1] for i in range(1, 5)]
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0.4\nv 1 1 0\nv 0 1 0.4\nf 1 2 3 4\n")

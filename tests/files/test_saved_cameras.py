@@ -74,7 +74,7 @@ EYES = np.array([[500000.3, 4600000.3, 4.0], [500003.1, 4600001.7, 5.2]])  # of 
 
 
 def written(folder, kind, eyes):
-    """A file of cameras there that look down, by hand."""
+    """Write a file of cameras at these places that look down, by hand."""
     if kind == "save_camera":
         poses = np.stack([np.diag([1.0, -1, -1, 1])] * len(eyes))
         poses[:, :3, 3] = -(eyes * [1, -1, -1])

@@ -1,38 +1,14 @@
-"""save_mesh() into GLB: what load_scene(lit=True) reads is the same, in numbers and pictures; the rest is named."""
+"""save_mesh() writes a GLB from which load_scene(lit=True) reads the same numbers and pictures; the rest is named."""
 
 import warnings
-from functools import cache
 
 import pytest
 import torch
+from boxes import APPEARANCES, FACES, OWN, UV_FACES, UVS, VERTS, box, color, data, random, schema
 from lit_gltf import file
-from scenes import cube
-from trimesh.exchange.gltf import get_schema
 
 import edgegrad as eg
 from edgegrad.files.formats import gltf
-from edgegrad.files.image import srgb_to_linear
-
-VERTS, FACES = cube().verts.float(), cube().faces
-random = torch.Generator().manual_seed(0)
-UVS, UV_FACES = 2.0 * torch.rand(20, 2, generator=random), torch.arange(36).reshape(12, 3) % 20
-OWN = {"uvs": torch.rand(36, 2, generator=random), "uv_faces": torch.arange(36).reshape(12, 3).flip(0)}
-
-
-def data(channels=3, h=4, w=8, least=0):
-    """An image that 8 bits hold."""
-    return torch.randint(least, 256, (h, w, channels), generator=random) / 255.0
-
-
-def color(channels=3, **size):
-    """One whose sRGB they hold."""
-    image = srgb_to_linear(data(channels, **size).double()).float()
-    image[0, 0] = 1.0
-    return image
-
-
-def box(material=None, **look):
-    return eg.Mesh(VERTS, FACES, uvs=UVS, uv_faces=UV_FACES, material=material, **look)
 
 
 def seen(mesh, **options):
@@ -50,7 +26,7 @@ def saved(folder, mesh):
 
 
 def close(found, given):
-    """Numbers, or textures with how they lie on the mesh."""
+    """Check that numbers, or textures with their coordinates, are close."""
     if not isinstance(given, eg.Texture):
         torch.testing.assert_close(torch.as_tensor(found).double(), torch.as_tensor(given).double())
         return
@@ -105,19 +81,6 @@ def test_materials_come_back(name, tmp_path):
     assert float((seen(mesh) - other).abs().max()) > 0.05  # the pictures show
 
 
-LOOKS = {
-    "colours": {"colors": torch.rand(8, 3, generator=random)},
-    "grey": {"colors": torch.rand(8, 1, generator=random)},
-    "colours of faces": {"face_colors": torch.rand(12, 3, generator=random)},
-    "colours of corners": {"corner_colors": torch.rand(12, 3, 3, generator=random)},
-    "texture": {"texture": color(), "wrap": ("mirror", "clamp"), "filter": "nearest"},
-    "nothing": {},
-    "normals of corners": {"normals": eg.vertex_normals(VERTS, FACES)[FACES].flatten(0, 1).roll(1, 0),
-                           "normal_faces": torch.arange(36).reshape(12, 3)},
-    "name": {"name": "crate"},
-}  # fmt: skip
-
-
 BASES = {
     "none": None,
     "factor": FACTOR,
@@ -126,7 +89,7 @@ BASES = {
 }
 PAIRS = [
     (name, base)
-    for name in LOOKS
+    for name in APPEARANCES
     for base in BASES
     if (name, base) not in (("grey", "none"), ("texture", "texture"))  # lights have colours; a glTF has one texture
     and not (base == "vertices" and name in ("colours", "grey", "colours of faces", "colours of corners"))
@@ -134,8 +97,8 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("name", "base"), PAIRS)
-def test_looks_come_back(name, base, tmp_path):
-    mesh = box(eg.Material(BASES[base], roughness=0.6), **LOOKS[name])
+def test_appearances_come_back(name, base, tmp_path):
+    mesh = box(eg.Material(BASES[base], roughness=0.6), **APPEARANCES[name])
     found = saved(tmp_path, mesh)
     torch.testing.assert_close(seen(found), seen(mesh), rtol=1e-4, atol=1e-5)
     assert found.name == ("crate" if name == "name" else "geometry_0")
@@ -146,7 +109,7 @@ ALPHAS = {
     "cut out of a texture": ({"alpha": data(1)[..., 0], "texture": color(), "filter": "nearest"}, {}),
     "cut out of a material": ({"alpha": data(1)[..., 0]}, {"base_color": eg.Texture(color(), filter="mipmap")}),
     "seen through": ({"alpha": data(1)[..., 0]}, {"alpha_mode": "BLEND"}),
-    "seen through beside colours": ({"alpha": data(1)[..., 0], **LOOKS["colours"]}, {"alpha_mode": "BLEND"}),
+    "seen through, with colours": ({"alpha": data(1)[..., 0], **APPEARANCES["colours"]}, {"alpha_mode": "BLEND"}),
     "evenly seen through": ({"alpha": torch.full((1, 1), 0.3)}, {"alpha_mode": "BLEND"}),
 }
 
@@ -185,7 +148,7 @@ TEXTURE = eg.Texture(color())
         ({"base_color": 2.0 * FACTOR}, {}, r"no material\.base_color beyond 0 … 1"),
         ({"base_color": TEXTURE.replace(factor=3.0)}, {}, r"no material\.base_color beyond 0 … 1"),
         ({"base_color": TEXTURE}, {"texture": color()}, r"no material\.base_color beside a texture"),
-        ({"base_color": torch.rand(8, 3)}, LOOKS["colours"], r"no material\.base_color of vertices beside colors"),
+        ({"base_color": torch.rand(8, 3)}, APPEARANCES["colours"], r"no material\.base_color of vertices beside colors"),
         ({"metallic": 1.5}, {}, r"no material\.metallic beyond 0 … 1"),
         ({"roughness": eg.Texture(3.0 * data(1))}, {}, r"no material\.roughness beyond 0 … 1"),
         ({"metallic": eg.Texture(data(1)), "roughness": eg.Texture(data(1), wrap="clamp")}, {},
@@ -198,7 +161,7 @@ TEXTURE = eg.Texture(color())
         ({}, {"texture": color() - 0.5}, r"no texture beyond 0 … 1"),
         ({}, {"alpha": 2.0 * data(1)[..., 0]}, r"no alpha beyond 0 … 1"),
         ({}, {"alpha": data(1)[..., 0], "texture": color(h=5)}, r"no alpha that lies otherwise than the base colour's"),
-        (None, {"alpha": data(1)[..., 0], **LOOKS["colours"]}, r"no alpha beside colours of vertices"),
+        (None, {"alpha": data(1)[..., 0], **APPEARANCES["colours"]}, r"no alpha beside colours of vertices"),
     ],
 )  # fmt: skip
 def test_what_gltf_does_not_hold_is_named(material, look, message, tmp_path):
@@ -229,13 +192,6 @@ def test_what_is_matt(tmp_path):
             material = eg.load_scene(path, lit=True).meshes[0].material
         assert (material.metallic is None and material.roughness is None) == kept
         assert [str(w.message).endswith("KHR_materials_specular (left out)") for w in said] == ([] if kept else [True])
-
-
-@cache
-def schema():
-    """Checks a tree by the schema of the format, which trimesh has."""
-    jsonschema = pytest.importorskip("jsonschema")
-    return jsonschema.validators.validator_for(get_schema())(get_schema())
 
 
 def test_the_file_is_a_gltf(tmp_path):

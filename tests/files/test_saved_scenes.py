@@ -1,4 +1,5 @@
-"""save_scene(): what load_scene(lit=True) and load_cameras() read is the same, in numbers and pictures; the rest is named."""
+"""save_scene() writes what load_scene(lit=True) and load_cameras() read as the same numbers and pictures; the rest is
+named."""
 
 import json
 import math
@@ -6,8 +7,8 @@ import warnings
 
 import pytest
 import torch
+from boxes import APPEARANCES, FACES, OWN, VERTS, box, color, data, schema
 from scenes import cube, icosphere
-from test_saved_materials import FACES, LOOKS, OWN, VERTS, box, color, data, schema
 
 import edgegrad as eg
 from edgegrad.files.formats import gltf
@@ -32,7 +33,7 @@ def ground(**look):
 WOOD = eg.Material(eg.Texture(color(), filter="mipmap"), roughness=eg.Texture(data(1, least=60)), metallic=0.2)
 SCENES = {
     "plain": eg.Scene([eg.Mesh(VERTS, FACES)]),
-    "plain colours": eg.Scene([box(**LOOKS["colours"]), ball(face_colors=torch.rand(80, 3, generator=random))]),
+    "plain colours": eg.Scene([box(**APPEARANCES["colours"]), ball(face_colors=torch.rand(80, 3, generator=random))]),
     "plain textures": eg.Scene([box(texture=color(), wrap="clamp"), ball()]),
     "lights on a ball": eg.Scene([ball(material=eg.Material(0.8)), ground(material=eg.Material())], lights=[POINT, SPOT, SUN]),
     "a shared material": eg.Scene(
@@ -41,7 +42,7 @@ SCENES = {
     "a shared texture": eg.Scene(
         [box(WOOD), box(WOOD.replace(metallic=0.8, two_sided=False)).transformed(t=(2.0, 0.0, -1.0))], lights=[POINT, SUN]
     ),
-    "lit beside unlit": eg.Scene(
+    "lit and unlit": eg.Scene(
         [box(texture=color()), ball(material=eg.Material(0.5), colors=torch.rand(42, 3, generator=random)), ground()],
         lights=[POINT],
     ),
@@ -62,7 +63,7 @@ SCENES = {
 
 
 def saved(path, scene, cameras=None):
-    """What comes back, without a warning."""
+    """Save a scene, and return what is read, without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         eg.save_scene(path, scene, cameras)

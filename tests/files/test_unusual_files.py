@@ -55,7 +55,8 @@ def compare(mesh: eg.Mesh, lit: eg.Mesh, expected: ExpectedMesh, extent: float) 
 
 
 def check_text(folder: Path, file: DrawnFile) -> None:
-    """Names are kept, vertices are welded, faces begin at their first corner, and texture coordinates are exact."""
+    """Check that names are kept, vertices are welded, faces begin at their first corner, and texture coordinates are
+    exact."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what nobody reads
         found = eg.load_scene(folder / next(iter(file.contents)), lit=True).meshes
@@ -71,7 +72,7 @@ def check_text(folder: Path, file: DrawnFile) -> None:
 
 
 def check_scene(folder: Path, file: DrawnFile) -> None:
-    """Meshes are in their places, and nothing is warned of."""
+    """Check that meshes are in their places, and that nothing is warned of."""
     path = folder / next(iter(file.contents))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

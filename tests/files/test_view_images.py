@@ -1,4 +1,4 @@
-"""Views of files: the camera and the pixels that read_image() gives of its image agree, whatever the image's header says."""
+"""A view's camera agrees with the pixels that read_image() gives of its image, whatever the image's header says."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def write_transforms(folder: Path, camera: eg.Camera, **sizes: int) -> None:
 
 
 def check(view: eg.io.View) -> None:
-    """The image is a render by the camera, to the rounding of its 8 bits and the noise of its samples."""
+    """Check that the image is a render by the camera, to the rounding of its 8 bits and the noise of its samples."""
     assert view.image is not None
     seen, again = eg.read_image(view.image, channels=3), eg.render(TRIANGLE, view.camera, 64)
     assert seen.shape == again.shape
@@ -76,7 +76,7 @@ def test_cameras_speak_of_the_pixels_that_are_stored(orientation: int, tmp_path)
 
 
 def test_a_camera_of_the_upright_size_speaks_of_the_upright_image(tmp_path) -> None:
-    """As some programs write them, which turn images before they look at them."""
+    """Some programs write such cameras, since they rotate images before they use them."""
     camera = camera_of(48, 36)
     upright = picture_of(camera)
     write(tmp_path / "images" / "a.png", np.rot90(upright), 6)  # to be turned clockwise
@@ -134,7 +134,7 @@ def test_what_is_no_image_is_named_by_who_reads_it(tmp_path) -> None:
 
 
 def test_a_texture_is_laid_on_as_it_is_stored(tmp_path) -> None:
-    """As the one that an OBJ names, and as Blender shows it."""
+    """The texture is as the OBJ names it, and as Blender shows it."""
     pixels = np.random.default_rng(0).integers(0, 256, (4, 4, 3), dtype=np.uint8)
     write(tmp_path / "a.png", pixels, 6)
     (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")

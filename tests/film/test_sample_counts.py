@@ -33,7 +33,7 @@ def relative_error(a: Tensor, b: Tensor) -> float:
 
 
 def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = True) -> tuple[int, int]:
-    """What the kernel says it drew for the triangle's vertices."""
+    """Return how many samples the kernel says it drew for the triangle's vertices."""
     # All pixels covered by many samples, so that no budget binds; nothing is occluded.
     hits = HitBuffers(
         torch.ones(1, SIZE, SIZE, dtype=F64),

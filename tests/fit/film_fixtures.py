@@ -21,13 +21,13 @@ def film() -> Film:
 
 @pytest.fixture(scope="session")
 def frames(film: Film) -> list[Tensor]:
-    """With little noise of light, whose draws the bounds on poses are not about."""
+    """Return frames with little noise of light, since the bounds on poses are not about its draws."""
     return list(replace(film, spp=32))
 
 
 @pytest.fixture
 def arguments(film: Film, tmp_path: Path) -> Callable[[str], list[str]]:
-    """Of `edgegrad track`, for a video or a folder in tmp_path by its name."""
+    """Return the arguments of `edgegrad track` for a video or a folder in tmp_path, by its name."""
     eg.save_mesh(tmp_path / "stone.ply", film.mesh)
     eg.save_camera(tmp_path / "camera.json", film.camera)
     (tmp_path / "init.json").write_text(json.dumps({"mesh_to_world": film.poses[0].tolist()}))

@@ -1,4 +1,4 @@
-"""A painted stone that turns before clutter, in light that its mesh does not have, and a hand that passes over it."""
+"""A painted stone that rotates before clutter, in light that its mesh does not have, while a hand passes over it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DISTANCE = 3.4
 
 
 def stone(subdivisions: int = 3) -> eg.Mesh:
-    """A body without symmetry, 1.8 units across, with smooth patches of colours."""
+    """Return a body without symmetry, 1.8 units across, with smooth patches of colours."""
     ball = icosphere(subdivisions)
     x, y, z = ball.verts.double().unbind(-1)
     radius = 1.0 + 0.25 * x * y + 0.2 * torch.sin(3.0 * z + x) + 0.15 * torch.cos(4.0 * y - z)
@@ -39,7 +39,7 @@ def camera_of(size: int) -> eg.Camera:
 
 
 def clutter(size: int, seed: int = 0) -> Tensor:
-    """(size, size, 3) sRGB values: blots of many sizes, and rectangles."""
+    """Return sRGB values (size, size, 3) of blots of many sizes, and rectangles."""
     generator = torch.Generator().manual_seed(seed)
     image = torch.full((1, 3, size, size), 0.45)
     for cells, contrast in ((4, 0.3), (9, 0.25), (24, 0.15), (60, 0.1)):
@@ -67,7 +67,7 @@ class Film:
 
     @staticmethod
     def turning(size: int, count: int, degrees: float = 3.0, mesh: eg.Mesh | None = None, **others: object) -> Film:
-        """By so many degrees a frame, about an axis that wanders, along a curve."""
+        """Return a film whose mesh rotates by so many degrees a frame about an axis that wanders, along a curve."""
         poses, R = [], rotation(torch.tensor([0.3, -0.5, 0.2]).double())
         for k in range(count):
             axis = torch.tensor([math.cos(0.05 * k), 1.0, math.sin(0.03 * k)]).double()
@@ -86,7 +86,7 @@ class Film:
         return (self.frame(k) for k in range(len(self)))
 
     def frame(self, k: int) -> Tensor:
-        """(H, W, 3) linear radiance, of 8 bits."""
+        """Return linear radiance (H, W, 3) of 8 bits."""
         size = self.camera.size[0]
         if self.gone is not None and self.gone[0] <= k < self.gone[1]:
             picture = self.background
@@ -111,7 +111,8 @@ class Film:
 
 
 def _before(picture: Tensor, way: float) -> Tensor:
-    """With an arm across, a sixth of the picture wide, that goes from the left to the right."""
+    """Return the picture behind an arm, a sixth of its width wide, that moves from left to right as `way` grows to
+    1."""
     size = picture.shape[0]
     v, u = torch.meshgrid((torch.arange(size) + 0.5) / size, (torch.arange(size) + 0.5) / size, indexing="ij")
     x, y = u - (1.5 * way - 0.25), v - 0.75
@@ -123,7 +124,7 @@ def _before(picture: Tensor, way: float) -> Tensor:
 
 
 def errors(film: Film, index: int, R: Tensor, t: Tensor) -> tuple[float, float]:
-    """Degrees, and percent of the object's size that its centre is off."""
+    """Return by how many degrees, and percent of the object's size, a pose is off."""
     M, verts = film.poses[index], film.mesh.verts.double()
     low, high = verts.aminmax(dim=0)
     c = 0.5 * (low + high)

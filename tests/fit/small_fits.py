@@ -1,4 +1,4 @@
-"""Small fits with known answers, lit and not, and such as cannot end right: do they say so, and in how many steps?"""
+"""Small fits with known answers, lit and unlit, and fits that cannot end right."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from typing import Any
 
 import torch
 import trimesh
-from test_fit import bracket, rotation
+from brackets import CENTER, SIZE, bracket, rotation
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import Fit, Parameter, Pose, PoseParameter, fit_scene
 
-CENTER = torch.tensor([1.0, 0.75, 0.4]).double()
-SIZE = 2.62  # the bracket's diagonal
 SKY = torch.tensor([0.1, 0.2, 0.3])
 
 
@@ -43,7 +41,7 @@ def lit(mesh: eg.Mesh, *lights: Any) -> eg.Scene:
 
 
 def pictures(scene: eg.Scene, views: list[eg.Camera], seeds: int = 8) -> list[Tensor]:
-    """Means over seeds, for a face is shaded at few points of a pixel."""
+    """Return means over seeds, since a face is shaded at few points of a pixel."""
     with torch.no_grad():
         return [
             torch.stack([eg.render(scene, view, 64, (1 << 20) + k) for k in range(seeds)]).mean(0) for view in views
@@ -61,7 +59,7 @@ def degrees_between(a: Tensor, b: Tensor) -> float:
 
 
 def pose_error(matrix: Tensor) -> float:
-    """Degrees, and hundredths of the size, whichever is more, from where the bracket is."""
+    """Return the larger of degrees and hundredths of the size by which a pose is off."""
     M = matrix.double()
     turned = math.degrees(2.0 * math.asin(min(1.0, float((M[:3, :3] - torch.eye(3)).norm()) / math.sqrt(8.0))))
     apart = M[:3, :3] @ CENTER + M[:3, 3] - CENTER
@@ -73,7 +71,7 @@ START = about_center(rotation(0.12, -0.15, 0.1), (0.12, -0.1, 0.15))  # 12.3° a
 
 @dataclass
 class Problem:
-    """One fit: what it starts from, what it is given, and how far off its answer is, 1 being as far as a right one may be."""
+    """A fit with its start and arguments; `error` is 1 where its answer is as far off as a right one may be."""
 
     scene: Any
     views: list[eg.Camera]
@@ -134,7 +132,7 @@ def emitter() -> Problem:
 
 
 def patched_ball(colours: Tensor) -> eg.Mesh:
-    """A smooth ball, one colour (8, 3) an octant."""
+    """Return a smooth ball with one colour (8, 3) an octant."""
     shape = trimesh.creation.icosphere(subdivisions=2)
     verts, faces = torch.tensor(shape.vertices).float(), torch.tensor(shape.faces)
     octant = ((verts[faces].mean(1) > 0).long() * torch.tensor([1, 2, 4])).sum(1)
@@ -144,7 +142,7 @@ def patched_ball(colours: Tensor) -> eg.Mesh:
 
 
 def light_and_colours() -> Problem:
-    """Eight colours, and where the sun stands: 27 numbers."""
+    """Find eight colours and the sun's direction, 27 numbers."""
     views = cameras(2, 40)
     colours = 0.2 + 0.6 * torch.rand(8, 3, generator=torch.Generator().manual_seed(1))
     truth = torch.tensor([-0.5, -0.8, -1.0])
@@ -240,7 +238,7 @@ def vertices() -> Problem:
 
 
 def covered() -> Problem:
-    """A third of the picture shows something else, under a robust loss."""
+    """Find the pose under a robust loss where a third of the picture shows something else."""
     problem = pose(loss="robust")
     problem.targets[0][:, :16] = 0.9
     problem.error = lambda fit: pose_error(fit.values["meshes.0.pose"]) / 0.8
@@ -271,7 +269,7 @@ def another_object() -> Problem:
 
 
 def another_light() -> Problem:
-    """A background alone is sought where the sun stands elsewhere, and the object too."""
+    """Find a background alone where both the sun and the object are elsewhere."""
     views = cameras()
     moved = lit_bracket().transformed(about_center(rotation(0.5, 0.9, 0.3)).R.float())
     return Problem(
@@ -281,7 +279,7 @@ def another_light() -> Problem:
 
 
 def turned_over() -> Problem:
-    """A start from the other side, from which the way down ends elsewhere."""
+    """Start from the other side, where the descent ends elsewhere."""
     problem = pose()
     start = about_center(rotation(0.0, 0.0, math.pi - 0.2))
     problem.parameters = {"meshes.0.pose": PoseParameter(start, rotation=0.015, shift=0.006)}

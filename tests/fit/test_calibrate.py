@@ -1,4 +1,4 @@
-"""calibrate() and the uncertainty of cameras: lenses that are known, numbers that pictures do not show, and noise by hand."""
+"""calibrate() and the uncertainty of cameras: known lenses, numbers that pictures do not show, and noise by hand."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from test_fit import BACKGROUND, about_center, bracket, camera, picture, rotation, silhouette
+from brackets import BACKGROUND, about_center, bracket, camera, picture, rotation, silhouette, task_of
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import Calibration, calibrate, fit_camera
 from edgegrad.fit.ending import Ending
 from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.loss_model import ColorLoss, score_covariance
 from edgegrad.fit.pose.pose import Pose
-from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, PoseTask, Unknowns
+from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, Unknowns
 
 LENS = torch.tensor([-0.15, 0.05, 0.0, 0.0], dtype=torch.float64)
 SIMPLE = torch.tensor([-0.15, 0.0, 0.0, 0.0], dtype=torch.float64)
@@ -26,7 +25,7 @@ DIRECTIONS = rotation(0.0, 0.0, 0.0), rotation(0.2, 0.9, 0.1), rotation(-0.3, -0
 
 
 def taken(count: int, size: int, distance: float = 2.4, distortion: Tensor = LENS) -> list[eg.Camera]:
-    """Cameras around the bracket with one lens, whose principal point is aside."""
+    """Return cameras around the bracket with one lens, whose principal point is off the middle."""
     one = camera(size, distance).to(torch.float64)
     K = one.K.clone()
     K[0, 2] += 0.012 * size
@@ -36,7 +35,7 @@ def taken(count: int, size: int, distance: float = 2.4, distortion: Tensor = LEN
 
 
 def guessed(true: list[eg.Camera], zoom: float = 1.05) -> list[eg.Camera]:
-    """Where a fit starts: another focal length, the middle of the image, no distortion, and poses some 4° and 3 % off."""
+    """Return starts: another focal length, the middle of the image, no distortion, and poses some 4° and 3 % off."""
     off = about_center(rotation(0.04, -0.05, 0.03).double(), (0.05, -0.04, 0.03))
     size = true[0].size[0]
     K = true[0].K.clone()
@@ -53,8 +52,8 @@ def scene() -> eg.Scene:
     return eg.Scene([bracket()], BACKGROUND)
 
 
-def test_noise_of_pixels_that_are_alike_nearby() -> None:
-    """S = Σ s_p s_qᵀ, by pairs, with the weights (1 − |Δx|/8)(1 − |Δy|/8)."""
+def test_noise_of_correlated_neighbouring_pixels() -> None:
+    """The covariance is S = Σ s_p s_qᵀ over pairs, with the weights (1 − |Δx|/8)(1 − |Δy|/8)."""
     s = torch.randn(2, 5, 11, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     y, x = (axis.flatten() for axis in torch.meshgrid(torch.arange(5), torch.arange(11), indexing="ij"))
     near = [(1.0 - (axis[:, None] - axis).abs() / 8.0).clamp(min=0.0) for axis in (y, x)]
@@ -64,7 +63,7 @@ def test_noise_of_pixels_that_are_alike_nearby() -> None:
 
 @pytest.mark.parametrize("projection", ["perspective", "fisheye"])
 def test_how_far_a_lens_moves_the_corners(projection: str) -> None:
-    """By the difference of where points land that the camera without distortion shows at its corners."""
+    """The reference moves the points that the camera without distortion shows at its corners."""
     K = torch.tensor([[40.0, 0, 30], [0, 40, 22], [0, 0, 1]], dtype=torch.float64)
     plain = eg.Camera(torch.eye(4, dtype=torch.float64), K, (48, 64), projection, torch.zeros(4))
     corners = torch.tensor([[x, y] for x in (0.0, 64.0) for y in (0.0, 48.0)], dtype=torch.float64)
@@ -82,7 +81,7 @@ def test_how_far_a_lens_moves_the_corners(projection: str) -> None:
 
 
 def noisy(clean: Tensor, blocks: int, seed: int) -> Tensor:
-    """A picture with noise that is the same in blocks of pixels."""
+    """Return a picture with noise that is the same in blocks of pixels."""
     h, w, c = clean.shape
     noise = torch.randn(-(-h // blocks), -(-w // blocks), c, generator=torch.Generator().manual_seed(seed))
     noise = noise.repeat_interleave(blocks, 0).repeat_interleave(blocks, 1)[:h, :w]
@@ -91,25 +90,23 @@ def noisy(clean: Tensor, blocks: int, seed: int) -> Tensor:
 
 @pytest.mark.parametrize("blocks", [1, 3])
 def test_deviations_are_those_of_pictures_with_noise(blocks: int) -> None:
-    """Steps from the true camera, which noise alone causes, in units of their covariance: χ² / n is about 1."""
+    """Noise alone causes steps from the true camera. In units of their covariance, χ² / n is about 1."""
     (true,) = taken(1, 48)
     clean, found = eg.render(scene(), true, 256, 1).float(), []
     one = torch.ones((), dtype=torch.float64)
     pose = Pose(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), one, one)
     for seed in range(10):
         lens = Unknowns(False, True, True, 2)
-        task = PoseTask.from_arguments(
-            scene(), noisy(clean, blocks, seed), true, None, None, BACKGROUND, lens, 1.0, ArgumentNames()
-        )
-        told = ColorLoss(task, pose, 512, 16, seed).at(pose)
-        step = torch.linalg.solve(told.curvature, told.gradient)
-        found.append(float(told.gradient @ torch.linalg.solve(told.scores, told.gradient)) / len(step))
-    # The mean over ten has a deviation of 0.13. Bartlett's weights leave out a part of what is alike: of blocks of 3, a ninth.
+        task = task_of(noisy(clean, blocks, seed), true, background=BACKGROUND, unknowns=lens)
+        loss = ColorLoss(task, pose, 512, 16, seed).at(pose)
+        step = torch.linalg.solve(loss.curvature, loss.gradient)
+        found.append(float(loss.gradient @ torch.linalg.solve(loss.scores, loss.gradient)) / len(step))
+    # The mean over ten has a deviation of 0.13. Bartlett's weights leave out a part of the correlation: of blocks of 3, a ninth.
     assert 0.6 < sum(found) / len(found) < 1.7
 
 
-def test_a_lens_that_a_picture_does_not_tell() -> None:
-    """Within a third of the image nothing tells k2; k1 is known roughly, and the focal length."""
+def test_a_lens_that_a_picture_does_not_show() -> None:
+    """An object within a third of the image does not show k2. It shows k1 and the focal length roughly."""
     (true,) = taken(1, 96, distance=11.0)
     (start,) = guessed([true], 1.0)
     start = start.replace(K=true.K)
@@ -124,7 +121,7 @@ def test_a_lens_that_a_picture_does_not_tell() -> None:
     assert 0.0 < known.focal < 0.05 and abs(float(fit.camera.K[0, 0] / true.K[0, 0]) - 1.0) < 4.0 * known.focal
 
 
-def test_a_near_object_tells_the_lens() -> None:
+def test_a_near_object_shows_the_lens() -> None:
     (true,) = taken(1, 64, distance=2.2, distortion=SIMPLE)
     (start,) = guessed([true])
     fit = fit_camera(
@@ -143,7 +140,7 @@ def test_a_near_object_tells_the_lens() -> None:
 
 
 def checked(fit: Calibration, true: list[eg.Camera], focal: float, center: float) -> None:
-    """Errors are below limits, and agree with their deviations."""
+    """Check that errors are below limits and agree with their deviations."""
     known, lens = fit.uncertainty, true[0].distortion
     assert known is not None and lens is not None and fit.camera.distortion is not None
     assert abs(float(fit.camera.K[0, 0] / true[0].K[0, 0]) - 1.0) < min(focal, 4.0 * known.focal)
@@ -156,7 +153,7 @@ def checked(fit: Calibration, true: list[eg.Camera], focal: float, center: float
 
 
 def chi_square(found: eg.Camera, true: eg.Camera, known: CameraUncertainty | None) -> float:
-    """Of how the camera is off, about the middle of the bracket, a number."""
+    """Return χ² / 6 of a camera's error about the middle of the bracket."""
     assert known is not None
     low, high = bracket().verts.double().aminmax(dim=0)
     center = 0.5 * (low + high)
@@ -188,7 +185,7 @@ def test_a_lens_from_several_pictures(tmp_path) -> None:
     torch.testing.assert_close(eg.load_camera(tmp_path / "camera-1.json").K.double(), fit.cameras[1].K)
 
 
-def test_a_calibration_without_rest_names_what_is_not_known() -> None:
+def test_a_calibration_that_ran_out_of_steps_names_what_is_not_known() -> None:
     """No more steps can be had, so numbers that the pictures hardly show are the reason."""
     zeros = torch.zeros(2, dtype=torch.float64)
     known = CameraUncertainty(
@@ -199,7 +196,7 @@ def test_a_calibration_without_rest_names_what_is_not_known() -> None:
 
 
 @pytest.mark.slow
-def test_a_calibration_that_goes_on_ends_as_if_it_had_never_stopped(tmp_path) -> None:
+def test_a_resumed_calibration_ends_as_if_it_had_never_stopped(tmp_path) -> None:
     true = taken(2, 48, distortion=SIMPLE)
 
     def stop(now: Calibration) -> None:
@@ -276,7 +273,7 @@ def test_a_lens_from_masks_alone() -> None:
 
 @pytest.mark.slow
 def test_a_lens_from_photographs() -> None:
-    """Before clutter, where the terms of photographs are compared."""
+    """The pictures have clutter behind the object, so the terms of photographs are compared."""
     true = taken(4, 128, distance=2.8, distortion=SIMPLE)
     coarse = 0.05 + 0.5 * torch.rand(4, 3, 11, 11, generator=torch.Generator().manual_seed(3))
     clutter = torch.nn.functional.interpolate(coarse, (128, 128), mode="bilinear").movedim(1, -1)
@@ -288,8 +285,8 @@ def test_a_lens_from_photographs() -> None:
 
 @pytest.mark.slow
 def test_deviations_of_cameras_are_calibrated() -> None:
-    """Errors over their deviations, of the lenses of single pictures: the median is that of a normal number, 0.67, within a
-    factor of two."""
+    """The median error of single pictures' lenses over its deviation is that of a normal number, 0.67, within a factor
+    of two."""
     ratios = []
     for k, distance in enumerate((2.2, 2.6, 3.2, 4.0)):
         true = taken(4, 96, distance)[k]

@@ -1,4 +1,4 @@
-"""fit-pose when things go wrong around it: killed, no room or rights to write, nowhere to print."""
+"""fit-pose is killed, has no room or rights to write, or cannot print."""
 
 import errno
 import json
@@ -12,13 +12,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import trimesh
-from test_fit import START, bracket, camera, picture
+from bracket_files import write_bracket
 
 import edgegrad.fit
 from edgegrad import cli
-from edgegrad.files.cameras import save_camera
-from edgegrad.files.image import linear_to_srgb, write_image
 from edgegrad.fit import PoseFit
 
 pytestmark = pytest.mark.unsanitized
@@ -33,14 +30,7 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals
 
 @pytest.fixture
 def files(tmp_path):
-    """A folder with mesh.ply, target.png, camera.json and init.json."""
-    mesh, view = bracket(), camera(32)
-    colors = (linear_to_srgb(mesh.face_colors) * 255).round().byte().numpy()
-    trimesh.Trimesh(mesh.verts, mesh.faces, face_colors=colors, process=False).export(tmp_path / "mesh.ply")
-    write_image(tmp_path / "target.png", picture(view))
-    save_camera(tmp_path / "camera.json", view)
-    (tmp_path / "init.json").write_text(json.dumps({"mesh_to_world": START.tolist()}))
-    return tmp_path
+    return write_bracket(tmp_path, 32)
 
 
 def arguments(files, out="out", steps=None):
@@ -51,7 +41,8 @@ def arguments(files, out="out", steps=None):
 
 
 class Forked:
-    """A child that runs `work()`, which gives its exit code; `out` is what it writes to file descriptors 1 and 2."""
+    """A child process that runs `work()` and exits with its result; `out` is what it writes to file descriptors 1 and
+    2."""
 
     def __init__(self, work):
         read, write = os.pipe()
@@ -70,7 +61,7 @@ class Forked:
         self.out = os.fdopen(read)
 
     def wait(self):
-        """The exit code, or minus the signal that ended it."""
+        """Return the exit code, or minus the signal that ended the child."""
         with self.out:
             return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
 
@@ -78,15 +69,15 @@ class Forked:
 # -- killed -----------------------------------------------------------------------------------------------------------
 
 
-def told_fit(*args, callback, **options):
-    """fit_pose that prints which pose is the best before it may be written: the file is at most one step behind."""
+def printing_fit(*args, callback, **options):
+    """Run fit_pose and print the best pose before it may be written, so that the file is at most one step behind."""
 
-    def tell(fit):
+    def print_and_call(fit):
         print(fit.to_json().replace("\n", " "), flush=True)
         callback(fit)
 
     options["progress"] = False
-    return FIT_POSE(*args, callback=tell, **options)
+    return FIT_POSE(*args, callback=print_and_call, **options)
 
 
 FIT_POSE = edgegrad.fit.fit_pose
@@ -95,23 +86,23 @@ FIT_POSE = edgegrad.fit.fit_pose
 @linux
 @pytest.mark.parametrize("kills", [2, pytest.param(60, marks=pytest.mark.slow)])
 def test_a_killed_fit_leaves_the_best_pose_so_far(files, kills, monkeypatch):
-    monkeypatch.setattr(edgegrad.fit, "fit_pose", told_fit)
+    monkeypatch.setattr(edgegrad.fit, "fit_pose", printing_fit)
     chance = random.Random(kills)
     for kill in range(kills):
         out = f"out{kill}"
         run = Forked(lambda out=out: cli.main(arguments(files, out)))
         steps = chance.randint(0, 40) if kill else 0  # of about 60
-        told = [json.loads(run.out.readline()) for _ in range(steps)]
+        printed = [json.loads(run.out.readline()) for _ in range(steps)]
         # From the next step's beginning to its end; the first step comes after reading the files.
         time.sleep(chance.uniform(0.0, 0.02 if steps else 0.2))
         os.kill(run.pid, signal.SIGKILL)
-        told += [json.loads(line) for line in run.out if line.endswith("\n")]
+        printed += [json.loads(line) for line in run.out if line.endswith("\n")]
         assert run.wait() == -signal.SIGKILL
         file = files / out / "pose.json"
-        if len(told) > 1 or file.exists():
+        if len(printed) > 1 or file.exists():
             found = json.loads(file.read_text())
             PoseFit.from_json(file.read_text())  # nothing is missing
-            assert found in told[-2:], (steps, found, told[-2:])
+            assert found in printed[-2:], (steps, found, printed[-2:])
 
 
 def test_the_pose_on_disk_follows_the_search(files, monkeypatch):
@@ -136,7 +127,7 @@ def test_the_pose_on_disk_follows_the_search(files, monkeypatch):
 
 
 def is_a_result(printed):
-    """Whether a pose stands there: four rows of four numbers, the last 0 0 0 1."""
+    """Return whether a pose is printed: four rows of four numbers, the last 0 0 0 1."""
     lines = printed.splitlines()
     at = lines.index("mesh to world:")
     rows = [[float(number) for number in line.split()] for line in lines[at + 1 : at + 5]]
@@ -145,7 +136,7 @@ def is_a_result(printed):
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, pytest.param(errno.EACCES, marks=pytest.mark.slow)])
 def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsys):
-    """As on a full disk, where the rights are taken away meanwhile, and so on."""
+    """The disk is full, or the rights to write are taken away during the fit."""
 
     def replace(source, target):
         raise OSError(code, os.strerror(code), source, None, target)
@@ -184,7 +175,7 @@ def test_a_folder_that_cannot_be_made_is_named_before_the_fit(files, out, monkey
 
 
 def test_a_folder_without_permission_is_named_before_the_fit(files, monkeypatch, capsys):
-    """access() is what tells; root, as whom tests may run, may write anywhere."""
+    """The test replaces access(), since root, who may run tests, may write anywhere."""
     monkeypatch.setattr(edgegrad.fit, "fit_pose", lambda *_, **__: pytest.fail("no fit should begin"))
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != files / "out")
     assert cli.main(arguments(files)) == 2

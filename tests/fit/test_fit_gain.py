@@ -6,17 +6,15 @@ import math
 
 import pytest
 import torch
-from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation
-from test_fit_photo import clutter
+from brackets import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, task_of
+from photographs import clutter
 
 import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import PoseFit, PoseParameter, fit_pose, fit_scene
 from edgegrad.fit.edge_support import edge_support
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.robust_loss import Comparison
-from edgegrad.fit.pose.task import PoseTask, Unknowns
 from edgegrad.fit.views import has_levels, white_level
 
 
@@ -26,7 +24,7 @@ def expected() -> PoseFit:
     return fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
 
 
-@pytest.mark.parametrize("gain", [1 / 256, 0.1, 2.0, pytest.param(16.0, marks=pytest.mark.slow), 256.0])
+@pytest.mark.parametrize("gain", [1 / 256, pytest.param(16.0, marks=pytest.mark.slow), 256.0])
 def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> None:
     """The background is given in the unit of the mesh's colours."""
     view = camera(48)
@@ -36,8 +34,8 @@ def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> N
     assert errors(expected)[0] < 0.1 and fit.loss == pytest.approx(expected.loss, rel=0.3)
 
 
-def test_a_broken_pixel_does_not_hold_a_fit() -> None:
-    """The range of the pictures, which the width of the robust loss follows, is that of what is not brighter than white."""
+def test_a_broken_pixel_does_not_stop_a_fit() -> None:
+    """The width of the robust loss follows the range of pixels that are not brighter than white."""
     view = camera(48)
     image = picture(view)
     image[3, 3] = 1e5
@@ -61,7 +59,7 @@ def test_the_gains_of_object_and_background(gain: float, behind: float) -> None:
     with torch.no_grad():
         alpha = eg.render_aovs(bracket(), view, ["image", "alpha"], spp=64)
     image = gain * alpha["image"] + behind * (1.0 - alpha["alpha"]) * BACKGROUND.to(alpha["image"])
-    task = PoseTask.from_arguments(bracket(), image, view, None, None, BACKGROUND, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(image, view, background=BACKGROUND)
     level = task.level(1.0, 0.0, 1.0, 64, task.dofs)
     with torch.no_grad():
         compared = Comparison(task, level, task.images(level, pose_from_matrix("", torch.eye(4)), 64, 1))
@@ -89,18 +87,18 @@ def test_noise_makes_no_edge_stronger(noise: float) -> None:
 
 @pytest.mark.parametrize("gain", [1.0, 2.5])
 def test_a_scene_whose_pictures_are_brighter_is_not_converged(gain: float) -> None:
-    """fit_scene() takes colours as they are: edges that are stronger than those of the scene are not explained by it."""
+    """fit_scene() takes colours as they are, so the scene does not explain stronger edges than its own."""
     view = camera(32)
     start = pose_from_matrix("", about_center(rotation(0.03, -0.1, 0.04), (0.04, 0.0, 0.0)))
     wanted = {"meshes.0.pose": PoseParameter(start, rotation=0.02, shift=0.01)}
-    options = {"steps": 60, "spp": 4, "progress": False, "method": "gauss-newton"}
+    options = {"steps": 20, "spp": 4, "progress": False, "method": "gauss-newton"}
     fit = fit_scene(eg.Scene([bracket()], BACKGROUND), view, gain * picture(view), wanted, **options)
     assert (fit.explained > 0.9) == (gain == 1.0) and (fit.explained < 0.6) == (gain > 1.0), fit.explained
     assert gain == 1.0 or not fit.converged
 
 
 def test_the_deviation_that_noise_leaves() -> None:
-    """Root mean square of errors in parts of the stated deviations; 1 where these are right."""
+    """The root mean square of errors over the stated deviations is 1 where these are right."""
     view, ratios = camera(32), []
     clean = picture(view)
     for seed in range(4):
@@ -123,7 +121,7 @@ def test_the_uncertainty_is_saved(expected: PoseFit) -> None:
     assert '"reason": "converged"' in expected.to_json()
 
 
-def test_the_white_level_a_picture() -> None:
+def test_the_white_level_of_a_picture() -> None:
     levels = torch.randint(0, 40, (32, 32, 3), generator=torch.Generator().manual_seed(0))
     dark = srgb_to_linear(levels / 255.0)
     assert has_levels(dark) and not has_levels(0.5 * dark) and not has_levels(2.0 * picture(camera(32)))

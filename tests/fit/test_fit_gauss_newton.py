@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from test_fit import BACKGROUND, bracket, camera, rotation
+from brackets import BACKGROUND, bracket, camera, rotation
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses
@@ -41,7 +41,7 @@ def objective_of(scene, cameras, targets, parameters, regularizer=None, weights=
 
 
 def test_curvature_of_a_background_is_that_of_its_square():
-    """image = … + (1 − α) b: the second derivative of the mean square by b is 2 Σ(1 − α)² over pixels and channels, weighted."""
+    """The image is … + (1 − α) b, so the second derivative of the mean square by b is 2 Σ(1 − α)², weighted."""
     cameras = views()
     weights = [torch.linspace(0.2, 1.8, view.size[0])[:, None].expand(view.size) for view in cameras]
     scene = eg.Scene([bracket()], BACKGROUND)
@@ -60,7 +60,7 @@ def test_curvature_of_a_background_is_that_of_its_square():
 
 
 def test_curvature_of_a_pose_is_that_of_its_loss():
-    """At the answer the loss of an expected image is ½ δᵀ H δ; here of the differences of renders with many samples."""
+    """At the answer the loss is ½ δᵀ H δ, here by differences of renders with many samples."""
     view = camera(32)
     scene = eg.Scene([bracket()], BACKGROUND)
     target = eg.render(scene, view, spp=1024, seed=5)
@@ -97,7 +97,8 @@ def test_weights_equal_the_slope_over_the_residual(name):
 
 
 def test_curvature_of_a_regularizer():
-    """The regularizers are (b − 1)⁴, one on which b has no influence, and a saddle, whose way down is left out."""
+    """The regularizers are (b − 1)⁴, one that b does not influence, and a saddle, whose negative curvature is left
+    out."""
     scene, view = eg.Scene([bracket()], BACKGROUND), camera(16)
     target = torch.zeros(16, 16, 3)
     parameters = {"background": Parameter(0.1, torch.tensor([0.0, 2.0, 1.5]))}
@@ -118,7 +119,7 @@ def test_curvature_of_a_regularizer():
 
 
 class Valley:
-    """A loss by two numbers that have no picture: it falls to 0 at (1, −2), and is no parabola far from there."""
+    """A loss of two numbers without a picture. It falls to 0 at (1, −2) and is no parabola far from there."""
 
     def renews(self, step):
         return False

@@ -4,18 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from brackets import BACKGROUND, CENTER, START, about_center, bracket, camera, task_of
 from motions import about, derivatives
-from test_fit import BACKGROUND, START, about_center, bracket, camera
 
 import edgegrad as eg
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.jacobian import Motion
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import DISTORTION, PoseTask, Unknowns
+from edgegrad.fit.pose.task import DISTORTION
 
 pytestmark = pytest.mark.quick
 
-CENTER = torch.tensor([1.0, 0.75, 0.4], dtype=torch.float64)
 CHANNELS = ["image", "alpha", "position", "depth", "shading_normal", "normal"]
 
 
@@ -25,7 +23,7 @@ def smooth():
 
 
 def test_derivatives_by_a_rigid_motion():
-    """The same as torch.func's from the same samples, of all channels."""
+    """All channels have the derivatives of torch.func by the same samples."""
     view, scene = camera(24), eg.Scene([smooth()], BACKGROUND)
     axes = camera().world_to_camera[:3, :3]
     motion = about(CENTER, axes, size=2.0)
@@ -70,7 +68,7 @@ def test_other_channels_are_refused():
 @pytest.mark.parametrize("dofs", [range(7), [0, 1, 2, 3, 4, 5, 7], range(18), [0, 1, 2, 3, 4, 5, *range(8, 18)]])
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
 def test_the_motion_of_a_step(dofs, kind):
-    """That of where points are, and of the lens, by differences of PoseTask.moved() and lens()."""
+    """Points and lens move as by differences of PoseTask.moved() and lens()."""
     dofs = [
         entry for entry in dofs if entry < DISTORTION or kind == "perspective"
     ]  # a parallel projection has no distortion
@@ -82,7 +80,7 @@ def test_the_motion_of_a_step(dofs, kind):
     if kind == "perspective":
         view = view.replace(distortion=torch.tensor([0.1, 0.0, 0.01, 0.0]).double())
     picture = eg.render(eg.Scene([bracket()], BACKGROUND), view)
-    task = PoseTask.from_arguments(bracket(), picture, view, None, None, BACKGROUND, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(picture, view, background=BACKGROUND)
     task = replace(task, dofs=dofs)
     level = task.level(1.0, 0.0, 1.0, 4, dofs)
     pose = pose_from_matrix("", about_center(1.1 * START[:3, :3], (0.2, 0.1, -0.1)))._replace(

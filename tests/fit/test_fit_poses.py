@@ -1,7 +1,5 @@
-"""fit_poses: several objects that cover one another in one photograph, with equations against oracles and poses end to end; and
-what occluder_weights an object that fit_pose looks for."""
+"""fit_poses finds several objects that cover one another in one photograph; its equations agree with oracles."""
 
-import io
 import json
 import math
 
@@ -9,17 +7,16 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from brackets import CENTER, bracket, rotation, task_of
 from motions import about
+from photographs import clutter, depth_of, photograph
 from PIL import Image
-from test_fit import bracket, rotation
-from test_fit_photo import clutter
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.cli import main
-from edgegrad.files.image import linear_to_srgb, srgb_to_linear
+from edgegrad.files.image import linear_to_srgb
 from edgegrad.fit import PoseFit, fit_pose, fit_poses
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.jacobian import Motions, Rendered
 from edgegrad.fit.pose.photo.level import photo_levels
 from edgegrad.fit.pose.photo.light import FittedLight
@@ -28,20 +25,18 @@ from edgegrad.fit.pose.photo.picture import Picture
 from edgegrad.fit.pose.photo.region_term import regions_term
 from edgegrad.fit.pose.photo.surface_interior import AOVS, SurfaceInterior
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import PoseTask, Unknowns
 from edgegrad.fit.region import OUTLIERS, smoothed
 
-MIDDLE = torch.tensor([1.0, 0.75, 0.4]).double()
-BESIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which occluder_weights a part of the bracket
+ASIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which covers a part of the bracket
 
 
 def view_of(size=96, distance=6.0):
-    eye = MIDDLE + distance * torch.tensor([0.35, 0.3, 0.89]).double()
-    return eg.Camera.look_at(eye, MIDDLE, fov_y=40.0, size=(size, size))
+    eye = CENTER + distance * torch.tensor([0.35, 0.3, 0.89]).double()
+    return eg.Camera.look_at(eye, CENTER, fov_y=40.0, size=(size, size))
 
 
 def box(extents=(1.3, 1.0, 1.2), plain=False, seed=3):
-    """With two colours a side, so that no pose is ambiguous."""
+    """Return a box with two colours a side, so that no pose is ambiguous."""
     body = trimesh.creation.box(extents=extents)
     colors = torch.rand(12, 3, generator=torch.Generator().manual_seed(seed)) * 0.8 + 0.1
     verts, faces = torch.from_numpy(np.array(body.vertices)), torch.from_numpy(np.array(body.faces))
@@ -59,15 +54,15 @@ def centre(mesh):
     return 0.5 * (low + high)
 
 
-def beside(mesh, pose, turn, shift):
-    """Turned about the object's centre, and shifted."""
+def moved_by(mesh, pose, turn, shift):
+    """Return a pose that is rotated about the object's centre and shifted."""
     R = rotation(*turn) @ pose[:3, :3]
     where = pose[:3, :3] @ centre(mesh) + pose[:3, 3] + torch.tensor(shift).double()
     return at(R, where - R @ centre(mesh))
 
 
 def errors(fit, mesh, truth):
-    """Degrees, and the way between the centres in % of the size."""
+    """Return degrees, and the distance of the centres in percent of the size."""
     low, high = mesh.verts.double().aminmax(dim=0)
     cosine = 0.5 * (float((fit.R.T @ truth[:3, :3]).trace()) - 1.0)
     way = (fit.R @ centre(mesh) + fit.t) - (truth[:3, :3] @ centre(mesh) + truth[:3, 3])
@@ -77,38 +72,23 @@ def errors(fit, mesh, truth):
 MESHES = [bracket(), box(), box((0.7, 0.9, 0.6), seed=8)]
 TRUTHS = [
     at(torch.eye(3).double(), torch.zeros(3).double()),
-    at(rotation(0.5, 0.7, 0.2), MIDDLE + BESIDE),
-    at(rotation(-0.4, 0.3, 0.6), MIDDLE + torch.tensor([-1.15, 0.6, 0.5]).double()),
+    at(rotation(0.5, 0.7, 0.2), CENTER + ASIDE),
+    at(rotation(-0.4, 0.3, 0.6), CENTER + torch.tensor([-1.15, 0.6, 0.5]).double()),
 ]
 STARTS = [
-    beside(MESHES[0], TRUTHS[0], (0.1, -0.12, 0.08), (0.08, -0.06, 0.08)),
-    beside(MESHES[1], TRUTHS[1], (-0.1, 0.08, 0.1), (-0.05, 0.05, 0.06)),
-    beside(MESHES[2], TRUTHS[2], (0.09, 0.1, -0.08), (0.03, 0.04, -0.04)),
+    moved_by(MESHES[0], TRUTHS[0], (0.1, -0.12, 0.08), (0.08, -0.06, 0.08)),
+    moved_by(MESHES[1], TRUTHS[1], (-0.1, 0.08, 0.1), (-0.05, 0.05, 0.06)),
+    moved_by(MESHES[2], TRUTHS[2], (0.09, 0.1, -0.08), (0.03, 0.04, -0.04)),
 ]
 
 
-def scene_of(count, light=True):
-    moved = [mesh.transformed(M[:3, :3], M[:3, 3]) for mesh, M in zip(MESHES[:count], TRUTHS, strict=False)]
-    return [mesh.replace(material=eg.Material()) for mesh in moved] if light else moved
-
-
-def photograph(view, meshes, seed=0):
-    """In the light of a sun and a sky, before clutter, blurred as a lens does, noisy, compressed."""
-    lights = [
-        eg.DirectionalLight(torch.tensor([-0.5, -1.0, -0.8]).double(), 2.0),
-        eg.Environment(torch.full((3,), 0.35), visible=False),
-    ]
-    with torch.no_grad():
-        image = eg.render(eg.Scene(meshes, clutter(view.size[0], seed), lights), view, spp=32, seed=1 << 40)
-    seen = smoothed((image * torch.tensor([1.3, 1.0, 0.8])).clamp(0, 1).movedim(-1, 0), 0.7).movedim(0, -1)
-    values = linear_to_srgb(seen) + 0.015 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
-    file = io.BytesIO()
-    Image.fromarray((255 * values.clamp(0, 1)).round().byte().numpy()).save(file, "JPEG", quality=85)
-    return srgb_to_linear(torch.from_numpy(np.array(Image.open(file))).float() / 255)
+def scene_of(count):
+    """Return the first meshes in their places."""
+    return [mesh.transformed(M[:3, :3], M[:3, 3]) for mesh, M in zip(MESHES[:count], TRUTHS, strict=False)]
 
 
 def shares_of(view, meshes, spp=32):
-    """(H, W, n), of each pixel what each mesh occluder_weights."""
+    """Return the shares (H, W, n) of each pixel that each mesh covers."""
     colours = torch.eye(len(meshes))
     painted = [
         eg.Mesh(mesh.verts, mesh.faces, colors=colour.expand(len(mesh.verts), -1))
@@ -118,7 +98,7 @@ def shares_of(view, meshes, spp=32):
 
 
 def labels_of(view, meshes):
-    """(H, W) of integers."""
+    """Return labels (H, W), whole numbers."""
     shares = shares_of(view, meshes)
     return torch.where(shares.sum(-1) > 0.5, shares.argmax(-1) + 1, 0)
 
@@ -126,16 +106,16 @@ def labels_of(view, meshes):
 @pytest.fixture(scope="module")
 def two():
     view = view_of(160)
-    return view, photograph(view, scene_of(2), seed=2)
+    return view, photograph(view, *scene_of(2), seed=2)
 
 
 # Equations
 
 
 def test_the_region_terms_gradient_is_that_of_its_loss():
-    """Of two objects, of which one occluder_weights the other: against central differences of renders with many samples."""
+    """One of two objects covers the other. The reference is central differences of renders with many samples."""
     view, h, sigma = view_of(48), 0.004, 0.7
-    meshes = [mesh.replace(material=None) for mesh in scene_of(2, light=False)]
+    meshes = scene_of(2)
     axes, colours = view.world_to_camera[:3, :3].double(), torch.eye(2, dtype=torch.float64)
     centres, size = [centre(mesh) for mesh in meshes], 2.0
     posteriors = torch.rand(3, 1, 6, 6, generator=torch.Generator().manual_seed(3))
@@ -172,16 +152,11 @@ def test_the_region_terms_gradient_is_that_of_its_loss():
         off = float((normal.gradient[own] - expected[own]).norm() / expected[own].norm())
         assert off < 0.04, (own, normal.gradient, expected)
     assert mean == pytest.approx(loss(zero) / float(near.sum()), rel=1e-3)
-    # Where the box occluder_weights the bracket, both move the same contour.
+    # Where the box covers the bracket, both move the same contour.
     assert float(normal.curvature[:6, 6:].abs().max()) > 0.01 * float(normal.curvature.abs().max())
 
 
 # Fits
-
-
-def depth_of(view, count):
-    seen = eg.render_aovs(eg.Scene(scene_of(count, light=False)), view, ["alpha", "depth"], spp=16)
-    return torch.where(seen["alpha"] > 0.99, seen["depth"] / seen["alpha"].clamp(min=0.01), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -206,14 +181,14 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
     if kind == "shares":
         given = {"mask": list(shares_of(view, scene_of(2), 256).unbind(-1))}
     if kind == "depth":
-        given["depth"] = depth_of(view, 2)
+        given["depth"] = depth_of(view, *scene_of(2))
     meshes = [mesh.replace(face_colors=None) for mesh in MESHES[:2]] if kind == "plain" else MESHES[:2]
     fits = fit_poses(meshes, image, view, init=STARTS[:2], progress=False, **given)
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=False):
         off = errors(fit, mesh, truth)
         assert off[0] < degrees and off[1] < percent, (kind, off, fit.explained)
         known = fit.uncertainty.degrees
-        if kind == "plain" and known > 2.0:  # the contour of the covered one tells its turn to about as much
+        if kind == "plain" and known > 2.0:  # the contour of the covered one shows its rotation to about as much
             assert fit.reason.startswith("directions unknown: ") and off[0] < known < 2.5, (off, known)
         elif kind == "plain":  # a plain box shows nearly the same contour in a pose that is turned by 10°
             assert fit.converged or fit.reason.startswith("ambiguous: "), (off, fit.reason)
@@ -225,8 +200,8 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
 @pytest.mark.slow
 def test_three_objects():
     view = view_of(96)
-    image = photograph(view, scene_of(3), seed=1)
-    fits = fit_poses(MESHES, image, view, init=STARTS, depth=depth_of(view, 3), progress=False)
+    image = photograph(view, *scene_of(3), seed=1)
+    fits = fit_poses(MESHES, image, view, init=STARTS, depth=depth_of(view, *scene_of(3)), progress=False)
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=True):
         off = errors(fit, mesh, truth)
         assert off[0] < 0.3 and off[1] < 0.1 and fit.converged, (off, fit.explained)
@@ -235,7 +210,7 @@ def test_three_objects():
 @pytest.mark.slow
 def test_a_mesh_that_is_not_there_makes_no_other_wrong(two):
     view, image = two
-    absent = at(rotation(0.2, 0.3, 0.1), MIDDLE + torch.tensor([-1.2, -1.0, 0.2]).double())
+    absent = at(rotation(0.2, 0.3, 0.1), CENTER + torch.tensor([-1.2, -1.0, 0.2]).double())
     fits = fit_poses(MESHES, image, view, init=[*STARTS[:2], absent], search=False, progress=False)
     assert fits[0].converged and fits[1].converged and not fits[2].converged, [fit.explained for fit in fits]
     assert fits[2].explained < 0.65 and fits[2].reason.startswith(("edges not explained", "steps ran out"))
@@ -244,12 +219,12 @@ def test_a_mesh_that_is_not_there_makes_no_other_wrong(two):
 
 @pytest.mark.slow
 def test_a_hidden_mesh_is_said_to_be_hidden(two):
-    """Behind the box as the camera sees it."""
+    """The mesh lies behind the box as the camera sees it."""
     view, image = two
     eye = torch.linalg.inv(view.world_to_camera.double())[:3, 3]
-    away = torch.nn.functional.normalize(MIDDLE + BESIDE - eye, dim=0)
+    away = torch.nn.functional.normalize(CENTER + ASIDE - eye, dim=0)
     small = box((0.3, 0.3, 0.3), seed=5)
-    hidden = at(torch.eye(3).double(), MIDDLE + BESIDE + 1.3 * away)
+    hidden = at(torch.eye(3).double(), CENTER + ASIDE + 1.3 * away)
     fits = fit_poses([*MESHES[:2], small], image, view, init=[*STARTS[:2], hidden], search=False, progress=False)
     assert fits[0].converged and fits[1].converged and not fits[2].converged
     assert fits[2].visible < 0.1 and fits[2].reason.startswith("hidden: the other objects leave"), fits[2].reason
@@ -272,9 +247,9 @@ def test_a_stopped_fit_keeps_the_poses_so_far(two):
 
 
 BLANK = torch.zeros(160, 160, 3)
-FAR = at(torch.eye(3).double(), MIDDLE + 40.0 * view_of().world_to_camera[0, :3].double())
-BEHIND = at(torch.eye(3).double(), MIDDLE + 20.0 * torch.tensor([0.35, 0.3, 0.89]).double())
-WITHIN = at(torch.eye(3).double(), MIDDLE + BESIDE)
+FAR = at(torch.eye(3).double(), CENTER + 40.0 * view_of().world_to_camera[0, :3].double())
+BEHIND = at(torch.eye(3).double(), CENTER + 20.0 * torch.tensor([0.35, 0.3, 0.89]).double())
+WITHIN = at(torch.eye(3).double(), CENTER + ASIDE)
 
 
 @pytest.mark.parametrize(
@@ -298,14 +273,14 @@ WITHIN = at(torch.eye(3).double(), MIDDLE + BESIDE)
         (MESHES[:2], {"init": STARTS[:2], "callback": 3}, TypeError, r"callback: expected a function of a list of PoseFits"),
     ],
 )  # fmt: skip
-def test_errors(two, meshes, given, error, message):
+def test_errors_name_the_argument(two, meshes, given, error, message):
     view, image = two
     with pytest.raises(error, match=message):
         fit_poses(meshes, image, view, progress=False, **given)
 
 
 @pytest.mark.slow
-def test_from_the_shell(two, tmp_path, capsys):
+def test_the_command_line(two, tmp_path, capsys):
     view, image = two
     eg.write_image(tmp_path / "photo.png", image)
     eg.save_camera(tmp_path / "camera.json", view)
@@ -327,7 +302,7 @@ def test_from_the_shell(two, tmp_path, capsys):
         off = errors(fit, MESHES[k], TRUTHS[k])
         assert off[0] < 2.5 and off[1] < 1.4, off
     said = capsys.readouterr().out
-    # The contour of the first tells its rotation to about 2°, and what is less exact is unknown. That of a box in so few
+    # The contour of the first shows its rotation to about 2°, and what is less exact is unknown. That of a box in so few
     # pixels is nearly the same in a pose that is turned by 10°.
     assert f"{tmp_path}/0.ply: converged" in said or f"{tmp_path}/0.ply: directions unknown" in said, said
     assert f"{tmp_path}/1.ply: converged" in said or f"{tmp_path}/1.ply: ambiguous" in said, said
@@ -340,14 +315,14 @@ def test_from_the_shell(two, tmp_path, capsys):
     assert "--label" not in said
 
 
-# What occluder_weights an object and is none of the meshes
+# Covers of an object that are none of the meshes
 
 
 @pytest.fixture(scope="module")
 def covered():
-    """Another clutter before a quarter of the bracket."""
+    """Return a picture in which other clutter covers a quarter of the bracket."""
     view = view_of(160, 4.5)
-    image = photograph(view, [bracket().replace(material=eg.Material())], seed=2)
+    image = photograph(view, seed=2)
     alpha = eg.render_aovs(bracket(), view, ["alpha"], 16)["alpha"][..., 0]
     along = (torch.arange(160)[:, None] + 0.3 * torch.arange(160)).float()
     over = along < along[alpha > 0.5].quantile(0.25)
@@ -355,12 +330,12 @@ def covered():
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.3])
-def test_what_covers_an_object_is_told_by_its_light(covered, strength):
-    """Also a cover whose colours are nearly the object's: pixels around show what one alone does not."""
+def test_what_covers_an_object_is_found_by_its_light(covered, strength):
+    """The colours of a cover may be nearly the object's: neighbouring pixels show what one alone does not."""
     view, image, over, alpha = covered
-    bare = photograph(view, [bracket().replace(material=eg.Material())], seed=2)
+    bare = photograph(view, seed=2)
     image = torch.lerp(bare, image, strength)
-    task = PoseTask.from_arguments(bracket(), image, view, None, None, None, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(image, view)
     pose = pose_from_matrix("pose", torch.eye(4))
     level = photo_levels(task, pose, [None], 256, 16, 0)[-1]
     (weight,) = occluder_weights(level.comparisons(pose, 0))
@@ -372,7 +347,7 @@ def test_what_covers_an_object_is_told_by_its_light(covered, strength):
     rows, columns = slice(top, top + h), slice(left, left + w)
     inside = alpha[rows, columns] > 0.99
     wrong = ((weight < 0.5) != over[rows, columns])[inside].float().mean()
-    assert float(wrong) < 0.03, float(wrong)  # 0.25 where nothing is told
+    assert float(wrong) < 0.03, float(wrong)  # 0.25 where no cover is found
     assert visible_share(level.comparisons(pose, 0), [weight]) == pytest.approx(0.75, abs=0.02)
 
 
@@ -385,13 +360,13 @@ def test_a_quarter_covered(covered):
 
 
 def test_white_may_be_any_brighter_colour():
-    """The light of a surface that a sensor shows in part as white is that of the part that it does not."""
+    """The light is that of the channels that the sensor does not clip to white."""
     view = view_of(96, 4.5)
     mesh = bracket().replace(face_colors=bracket().face_colors * 0.0 + torch.tensor([0.9, 0.5, 0.2]))
     with torch.no_grad():
         seen = eg.render_aovs(mesh, view, list(AOVS), 32)
     picture = (seen["image"] * 1.6 + (1 - seen["alpha"]) * 0.2).float().clamp(0, 1)
-    surface = SurfaceInterior.from_channels(view, seen, about(MIDDLE))
+    surface = SurfaceInterior.from_channels(view, seen, about(CENTER))
     display = linear_to_srgb(picture)
     lit = FittedLight.from_picture(Picture(view, picture, display, None, torch.ones(96, 96), None), surface, 1)
     torch.testing.assert_close(lit.coefficients[1:, 0], torch.tensor([1.6, 1.6]), atol=0.02, rtol=0.0)
@@ -399,15 +374,15 @@ def test_white_may_be_any_brighter_colour():
 
 
 def test_two_meshes_that_end_in_one_place_have_not_converged():
-    """The picture shows one of them. Two steps leave both about where they start; where many take them depends on rounding."""
+    """The picture shows one of them. Two steps leave both near their starts; the end of many depends on rounding."""
     view = view_of(96)
-    beside_it = beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
-    image = photograph(view, scene_of(1), seed=4)
-    starts = [TRUTHS[0], beside_it]
+    neighbour = moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
+    image = photograph(view, *scene_of(1), seed=4)
+    starts = [TRUTHS[0], neighbour]
     fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, spp=8, steps=2, search=False, progress=False)
     for k, fit in enumerate(fits):
         assert not fit.converged and fit.reason.startswith(f"in one place: meshes[{k}] ends where")
-    apart = [TRUTHS[0], beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (2.5, 0.02, 0.02))]
+    apart = [TRUTHS[0], moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (2.5, 0.02, 0.02))]
     fits = fit_poses([MESHES[0]] * 2, image, view, init=apart, spp=8, steps=2, search=False, progress=False)
     assert not any(fit.reason.startswith("in one place") for fit in fits)
 
@@ -416,6 +391,6 @@ def test_two_meshes_that_end_in_one_place_have_not_converged():
 def test_a_direction_that_contours_do_not_show_is_unknown():
     view = view_of(96)
     plain = [mesh.replace(face_colors=None) for mesh in MESHES[:2]]
-    first, _ = fit_poses(plain, photograph(view, scene_of(2), seed=2), view, init=STARTS[:2], spp=8, progress=False)
+    first, _ = fit_poses(plain, photograph(view, *scene_of(2), seed=2), view, init=STARTS[:2], spp=8, progress=False)
     assert not first.converged and first.uncertainty is not None and first.uncertainty.unknown
     assert first.reason.startswith("directions unknown")

@@ -10,49 +10,10 @@ from typing import Any
 
 import pytest
 import torch
+from arms import TRUTH, arm, degrees, shown, views
 
 import edgegrad as eg
 from edgegrad.fit import fit_rig, priors, track_rig
-
-
-def arm(bones: int = 2, colored: bool = False) -> eg.Rig:
-    """A flat bar along y of some bones of length 1."""
-    n = 4 * bones
-    y = torch.linspace(0.0, float(bones), n + 1, dtype=torch.float64)
-    ring = [(0.22, 0.1), (-0.22, 0.1), (-0.22, -0.1), (0.22, -0.1)]
-    verts = torch.stack(
-        [torch.tensor([x * (1.2 - 0.3 * float(h) / bones), float(h), z]).double() for h in y for x, z in ring]
-    )
-    faces = [[4 * k + a, 4 * k + (a + 1) % 4, 4 * k + 4 + (a + 1) % 4] for k in range(n) for a in range(4)]
-    faces += [[4 * k + a, 4 * k + 4 + (a + 1) % 4, 4 * k + 4 + a] for k in range(n) for a in range(4)]
-    faces += [[0, 2, 1], [0, 3, 2], [4 * n, 4 * n + 1, 4 * n + 2], [4 * n, 4 * n + 2, 4 * n + 3]]
-    weights = torch.zeros(len(verts), bones)
-    for k in range(bones):
-        up = (verts[:, 1] - k + 0.25).mul(2.0).clamp(0.0, 1.0) if k else torch.ones(len(verts))
-        weights[:, : k or None] *= (1.0 - up)[:, None] if k else 1.0
-        weights[:, k] = up
-    joints = eg.Joints(
-        [f"bone {k}" for k in range(bones)], list(range(-1, bones - 1)),
-        torch.tensor([[0.0, float(k > 0), 0.0] for k in range(bones)]), torch.zeros(bones, 3),
-    )  # fmt: skip
-    colors = 0.3 + 0.5 * torch.rand(len(verts), 3, generator=torch.Generator().manual_seed(0)) if colored else None
-    return eg.Rig.from_arrays(eg.Mesh(verts.float(), torch.tensor(faces), colors=colors), joints, weights)
-
-
-def views(size: int = 48, count: int = 3) -> list[eg.Camera]:
-    eyes = [(5.0 * math.sin(a), 1.8, 5.0 * math.cos(a)) for a in (0.3 + math.tau * k / count for k in range(count))]
-    return [eg.Camera.look_at(eye, (0, 1, 0), up=(0, 1, 0), fov_y=40, size=(size, size)) for eye in eyes]
-
-
-def shown(posed: eg.Mesh, cameras: list[eg.Camera], name: str = "alpha") -> list[torch.Tensor]:
-    return [eg.render_aovs(posed, camera, [name], spp=64, seed=9)[name] for camera in cameras]
-
-
-def degrees(found: torch.Tensor, truth: torch.Tensor) -> float:
-    return math.degrees(float((found - truth).norm(dim=-1).max()))
-
-
-TRUTH = torch.tensor([[0.1, 0.2, -0.3], [0.3, -0.2, 0.5]], dtype=torch.float64)
 
 
 def test_a_pose_from_masks() -> None:
@@ -74,8 +35,8 @@ def test_a_pose_from_masks() -> None:
 def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
     rig, cameras = arm(colored=True).with_limits(rotations={"bone 1": ([-0.2] * 3, [0.2] * 3)}), views()
     pictures = shown(rig.posed(TRUTH), cameras, "image")
-    told = {"seek": ["rotations"], "joints": ["bone 1"], "start": {"rotations": {"bone 0": TRUTH[0]}}, "tries": 0}
-    found = fit_rig(rig, cameras, pictures, progress=False, steps=5, **told)
+    options = {"seek": ["rotations"], "joints": ["bone 1"], "start": {"rotations": {"bone 0": TRUTH[0]}}, "tries": 0}
+    found = fit_rig(rig, cameras, pictures, progress=False, steps=5, **options)
     assert (
         torch.allclose(found.values["rotations"][0], TRUTH[0])
         and found.values["rotations"][1].abs().max() <= 0.2 + 1e-12
@@ -84,7 +45,7 @@ def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
 
 
 def photographs(rig: eg.Rig, cameras: list[eg.Camera], seed: int) -> tuple[eg.Mesh, list[torch.Tensor]]:
-    """The true pose, before clutter, in colours that the rig does not know."""
+    """Return the true pose, and pictures of it before clutter, in colours that the rig does not know."""
     g = torch.Generator().manual_seed(seed)
     posed = rig.posed(TRUTH, translation=[0.05, 0.0, -0.1])
     warm = torch.tensor([0.8, 0.35, 0.15]) * (0.7 + 0.3 * torch.rand(len(posed.verts), 1, generator=g))
@@ -110,12 +71,12 @@ def test_a_pose_from_photographs_without_masks() -> None:
 
 @pytest.mark.slow
 def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
-    """In small pictures, where a descent alone stops with the upper bone across the clutter and the whole well explained."""
+    """In small pictures a descent alone stops with the upper bone across the clutter and the whole well explained."""
     rig, cameras = arm(), views(48)
     posed, photos = photographs(rig, cameras, 1)
     start = {"rotations": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.6]]).double()}
-    told = {"loss": "region", "start": start, "progress": False}
-    alone, helped = (fit_rig(rig, cameras, photos, tries=n, **told) for n in (0, 40))
+    options = {"loss": "region", "start": start, "progress": False}
+    alone, helped = (fit_rig(rig, cameras, photos, tries=n, **options) for n in (0, 40))
     off = [float((fit.posed().verts - posed.verts).norm(dim=1).max()) for fit in (alone, helped)]
     assert off[0] > 0.5 and not alone.converged and "bone 1" in alone.reason
     assert off[1] < 0.1 and helped.converged
@@ -123,7 +84,7 @@ def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
 
 @pytest.mark.slow
 def test_keypoints_find_what_masks_do_not() -> None:
-    """A limb far from its mask, by its joints, of which one is wrong in one picture."""
+    """A limb is far from its mask. Its joints lead there, of which one is wrong in one picture."""
     rig, cameras = arm(3), views(count=4)
     truth = torch.tensor([[0.0, 0.0, 1.3], [0.0, 0.0, 0.9], [0.0, 0.0, 0.3]], dtype=torch.float64)
     joints = rig.shape({"rotations": truth}).joints
@@ -139,12 +100,12 @@ def test_keypoints_find_what_masks_do_not() -> None:
 
 
 @pytest.mark.slow
-def test_a_limb_that_is_drawn_anew() -> None:
-    """From where a descent alone does not lead: the limb is bent to the other side."""
+def test_a_limb_is_found_from_new_starts() -> None:
+    """The limb is bent to the other side, from where a descent alone does not lead to the answer."""
     rig, cameras = arm(3), views(count=2)
     truth = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.4], [0.0, 0.0, 0.6]], dtype=torch.float64)
     masks = shown(rig.posed(truth), cameras)
-    told = {
+    options = {
         "masks": masks,
         "start": {"rotations": -truth},
         "coarsest": 24,
@@ -152,11 +113,11 @@ def test_a_limb_that_is_drawn_anew() -> None:
         "seek": ["rotations"],
         "steps": 8,
     }
-    alone, helped = (fit_rig(rig, cameras, tries=tries, **told) for tries in (0, 6))
+    alone, helped = (fit_rig(rig, cameras, tries=tries, **options) for tries in (0, 6))
     assert helped.loss < 0.3 * alone.loss and not alone.converged
 
 
-def test_ctrl_c_while_limbs_are_drawn_anew_keeps_what_there_is(monkeypatch) -> None:
+def test_ctrl_c_in_the_search_of_limbs_keeps_the_descent(monkeypatch) -> None:
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -178,20 +139,20 @@ def test_a_sequence() -> None:
 
 
 @pytest.mark.parametrize(("loss", "angles"), [(0.5, [0.0, 2.0, 3.0]), (2.0, [0.0, 1.0, 2.0])])
-def test_what_a_frame_misses_is_looked_for_once(monkeypatch, loss: float, angles: list[float]) -> None:
-    """What is found is kept where it is better, and a limb that is missed still is not looked for in the next frame."""
+def test_what_a_frame_misses_is_searched_once(monkeypatch, loss: float, angles: list[float]) -> None:
+    """A result is kept where it is better. A limb that is still missed is not searched again in the next frame."""
     calls: list[tuple[int | None, float]] = []
 
-    def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **told: Any) -> Any:
+    def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **options: Any) -> Any:
         angle = float(start["rotations"][0, 0]) + (1.0 if calls else 0.0)
-        calls.append((told.get("tries"), angle))
-        assert told["resume"] == (told["checkpoint"] is not None)
+        calls.append((options.get("tries"), angle))
+        assert options["resume"] == (options["checkpoint"] is not None)
         values = {"rotations": torch.full((2, 3), angle, dtype=torch.float64)}
         missed = ["bone 1"] if len(calls) > 1 else []
         return SimpleNamespace(
             values=values,
             missed=missed,
-            loss=loss if told.get("tries") else 1.0,
+            loss=loss if options.get("tries") else 1.0,
             fit=SimpleNamespace(interrupted=False),
         )
 
@@ -206,8 +167,8 @@ def test_what_a_frame_misses_is_looked_for_once(monkeypatch, loss: float, angles
 def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
     rig, cameras = arm(), views(16, 2)
     frames = [{"masks": shown(rig.posed(TRUTH * k), cameras)} for k in (0.1, 0.2)]
-    told = {"tries": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
-    first, again = (list(track_rig(rig, cameras, frames, start={}, resume=True, **told)) for _ in range(2))
+    options = {"tries": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
+    first, again = (list(track_rig(rig, cameras, frames, start={}, resume=True, **options)) for _ in range(2))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["walk-0001.ckpt", "walk-0002.ckpt"]
     for a, b in zip(first, again, strict=True):
         assert torch.equal(a.values["rotations"], b.values["rotations"])
@@ -225,10 +186,10 @@ def test_a_start_within_limits_that_leave_out_rest() -> None:
     assert float(found.values["rotations"][1].min()) >= 0.1
 
 
-def test_it_goes_on_where_it_stopped(tmp_path) -> None:
+def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
     rig, cameras = arm(), views(32, 2)
-    told = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
-    whole = fit_rig(rig, cameras, **told)
+    options = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
+    whole = fit_rig(rig, cameras, **options)
     count = 0
 
     def stop(record: object) -> None:
@@ -238,9 +199,9 @@ def test_it_goes_on_where_it_stopped(tmp_path) -> None:
             raise KeyboardInterrupt
 
     path = tmp_path / "checkpoint.pt"
-    half = fit_rig(rig, cameras, checkpoint=path, callback=stop, **told)
+    half = fit_rig(rig, cameras, checkpoint=path, callback=stop, **options)
     assert half.fit.interrupted and half.reason == "interrupted"
-    rest = fit_rig(rig, cameras, checkpoint=path, resume=True, **told)
+    rest = fit_rig(rig, cameras, checkpoint=path, resume=True, **options)
     assert torch.equal(rest.values["rotations"], whole.values["rotations"]) and len(rest.history) == len(whole.history)
     assert "pose.json" in rest.save(tmp_path / "out", figures=False)
 
@@ -255,7 +216,7 @@ def test_the_command_line(tmp_path, capsys) -> None:
     eg.save_camera(tmp_path / "camera.json", camera)
     (mask,) = shown(rig.posed({"upper": [0.0, 0.0, 0.4]}), [camera])
     eg.write_image(tmp_path / "mask.png", eg.image.srgb_to_linear(mask))
-    told = [
+    command = [
         "fit-rig",
         tmp_path / "a.gltf",
         tmp_path / "mask.png",
@@ -264,13 +225,13 @@ def test_the_command_line(tmp_path, capsys) -> None:
         "--joints",
         "upper",
     ]
-    told += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
-    assert cli.main([str(word) for word in told]) == 0
+    command += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
+    assert cli.main([str(word) for word in command]) == 0
     assert "wrote pose.json, joints.json, posed.glb" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "pose.json").read_text())["rotations"]
     assert abs(found[-1][2] - 0.4) < 0.15 and found[0] == [0.0, 0.0, 0.0]
-    told = json.loads((tmp_path / "out" / "joints.json").read_text())
-    assert list(told) == ["upper"] and told["upper"]["explained"] > 0.6 and told["upper"]["degrees"] > 0.0
+    joints = json.loads((tmp_path / "out" / "joints.json").read_text())
+    assert list(joints) == ["upper"] and joints["upper"]["explained"] > 0.6 and joints["upper"]["degrees"] > 0.0
 
 
 def test_priors() -> None:
@@ -281,10 +242,10 @@ def test_priors() -> None:
     assert torch.isclose(priors.near({"scale": torch.tensor(2.0)}, 3.0)(values).double(), torch.tensor(3.0).double())
 
 
-def test_bad_input() -> None:
+def test_errors_name_the_argument() -> None:
     rig, cameras = arm(), views(16, 2)
     masks = shown(rig.posed(), cameras)
-    for error, message, told in (
+    for error, message, change in (
         (TypeError, "rig: expected a Rig", {"rig": rig.posed()}),
         (ValueError, "seek: expected names among .*got 'pose'", {"seek": ["pose"]}),
         (ValueError, "seek: expected a name or more", {"seek": []}),
@@ -314,6 +275,6 @@ def test_bad_input() -> None:
         (TypeError, "expected options among", {"step": 3}),
         (ValueError, "images: expected pictures or masks", {"masks": None}),
     ):
-        given = {"rig": rig, "cameras": cameras, "masks": masks, "progress": False, **told}
+        given = {"rig": rig, "cameras": cameras, "masks": masks, "progress": False, **change}
         with pytest.raises(error, match=message):
             fit_rig(**given)

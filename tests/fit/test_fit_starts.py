@@ -1,4 +1,5 @@
-"""Many starts of fit_pose, and none at all: rotations that cover what they should, matches with a picture, ends and refusals."""
+"""fit_pose from many starts and from none: rotations cover SO(3), matches find the object, and wrong counts are
+refused."""
 
 from __future__ import annotations
 
@@ -7,20 +8,19 @@ import math
 import numpy as np
 import pytest
 import torch
+from brackets import bracket, task_of
 from objects import pebble
-from test_fit import bracket
 from torch import Tensor
 
 import edgegrad as eg
 from benchmarks import photo_cases
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import fit_pose
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.photo.match import BEAM_ROUNDS, SIZE_SPACING, VIEW_PIXELS, Matches, Mips, _in_mask, closer
 from edgegrad.fit.pose.photo.nearby import EVERYWHERE, comparable, nearby
 from edgegrad.fit.pose.photo.template_views import TemplateViews, all_sides, ball, pose_at, seen_at, spread
 from edgegrad.fit.pose.pose import Pose, angle, pose_from_matrix
-from edgegrad.fit.pose.task import PoseTask, Unknowns
+from edgegrad.fit.pose.task import PoseTask
 
 CENTER = torch.tensor([1.0, 0.75, 0.4])
 SIZE = 96
@@ -32,13 +32,13 @@ def camera() -> eg.Camera:
 
 
 def truth(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-    """A pose turned about the object's centre."""
+    """Return a pose that is rotated about the object's centre."""
     R = rotation(torch.tensor(turn))
     return R, CENTER + torch.tensor(shift) - R @ CENTER
 
 
 def pictured(R: Tensor, t: Tensor) -> tuple[eg.Mesh, Tensor, Tensor]:
-    """The mesh, its picture in light before clutter, and a mask."""
+    """Return the mesh, its picture in light before clutter, and a mask."""
     mesh = bracket().to(torch.float32)
     moved = mesh.transformed(R, t)
     generator = torch.Generator().manual_seed(3)
@@ -56,7 +56,7 @@ def pictured(R: Tensor, t: Tensor) -> tuple[eg.Mesh, Tensor, Tensor]:
 
 
 def farthest(rotations: Tensor, seed: int = 0) -> float:
-    """Radians from random rotations to the nearest of these, at most."""
+    """Return the largest angle from random rotations to the nearest of these, in radians."""
     q = torch.nn.functional.normalize(
         torch.randn(300, 4, generator=torch.Generator().manual_seed(seed)), dim=-1
     ).double()
@@ -79,16 +79,16 @@ def test_rotations_are_rotations() -> None:
         assert torch.allclose(torch.linalg.det(found), torch.ones(len(found)).double())
 
 
-def test_a_ball_begins_with_no_turn_and_is_filled_evenly() -> None:
+def test_a_ball_of_rotations_begins_with_none_and_is_filled_evenly() -> None:
     angles = torch.tensor([angle(torch.eye(3).double(), R) for R in ball(200, 0.8)])
     assert float(angles[0]) < 1e-9 and float(angles.max()) <= 0.8
     # Half of a ball's volume is within 2^(-1/3) of its radius.
     assert float((angles < 0.8 * 0.5 ** (1.0 / 3.0)).double().mean()) == pytest.approx(0.5, abs=0.04)
 
 
-def test_a_pose_off_the_axis_shows_the_object_where_it_should_and_turned_alike() -> None:
+def test_a_pose_off_the_axis_shows_the_object_in_its_place_and_from_its_side() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    task = PoseTask.from_arguments(mesh, picture, camera(), mask, None, None, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(picture, camera(), mesh, mask)
     R = rotation(torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64))
     pose = pose_at(task, R, torch.tensor([80.0, 20.0]), 5.0)
     center = pose.R @ task.center + pose.t
@@ -105,16 +105,16 @@ def test_a_pose_off_the_axis_shows_the_object_where_it_should_and_turned_alike()
 
 
 def near(pose: Pose, R: Tensor, t: Tensor, task: PoseTask, turn: float, share: float) -> bool:
-    """Within an angle in radians and a share of the object's size."""
+    """Return whether a pose is within an angle in radians and a share of the object's size."""
     off = (pose.R @ task.center + pose.t) - (R.double() @ task.center + t.double())
     return angle(pose.R, R.double()) < turn and float(off.norm()) < share * task.size
 
 
 def test_matches_come_closer_than_views_are_apart() -> None:
-    """Views are 20° apart, and places a tenth of the object's size: the rounds after them bring matches nearer."""
+    """Views are 20° apart, and places a tenth of the object's size. The later rounds bring matches nearer."""
     R, t = truth((2.5, 0.3, 0.2), (0.3, -0.2, 0.4))
     mesh, picture, mask = pictured(R, t)
-    task = PoseTask.from_arguments(mesh, picture, camera(), mask, None, None, Unknowns(), 1.0, ArgumentNames())
+    task = task_of(picture, camera(), mesh, mask)
     mips = Mips(task, VIEW_PIXELS)
     found = _in_mask(TemplateViews.from_rotations(task, all_sides()[::2], VIEW_PIXELS, 0), mips).distinct(
         24, 0.2, 0.1, SIZE_SPACING
@@ -133,19 +133,17 @@ def test_matches_come_closer_than_views_are_apart() -> None:
 
 @pytest.mark.slow
 def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a quarter nothing is seen: one side has to be left out, and the right one."""
+    """A quarter of the object is covered, so the right side has to be left out."""
     monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.NEARBY_ROTATIONS", 24)
     case = photo_cases.rendered("pebble", pebble(), [photo_cases.clutter(k) for k in range(2)], "covered", 4)
-    task = PoseTask.from_arguments(
-        case.mesh, case.picture, case.camera, None, None, None, Unknowns(), 1.0, ArgumentNames()
-    )
+    task = task_of(case.picture, case.camera, case.mesh)
     start = pose_from_matrix(
         "init", case.perturbed(case.truth, 15.0, 0.05 * case.size, np.random.default_rng(4)).matrix
     )
     assert comparable(task, start) and not comparable(task, start._replace(scale=2.0 * start.scale))
     R, t = case.truth.R, case.truth.t
     pose, side = nearby(task, start, 0)[0]
-    assert near(pose, R, t, task, 0.1, 0.06) and side != EVERYWHERE  # its distance is found on the way down
+    assert near(pose, R, t, task, 0.1, 0.06) and side != EVERYWHERE  # the descent finds its distance
     assert not near(start, R, t, task, 0.2, 0.03)
 
 
@@ -185,7 +183,7 @@ def test_the_same_seed_gives_the_same_fit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("masked", [False, True])
 def test_nine_of_ten_are_found_without_a_start(masked: bool) -> None:
-    """A stone with patterns in any pose, in any light, before boards: 256², worn as photographs are."""
+    """A stone with patterns has any pose and any light before boards, in 256² that are worn as photographs are."""
     right, count = 0, 10
     for k in range(count):
         case = photo_cases.rendered("lit", pebble(), [photo_cases.clutter(seed) for seed in range(4)], "lit", 300 + k)
@@ -200,7 +198,7 @@ def test_nine_of_ten_are_found_without_a_start(masked: bool) -> None:
     assert right >= 9
 
 
-def test_refused() -> None:
+def test_errors_name_the_argument() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     for starts, says in ((0, "starts"), ("all", 'or "global"'), (10**6, "starts")):
         with pytest.raises(ValueError, match=says):

@@ -1,4 +1,5 @@
-"""How exactly a picture shows a pose: covariances by hand, directions that nothing shows, and what a fit says of them."""
+"""How exactly a picture shows a pose: covariances by hand, directions that nothing shows, and the reasons that a fit
+gives."""
 
 from __future__ import annotations
 
@@ -6,13 +7,13 @@ import math
 
 import pytest
 import torch
+from brackets import task_of
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import PoseFit, Uncertainty, fit_pose
-from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.pose import Pose
-from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask, Unknowns
+from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask
 from edgegrad.fit.pose.uncertainty import CORRELATION_LENGTH
 from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
 
@@ -22,7 +23,7 @@ SIZE = 160
 
 
 def vase() -> eg.Mesh:
-    """Turned on a lathe about y, without colours."""
+    """Return a solid of revolution about y, without colours."""
     heights = torch.tensor([-1.0, -0.99, -0.5, 0.1, 0.45, 0.6, 0.99, 1.0])
     radii = torch.tensor([0.0, 0.45, 0.62, 0.5, 0.22, 0.2, 0.3, 0.0])
     around = torch.arange(48) * (2.0 * math.pi / 48)
@@ -38,7 +39,7 @@ def camera() -> eg.Camera:
 
 
 def picture(mesh: eg.Mesh) -> Tensor:
-    """Grey in light, before boards of many colours."""
+    """Return the mesh in grey in light, before boards of many colours."""
     coarse = 0.05 + 0.3 * torch.rand(1, 3, 9, 9, generator=torch.Generator().manual_seed(3))
     clutter = torch.nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bilinear")[0].movedim(0, -1)
     lit = mesh.replace(colors=torch.full((len(mesh.verts), 3), 0.8), material=eg.Material())
@@ -48,9 +49,7 @@ def picture(mesh: eg.Mesh) -> Tensor:
 
 
 def task() -> PoseTask:
-    return PoseTask.from_arguments(
-        vase(), picture(vase()), camera(), None, None, None, Unknowns(), 1.0, ArgumentNames()
-    )
+    return task_of(picture(vase()), camera(), vase())
 
 
 def standing() -> Pose:
@@ -94,8 +93,8 @@ def test_a_continuous_symmetry_makes_its_axis_known() -> None:
     assert Uncertainty.from_curvature(given, standing(), curvature, list(range(6)), other).unknown != ""
 
 
-def test_a_focal_length_that_is_not_known_is_said() -> None:
-    """Where perspective hardly shows, its curvature is that of the distance."""
+def test_an_unknown_focal_length_is_named() -> None:
+    """Where perspective hardly shows, the focal length has the curvature of the distance."""
     given = task()
     free = [*range(6), FOCAL_LENGTH]
     curvature = 1e6 * torch.eye(7, dtype=torch.float64)

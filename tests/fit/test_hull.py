@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from test_fit_scene import QUIET, ball
+from small_scenes import QUIET, ball
 
 import edgegrad as eg
 from edgegrad.fit import fit_texture, regularizers, visual_hull

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from test_fit_scene import QUIET, ball, egg_views
+from small_scenes import QUIET, ball, egg_views
 
 import edgegrad as eg
 from edgegrad.fit import Measured, fit_shape

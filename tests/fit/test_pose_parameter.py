@@ -7,8 +7,8 @@ import math
 
 import pytest
 import torch
-from test_fit import BACKGROUND, bracket, camera, rotation
-from test_fit import START as START_MATRIX
+from brackets import BACKGROUND, CENTER, bracket, camera, rotation
+from brackets import START as START_MATRIX
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene
@@ -35,21 +35,20 @@ def fitted(size=24, **options):
 
 def test_steps_are_rotation_vectors_about_the_middle_and_shifts_in_sizes():
     mesh, size = bracket(), math.sqrt(2.0**2 + 1.5**2 + 0.8**2)
-    center = torch.tensor([1.0, 0.75, 0.4], dtype=F64)
     scaled = START._replace(scale=torch.tensor(1.3, dtype=F64))
     placement = PoseParameter(scaled, mesh, scale=0.01).placed("pose")
     at = {name: p.value for name, p in placement.coordinates.items()}
     torch.testing.assert_close(placement.pose(at).matrix, scaled.matrix)
-    where = 1.3 * START.R @ center + START.t
+    where = 1.3 * START.R @ CENTER + START.t
     turn = torch.tensor([0.3, -2.0, 0.4], dtype=F64)
     turned = placement.pose({**at, "rotation": turn})
     torch.testing.assert_close(turned.R, rotation(*turn.tolist()) @ START.R)
-    torch.testing.assert_close(1.3 * turned.R @ center + turned.t, where)
+    torch.testing.assert_close(1.3 * turned.R @ CENTER + turned.t, where)
     moved = placement.pose({**at, "shift": torch.tensor([0.5, 0.0, -1.0], dtype=F64)})
     torch.testing.assert_close(moved.t - scaled.t, 1.3 * size * torch.tensor([0.5, 0.0, -1.0], dtype=F64))
     grown = placement.pose({**at, "scale": torch.tensor(math.log(2.0), dtype=F64)})
     assert float(grown.scale) == pytest.approx(2.6)
-    torch.testing.assert_close(2.6 * grown.R @ center + grown.t, where)
+    torch.testing.assert_close(2.6 * grown.R @ CENTER + grown.t, where)
 
 
 def test_a_pose_is_differentiable_in_all_its_steps():
@@ -84,13 +83,12 @@ def test_finds_a_pose_by_name():
     pose = fit.poses["meshes.0.pose"]
     torch.testing.assert_close(fit.history[0].values["meshes.0.pose"], START_MATRIX, rtol=0, atol=1e-12)
     apart = math.degrees(math.asin(float((pose.R - torch.eye(3)).norm()) / 8**0.5) * 2.0)
-    middle = torch.tensor([1.0, 0.75, 0.4], dtype=F64)
     assert fit.converged and apart < 0.5
-    assert float((pose.R @ middle + pose.t - middle).norm()) < 0.005 * 2.62
+    assert float((pose.R @ CENTER + pose.t - CENTER).norm()) < 0.005 * 2.62
     torch.testing.assert_close(fit.mesh.verts, bracket().transformed(pose.R, pose.t).verts)
 
 
-def test_turns_of_more_than_a_half_circle_are_rotations():
+def test_rotation_vectors_longer_than_pi_are_rotations():
     """Steps add up in a rotation vector of any length, which still makes a rotation."""
     placement = PoseParameter(START, bracket()).placed("pose")
     for turn in (3.5, 6.0, 20.0):
@@ -99,8 +97,8 @@ def test_turns_of_more_than_a_half_circle_are_rotations():
         torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=F64))
 
 
-def test_the_pose_of_a_mesh_and_what_else_is_sought_of_it():
-    """Its vertices are moved with it; a scene's second mesh moves alone."""
+def test_a_mesh_has_a_pose_and_other_parameters():
+    """The mesh's vertices move with its pose. A scene's second mesh moves alone."""
     mesh, view = bracket(), camera(16)
     pose = Pose(START.R, START.t)
     fit = fit_scene(mesh, view, target(view), {"pose": PoseParameter(pose), "verts": 1e-3}, steps=2, **QUIET)
@@ -220,7 +218,7 @@ def test_errors_name_the_argument(parameters, error, message):
         fit_scene(eg.Scene([bracket()], BACKGROUND), view, target(view), parameters, **QUIET)
 
 
-def test_a_function_must_be_told_of_what():
+def test_a_function_needs_the_mesh_that_is_moved():
     view = camera(16)
     with pytest.raises(
         TypeError, match=r"place: of: expected the Mesh or Scene that is moved, got none; give PoseParam"

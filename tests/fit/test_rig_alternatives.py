@@ -1,8 +1,7 @@
-"""Poses that outlines hardly separate from another one: two limbs exchanged, a twist shared in another way."""
+"""Poses that outlines hardly separate from another one: two exchanged limbs, or a rotation that two bones share
+differently."""
 
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,7 +17,6 @@ from edgegrad.fit.rig.limbs import Limb, LimbSearch, Values, limbs
 from edgegrad.fit.views import views_of
 
 roma = pytest.importorskip("roma")
-sys.path.append(str(Path(__file__).parents[2] / "examples"))
 import body  # noqa: E402
 import figure  # noqa: E402
 
@@ -28,7 +26,7 @@ F64 = torch.float64
 
 
 def legs(apart: float) -> eg.Joints:
-    """Two of three joints, whose own axes at rest are not alike."""
+    """Return two legs of three joints, whose own axes at rest are not alike."""
     one = torch.tensor([[0.5 * apart, 0.0, 0.0], [0.0, -0.4, 0.0], [0.0, -0.3, 0.1]], dtype=F64)
     turns = torch.tensor([[0.3, 0.0, 0.2], [0.0, 0.5, 0.0], [0.1, 0.0, 0.0]], dtype=F64)
     mirror = torch.tensor([-1.0, 1.0, 1.0], dtype=F64)
@@ -63,8 +61,8 @@ def test_limbs_that_hang_apart_point_to_where_the_other_one_was() -> None:
         torch.testing.assert_close(along, wanted)
 
 
-def test_what_is_exchanged_hangs_alike() -> None:
-    """Arms and legs of a figure; not a leg with the spine, nor a limb with one that branches."""
+def test_exchanged_limbs_hang_on_joints_alike() -> None:
+    """A figure's arms and legs are exchanged, but no leg with the spine, nor a limb with one that branches."""
     rig = figure.figure(fine=3)
     pairs = [limb.twins for limb in limbs(rig, range(20)) if limb.twins is not None]
     names = [[rig.joints.names[k].removeprefix("left ") for k in one] for one, _ in pairs]
@@ -73,7 +71,7 @@ def test_what_is_exchanged_hangs_alike() -> None:
 
 @pytest.mark.slow
 def test_crossed_legs_are_found() -> None:
-    """A descent from rest, and limbs drawn anew by themselves, end with each leg in the outline of the other one."""
+    """A descent from rest and a search of single limbs end with each leg in the outline of the other."""
     rig, truth, _, fit = body.trial(6, size=96, progress=False)
     legs = [rig.joints.names.index(name) for name in LEGS]
     assert fit.converged and float(body.Errors.of(rig, fit.values["rotations"], truth).direction[legs].max()) < 2.0
@@ -81,31 +79,33 @@ def test_crossed_legs_are_found() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", (4, 7))
-def test_twists_are_found(seed: int) -> None:
-    """Descents end with an arm and its elbow 20° to 45° twisted against each other, and the outlines less than a pixel off (7);
-    with a hand 86° across its true place, and a shoulder and its arm twisted by 15° (4)."""
+def test_axial_rotations_are_found(seed: int) -> None:
+    """In pose 7, descents end with an arm and its elbow rotated by 20° to 45° against each other, with outlines less
+    than a pixel off. In pose 4, a hand ends 86° across its place, and a shoulder and its arm are rotated by 15°."""
     _, truth, _, fit = body.trial(seed, progress=False)
     assert fit.converged and float(body.Errors.of(fit.rig, fit.values["rotations"], truth).rotation.quantile(0.9)) < 3.0
 
 
 def arm_of(rig: eg.Rig) -> tuple[FreeParameters, Alternatives]:
-    """Of a figure, the joints of one arm, by whose rotations it is posed."""
-    sought = FreeParameters.from_arguments(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
-    return sought, Alternatives(rig, sought, "rotations")
+    """Return the rotations of one arm of a figure as free parameters, and their alternatives."""
+    free = FreeParameters.from_arguments(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
+    return free, Alternatives(rig, free, "rotations")
 
 
-def test_a_twist_keeps_what_hangs_below_in_place() -> None:
+def test_an_axial_rotation_keeps_what_hangs_below_in_place() -> None:
     rig = figure.figure(fine=3)
-    sought, alternatives = arm_of(rig)
+    free, alternatives = arm_of(rig)
     values = {"rotations": figure.pose(7, 40.0)[[rig.joints.names.index(name) for name in ARM]]}
-    twists = {(ARM[t.row], None if t.child is None else ARM[t.child]): t for t in alternatives.axial_rotations(values)}
-    assert list(twists) == [("left arm", "left elbow"), ("left elbow", "left hand"), ("left hand", None)]
+    rotations = {
+        (ARM[t.row], None if t.child is None else ARM[t.child]): t for t in alternatives.axial_rotations(values)
+    }
+    assert list(rotations) == [("left arm", "left elbow"), ("left elbow", "left hand"), ("left hand", None)]
     # The hand's own axis points to the middle of its ellipsoid.
     along = torch.tensor(figure.BONES_ALONG[8], dtype=F64)
-    assert float(twists["left hand", None].axis @ along / along.norm()) > 0.99
-    before = rig.joints.world(roma.rotvec_to_rotmat(sought.all(values)["rotations"]))
-    for (name, _), twist in twists.items():
-        found = sought.all({"rotations": alternatives.with_rotation(values, twist, 0.7)})["rotations"]
+    assert float(rotations["left hand", None].axis @ along / along.norm()) > 0.99
+    before = rig.joints.world(roma.rotvec_to_rotmat(free.all(values)["rotations"]))
+    for (name, _), rotation in rotations.items():
+        found = free.all({"rotations": alternatives.with_rotation(values, rotation, 0.7)})["rotations"]
         after = rig.joints.world(roma.rotvec_to_rotmat(found))
         at = rig.joints.names.index(name)
         others = [k for k in range(20) if k != at]
@@ -115,19 +115,17 @@ def test_a_twist_keeps_what_hangs_below_in_place() -> None:
         assert float(turned) == pytest.approx(0.7, abs=1e-6)
 
 
-def test_twists_are_found_by_the_loss_along_them() -> None:
-    """A hand turned across its true place, and an arm and its elbow twisted against each other; what is right stays."""
+def test_axial_rotations_are_found_by_the_loss_along_them() -> None:
+    """A hand is rotated across its true place, and an arm against its elbow. What is right stays."""
     rig, cameras = figure.figure(fine=4), figure.cameras(64)[:3]
-    sought, alternatives = arm_of(rig)
-    parameter = sought.parameters["rotations"]
+    free, alternatives = arm_of(rig)
+    parameter = free.parameters["rotations"]
     assert parameter.value is not None
     truth = {"rotations": parameter.value}
-    masks = [
-        eg.render_aovs(rig.posed(sought.fixed["rotations"]), c, ["alpha"], spp=64, seed=5)["alpha"] for c in cameras
-    ]
+    masks = [eg.render_aovs(rig.posed(free.fixed["rotations"]), c, ["alpha"], spp=64, seed=5)["alpha"] for c in cameras]
     views = views_of(cameras, None, masks, None)
     objective = Objective(
-        lambda values: (eg.Scene([rig.posed(**sought.all(values))]), cameras),
+        lambda values: (eg.Scene([rig.posed(**free.all(values))]), cameras),
         views,
         Options(spp=32),
     )
@@ -142,7 +140,7 @@ def test_twists_are_found_by_the_loss_along_them() -> None:
 
 @pytest.mark.parametrize(("nearly", "costs", "tries"), [(True, [1.0], 6), (False, [1.0], 20), (True, [0.9, 0.89], 7)])
 def test_tries_that_gain_nothing_end(nearly: bool, costs: list[float], tries: int) -> None:
-    """Where pictures are explained but for what a finer level tells, after six; else all of them."""
+    """They end after six where a finer level may explain the rest, and otherwise after all."""
 
     class Same:
         worse, gain = 2.0, 0.0
@@ -164,13 +162,19 @@ def test_tries_that_gain_nothing_end(nearly: bool, costs: list[float], tries: in
 
     class Few(LimbSearch):
         def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
-            return (dict(best[0]), costs[len(told)]) if len(told) < len(costs) and costs[len(told)] < 1.0 else best
+            return (
+                (dict(best[0]), costs[len(reports)])
+                if len(reports) < len(costs) and costs[len(reports)] < 1.0
+                else best
+            )
 
         def drawn(self, best: Values, limb: Limb) -> list[Values]:
             return []
 
-    told: list[None] = []
+    reports: list[None] = []
     nothing: Any = None
-    search = Few(nothing, Same(), "x", [Limb([0])], {}, torch.zeros(1), nothing, nothing, 0, lambda: told.append(None))
+    search = Few(
+        nothing, Same(), "x", [Limb([0])], {}, torch.zeros(1), nothing, nothing, 0, lambda: reports.append(None)
+    )
     search.run({"x": torch.zeros(1)}, 20)
-    assert len(told) == tries
+    assert len(reports) == tries

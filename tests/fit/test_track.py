@@ -1,4 +1,4 @@
-"""edgegrad.fit.track and `edgegrad track`: a mesh in a film, in light that nobody told it, before clutter."""
+"""edgegrad.fit.track and `edgegrad track` follow a mesh in a film, in unknown light, before clutter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytest_plugins = "film_fixtures"
 SIZE, COUNT = 80, 7  # of its film
 
 
-def test_a_stone_that_turns(film, frames):
+def test_a_rotating_stone_is_followed(film, frames):
     read = []
 
     def one_by_one():
@@ -54,8 +54,9 @@ def test_lost_and_found_again(film):
 
 
 @pytest.mark.slow
-def test_found_again_elsewhere_and_turned(film):
-    """By 30°, and a quarter of the picture aside; while it is away nothing else is taken for it. The mesh is of other units."""
+def test_found_again_elsewhere_and_rotated(film):
+    """The mesh returns rotated by 30° and shifted by a quarter of the picture. Nothing else is taken for it meanwhile.
+    The mesh has other units."""
     there = film.poses[0].clone()
     there[:3, :3] = rotation(torch.tensor([0.3, 0.4, 0.15]).double()) @ there[:3, :3]
     there[:3, 3] += film.camera.world_to_camera[1, :3].double() * 0.25 * 2.0 * DISTANCE * math.tan(math.radians(20.0))
@@ -175,7 +176,8 @@ def test_a_pose_of_a_film_is_the_last_one_that_is_not_lost():
 
 @pytest.mark.slow
 def test_a_hand_that_covers_more_than_half(film):
-    """Over three pictures, while the stone turns on: then the light of one picture alone would be the hand's."""
+    """The hand stays for three pictures while the stone rotates, so the light of one picture alone would be the
+    hand's."""
     going = replace(film, poses=film.poses[:3] + [film.poses[k] for k in range(3, COUNT)], hand=(-4, 9))
     found = list(track(film.mesh, going, film.camera, film.poses[0]))
     assert not any(pose.lost for pose in found) and max(pose.covered for pose in found) > 0.4

@@ -1,4 +1,4 @@
-"""`edgegrad track` on videos: read, followed, and written as a film, with a frame's contour in it; broken ones are named."""
+"""`edgegrad track` reads videos, follows the mesh, and writes a film with its contour; broken videos are named."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COUNT = 4
 
 @pytest.fixture(scope="module")
 def pictures(frames: list[torch.Tensor]) -> list[np.ndarray]:
-    """Of 8 bits."""
+    """Return frames of 8 bits."""
     return [(linear_to_srgb(frame) * 255.0).round().byte().numpy() for frame in frames[:COUNT]]
 
 
@@ -92,7 +92,7 @@ def test_frames_of_a_video_are_read_as_they_were_written(pictures, tmp_path):
         assert float(off.max()) < 10.0 and float(off.mean()) < 2.0
 
 
-def test_a_picture_is_turned_as_the_file_says():
+def test_frames_are_rotated_as_the_file_says():
     picture = torch.arange(6.0).reshape(2, 3, 1)
     assert torch.equal(upright(picture, 0), picture)
     assert upright(picture, 90)[..., 0].tolist() == [[2.0, 5.0], [1.0, 4.0], [0.0, 3.0]]  # counterclockwise
@@ -103,7 +103,7 @@ def test_a_picture_is_turned_as_the_file_says():
 @pytest.mark.parametrize("matrix", [(1, 0, 0, 1), (0, 1, -1, 0), (-1, 0, 0, -1), (0, -1, 1, 0), (-1, 0, 0, 1), (1, 0, 0, -1),
                                     (0, 1, 1, 0), (0, -1, -1, 0)])  # fmt: skip
 def test_all_orientations_of_a_film_are_shown_as_players_do(matrix, tmp_path):
-    """By the display matrix in its tkhd, which takes a pixel (p, q) to (a p + c q, b p + d q); those of front cameras mirror."""
+    """The display matrix in the tkhd takes a pixel (p, q) to (a p + c q, b p + d q); those of front cameras mirror."""
     stored = np.zeros((48, 64, 3), np.uint8)
     stored[:24, :32, 0], stored[:24, 32:, 1], stored[24:, :32, 2] = 255, 255, 255
     write_video(tmp_path / "a.mp4", [stored] * 2, "mpeg4")

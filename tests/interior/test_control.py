@@ -78,7 +78,7 @@ SCENES = {
 
 
 class Gradient:
-    """What the interior term gives for a few motions that no control was made for, and for the colours."""
+    """The interior term for the colours and for a few motions that no control was made for."""
 
     def __init__(self, meshes: list[eg.Mesh], adjoint: Tensor) -> None:
         self.meshes, self.adjoint = meshes, adjoint
@@ -125,7 +125,7 @@ def test_few_samples_estimate_what_is_exact(name: str, rough: bool, filter: str)
 
 
 def test_a_smooth_loss_needs_few_samples() -> None:
-    """Without the control, a sample or two somewhere on each face: 11 % with three times the samples."""
+    """The error was 11 % without the control, with three times the samples."""
     mesh, adjoint = icosphere(4), smooth_adjoint(96, 96, 3)
     camera = front_camera(96)
 
@@ -143,8 +143,8 @@ def test_a_smooth_loss_needs_few_samples() -> None:
 
 @pytest.mark.parametrize("signs", [False, True])
 def test_a_rough_loss_gets_its_samples(signs: bool) -> None:
-    """Where neighbouring pixels have nothing to do with one another, corners say little of what is between them, and less
-    where they agree by chance, as the signs of an L1 loss do: then a face was sampled a sixteenth as often, error × 3."""
+    """Corners say little of what is between them where neighbouring pixels are independent. They say less where they agree by
+    chance, as the signs of an L1 loss do: then a face was sampled a sixteenth as often, error × 3."""
     mesh, camera = icosphere(4), front_camera(64)
     assert mesh.colors is not None
     mesh = mesh.replace(colors=mesh.colors[:, :1])
@@ -251,7 +251,7 @@ def test_default_samples_at_creases(name: str) -> None:
 
 def test_hidden_creases_seen_through_a_gap() -> None:
     """A hole of half a pixel, which one ray a pixel misses every other time: then what lies behind it was not hit, and only its
-    rim tells that it may be seen."""
+    border tells that it may be seen."""
     ball = coloured_sphere(3)
     corner = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], dtype=F64)
     verts = torch.cat([torch.cat([size * corner, torch.full((4, 1), 1.3, dtype=F64)], 1) for size in (2.0, 0.03)])
@@ -300,12 +300,12 @@ def test_creases_that_something_hides() -> None:
     assert float(errors.square().mean().sqrt()) < 0.05, errors
 
 
-def test_a_crease_beside_a_face_that_is_seen_edge_on() -> None:
+def test_a_crease_next_to_a_face_that_is_seen_edge_on() -> None:
     """Rays, placed in float, slip past a face that is a hundred-thousandth of a pixel wide, and see the crease behind it. It must
     not be taken for visible: what samples then take away again is 0.6 % of the whole gradient, in one seed of two."""
     scene = build("flat-colors")
-    behind, beside = 43, 10492  # the crease's vertices
+    behind, adjacent = 43, 10492  # the crease's vertices
     for seed in range(6):
         gradient, *_ = differentiate(scene, spp=16, seed=seed)
-        assert float(gradient[beside].norm()) > 0
+        assert float(gradient[adjacent].norm()) > 0
         assert float(gradient[behind].norm() / gradient.norm()) < 1e-3

@@ -1,5 +1,5 @@
-"""Where the samples of the gradient go must not change what they estimate: large textured triangles, hidden layers, faces
-that are smaller than what floats show apart."""
+"""Where the gradient's samples lie must not change what they estimate: large textured triangles, hidden layers, and faces that
+are smaller than what floats show apart."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def textured_scene(ball: bool) -> eg.Scene:
 @pytest.mark.slow
 @pytest.mark.parametrize(("ball", "filter"), diagonal([False, True], ["gaussian", "box"]))
 def test_large_textured_triangles_agree_with_exact_derivatives(ball: bool, filter: str) -> None:
-    """Along the gradient, where nothing cancels."""
+    """Compare along the gradient, where nothing cancels."""
     scene, fields = textured_scene(ball), ("verts", "uvs", "texture")
 
     def gradients(render: Callable[[eg.Scene, eg.Camera], Tensor]) -> list[Tensor]:
@@ -61,7 +61,7 @@ def test_large_textured_triangles_agree_with_exact_derivatives(ball: bool, filte
 
 
 def test_samples_of_large_textured_triangles_are_those_of_pixels() -> None:
-    """As many in each pixel; one at least, however few are asked for."""
+    """Each pixel has as many, and at least one, however few are asked for."""
     adjoint = torch.ones(48, 48, 3, dtype=F64)
     surface, _ = default_samples(textured_scene(False), CAMERA, adjoint)
     assert surface % 48**2 == 0 and 4 <= surface // 48**2 <= 6  # 4 a unit of area and a little for the sides
@@ -173,7 +173,7 @@ def turned_away(mesh: eg.Mesh, camera: eg.Camera) -> torch.Tensor:
 
 @pytest.mark.parametrize("inside_out", [False, True])
 def test_the_far_side_costs_little(inside_out: bool) -> None:
-    """What lies behind the near side gets a 64th of the samples. Near the limb, where some samples hit nothing, faces that turn
+    """Faces behind the near side get a 64th of the samples. Near the limb, where some samples hit nothing, faces that turn
     their backs get a 64th where no face is visible from behind, else an eighth."""
     camera, adjoint = front_camera(128), smooth_adjoint(128, 128, 3)
     mesh = icosphere(5)

@@ -168,7 +168,7 @@ def triangle(verts: Tensor, camera: eg.Camera = CAMERA) -> Tensor:
 
 @pytest.mark.parametrize("value", [torch.nan, -torch.inf])
 def test_an_adjoint_that_is_not_finite_is_named_at_its_place(value):
-    """That of the image as the user has it, with an axis for cameras where there is a batch of them."""
+    """The place is that in the user's image, with an axis for cameras where there is a batch of them."""
     for camera, place in ((CAMERA, (7, 4, 1)), (eg.Camera.stack([CAMERA]), (0, 7, 4, 1)), (BATCH, (1, 7, 4, 2))):
         image = triangle(leaf(MESH.verts), camera)
         adjoint = torch.ones_like(image)

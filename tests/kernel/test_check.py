@@ -13,7 +13,7 @@ from edgegrad.library import core
 pytestmark = pytest.mark.quick
 
 # Around the sizes of vectors, of blocks, and of what is worth several threads.
-SIZES = [1, 7, 15, 16, 17, 33, 4095, 4096, 4097, (1 << 18) - 1, (1 << 18) + 3]
+SIZES = [1, 15, 16, 33, 4095, 4097, (1 << 18) + 3]
 
 
 def places(n: int) -> list[int]:
@@ -114,13 +114,6 @@ def test_indices_of_few_bits_in_a_scene_of_many_vertices(dtype: torch.dtype) -> 
     camera = eg.Camera.look_at((4, 5, 9), (1, 1, 1), size=(16, 16))
     wide = [mesh.replace(faces=mesh.faces.long()) for mesh in (first, second)]
     assert torch.equal(eg.render(eg.Scene([first, second]), camera), eg.render(eg.Scene(wide), camera))
-
-
-def test_an_index_changed_in_place_is_named_as_it_is() -> None:
-    mesh = cube()
-    mesh.faces[2, 1] = -5
-    with pytest.raises(ValueError, match=r"faces: expected indices .*, got -5 at \[2, 1\]"):
-        eg.render(mesh, eg.Camera.look_at((3, 2, 4), (0, 0, 0), size=(8, 8)))
 
 
 def test_numbers_within_a_transform_are_looked_at() -> None:

@@ -81,7 +81,7 @@ def test_compile_everything_inside(compiled):
 
 
 def test_compile_once_for_many_integers(compiled):
-    """From the second call on they are symbols. The seeds that follow from one must come out as they do in Python."""
+    """They are symbols from the second call on. The seeds that follow from one must come out as they do in Python."""
 
     def function(verts, seed, spp, samples):
         mesh = MESH.replace(verts=verts)

@@ -28,20 +28,20 @@ import edgegrad as eg
 
 
 def strided(tensor: Tensor) -> Tensor:
-    """The same values, one in three of a larger tensor."""
+    """Return the same values, one in three of a larger tensor."""
     larger = torch.zeros((*tensor.shape, 3), dtype=tensor.dtype)
     larger[..., 1] = tensor
     return larger[..., 1]
 
 
 def transposed(tensor: Tensor) -> Tensor:
-    """The same values, stored the other way round."""
+    """Return the same values, stored along the other axis."""
     return tensor.mT.contiguous().mT if tensor.dim() > 1 else tensor
 
 
 @pytest.mark.parametrize("layout", [strided, transposed])
 def test_layouts(layout):
-    """Of inputs and of the adjoint image."""
+    """Inputs and the adjoint image may have any layout."""
     plain, camera, leaves = with_leaves(mixed_scene(), CAMERA)
     adjoint = smooth_adjoint(SIZE, SIZE, 3)
     image = eg.render(plain, camera, 4)

@@ -6,22 +6,10 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from scenes import front_camera, one_triangle, smooth_adjoint
 from torch import Tensor
+from torch_scenes import ADJOINT, BACKGROUND, CAMERA, F64, MESH, SIZE, leaf
 
 import edgegrad as eg
-
-F64 = torch.float64
-SIZE = 20
-TRIANGLE = one_triangle()
-MESH, BACKGROUND = TRIANGLE.meshes[0], TRIANGLE.background
-CAMERA = front_camera(SIZE)
-ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
-
-
-def leaf(tensor: Tensor) -> Tensor:
-    return tensor.detach().clone().requires_grad_()
-
 
 SECOND = "second derivatives of a rendered image are not available.*Gauss-Newton"
 
@@ -60,7 +48,7 @@ def gradient_penalty(loss: Callable[[Tensor], Tensor]) -> None:
 
 
 def learnt_step(loss: Callable[[Tensor], Tensor]) -> None:
-    """As in meta-learning: the loss after a step, differentiated by where the step began."""
+    """Differentiate the loss after a step by where the step began, as meta-learning does."""
     verts = leaf(MESH.verts)
     loss(verts - 0.1 * first_order(loss, verts)).backward()
 
@@ -90,12 +78,17 @@ TWICE = {
 }
 
 
-@pytest.mark.parametrize("loss", [linear, quadratic, shaded, lit])
-@pytest.mark.parametrize("way", TWICE)
-def test_second_derivatives_are_refused(way, loss):
+@pytest.mark.parametrize(
+    ("method", "loss"),
+    [
+        *((method, loss) for method in TWICE for loss in (linear, quadratic)),
+        *((method, loss) for method in ("gradient penalty", "func.hessian", "jvp(grad)") for loss in (shaded, lit)),
+    ],
+)
+def test_second_derivatives_are_refused(method, loss):
     """Zeros came, without a word, where the loss is linear in the image, and from some of these for any loss."""
     with pytest.raises(RuntimeError, match=SECOND):
-        TWICE[way](loss)
+        TWICE[method](loss)
 
 
 def test_a_gradient_in_the_graph_is_no_second_derivative():
@@ -161,7 +154,7 @@ BATCHES = {
 
 @pytest.mark.parametrize("name", BATCHES)
 def test_vmap(name):
-    """Of anything, images and gradients are those of a loop; also of the other transforms within it, and around it."""
+    """Images and gradients are those of a loop, also of the other transforms within vmap and around it."""
     function, batch = BATCHES[name]
 
     def loss(x: Tensor) -> Tensor:

@@ -26,13 +26,11 @@ UVS = BALL.verts[:, :2] / 2
 def lit(
     verts: Tensor = BALL.verts,
     place: Tensor = PLACE,
-    roughness: Tensor | float = 0.4,
     image: Tensor = IMAGE,
-    radiance: Tensor = RADIANCE,
     camera: eg.Camera = CAMERA,
 ) -> Tensor:
-    shiny = eg.Material(eg.Texture(image, UVS, BALL.faces, filter="linear"), roughness=roughness)
-    lights = [eg.PointLight(place, 20.0), eg.Environment(radiance)]
+    shiny = eg.Material(eg.Texture(image, UVS, BALL.faces, filter="linear"), roughness=0.4)
+    lights = [eg.PointLight(place, 20.0), eg.Environment(RADIANCE)]
     return eg.render(eg.Scene([eg.Mesh(verts, BALL.faces, material=shiny), FLOOR], lights=lights), camera, 1)
 
 
@@ -52,9 +50,7 @@ TWO = torch.tensor([1.0, 1.2], dtype=F64)
 BATCHES: dict[str, tuple[Callable[[Tensor], Tensor], Tensor]] = {
     "verts": (lambda v: lit(v), BALL.verts * TWO[:, None, None]),
     "light": (lambda p: lit(place=p), PLACE * TWO[:, None]),
-    "roughness": (lambda r: lit(roughness=r), 0.3 * TWO),
     "texture": (lambda i: lit(image=i), IMAGE * TWO[:, None, None, None]),
-    "sky": (lambda r: lit(radiance=r), RADIANCE * TWO[:, None]),
     "emitter": (emitter, RADIANCE * TWO[:, None]),
     "K": (lambda k: lit(camera=CAMERA.replace(K=k)), CAMERA.K * torch.stack([torch.ones(3, 1), TWO[[0, 1, 0], None]]).to(F64)),
     "mipmaps": (mipmapped, IMAGE * TWO[:, None, None, None]),

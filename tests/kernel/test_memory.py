@@ -25,7 +25,7 @@ def requiring(mesh, *names):
 
 
 def test_an_image_larger_than_memory_is_refused():
-    """For real: 172 GB. Nothing is allocated, so it is refused at once."""
+    """The image would take 172 GB. Nothing is allocated, so it is refused at once."""
     size, before = 65536, psutil.Process().memory_info().rss
     if psutil.virtual_memory().total > 100e9:
         pytest.skip("this machine may have the memory")

@@ -21,7 +21,7 @@ SCENES = {"colors": lambda: TRIANGLE, "mixed": mixed_scene, "float32": lambda: T
 
 
 @pytest.mark.parametrize("wanted", ["11111111111", "10000110000"])
-def test_opcheck_of_channels_beside_the_image(wanted):
+def test_opcheck_of_auxiliary_channels(wanted):
     names = ["image", "alpha", "position", "depth", "shading_normal", "normal", "barycentrics"]
     inputs = with_channels(make_request(TRIANGLE, CAMERA, 4, surface_samples=200, edge_samples=200), names).pack()
     image, *forward = torch.ops.edgegrad.render(*inputs)

@@ -1,4 +1,4 @@
-"""That `make sanitize` tests the kernel it built, and that what watches it there reports faults."""
+"""`make sanitize` tests the kernel that it built, and the sanitizers report faults there."""
 
 from __future__ import annotations
 

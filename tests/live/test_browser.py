@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 import torch
-from test_fit import BACKGROUND, START, bracket, camera, picture
+from brackets import BACKGROUND, START, bracket, camera, picture
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, fit_pose, fit_scene

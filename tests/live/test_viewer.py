@@ -1,43 +1,25 @@
-"""The live view without a browser: what its server holds, how it pauses and stops, and how little time it takes."""
+"""What the live view shows, by what its server holds; no browser is needed."""
 
 import io
-import json
-import signal
-import socket
-import sys
-import threading
-import time
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from test_fit import BACKGROUND, START, bracket, camera, picture
-from test_fit_scene import pictures, views
+from brackets import BACKGROUND, START, bracket, camera, picture
+from live_fixtures import page
+from small_scenes import QUIET, pictures, views
 
 import edgegrad as eg
-from edgegrad import cli
-from edgegrad.files.cameras import save_camera
-from edgegrad.files.image import linear_to_srgb, write_image
-from edgegrad.fit import Parameter, fit_camera, fit_pose, fit_rig, fit_scene, fit_shape, fit_texture
+from edgegrad.files.image import linear_to_srgb
+from edgegrad.fit import fit_camera, fit_pose, fit_rig, fit_shape, fit_texture
 from edgegrad.fit.views import white_level
 from edgegrad.live import snapshot, view
-from edgegrad.live.browser import Browser
 
 pytestmark = [pytest.mark.quick, pytest.mark.unsanitized]
 
 viser = pytest.importorskip("viser", reason="the live view needs edgegrad[view]")
-QUIET = {"progress": False, "spp": 4}
-
-
-@pytest.fixture
-def viewer():
-    with eg.viewer(port=0, share=1.0) as made:
-        yield made
-
-
-def page(viewer) -> Browser:
-    return viewer._display
+pytest_plugins = "live_fixtures"
 
 
 def vertices(handle):
@@ -54,9 +36,6 @@ def vertices(handle):
 
 def extent(points):
     return np.concatenate([points.min(1), points.max(1)])
-
-
-# -- what it shows ----------------------------------------------------------------------------------------------------
 
 
 def test_a_pose_moves_the_mesh_and_keeps_the_camera(viewer):
@@ -95,8 +74,8 @@ def test_a_camera_moves_before_a_scene_at_rest(viewer):
 
 
 def test_the_skeleton_of_a_rig_is_drawn(viewer, monkeypatch):
-    from test_fit_rig import arm, shown
-    from test_fit_rig import views as around
+    from arms import arm, shown
+    from arms import views as around
 
     monkeypatch.setattr(view, "MIN_INTERVAL", 0.0)
     rig, cameras = arm(3), around(24, 2)
@@ -245,208 +224,3 @@ def test_cameras_of_all_kinds_are_shown(viewer, kind):
     assert viewer.update(bracket(), eg.Camera(at.world_to_camera, K, at.size, kind))
     assert 0.0 < page(viewer)._frusta[0][1].fov <= 2.0
     assert page(viewer).picture.image.shape == (16, 16, 3)  # the render alone
-
-
-# -- pause, stop, and out of the way ----------------------------------------------------------------------------------
-
-
-def colour_fit(**options):
-    cameras = views(1)
-    return fit_scene(
-        bracket(), cameras, pictures(bracket(), cameras), {"face_colors": Parameter(0.01)}, **{**QUIET, **options}
-    )
-
-
-def test_a_pause_holds_the_fit_and_stop_ends_it_with_its_best(viewer):
-    steps, reached = [], threading.Event()
-
-    def callback(record):
-        steps.append(record.step)
-        if record.step == 3:
-            viewer.pause()
-            reached.set()
-        viewer(record)
-
-    found = []
-    thread = threading.Thread(target=lambda: found.append(colour_fit(steps=10**6, tolerance=0.0, callback=callback)))
-    thread.start()
-    assert reached.wait(20)
-    time.sleep(0.5)
-    assert steps == [0, 1, 2, 3] and viewer.paused
-    for _ in range(100):
-        if page(viewer).status.content.startswith("**paused** at step 4"):
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("the page does not say that it is paused")
-    assert page(viewer).pause.label == "Resume"
-    viewer.resume()
-    while len(steps) < 8:
-        time.sleep(0.01)
-    viewer.pause()
-    viewer.stop()  # also of a fit that is paused
-    thread.join(20)
-    assert not thread.is_alive() and found[0].interrupted and found[0].steps == len(steps)
-    assert not viewer.stopped and not viewer.paused  # ready for the next fit
-    assert colour_fit(steps=2, callback=viewer).steps == 2
-
-
-def test_stop_ends_a_loop_of_ones_own(viewer):
-    assert viewer.update(bracket())
-    viewer.stop()
-    assert not viewer.update(bracket()) and viewer.stopped
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
-def test_ctrl_c_ends_a_pause(viewer):
-    viewer.pause()
-    threading.Timer(0.5, signal.raise_signal, [signal.SIGINT]).start()
-    fit = colour_fit(steps=10**6, callback=viewer)
-    assert fit.interrupted and fit.steps == 1
-
-
-def test_drawing_takes_no_more_than_its_share_of_the_time(monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr(view.time, "perf_counter", lambda: now[0])
-    drawn = []
-    with eg.viewer(port=0, share=0.05) as viewer:
-
-        def draw(*_):
-            drawn.append(now[0])
-            now[0] += 0.04
-
-        monkeypatch.setattr(viewer._display, "draw", draw)
-        while now[0] < 20.0:
-            now[0] += 0.01
-            viewer.update(bracket())
-    assert drawn[1] - drawn[0] < 0.2  # the first one may take long
-    gaps = np.diff(drawn[1:])
-    assert 0.04 / gaps.max() > 0.04 and 0.04 / gaps.min() < 0.0501
-
-
-def test_scenes_are_made_only_where_they_are_drawn(viewer, monkeypatch):
-    monkeypatch.setattr(view, "MIN_INTERVAL", 1e9)
-    made = []
-    monkeypatch.setattr(
-        snapshot, "snapshot_from_scene", lambda *a, of=snapshot.snapshot_from_scene: made.append(1) or of(*a)
-    )
-    for _ in range(5):
-        viewer.update(bracket())
-    assert len(made) == 1 and viewer._steps == 5
-
-
-def test_another_port_where_one_is_taken_and_only_this_computer():
-    with eg.viewer(port=0) as one:
-        port = int(one.url.rsplit(":", 1)[1])
-        with eg.viewer(port) as two:
-            assert two.url != one.url
-        assert page(one).server.get_host() == "127.0.0.1"
-        assert f'<iframe src="{one.url}"' in one._repr_html_()
-    assert "iframe" not in one._repr_html_() and "closed" in repr(one)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", port))  # given back
-    assert one.update(bracket())  # a fit goes on without it
-
-
-# -- a figure in a notebook -------------------------------------------------------------------------------------------
-
-
-def test_a_figure_where_there_is_no_server(monkeypatch):
-    ipython = pytest.importorskip("IPython.display")
-    shown = []
-
-    class Handle:
-        def update(self, image):
-            shown.append(image.data)
-
-    monkeypatch.setattr(view, "in_notebook", lambda: True)
-    monkeypatch.setattr(ipython, "display", lambda image, display_id: shown.append(image.data) or Handle())
-    monkeypatch.setattr(view.importlib.util, "find_spec", lambda name: None)
-    with eg.viewer() as made:
-        assert made.url is None and made._repr_html_() is None
-        made._next = 0.0
-        fit = colour_fit(steps=3, callback=made)
-        made.show(fit)
-        made.wait()  # for nobody
-    titles = [ax.get_title() for ax in made._display.figure.axes]
-    assert titles == ["target", "render", "difference × 4", "loss"]
-    assert len(shown) >= 2 and shown[0] != shown[-1] and all(data.startswith(b"\x89PNG") for data in shown)
-
-
-# -- faults -----------------------------------------------------------------------------------------------------------
-
-
-def test_errors_name_the_argument(viewer):
-    for options, error, text in [
-        ({"port": -1}, ValueError, "port: expected"), ({"port": "x"}, TypeError, "port: expected"),
-        ({"host": 3}, TypeError, "host: expected a str"), ({"server": 1}, TypeError, "server: expected True"),
-        ({"server": False}, ValueError, "server: expected True outside of a notebook"),
-        ({"share": 0.0}, ValueError, "share: expected"), ({"share": 1.5}, ValueError, "share: expected"),
-    ]:  # fmt: skip
-        with pytest.raises(error, match=text):
-            eg.viewer(**{"port": 0, **options})
-    with pytest.raises(TypeError, match="fit: expected what a fit gives its callback"):
-        viewer.show(3)
-    with pytest.raises(TypeError, match="scene: expected a Scene or a Mesh, got int"):
-        viewer.update(3)
-    with pytest.raises(ValueError, match="cameras: expected with images and masks, got None"):
-        viewer.update(bracket(), None, torch.zeros(4, 4, 3))
-
-
-def test_without_viser_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ImportError, match=r"live view needs edgegrad\[view\]; install it with: pip install 'edgegrad"):
-        eg.viewer()
-
-
-# -- the command line -------------------------------------------------------------------------------------------------
-
-
-def test_the_command_line_opens_it_and_saves_before_it_waits(tmp_path, monkeypatch, capsys):
-    mesh, at = bracket(), camera(48)
-    colors = (linear_to_srgb(mesh.face_colors) * 255).round().to(torch.uint8).numpy()
-    made = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), face_colors=colors, process=False)
-    made.export(tmp_path / "mesh.ply")
-    save_camera(tmp_path / "camera.json", at)
-    write_image(tmp_path / "target.png", picture(at))
-    out, waited = tmp_path / "out", []
-
-    def wait(viewer):
-        saved = json.loads((out / "pose.json").read_text())["mesh_to_world"]
-        shown = viewer._snapshot.matrix
-        waited.append(np.allclose(saved, shown) and (out / "fit.png").exists())
-
-    monkeypatch.setattr(view.Viewer, "wait", wait)
-    arguments = ["fit-pose", "mesh.ply", "target.png", "--camera", "camera.json", "--steps", "3", "--size", "32"]
-    monkeypatch.chdir(tmp_path)
-    assert cli.main([*arguments, "--out", "out", "--view", "--port", "0"]) == 0
-    assert waited == [True]
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("live view: http://localhost:")
-    assert lines[-1] == lines[0] + " until Ctrl-C or Close" and "viser" not in "".join(lines)
-
-    # Stop in the page is Ctrl-C in the shell.
-    draw = Browser.draw
-    monkeypatch.setattr(Browser, "draw", lambda self, *given: (draw(self, *given), press(self.stop)))
-    assert cli.main([*arguments, "--out", "out", "--view", "--port", "0"]) == cli.INTERRUPTED
-    assert len(waited) == 1 and "interrupted" in capsys.readouterr().out
-
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert cli.main([*arguments, "--out", "out", "--view"]) == 2
-    assert "needs edgegrad[view]" in capsys.readouterr().err
-
-
-def press(button):
-    """Call a button's callback, as the server does for a click in the page."""
-    for callback in button._impl.update_cb:
-        callback(None)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
-def test_the_page_stays_until_close_or_ctrl_c(viewer):
-    viewer.update(bracket())
-    threading.Timer(0.3, signal.raise_signal, [signal.SIGINT]).start()
-    viewer.wait()
-    assert page(viewer).stop.label == "Close"
-    threading.Timer(0.3, press, [page(viewer).stop]).start()
-    viewer.wait()

@@ -16,7 +16,7 @@ from edgegrad.points.sobol import sobol
 
 
 class Lobes(NamedTuple):
-    """Of N points, without derivatives, in float64. Where they are wide, directions drawn by them only cost."""
+    """The lobes of N points, without derivatives, in float64. Directions drawn by wide lobes only cost."""
 
     v: Tensor  # (N, 3) unit, above the surface
     n: Tensor  # (N, 3) unit
@@ -27,7 +27,7 @@ class Lobes(NamedTuple):
     @classmethod
     @torch.no_grad()
     def of(cls, v: Tensor, n: Tensor, roughness: Tensor) -> Lobes:
-        """Of unit directions to the viewer and normals (N, 3), and roughnesses (N, 1) or (1, 1)."""
+        """Make the lobes of unit directions to the viewer, normals (N, 3), and roughnesses (N, 1) or (1, 1)."""
         v, n = v.detach().double(), n.detach().double()
         roughness = roughness.detach().double().expand(len(n), 1)
         narrow = (roughness <= WIDEST_LOBE)[:, 0]

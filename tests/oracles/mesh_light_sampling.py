@@ -132,7 +132,7 @@ class EmissiveMeshSampler(NamedTuple):
         return which[:, 0], which[:, 1], where[:, :2], where[:, 2]
 
     def towards(self, l: Tensor) -> tuple[Tensor, LightPoints]:
-        """What lies in directions l (N, 3), nearest first: (M,) ascending rows, and points."""
+        """Return what lies in directions l (N, 3), nearest first: (M,) ascending rows, and points."""
         ray, face, uv, t = self._crossings(l, torch.full_like(self.contact, math.inf))
         kept = face != self.own[ray]
         ray, face, uv, t = ray[kept], face[kept], uv[kept], t[kept]

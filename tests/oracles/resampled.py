@@ -115,7 +115,7 @@ class _Shares(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """What candidates for N points are drawn by."""
+    """How candidates for N points are drawn."""
 
     light: Light
     stream: int
@@ -209,7 +209,8 @@ class _Candidates(NamedTuple):
     running: Tensor  # (N, J) the running sum of their weights, target / density
 
     def kept(self, stream: int, seed: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Of `count` times K points the index, uv and density, drawn with one random number each (systematic resampling)."""
+        """Return the index, uv and density of `count` times K points, drawn with one random number each (systematic
+        resampling)."""
         total = self.running[:, -1:]
         u = sobol(seed, key_of(stream, 2))[:, :1]
         at = (torch.arange(count, device=u.device) + u) / count * total

@@ -1,64 +1,20 @@
-"""Shaders written in PyTorch: the same images and gradients as the kernel's own, finite differences of others, and what is
-refused."""
+"""Shaders written in PyTorch: the same images and gradients as the kernel's own, and what is refused."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import pytest
 import torch
 import torch.utils.checkpoint
 from combinations import diagonal
-from finite_differences import Estimate, estimate, right_ratio
 from scenes import front_camera, icosphere, smooth_adjoint, smooth_colors
+from shader_scenes import F64, SIZE, bumpy, by_hand, cameras, colored, network, textured
 from torch import Tensor
 
 import edgegrad as eg
 
-F64 = torch.float64
-SIZE = 24
-Case = Callable[[Tensor], tuple[eg.Scene, eg.Camera, Callable[[eg.Hits], Tensor]]]
-
-# -- the same as the kernel's own shading -----------------------------------------------------------------------------
-
-
-def colored(filter: str = "box") -> tuple[eg.Scene, eg.Camera]:
-    ball = icosphere(2)
-    ball = ball.replace(verts=0.9 * ball.verts, colors=smooth_colors(ball.verts))
-    return eg.Scene([ball], torch.tensor([0.2, 0.5, 0.3], dtype=F64)), front_camera(SIZE)
-
-
-def cameras() -> dict[str, eg.Camera]:
-    straight = front_camera(SIZE)
-    w, K = straight.world_to_camera, straight.K
-    flat = K.clone()
-    flat[:2, :2] /= 3.0
-    return {
-        "perspective": straight,
-        "orthographic": eg.Camera(w, flat, (SIZE, SIZE), "orthographic"),
-        "distorted": straight.replace(distortion=torch.tensor([-0.4, 0.3, 0.02, -0.01], dtype=F64)),
-    }
-
-
-def by_hand(scene: eg.Scene) -> Callable[[eg.Hits], Tensor]:
-    mesh = scene.meshes[0]
-    if mesh.texture is not None:
-        texture = mesh.texture
-        return lambda hits: hits.sample(texture)
-    colors = mesh.colors
-    assert colors is not None
-    return lambda hits: hits.interpolate(colors)
-
-
-def textured() -> eg.Scene:
-    ball = icosphere(2)
-    uvs = 0.25 * ball.verts[:, :2] + 0.5
-    texture = torch.rand((4, 4, 3), generator=torch.Generator().manual_seed(1), dtype=F64)
-    return eg.Scene([eg.Mesh(0.9 * ball.verts, ball.faces, texture=texture, uvs=uvs, uv_faces=ball.faces)])
-
 
 def gradients(scene: eg.Scene, camera: eg.Camera, shaded: bool, seed: int, **options: object) -> dict[str, Tensor]:
-    """Of the loss by every tensor of scene and camera."""
+    """Return the gradient of the loss by every tensor of scene and camera."""
     leaves: dict[str, Tensor] = {}
 
     def leaf(name: str, tensor: Tensor) -> Tensor:
@@ -134,190 +90,6 @@ def coverage(scene: eg.Scene, camera: eg.Camera) -> Tensor:
     ]
 
 
-# -- against finite differences ---------------------------------------------------------------------------------------
-
-
-def turned(scene: eg.Scene, theta: Tensor) -> eg.Scene:
-    c, s, zero, one = torch.cos(theta), torch.sin(theta), torch.zeros_like(theta), torch.ones_like(theta)
-    R = torch.stack([torch.stack([c, zero, s]), torch.stack([zero, one, zero]), torch.stack([-s, zero, c])])
-    return scene.transformed(R, 0.3 * theta * torch.tensor([1.0, -0.5, 0.2], dtype=F64))
-
-
-def bumpy() -> eg.Mesh:
-    ball = icosphere(3)
-    return ball.replace(
-        verts=ball.verts * (0.8 + 0.12 * torch.sin(5 * ball.verts[:, :1]) * torch.cos(4 * ball.verts[:, 1:2]))
-    )
-
-
-def network(width: int) -> torch.nn.Module:
-    torch.manual_seed(3)
-    layers = [torch.nn.Linear(width, 16), torch.nn.Tanh(), torch.nn.Linear(16, 3), torch.nn.Sigmoid()]
-    return torch.nn.Sequential(*layers).double()
-
-
-NET, FEATURES = network(6), network(4)
-TEXTURE = torch.rand((8, 8, 4), generator=torch.Generator().manual_seed(5), dtype=F64)
-HARMONICS = torch.rand((4, 3), generator=torch.Generator().manual_seed(6), dtype=F64)
-
-
-def of_position_and_view(hits: eg.Hits, theta: Tensor) -> Tensor:
-    return NET(torch.cat([2 * hits.position, hits.view], 1))
-
-
-def harmonics(hits: eg.Hits, theta: Tensor) -> Tensor:
-    n = hits.shading_normal
-    return torch.cat([torch.ones_like(n[:, :1]), n], 1) @ HARMONICS
-
-
-def neural_texture(hits: eg.Hits, theta: Tensor) -> Tensor:
-    return FEATURES(hits.sample(TEXTURE, uv=0.4 * hits.position[:, :2] + 0.5))
-
-
-def flat_normals(hits: eg.Hits, theta: Tensor) -> Tensor:
-    return 0.5 + 0.5 * hits.normal
-
-
-def by_mesh(hits: eg.Hits, theta: Tensor) -> Tensor:
-    red = torch.stack([0.9 + 0 * hits.depth, 0.2 * hits.depth, 0.1 + 0 * hits.depth], 1)
-    return torch.where((hits.mesh == 0)[:, None], red, 0.5 + 0.4 * hits.shading_normal)
-
-
-def checkerboard(hits: eg.Hits, theta: Tensor) -> Tensor:
-    """In world space."""
-    cells = hits.floor(1.7 * hits.position[:, :2] + 0.6 * hits.position[:, 2:] + 0.4).sum(1, keepdim=True)
-    return 0.2 + 0.6 * (cells % 2) * torch.tensor([1.0, 0.7, 0.4], dtype=F64) + 0.1 * hits.position
-
-
-def disc(hits: eg.Hits, theta: Tensor) -> Tensor:
-    """Painted on, along the view, and a ring of the same border that must not count twice."""
-    s = 0.4 - (hits.position[:, :2] - 0.1).norm(dim=1)
-    inside = hits.where(s, torch.tensor([0.9, 0.8, 0.7], dtype=F64), 0.3 + 0.2 * hits.position)
-    return inside + hits.where(-3 * s, 0.0, 0.2)
-
-
-def nearest(hits: eg.Hits, theta: Tensor) -> Tensor:
-    return hits.sample(TEXTURE[..., :3], uv=0.4 * hits.position[:, :2] + 0.5, filter="nearest")
-
-
-def step_of_itself(hits: eg.Hits, theta: Tensor) -> Tensor:
-    return hits.where(hits.position[:, 1] - 0.4 * hits.position[:, 0] - theta, 0.8 * torch.ones(3, dtype=F64), 0.2)
-
-
-def of_itself(hits: eg.Hits, theta: Tensor) -> Tensor:
-    return torch.sigmoid((2 + theta) * hits.position + theta)
-
-
-SHADERS = {
-    "network": of_position_and_view,
-    "harmonics": harmonics,
-    "neural texture": neural_texture,
-    "flat normals": flat_normals,
-    "by mesh": by_mesh,
-    "its own parameter": of_itself,
-    "checkerboard": checkerboard,
-    "disc": disc,
-    "nearest texture": nearest,
-    "its own step": step_of_itself,
-}
-STEPS = {"pose": 0.01, "focal": 0.3, "shape": 0.02}
-
-
-def case(name: str, of: str) -> Case:
-    other = icosphere(2)
-    meshes = [bumpy(), other.replace(verts=0.6 * other.verts + 0.45)] if name == "by mesh" else [bumpy()]
-    # Nothing straight on: there a few edges would come and go together.
-    R = torch.linalg.matrix_exp(torch.tensor([[0, 0.3, -0.2], [-0.3, 0, 0.4], [0.2, -0.4, 0]], dtype=F64))
-    scene = eg.Scene(
-        [eg.Mesh(mesh.verts @ R.T, mesh.faces) for mesh in meshes], torch.tensor([0.1, 0.3, 0.6], dtype=F64)
-    )
-    camera = front_camera(SIZE)
-
-    def at(theta: Tensor) -> tuple[eg.Scene, eg.Camera, Callable[[eg.Hits], Tensor]]:
-        def shader(hits: eg.Hits) -> Tensor:
-            return SHADERS[name](hits, theta)
-
-        if name.startswith("its own"):
-            return scene, camera, shader
-        if of == "pose":
-            return turned(scene, theta), camera, shader
-        if of == "focal":
-            K = camera.K.clone() * torch.stack([1 + theta / camera.K[0, 0]] * 2 + [torch.ones_like(theta)])[:, None]
-            K = torch.cat(
-                [
-                    torch.stack([K[0, 0], K[0, 1], camera.K[0, 2]])[None],
-                    torch.stack([K[1, 0], K[1, 1], camera.K[1, 2]])[None],
-                    camera.K[2:],
-                ]
-            )
-            return scene, camera.replace(K=K), shader
-        return (
-            eg.Scene(
-                [m.replace(verts=m.verts * (1 + theta * torch.sin(3 * m.verts))) for m in scene.meshes],
-                scene.background,
-            ),
-            camera,
-            shader,
-        )
-
-    return at
-
-
-def loss(case: Case, theta: Tensor, seed: int, spp: int, **options: object) -> Tensor:
-    scene, camera, shader = case(theta)
-    image = eg.render(scene, camera, spp=spp, seed=seed, shader=shader, **options)  # type: ignore[arg-type]
-    return (image * smooth_adjoint(*camera.size, 3)).sum()
-
-
-FINER = 24
-
-
-def differences(case: Case, step: float, seeds: int) -> Estimate:
-    """Of images whose samples are the pixels of a finer one: there a shader is asked for each, not once for all on a face."""
-
-    def fine_loss(theta: float, seed: int) -> float:
-        scene, camera, shader = case(torch.tensor(theta, dtype=F64))
-        K = torch.cat([FINER * camera.K[:2], camera.K[2:]])
-        fine = camera.replace(K=K, size=(FINER * SIZE, FINER * SIZE))
-        image = eg.render(scene, fine, spp=1, seed=seed, shader=shader).movedim(-1, 0)
-        image = torch.nn.functional.avg_pool2d(image, FINER).movedim(0, -1)
-        return float((image * smooth_adjoint(SIZE, SIZE, 3)).sum())
-
-    with torch.no_grad():
-        return estimate([(fine_loss(step, seed) - fine_loss(-step, seed)) / (2 * step) for seed in range(seeds)])
-
-
-def derivative(case: Case, seeds: int) -> Estimate:
-    values = []
-    for seed in range(seeds):
-        theta = torch.zeros((), dtype=F64, requires_grad=True)
-        value = loss(case, theta, 1000 + seed, 16, surface_samples=60000, edge_samples=60000, step_spacing=1 / 16)
-        values.append(torch.autograd.grad(value, theta)[0].item())
-    return estimate(values)
-
-
-def check(name: str, of: str, seeds: int) -> None:
-    own, stepped = name.startswith("its own"), name in ("checkerboard", "disc", "nearest texture", "its own step")
-    step = STEPS["pose" if own else of]
-    if stepped and of == "shape":  # borders move much: the second-order error is larger still
-        # Of nearest texels less so, and noise is more.
-        step, seeds = step / (2 if name == "nearest texture" else 4), 4 * seeds
-    at = case(name, of)
-    right_ratio(differences(at, step, seeds), derivative(at, 24 if stepped else 6))
-
-
-@pytest.mark.parametrize("name", ["network", "flat normals", pytest.param("disc", marks=pytest.mark.slow)])
-def test_against_finite_differences(name: str):
-    check(name, "pose", 8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("of", STEPS)
-@pytest.mark.parametrize("name", SHADERS)
-def test_all_against_finite_differences(name: str, of: str):
-    check(name, of, 60 if of == "shape" else 40)  # whose step is short, for its second-order error is large
-
-
 # -- as any PyTorch ---------------------------------------------------------------------------------------------------
 
 
@@ -384,15 +156,6 @@ def test_graphs_of_all_kinds():
     assert linear.weight.grad is not None and bool(linear.weight.grad.any())
 
 
-@pytest.mark.parametrize("power", [1, 2])
-def test_second_derivatives_are_refused(power: int):
-    verts, colors, *_ = inputs()
-    leaf = verts.clone().requires_grad_()
-    grad = torch.autograd.grad(lit(leaf, colors).pow(power).sum(), leaf, create_graph=True)[0]
-    with pytest.raises(RuntimeError, match="second derivatives"):
-        grad.sum().backward()
-
-
 def test_cameras_of_a_batch():
     verts, colors, *_ = inputs()
     camera = front_camera(SIZE)
@@ -440,31 +203,6 @@ def test_more_arguments_that_are_refused():
         torch.vmap(lambda v: eg.render(icosphere(1).replace(verts=v), front_camera(8), shader=lambda h: h.position))(
             torch.stack([icosphere(1).verts] * 2)
         )
-
-
-def test_creases_are_found_where_the_shader_jumps():
-    """Of flat normals, most of the gradient is at creases; a shader that makes its own of positions says so by True."""
-    at = case("flat normals", "pose")
-    full = derivative(at, 2)
-
-    def own(theta: Tensor) -> tuple[eg.Scene, eg.Camera, Callable[[eg.Hits], Tensor]]:
-        scene, camera, _ = at(theta)
-        faces = scene.meshes[0].faces
-
-        def shader(hits: eg.Hits) -> Tensor:
-            corner = scene.meshes[0].verts[faces][hits._face]
-            normal = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-            return 0.5 + 0.5 * torch.nn.functional.normalize(normal, dim=-1)
-
-        return scene, camera, shader
-
-    def found(creases: bool | str) -> float:
-        theta = torch.zeros((), dtype=F64, requires_grad=True)
-        options = {"surface_samples": 60000, "edge_samples": 60000, "creases": creases}
-        return torch.autograd.grad(loss(own, theta, 7, 16, **options), theta)[0].item()
-
-    assert abs(found(True) - full.mean) < 0.03 * abs(full.mean)
-    assert abs(found("auto") - full.mean) > 0.05 * abs(full.mean)
 
 
 # -- each face in a pixel shaded once -----------------------------------------------------------------------------------
@@ -537,7 +275,7 @@ def test_a_batch_of_attributes_of_faces_under_vmap():
 
 
 def test_in_parts_of_bounded_size(monkeypatch: pytest.MonkeyPatch):
-    """What is given to the shader at once changes nothing."""
+    """The number of points that the shader is given at once changes nothing."""
     mesh, camera = bumpy(), front_camera(SIZE)
     net = network(6)
     sizes = []
@@ -561,7 +299,7 @@ def test_in_parts_of_bounded_size(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_nothing_in_view_has_gradients_of_zero():
-    """As without a shader: a loop goes on where the mesh has left the image."""
+    """A loop goes on where the mesh has left the image, as without a shader."""
     mesh, camera = bumpy(), front_camera(SIZE)
     net = network(6)
     verts = (mesh.verts + 100.0).requires_grad_()

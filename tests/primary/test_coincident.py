@@ -1,5 +1,7 @@
 """Curves that lie on one another in the image: each side of such a line shows something else of each of them, and rays
-through it leave to rounding what they meet. Gradients against finite differences, as in test_pitfalls.py."""
+through it leave to rounding what they meet. Boxes seen along their sides, copies, T-junctions and stacks are among the extreme
+cases (test_stability.py), against exact integrals.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,6 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from combinations import diagonal
 from finite_differences import check_ratio
 from oracles.exact import exact_image
 from scenes import cube, front_camera, icosphere
@@ -21,12 +22,9 @@ F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
 ALONG = torch.tensor([0.7, 0.6, -0.2], dtype=F64)
 SAMPLES = {"surface_samples": 20_000, "edge_samples": 20_000}
-STRAIGHT = eg.Camera.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 35.0, (48, 48)).to(F64)
-FROM_ABOVE = eg.Camera.look_at((0.8, 1.2, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 35.0, (48, 48)).to(F64)
 ORTHOGRAPHIC = eg.Camera.orthographic((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, (48, 48)).to(F64)
 # Off the borders of pixels, where the box filter's adjoint jumps.
 ORTHOGRAPHIC = ORTHOGRAPHIC.replace(K=ORTHOGRAPHIC.K + torch.tensor([[0, 0, 0.31], [0, 0, 0.27], [0, 0, 0]], dtype=F64))
-VIEWS = {"orthographic": ORTHOGRAPHIC, "straight": STRAIGHT, "above": FROM_ABOVE}
 
 
 def face_colored(mesh: eg.Mesh, seed: int = 0) -> eg.Mesh:
@@ -36,29 +34,15 @@ def face_colored(mesh: eg.Mesh, seed: int = 0) -> eg.Mesh:
     return eg.Mesh(mesh.verts, mesh.faces, face_colors=colors.repeat_interleave(2, 0))
 
 
-def check(
-    case: Callable[[Tensor], list[eg.Mesh]], view: str, step: float = 0.004, spp: int = 1024, **options: object
-) -> None:
-    check_ratio(lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=spp, **{**SAMPLES, **options})
-
-
-@pytest.mark.parametrize("moved", ["along", "scale", "turn"])
-@pytest.mark.parametrize("faces", [False, True], ids=["smooth", "face colours"])
-def test_box_seen_straight_on(faces: bool, moved: str) -> None:
-    """Its front and back rims fall on the same lines, and its sides on them too: 0 to 2.2 before."""
-    box = face_colored(cube(0.5)) if faces else cube(0.5)
-    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=F64)
-    motion = {
-        "along": ALONG.expand(8, 3),
-        "scale": box.verts,
-        "turn": box.verts @ turn + torch.tensor([0.5, -0.7, 0.1], dtype=F64),
-    }[moved]
-    check(lambda theta: [box.replace(verts=box.verts + theta * motion)], "orthographic")
+def check(case: Callable[[Tensor], list[eg.Mesh]], spp: int = 1024, **options: object) -> None:
+    check_ratio(
+        lambda theta: (eg.Scene(case(theta), BACKGROUND), ORTHOGRAPHIC), 0.004, spp=spp, **{**SAMPLES, **options}
+    )
 
 
 @pytest.mark.parametrize("moved", ["both", "front", "back"])
 def test_two_sheets_behind_one_another(moved: str) -> None:
-    """Their rims fall on the same lines. A motion that parts them has a derivative for each direction, and central
+    """Their borders fall on the same lines. A motion that parts them has a derivative for each direction, and central
     differences are their mean; so is the gradient, for two."""
     flat = torch.tensor([[-0.5, -0.4, 0.0], [0.6, -0.4, 0.0], [0.6, 0.5, 0.0], [-0.5, 0.5, 0.0]], dtype=F64)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
@@ -71,52 +55,7 @@ def test_two_sheets_behind_one_another(moved: str) -> None:
             for k in range(2)
         ]
 
-    check(case, "orthographic")
-
-
-@pytest.mark.parametrize(("copies", "view"), diagonal([2, 3], list(VIEWS)))
-def test_meshes_in_the_same_place(copies: int, view: str) -> None:
-    sphere = icosphere(2).transformed(scale=0.7)
-    check(lambda theta: [sphere.transformed(t=theta * ALONG)] * copies, view, edge_samples=20_000)
-
-
-@pytest.mark.parametrize(
-    ("tilted", "view", "dtype"), diagonal([False, True], list(VIEWS), [torch.float64, torch.float32])
-)
-def test_t_junction(tilted: bool, view: str, dtype: torch.dtype) -> None:
-    """A long side of one face against two short ones, in one plane: −14 instead of −93 before."""
-    verts = torch.tensor(
-        [[-0.7, -0.6], [0.1, -0.6], [0.1, 0.6], [-0.7, 0.6], [0.1, -0.6], [0.8, -0.6], [0.8, 0.6], [0.1, 0.6], [0.1, 0.05]],
-        dtype=F64,
-    )  # fmt: skip
-    verts = torch.nn.functional.pad(verts, (0, 1))
-    if tilted:
-        turn = torch.tensor([[0.0, -0.3, 0.2], [0.3, 0.0, -0.4], [-0.2, 0.4, 0.0]], dtype=F64)
-        verts = verts @ torch.linalg.matrix_exp(turn).T
-    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 8], [5, 6, 8], [8, 6, 7]])
-    colors = torch.stack([0.4 * verts[:, 0] + 0.5, 0.3 * verts[:, 1] + 0.4, 0.2 * verts.sum(1) + 0.5], 1)
-    check(lambda theta: [eg.Mesh((verts + theta * ALONG).to(dtype), faces, colors=colors)], view)
-
-
-@pytest.mark.parametrize("view", VIEWS)
-def test_boxes_on_one_another(view: str) -> None:
-    """Flush, each face with a colour of its own: up to 20 % off before."""
-    boxes = [face_colored(cube(0.3), seed) for seed in range(3)]
-    size = torch.tensor([1.0, 0.7, 1.0], dtype=F64)
-    place = [torch.tensor([0.0, 0.42 * k - 0.42, 0.0], dtype=F64) for k in range(3)]
-    along = torch.tensor([0.9, 0.9, -0.2], dtype=F64)
-    check(
-        lambda theta: [b.replace(verts=b.verts * size + p + theta * along) for b, p in zip(boxes, place, strict=True)],
-        view,
-    )
-
-
-def test_boxes_behind_one_another() -> None:
-    """Six rims on one line, at six depths."""
-    boxes = [face_colored(cube(0.25), seed) for seed in range(3)]
-    place = [torch.tensor([0.0, 0.0, 0.8 * k - 0.8], dtype=F64) for k in range(3)]
-    along = torch.tensor([0.9, -0.7, 0.3], dtype=F64)
-    check(lambda theta: [b.transformed(t=p + theta * along) for b, p in zip(boxes, place, strict=True)], "orthographic")
+    check(case)
 
 
 def test_a_thin_strip_is_not_taken_for_one_line() -> None:
@@ -143,7 +82,7 @@ def test_a_thin_strip_is_not_taken_for_one_line() -> None:
 
 
 def test_thin_plate_far_from_the_origin() -> None:
-    """Its front hides the rim of its back, though they lie closer than what may touch for rounding: 2.9 before."""
+    """Its front hides the border of its back, though they lie closer than what may touch for rounding: 2.9 before."""
     place = torch.tensor([100.0, -40.0, 60.0], dtype=F64)
     size = torch.tensor([1.0, 1.0, 3e-5], dtype=F64)
     plate = face_colored(cube(0.5), 7)
@@ -172,7 +111,6 @@ def test_curves_of_which_no_sample_is_seen(flat: bool) -> None:
     depth = torch.tensor([0.0, 0.0, 1e-3 if flat else 0.5], dtype=F64)
     check(
         lambda theta: [mesh.transformed(t=sign * depth + theta * ALONG) for mesh, sign in ((back, 1.0), (front, -1.0))],
-        "orthographic",
         spp=256,
         edge_samples=10_000,
     )
@@ -180,7 +118,7 @@ def test_curves_of_which_no_sample_is_seen(flat: bool) -> None:
 
 @pytest.mark.parametrize("edge_samples", [50, None])
 def test_few_samples_are_unbiased(edge_samples: int | None) -> None:
-    """Three sheets whose rims fall on the same lines. What a sample sees on either side once went by its place on the
+    """Three sheets whose borders fall on the same lines. What a sample sees on either side once went by its place on the
     curve, which seeds do not change: 2 to 6 % off at default samples, and nothing like the gradient at few."""
     corners = torch.tensor([[-0.7, -0.6], [0.5, -0.6], [0.5, 0.7], [-0.7, 0.7]], dtype=F64)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])

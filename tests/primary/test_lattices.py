@@ -14,7 +14,7 @@ import edgegrad as eg
 F64 = torch.float64
 SIZE = (24, 24)
 ADJOINT = smooth_adjoint(*SIZE, 3)
-KINDS = ["straight", "isometric", "eye in the side planes", "perspective"]
+KINDS = ["head-on", "isometric", "eye in the side planes", "perspective"]
 JOINED = ["meshes", "copies of vertices", "shared vertices"]
 
 
@@ -50,7 +50,7 @@ def view(kind: str, middle: Tensor, seed: int) -> tuple[eg.Camera, dict[str, Ten
     generator = torch.Generator().manual_seed(seed)
     offset = torch.tensor([0.0137, 0.0211, 0.0], dtype=F64)  # off the borders of pixels
     up = (0.0, 1.0, 0.0)
-    if kind == "straight":
+    if kind == "head-on":
         eye = middle + offset + torch.tensor([0.0, 0.0, 6.0], dtype=F64)
         camera = eg.Camera.orthographic(eye, eye - torch.tensor([0.0, 0.0, 1.0], dtype=F64), up, 3.7, SIZE)
     elif kind == "isometric":
@@ -124,7 +124,7 @@ def check_shared(seed: int, kind: str, joined: str, seeds: int, edge_samples: in
 @pytest.mark.parametrize("joined", JOINED)
 @pytest.mark.parametrize("kind", KINDS)
 def test_motions_that_all_share(kind: str, joined: str) -> None:
-    """73 of 800 were wrong before, all seen straight on, isometrically or with the eye in the side planes."""
+    """73 of 800 were wrong before, all seen head-on, isometrically or with the eye in the side planes."""
     check_shared(5, kind, joined, 6, 3000)
 
 
@@ -154,18 +154,19 @@ def check_vertices(seed: int, kind: str, seeds: int, edge_samples: int) -> tuple
     return outside, count
 
 
-@pytest.mark.parametrize("kind", ["straight", "eye in the side planes"])
+@pytest.mark.parametrize("kind", ["head-on", "eye in the side planes"])
 def test_single_vertices(kind: str) -> None:
-    """Where no faces touch: between the one-sided derivatives. About half of the vertices were not before."""
+    """The derivative lies between the one-sided derivatives where no faces touch. About half of the vertices were not
+    before."""
     found = [check_vertices(seed, kind, 4, 3000) for seed in range(4)]
     assert sum(outside for outside, _ in found) == 0, found
 
 
 def test_what_is_never_seen_does_not_matter() -> None:
-    """A box seen straight on, its sides of the background's colour: its front alone, as exact integrals have it, and
+    """A box seen head-on, its sides of the background's colour: its front alone, as exact integrals have it, and
     nothing of its back, whatever colour that has."""
     box, front = cube(0.5), [10, 11]
-    camera, _ = view("straight", torch.zeros(3, dtype=F64), 0)
+    camera, _ = view("head-on", torch.zeros(3, dtype=F64), 0)
     background = torch.tensor([0.1, 0.2, 0.3], dtype=F64)
     found = []
     for back in (0.0, 3.0):
@@ -184,7 +185,7 @@ def test_what_is_never_seen_does_not_matter() -> None:
 @pytest.mark.parametrize("order", [1, -1])
 def test_stacked_boxes(order: int) -> None:
     """Two boxes, one flush behind the other, of which a quad is seen: −543 or −681 instead of −612 before, by their order."""
-    camera, motions = view("straight", torch.zeros(3, dtype=F64), 0)
+    camera, motions = view("head-on", torch.zeros(3, dtype=F64), 0)
     front, background = torch.tensor([0.9, 0.6, 0.2], dtype=F64), torch.tensor([0.1, 0.2, 0.3], dtype=F64)
     boxes = [
         eg.Mesh(cube(0.5).verts + torch.tensor([0.0, 0.0, z], dtype=F64), cube().faces, face_colors=color.expand(12, 3))

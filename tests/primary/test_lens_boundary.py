@@ -1,5 +1,5 @@
-"""The rim of what a lens shows, where it folds the image over or ends: its motion with K and the coefficients, against areas in
-closed form, outlines in double, and finite differences of the image."""
+"""The boundary of what a lens shows, where it folds the image over or ends: its motion with K and the coefficients, against areas
+in closed form, outlines in double, and finite differences of the image."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 from around import BACKGROUND, ball, moved, pose, room
 from finite_differences import Case, check_ratio
 from scenes import cube, smooth_adjoint
+from threads import check_threads
 from torch import Tensor
 
 import edgegrad as eg
@@ -20,7 +21,7 @@ F64 = torch.float64
 SIZE = (40, 48)
 pytestmark = [pytest.mark.watched, pytest.mark.filterwarnings("ignore:distortion")]
 
-# Where det ∂m/∂n = 0 within the image; K takes the rim there to some 16 px.
+# Where det ∂m/∂n = 0 within the image; K takes the lens boundary there to some 16 px.
 COEFFICIENTS = {
     "fold": ("perspective", [-0.3, -0.02, 0.0, 0.0, 0.001, 0.0, 0.0, 0.0]),
     "rational": ("perspective", [-0.2, 0.01, 0.0, 0.0, 0.0, 0.15, 0.05, 0.01]),
@@ -33,7 +34,7 @@ LENSES = list(COEFFICIENTS)
 RADIAL = [name for name in LENSES if name != "decentred"]
 
 
-def bent(lens: str, d: Tensor, n: Tensor) -> Tensor:
+def distorted(lens: str, d: Tensor, n: Tensor) -> Tensor:
     """m (N, 2) of directions (N, 2) with their angle to the axis, or its tangent, as length: OpenCV's formulas."""
     if COEFFICIENTS[lens][0] == "fisheye":
         s = (n * n).sum(-1, keepdim=True)
@@ -52,12 +53,12 @@ def circle(r: float, count: int) -> Tensor:
 
 def area_scale(lens: str, d: Tensor, n: Tensor) -> Tensor:
     n = n.clone().requires_grad_()
-    m = bent(lens, d, n)
+    m = distorted(lens, d, n)
     x, y = (torch.autograd.grad(m[:, i].sum(), n, retain_graph=True)[0] for i in (0, 1))
     return x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
 
 
-def rim_radius(lens: str, d: Tensor) -> float:
+def boundary_radius(lens: str, d: Tensor) -> float:
     """The least at which the area scale is zero, at one of 16 angles; or 180°."""
     last = math.pi if COEFFICIENTS[lens][0] == "fisheye" else 2.0
     low, high = 0.0, last
@@ -73,7 +74,7 @@ def rim_radius(lens: str, d: Tensor) -> float:
 
 
 def outline(lens: str, K: Tensor, d: Tensor, count: int = 1000) -> Tensor:
-    return bent(lens, d, circle(rim_radius(lens, d), count)) @ K[:2, :2].mT + K[:2, 2]
+    return distorted(lens, d, circle(boundary_radius(lens, d), count)) @ K[:2, :2].mT + K[:2, 2]
 
 
 def area(points: Tensor) -> Tensor:
@@ -82,7 +83,7 @@ def area(points: Tensor) -> Tensor:
 
 
 def camera(lens: str, mirror: int = 1) -> eg.Camera:
-    """The rim lies within the image, as an ellipse of 16 px."""
+    """The lens boundary lies within the image, as an ellipse of 16 px."""
     kind, c = COEFFICIENTS[lens]
     d = torch.tensor(c, dtype=F64)
     K = torch.eye(3, dtype=F64)
@@ -98,7 +99,7 @@ def white_room() -> eg.Mesh:
 
 
 def derivative(value: Callable[[Tensor, Tensor], Tensor], view: eg.Camera) -> tuple[Tensor, Tensor]:
-    """By K (2, 3) and by the coefficients: central differences of what has no noise."""
+    """Return central differences, without noise, by K (2, 3) and by the coefficients."""
     step, out = 1e-6, []
     for which, origin in enumerate((view.K, view.coefficients)):
         rows = torch.zeros_like(origin)
@@ -126,7 +127,11 @@ def check(gradient: Tensor, truth: Tensor, relative: float = 2e-3) -> None:
 
 @pytest.mark.parametrize(
     ("lens", "mirror"),
-    [*((lens, 1) for lens in LENSES), pytest.param("decentred", -1, marks=pytest.mark.slow), ("wide fisheye", -1)],
+    [
+        *(("fold", 1), ("decentred", 1), ("wide fisheye", -1)),
+        *(pytest.param(lens, 1, marks=pytest.mark.slow) for lens in LENSES if lens not in ("fold", "decentred")),
+        pytest.param("decentred", -1, marks=pytest.mark.slow),
+    ],
 )
 def test_area(lens: str, mirror: int) -> None:
     """A white room before grey is an ellipse, for what is radial π |det K| ρ²: its area, and the derivative of that."""
@@ -145,9 +150,9 @@ def test_area_in_closed_form(lens: str) -> None:
     """∂(π |det K| ρ²)/∂c = 2 π |det K| ρ ∂ρ/∂c, with ∂ρ/∂c at the fixed radius r of the fold."""
     view = camera(lens)
     d = view.coefficients
-    r = rim_radius(lens, d)
+    r = boundary_radius(lens, d)
     c = d.clone().requires_grad_()
-    rho = bent(lens, c, torch.tensor([[r, 0.0]], dtype=F64))[0, 0]
+    rho = distorted(lens, c, torch.tensor([[r, 0.0]], dtype=F64))[0, 0]
     truth = torch.autograd.grad(math.pi * torch.linalg.det(view.K) * rho**2, c)[0]
     gradient = found(view, torch.sum, eg.Scene([white_room()], torch.zeros(1, dtype=F64)))[1]
     truth[2:4] = gradient[2:4] if COEFFICIENTS[lens][0] == "perspective" else truth[2:4]  # zero by symmetry
@@ -197,13 +202,13 @@ def filtered(adjoint: Tensor, x: np.ndarray, filter: str) -> Tensor:
 
 
 def balls(dx: Tensor | float = 0.0) -> eg.Scene:
-    """A coloured room, and balls before the rim of any lens: right, left and behind."""
+    """A coloured room, and balls before the lens boundary of any lens: right, left and behind."""
     places = [(1.5, 0.2, 1.1), (-2.2, 0.3, 0.4), (0.4, 2.0, -1.0), (0.1, 0.2, -2.5)]
     return eg.Scene([*(ball(place) for place in places), room(dx)], BACKGROUND)
 
 
 def case(lens: str, what: str) -> Case:
-    """One number moves, a coefficient so that the rim moves by some pixels."""
+    """One number moves, a coefficient so that the lens boundary moves by some pixels."""
     view = camera(lens).crop(5, -3, 38, 40)
     if what[0] != "d":
         return moved(balls, view, what)
@@ -232,12 +237,12 @@ def test_every_finite_difference(lens: str, what: str) -> None:
     check_ratio(case(lens, what), 0.01, spp=4096, seeds=6, surface_samples=200_000)
 
 
-# -- every way to a derivative ------------------------------------------------------------------------------------------
+# -- all modes of differentiation ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("lens", ["decentred", "wide fisheye"])
 def test_forward_mode_and_gradient_by_place(lens: str) -> None:
-    """Of a white room, so that nothing but the rim moves."""
+    """The room is white, so that nothing but the lens boundary moves."""
     view, scene = camera(lens), eg.Scene([white_room()], torch.zeros(1, dtype=F64))
     adjoint = smooth_adjoint(*SIZE, 1)
     reverse = found(view, lambda image: (image * adjoint).sum(), scene, edge_samples=20_000)
@@ -269,7 +274,7 @@ def test_channels(lens: str) -> None:
 
 @pytest.mark.parametrize("lens", ["fold", "all around"])
 def test_shader(lens: str) -> None:
-    """As without one. The places of samples show something: a ray goes there."""
+    """The gradient is that without a shader. The places of samples show something: a ray goes there."""
     scene = eg.Scene([white_room()], torch.full((1,), 0.25, dtype=F64))
     view, adjoint = camera(lens), smooth_adjoint(*SIZE, 1)
     expected = found(view, lambda image: (image * adjoint).sum(), scene, edge_samples=20_000)
@@ -311,12 +316,4 @@ def test_plan() -> None:
 
 
 def test_same_bits_at_any_number_of_threads() -> None:
-    results, threads = [], torch.get_num_threads()
-    try:
-        for n in (1, 3):
-            torch.set_num_threads(n)
-            results.append(found(camera("wide fisheye"), torch.sum, balls()))
-    finally:
-        torch.set_num_threads(threads)
-    for a, b in zip(*results, strict=True):
-        assert torch.equal(a, b)
+    check_threads(lambda: found(camera("wide fisheye"), torch.sum, balls()))

@@ -1,5 +1,8 @@
-"""Cases in which other edge-sampling renderers were wrong, each against finite differences of the forward renderer: the
-ratio must lie within 1 ± 0.02. The comment at each test says what went wrong elsewhere.
+"""Cases in which other edge-sampling renderers were wrong. Finite differences of the forward renderer must agree within 2 %.
+
+The comment at each test says what went wrong elsewhere. Crops, orthographic silhouettes, edges that cross the camera plane,
+triangle soups, narrow fields of view, other units, places far from the origin and very large triangles are among the extreme
+cases (test_stability.py), against exact integrals.
 """
 
 from __future__ import annotations
@@ -29,47 +32,6 @@ def tilted_cube(half: float = 0.5) -> eg.Mesh:
 
 def moving(mesh: eg.Mesh, camera: eg.Camera, direction: Tensor = ALONG):
     return lambda theta: (eg.Scene([mesh.transformed(t=theta * direction)], BACKGROUND), camera)
-
-
-def test_crop() -> None:
-    """0.25: the sample weight lacked the area of the crop."""
-    camera = front_camera(96).crop(top=20, left=14, height=48, width=48)
-    check_ratio(moving(tilted_cube(), camera), 0.004, **SAMPLES)
-
-
-def test_orthographic_silhouette() -> None:
-    """0: silhouettes were tested against an eye point."""
-    check_ratio(moving(icosphere(2).transformed(scale=0.7), front_camera(48, "orthographic")), 0.006, **SAMPLES)
-
-
-@pytest.mark.unwatched
-def test_edge_that_crosses_the_camera_plane() -> None:
-    """1.08 … 1.15: a sign slip where the edge was clipped. The triangle starts behind the camera."""
-    camera = eg.Camera.look_at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 60.0, (48, 48)).to(F64)
-    verts = torch.tensor([[-1.1, -0.9, 1.5], [0.35, -0.8, 1.2], [0.4, 0.9, -6.0]], dtype=F64)
-    mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=smooth_colors(verts))
-    # A step of 0.012 is 12 % off, of 0.006 2 %, of 0.003 0.5 %: the loss curves strongly there.
-    case = moving(mesh, camera, torch.tensor([0.9, 0.3, 0.2], dtype=F64))
-    check_ratio(case, 0.003, spp=8192, seeds=5, **SAMPLES)
-
-    def vertex_behind(theta: Tensor):
-        move = torch.zeros_like(verts)
-        move[0] = torch.tensor([0.6, -0.5, 0.7])
-        return eg.Scene([mesh.replace(verts=verts + theta * move)], BACKGROUND), camera
-
-    check_ratio(vertex_behind, 0.02, spp=256, **SAMPLES)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_triangle_soup(dtype: torch.dtype) -> None:
-    """2.00: each copy of a seam's edge was counted in full."""
-    mesh = soup(tilted_cube()).to(dtype)
-    camera = front_camera(48)
-
-    def moved(theta: Tensor):
-        return eg.Scene([mesh.replace(verts=mesh.verts + (theta * ALONG).to(dtype))], BACKGROUND), camera
-
-    check_ratio(moved, 0.006, **SAMPLES)
 
 
 def test_cube_split_at_its_edges() -> None:
@@ -156,59 +118,6 @@ def test_smooth_mesh_pays_for_silhouettes_alone() -> None:
     assert torch.equal(grads["vertex"], grads["corner"])
 
 
-@pytest.mark.parametrize("fov", [3.0, 1.0, 0.3, 0.1])
-def test_narrow_field_of_view(fov: float) -> None:
-    """0.99 / 0.55 / 0.12 / 0.05: a fixed offset on the screen fell below the spacing of floats. The camera is turned."""
-    distance = 1.3 / torch.tan(torch.deg2rad(torch.tensor(fov, dtype=F64) / 2))
-    eye = distance * torch.nn.functional.normalize(torch.tensor([0.5, 0.4, 0.77], dtype=F64), dim=0)
-    camera = eg.Camera.look_at(eye, torch.zeros(3, dtype=F64), torch.tensor([0.2, 1.0, 0.1], dtype=F64), fov, (48, 48))
-    check_ratio(moving(tilted_cube(), camera), 0.006, **SAMPLES)
-
-
-def test_very_large_triangle() -> None:
-    """0: both offset rays hit the ground plane. Its horizon, and a cube that stands on it and meets it exactly."""
-    ground = torch.tensor([[-3e4, 0.0, -3e4], [3e4, 0.0, -2.8e4], [-2e3, 0.0, 4e4]], dtype=F64)
-    plane = eg.Mesh(ground, torch.tensor([[0, 2, 1]]), face_colors=torch.tensor([[0.3, 0.6, 0.2]], dtype=F64))
-    camera = eg.Camera.look_at((1.1, 1.4, 3.0), (0.05, 0.5, 0.0), (0.45, 1.0, 0.0), 50.0, (48, 48)).to(F64)
-
-    def plane_turns(theta: Tensor):
-        return eg.Scene([plane.transformed(rotation((0.8, 0.0, 0.6), theta))], BACKGROUND), camera
-
-    check_ratio(plane_turns, 0.004, spp=1024, **SAMPLES)
-
-    standing = cube(0.4).transformed(
-        rotation((0.0, 1.0, 0.0), torch.tensor(0.5, dtype=F64)), torch.tensor([0.0, 0.4, 0.0], dtype=F64)
-    )
-
-    def cube_slides(theta: Tensor):
-        t = theta * torch.tensor([0.8, 0.0, 0.6], dtype=F64)
-        return eg.Scene([plane, standing.transformed(t=t)], BACKGROUND), camera
-
-    check_ratio(cube_slides, 0.01, **SAMPLES)
-
-
-@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
-def test_scaled_scene(unit: float) -> None:
-    """A black image: a fixed epsilon along the ray. The same picture and the same relative gradient in any unit."""
-    camera = front_camera(48)
-    M = camera.world_to_camera.clone()
-    M[:3, 3] *= unit
-    camera = camera.replace(world_to_camera=M)
-    mesh = tilted_cube().transformed(scale=unit)
-    assert eg.render(eg.Scene([mesh]), camera).mean() > 0.05
-    check_ratio(moving(mesh, camera, unit * ALONG), 0.006, **SAMPLES)
-
-
-def test_far_from_the_origin() -> None:
-    """Positions are taken relative to the scene: 10⁵ units away nothing is lost (float64 input)."""
-    far = torch.tensor([1e5, -2e5, 3e5], dtype=F64)
-    camera = front_camera(48)
-    M = camera.world_to_camera.clone()
-    M[:3, 3] -= M[:3, :3] @ far
-    mesh = tilted_cube().transformed(t=far)
-    check_ratio(moving(mesh, camera.replace(world_to_camera=M)), 0.006, **SAMPLES)
-
-
 @pytest.mark.parametrize("faces_on_edge", [1, 3, 4])
 def test_non_manifold_edge(faces_on_edge: int) -> None:
     """A fan of faces around one edge, each of its own colour: on each side the one in front counts."""
@@ -229,8 +138,8 @@ def test_non_manifold_edge(faces_on_edge: int) -> None:
 
 
 def test_loss_of_a_sparse_adjoint() -> None:
-    """Where the loss does not look, no samples go, and the gradient stays right: one pixel on a silhouette, against the
-    exact integral."""
+    """No samples go where the adjoint is zero, and the gradient stays right: one pixel on a silhouette, against the exact
+    integral."""
     mesh, camera = tilted_cube(), front_camera(48)
     with torch.no_grad():
         covered = eg.render(mesh.replace(face_colors=torch.ones(12, 1, dtype=F64)), camera, spp=256)[..., 0]

@@ -1,4 +1,4 @@
-"""The checks of `make lint` that are this project's own report what they are to report."""
+"""This project's own checks in `make lint` report what they are to report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of the package, and libraries that files need, are imported late, and missed by name."""
+"""Names of the package, and libraries that files need, are imported late, and errors name what is missing."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ trimesh = pytest.importorskip("trimesh")
 
 
 def test_libraries_that_are_missing_are_named(tmp_path, monkeypatch):
-    """That they are imported late is seen where a whole fit must do without them, in test_layers.py."""
+    """test_layers.py shows in a whole fit that they are imported late."""
     write_image(tmp_path / "a.png", torch.zeros(1, 1, 3))
     mesh = Mesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     for name in ("OpenImageIO", "trimesh", "trimesh.exchange.load"):
@@ -49,7 +49,7 @@ assert all(hasattr(eg, name) for name in eg.__all__) and all(hasattr(eg.fit, nam
 
 
 def alone(code: str) -> subprocess.CompletedProcess[str]:
-    """The code in a process of its own."""
+    """Run the code in a process of its own."""
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, env=env)
 
@@ -74,7 +74,7 @@ def test_ipython_knows_the_pictures_of_meshes_and_scenes() -> None:
 
 @pytest.mark.slow
 def test_a_library_is_asked_for_by_its_extra(tmp_path):
-    """As Pillow is, in test_layers.py."""
+    """test_layers.py does the same for Pillow."""
     trimesh.creation.box().export(tmp_path / "a.3mf")
     assert len(load_mesh(tmp_path / "a.3mf").faces) == 12
     code = (

@@ -77,8 +77,8 @@ for path in sys.argv[1:]:
 
 
 def test_a_fit_imports_no_compiler(tmp_path: Path) -> None:
-    """torch's compiler takes longer to import than torch itself, and than a fit; its rules of forward mode take up to seconds.
-    What files need is imported late, and where it is missing the error says how to get it."""
+    """torch's compiler takes longer to import than torch itself, and than a fit; its rules of forward mode take
+    seconds. Libraries for files are imported late, and errors say how to get them."""
     box = trimesh.creation.box()
     box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2], image=Image.new("RGB", (2, 2)))
     files = [tmp_path / "a.glb", tmp_path / "a.obj"]
@@ -95,7 +95,7 @@ def test_a_fit_imports_no_compiler(tmp_path: Path) -> None:
 
 
 def test_names_of_the_package_are_public() -> None:
-    """What is public, and the packages below: nothing that was imported on the way."""
+    """They are the public names and the packages below, and nothing that was imported on the way."""
     import edgegrad as eg
 
     inside = {name for layer in layers.layers(layers.imports()) for name in layer} | layers.LEFT_OUT

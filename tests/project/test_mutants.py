@@ -1,4 +1,4 @@
-"""That the mutants of `make mutants` change lines that there are, and are given to tests that there are."""
+"""The mutants of `make mutants` change lines that exist, and name tests that exist."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ import pytest
 import raster_twin as twin
 import torch
 from scenes import icosphere
+from threads import check_threads
 from torch import Tensor
 
 import edgegrad.raster as dr
@@ -28,13 +29,13 @@ def clip(points: Tensor, distance: float = 3.0) -> Tensor:
 
 
 def random_triangles(seed: int, count: int = 12, spread: float = 1.0) -> tuple[Tensor, Tensor]:
-    """In clip space; some reach behind the eye where `spread` is above 2."""
+    """Return triangles in clip space; some reach behind the eye where `spread` is above 2."""
     points = torch.randn(3 * count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * spread
     return clip(points), torch.arange(3 * count).reshape(count, 3)
 
 
 @pytest.mark.parametrize("seed, spread", [(0, 0.7), (1, 1.0), (2, 2.5), (3, 4.0)])
-def test_rasterize_beside_the_twin(seed: int, spread: float) -> None:
+def test_rasterize_equal_the_twin(seed: int, spread: float) -> None:
     pos, tri = random_triangles(seed, spread=spread)
     behind = (pos[tri][..., 3] < 0).any(1).sum()
     assert (behind > 0) == (spread > 2), behind
@@ -78,7 +79,7 @@ def faces_front(pos: Tensor, tri: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_each_centre_of_a_closed_surface_is_hit_once(seed: int) -> None:
-    """Of a convex mesh: all whose vertices lie on centres, or between them, so that edges pass through many."""
+    """All vertices of a convex mesh lie on centres, or between them, so that edges pass through many."""
     n = 16
     mesh = icosphere(2)
     verts = mesh.verts.double() * 0.9
@@ -195,7 +196,7 @@ def test_layers_behind_one_another() -> None:
         peeler.rasterize_next_layer()
 
 
-def test_interpolate_beside_its_definition() -> None:
+def test_interpolate_equals_its_definition() -> None:
     pos, tri = random_triangles(8)
     rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (9, 9))
     attr = torch.rand(1, len(pos), 4, dtype=torch.float64)
@@ -217,7 +218,7 @@ def test_interpolate_beside_its_definition() -> None:
 
 @pytest.mark.parametrize("mode", ["instanced", "ranges"])
 def test_derivatives_of_rasterize_and_interpolate(mode: str) -> None:
-    """Through all four outputs that have any; positions move so little that no centre changes its triangle."""
+    """All four outputs that have derivatives are used; positions move so little that no centre changes its triangle."""
     pos, tri = random_triangles(9, 4)
     ranges = None
     if mode == "instanced":
@@ -262,23 +263,18 @@ def test_gradients_of_derivatives_can_stay_out() -> None:
 
 def test_same_bits_at_any_number_of_threads() -> None:
     pos, tri = random_triangles(12, 60)
-    threads = torch.get_num_threads()
-    found = []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            for given in (pos.float()[None], torch.stack([pos, pos.roll(3, 0), pos.flip(0)]).float()):
-                given = given.clone().requires_grad_()
-                rast, rast_db = dr.rasterize(dr.RasterizeContext(), given, tri, (33, 40))
-                attr = torch.linspace(0, 1, 3 * len(pos)).reshape(1, -1, 3).requires_grad_()
-                values, da = dr.interpolate(attr, rast, tri, rast_db, [1])
-                image = dr.antialias(torch.cat([values, da], 3), rast, given, tri)
-                (image * torch.linspace(0, 1, image.numel()).view_as(image)).sum().backward()
-                found.append((rast, rast_db, image, given.grad, attr.grad))
-    finally:
-        torch.set_num_threads(threads)
-    for one, three in zip(found[:2], found[2:], strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
+    attr = torch.linspace(0, 1, 3 * len(pos)).reshape(1, -1, 3).requires_grad_()
+    for given in (pos.float()[None], torch.stack([pos, pos.roll(3, 0), pos.flip(0)]).float()):
+        given.requires_grad_()
+
+        def compute(given: Tensor = given) -> list[Tensor]:
+            rast, rast_db = dr.rasterize(dr.RasterizeContext(), given, tri, (33, 40))
+            values, da = dr.interpolate(attr, rast, tri, rast_db, [1])
+            image = dr.antialias(torch.cat([values, da], 3), rast, given, tri)
+            loss = (image * torch.linspace(0, 1, image.numel()).view_as(image)).sum()
+            return [rast, rast_db, image, *torch.autograd.grad(loss, [given, attr])]
+
+        check_threads(compute)
 
 
 @pytest.mark.parametrize(

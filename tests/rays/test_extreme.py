@@ -139,7 +139,7 @@ def test_an_orthographic_eye_very_far_away():
 
 
 def seconds_of_edges(verts: Tensor) -> float:
-    """Of the processor, to find the edges of a soup, and how many there are."""
+    """Return the seconds of processor time to find the edges of a soup."""
     faces = torch.arange(len(verts), dtype=torch.int32).reshape(-1, 3).numpy()
     begin = time.process_time()
     parts.edges(verts.numpy(), faces, [0], [2.0**-52])
@@ -149,8 +149,8 @@ def seconds_of_edges(verts: Tensor) -> float:
 def fan(n: int) -> Tensor:
     """A disc of n triangles, as a soup."""
     a = torch.linspace(0, 2 * math.pi, n + 1, dtype=F64)
-    rim = torch.stack([a.cos(), a.sin(), 0 * a], -1)
-    return torch.stack([torch.zeros(n, 3, dtype=F64), rim[:-1], rim[1:]], 1).reshape(-1, 3)
+    ring = torch.stack([a.cos(), a.sin(), 0 * a], -1)
+    return torch.stack([torch.zeros(n, 3, dtype=F64), ring[:-1], ring[1:]], 1).reshape(-1, 3)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_welding_takes_a_linear_time(soup):
 
 
 def cone(n: int) -> eg.Mesh:
-    """Around −z, its tip in the origin."""
+    """Return a cone around −z with its tip in the origin."""
     a = torch.linspace(0, 2 * math.pi, n + 1, dtype=F64)[:-1]
     verts = torch.cat(
         [torch.zeros(1, 3, dtype=F64), torch.stack([0.3 * a.cos(), 0.3 * a.sin(), -torch.ones_like(a)], -1)]
@@ -198,9 +198,9 @@ def test_the_eye_on_a_vertex_of_many_faces():
     seconds = time.process_time() - begin
     torch.testing.assert_close(seen_through, image)
     assert float((gradient_through - gradient).norm()) < 0.05 * float(gradient.norm())
-    beside = eg.Camera.look_at((1e-6, 0.0, 0.0), (1e-6, 0.0, -1.0), fov_y=60.0, size=(16, 16)).to(F64)
+    aside = eg.Camera.look_at((1e-6, 0.0, 0.0), (1e-6, 0.0, -1.0), fov_y=60.0, size=(16, 16)).to(F64)
     begin = time.process_time()
-    image_and_gradient(wall, beside, cone(1024))
+    image_and_gradient(wall, aside, cone(1024))
     assert seconds < 30 * (time.process_time() - begin)  # one ray a face: hundreds of times as long
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from combinations import diagonal
 from kernel_parts import parts
 
 import edgegrad as eg
@@ -37,7 +38,7 @@ def triangle_soup(faces: int, scale: float, centre: np.ndarray) -> np.ndarray:
 
 
 def rays_through(corners: np.ndarray, n: int, far: float, infinite: bool) -> Rays:
-    """From points about `far` sizes of the scene away towards points near it."""
+    """Return rays from points about `far` sizes of the scene away towards points near it."""
     rng = np.random.default_rng(4)
     faces, centre = len(corners), corners.mean((0, 1))
     size = np.abs(corners - centre).max()
@@ -73,12 +74,12 @@ def brute_force(corners: np.ndarray, rays: Rays) -> Truth:
     # Seen at a grazing angle, a face is so much narrower.
     normal, length = np.cross(e1, e2), np.linalg.norm(rays.directions, axis=1)[:, None]
     cosine = np.abs(determinant) / (np.linalg.norm(normal, axis=-1) * length)
-    near_rim = (np.abs(inside) * np.maximum(cosine, 1e-9) < slack) & (t <= nearest + slack * size)
+    near_border = (np.abs(inside) * np.maximum(cosine, 1e-9) < slack) & (t <= nearest + slack * size)
     with np.errstate(invalid="ignore"):
         near_end = (inside > -slack) & (np.abs(t - rays.ends[:, None]) < slack * size)
         near_start = (inside > -slack) & (np.abs(t) < slack * size)
         tied = (inside > -slack) & (t != nearest) & (np.abs(t - nearest) < slack * size)
-    return Truth(face, ~(near_rim | near_end | near_start | tied).any(1))
+    return Truth(face, ~(near_border | near_end | near_start | tied).any(1))
 
 
 def cast(corners: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
@@ -100,9 +101,7 @@ def cast(corners: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     return face, hidden.astype(bool)
 
 
-@pytest.mark.parametrize("infinite", [True, False], ids=["rays", "segments"])
-@pytest.mark.parametrize("far", [0.3, 3.0, 1e6], ids=["within", "outside", "far"])
-@pytest.mark.parametrize("scale", [1.0, 1e-12, 1e12])
+@pytest.mark.parametrize(("scale", "far", "infinite"), diagonal([1.0, 1e-12, 1e12], [0.3, 3.0, 1e6], [False, True]))
 def test_any_rays(far: float, infinite: bool, scale: float) -> None:
     corners = triangle_soup(150, scale, scale * np.array([30.0, -70.0, 5.0]))
     rays = rays_through(corners, 1001, far, infinite)  # not whole packets

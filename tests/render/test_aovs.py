@@ -26,7 +26,7 @@ RANDOM = torch.Generator().manual_seed(5)
 
 
 def textured(mesh: eg.Mesh, seams: bool = True) -> eg.Mesh:
-    """With uvs of its own for every face, which jump at all edges."""
+    """Return the mesh with uvs of its own for every face, which jump at all edges."""
     F = len(mesh.faces)
     uvs = torch.rand((3 * F, 2), dtype=F64, generator=torch.Generator().manual_seed(1)) if seams else mesh.verts[:, :2]
     uv_faces = torch.arange(3 * F).reshape(F, 3) if seams else mesh.faces
@@ -201,7 +201,7 @@ def test_a_pixel_holds_premultiplied_sums() -> None:
 
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 def test_gradients_of_exact_integrals(projection: str) -> None:
-    """Of alpha, that is the derivative of exact coverage."""
+    """The derivative of alpha is that of exact coverage."""
     scene, camera = two_meshes(), CAMERAS[projection]()
     found: dict[str, list[Tensor]] = {name: [] for name in AFFINE}
     for seed in range(6):

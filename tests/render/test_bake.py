@@ -59,7 +59,7 @@ def test_normals_of_a_sphere() -> None:
 
 @pytest.mark.parametrize("smooth", [True, False])
 def test_a_normal_map_shades_as_the_fine_mesh(smooth: bool) -> None:
-    """Of bumps that the coarse mesh, with interpolated normals or the faces', does not have."""
+    """The map has bumps that the coarse mesh, with interpolated normals or the faces', does not have."""
     coarse, fine = icosphere(2).verts.double(), icosphere(4)
     verts = fine.verts.double() * (1 + 0.03 * torch.sin(7 * fine.verts.double()).prod(1, keepdim=True))
     normals = eg.vertex_normals(verts.float(), fine.faces)
@@ -81,8 +81,8 @@ def test_a_normal_map_shades_as_the_fine_mesh(smooth: bool) -> None:
     assert off[0] < 0.015 and min(off[1:]) > 0.027, off
 
 
-def test_visibility_beside_a_wall() -> None:
-    """Of a floor next to an endless wall half of the sky is covered at its foot, and (1 + cos) / 2 away from it."""
+def test_visibility_next_to_a_wall() -> None:
+    """An endless wall covers half of the sky at its foot; the floor away from it sees (1 + cos) / 2."""
     wall = torch.tensor([[0.0, -400, 0], [0, 400, 0], [0, 400, 0.5], [0, -400, 0.5]])
     texture = eg.bake(
         square(),
@@ -120,7 +120,7 @@ def test_a_function_and_a_margin() -> None:
 
 
 def test_pictures_give_the_texture_back() -> None:
-    """Of a ball, from all around; what one picture does not see comes from others."""
+    """Pictures show a ball from all around; what one does not see comes from others."""
     ball = eg.unwrap(eg.Mesh(icosphere(2).verts.float(), icosphere(2).faces), size=64)
     truth = eg.bake(ball, lambda points: 0.5 + 0.4 * torch.sin(3 * points.position), 64, margin=None)
     eyes = [(3.0, 0, 0), (-3.0, 0, 0), (0, 3.0, 0.1), (0, -3.0, 0.1), (0, 0, 3.0), (0, 0, -3.0)]
@@ -151,7 +151,7 @@ def test_wrong_arguments() -> None:
         (lambda: eg.bake(mesh, plain, what="gloss"), ValueError, "what: expected one of"),
         (lambda: eg.bake(mesh, plain, by="luck"), ValueError, "by: expected"),
         (lambda: eg.bake(mesh, plain, 0), ValueError, "size: expected"),
-        (lambda: eg.bake(mesh, lambda points: torch.ones(3)), ValueError, "source: expected shape"),
+        (lambda: eg.bake(mesh, lambda points: torch.ones(3), 4), ValueError, "source: expected shape"),
         (lambda: eg.bake(mesh, plain, (4, 4, 3)), ValueError, "size: expected an int or"),
         (lambda: eg.bake(mesh, plain, 4.0), TypeError, "size: expected an int"),
         (lambda: eg.bake(mesh, lambda points: points.normal * torch.nan, 4), ValueError, "source: expected finite"),
@@ -168,7 +168,7 @@ def test_wrong_arguments() -> None:
         (lambda: eg.bake_pictures(mesh, [camera], []), ValueError, "images: expected one for each"),
         (lambda: eg.bake_pictures(mesh, [camera], [image[1:]]), ValueError, r"images\[0\]: expected shape"),
         (lambda: eg.bake_pictures(mesh, [camera], [image], masks=[image]), ValueError, r"masks\[0\]: expected shape"),
-        (lambda: eg.bake_pictures(mesh, [away], [image]), ValueError, "cameras: expected some that see"),
+        (lambda: eg.bake_pictures(mesh, [away], [image], 4), ValueError, "cameras: expected some that see"),
     ):
         with pytest.raises(error, match=words):
             call()  # pyright: ignore[reportArgumentType]

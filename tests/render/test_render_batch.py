@@ -67,8 +67,8 @@ def test_lit_scenes_and_lenses_come_one_by_one() -> None:
         [eg.Mesh(mesh.verts.float(), mesh.faces, material=eg.Material())],
         lights=[eg.PointLight((0, 3, 3), intensity=9.0)],
     )
-    bent = camera(1).replace(distortion=torch.tensor([0.05, 0.0, 0.0, 0.0]))
-    given = [(lit, camera(0)), (eg.Mesh(mesh.verts.float(), mesh.faces, colors=mesh.verts.float().abs()), bent)]
+    distorted = camera(1).replace(distortion=torch.tensor([0.05, 0.0, 0.0, 0.0]))
+    given = [(lit, camera(0)), (eg.Mesh(mesh.verts.float(), mesh.faces, colors=mesh.verts.float().abs()), distorted)]
     images = eg.render_batch(given, spp=4)
     assert isinstance(images, Tensor)
     for image, pair in zip(images, given, strict=True):

@@ -82,7 +82,7 @@ def test_bad_functions() -> None:
 
 @pytest.mark.slow
 def test_anny() -> None:
-    """A body model of some 13,700 vertices and 104 bones, by its own function."""
+    """The body model has some 13,700 vertices and 104 bones, and a function of its own."""
     anny = pytest.importorskip("anny")
     roma = pytest.importorskip("roma")
     model = anny.Anny(skinning_method="lbs")

@@ -1,4 +1,4 @@
-"""One bad part of a glTF file does not refuse the rest: what is read, and how the part is named."""
+"""A bad part of a glTF file is named, and the rest of the file is read."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lit_gltf import file
+from lit_gltf import CAMERAS, file
+from rig_checks import check, malformed, primitive
 from rig_files import Sample, quaternion_matrix, simple_morph, simple_skin
 from scipy.spatial.transform import Rotation, Slerp
-from test_gltf_lights import CAMERAS
-from test_rigs import check, malformed, primitive
 
 import edgegrad as eg
 
@@ -30,7 +29,7 @@ KEYS /= np.linalg.norm(KEYS, axis=1, keepdims=True)
 
 
 def turning(rows: np.ndarray, interpolation: str, dtype: str) -> Sample:
-    """A triangle at the axes whose node turns at 0, 1 and 2 s."""
+    """Return a triangle at the axes whose node rotates at 0, 1 and 2 s."""
     sample = Sample()
     attributes = {"POSITION": sample.add(np.eye(3))}
     sample.tree |= {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "name": "n"}]}
@@ -117,7 +116,7 @@ def test_vertices_without_weights_hang_on_the_first_joint(tmp_path) -> None:
 
 
 def test_a_primitive_without_joints_is_rigid_with_its_node(tmp_path) -> None:
-    """In both loaders, next to another that the skin moves."""
+    """Both loaders read it, next to another that the skin moves."""
     sample = simple_skin()
     there = primitive(sample)["attributes"]
     sample.tree["meshes"][0]["primitives"].append({"attributes": {"POSITION": there["POSITION"]}, "indices": 2})
@@ -177,7 +176,7 @@ def test_a_channel_of_a_node_that_is_not_there_is_named(tmp_path) -> None:
 
 
 def test_names_differ(tmp_path) -> None:
-    """Of nodes, morph targets and animations, also where one is called as another becomes."""
+    """Nodes, morph targets and animations differ, also where one has the name that another would get."""
     sample = simple_morph()
     sample.tree["meshes"][0]["extras"]["targetNames"] = ["smile", "smile"]
     sample.tree["nodes"] = [{"mesh": 0, "name": "a"}, {"name": "a (2)"}, {"name": "a"}, {"name": ""}]

@@ -4,35 +4,15 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 import roma
 import torch
-from rig_files import SAMPLES, Sample, places, rigged_simple, simple_morph, simple_skin, walk
+from rig_checks import check, malformed, primitive
+from rig_files import SAMPLES, Sample, rigged_simple, simple_morph, simple_skin, walk
 
 import edgegrad as eg
-
-
-def meshes_of(posed: Any) -> list[eg.Mesh]:
-    return [posed] if isinstance(posed, eg.Mesh) else list(posed.meshes)
-
-
-def check(sample: Sample, rig: eg.Rig, posed: Any, animation: int | None, t: float) -> None:
-    """To 1e-6 of the size of what is shown."""
-    expected = places(sample, animation, t)
-    found = meshes_of(posed)
-    assert len(found) == len(expected)
-    low, high = (np.array([getattr(p.positions.reshape(-1, 3), side)(0) for p in expected]) for side in ("min", "max"))
-    size = np.linalg.norm(high.max(0) - low.min(0))
-    for mesh, place in zip(found, expected, strict=True):
-        corners = mesh.verts[mesh.faces].double().numpy()
-        assert np.abs(corners - place.positions).max() <= 1e-6 * size
-        if place.normals is not None and mesh.normals is not None:
-            index = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
-            assert np.abs(mesh.normals[index].double().numpy() - place.normals).max() <= 2e-6
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -71,7 +51,7 @@ def test_plain_loaders_name_load_rig(tmp_path) -> None:
 
 
 def small(dtype: torch.dtype = torch.float64) -> eg.Rig:
-    """Three joints in a chain, one morph, normals."""
+    """Return three joints in a chain, one morph target, and normals."""
     g = torch.Generator().manual_seed(0)
     verts = torch.rand(7, 3, generator=g, dtype=dtype) * 3.0
     faces = torch.tensor([[0, 1, 2], [2, 3, 4], [4, 5, 6]])
@@ -224,16 +204,6 @@ def test_what_a_rig_hides_and_welds(tmp_path) -> None:
 # -- bad input --------------------------------------------------------------------------------------------------------
 
 
-def malformed(change: Callable[[Sample], Any], make: Callable[[], Sample] = simple_skin) -> Sample:
-    sample = make()
-    change(sample)
-    return sample
-
-
-def primitive(sample: Sample) -> dict[str, Any]:
-    return sample.tree["meshes"][0]["primitives"][0]
-
-
 BAD: dict[str, tuple[Sample, str]] = {
     "joint not in the scene": (
         malformed(lambda s: s.tree["scenes"].__setitem__(0, {"nodes": [0]})), r"skin 0: expected joints in the scene, got node 1"
@@ -307,8 +277,8 @@ def test_bad_arguments() -> None:
 
 
 def two_bars() -> eg.Rig:
-    """One rig of two bodies: coloured bars on joints of their own, the second across the first."""
-    from test_fit_rig import arm
+    """Return one rig of two coloured bars on joints of their own, the second across the first."""
+    from arms import arm
 
     one, skin = arm(), arm().deformer.skins[0]
     meshes = [
@@ -327,7 +297,8 @@ def two_bars() -> eg.Rig:
 
 @pytest.mark.parametrize("depth", [0.0, -0.35], ids=["in front", "through"])
 def test_gradients_of_bodies_that_occlude_each_other(depth: float) -> None:
-    """Of an image's loss by the joints of both, by finite differences; depth 0: one is before the other, −0.35: within it."""
+    """Finite differences give the derivatives of an image's loss by the joints of both. At depth 0 one is before the
+    other, at −0.35 within it."""
     rig = two_bars()
     camera = eg.Camera.look_at((0.8, 1.0, 5.0), (0, 1, 0), up=(0, 1, 0), fov_y=30, size=(32, 32))
     at = rig.joints.translations.clone()

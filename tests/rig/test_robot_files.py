@@ -1,4 +1,4 @@
-"""What a URDF and its mesh files say: mirrored meshes, units, materials, packages, limits; and odd trees of links."""
+"""URDF and its mesh files: mirrored meshes, units, materials, packages, limits, and malformed trees of links."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def volume(mesh: eg.Mesh) -> float:
 
 
 def write_obj(path: Path, materials: tuple[str, ...] = ()) -> None:
-    """A box with texture coordinates and normals; its faces have the materials in turn."""
+    """Write a box with texture coordinates and normals, whose faces have the materials in turn."""
     lines = [f"v {x} {y} {z}" for x, y, z in BOX] + [f"vt {(x + 1) / 2} {(y + 1) / 2}" for x, y, _ in BOX]
     lines += [f"vn {x} {y} {z}" for x, y, z in BOX]
     if materials:
@@ -77,7 +77,7 @@ def test_a_mirrored_mesh_keeps_its_outside(scale: str, tmp_path) -> None:
 
 
 def test_all_that_belongs_to_corners_is_reversed() -> None:
-    """A lit textured mesh that is mirrored and reversed: values at points are those of the mesh before, mirrored."""
+    """A lit textured mesh is mirrored. Values at its points are those of the mesh before, mirrored."""
     g = torch.Generator().manual_seed(0)
     faces = torch.tensor(TRIANGLES)
     own = torch.rand(3 * len(faces), 2, generator=g)
@@ -102,7 +102,7 @@ def test_all_that_belongs_to_corners_is_reversed() -> None:
     assert bool((outwards > 0).all())
 
 
-# -- looks ------------------------------------------------------------------------------------------------------------
+# -- appearance ------------------------------------------------------------------------------------------------------------
 
 DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -214,7 +214,7 @@ def test_meshes_of_packages(tmp_path) -> None:
         eg.load_robot(path, package_dirs=tmp_path / "nowhere")
     with pytest.raises(TypeError, match="package_dirs: expected folders, got int"):
         eg.load_robot(path, package_dirs=[3])  # type: ignore[list-item]
-    # Beside the robot's own folder, without an argument.
+    # Next to the robot's own folder, without an argument.
     shutil.move(tmp_path / "other" / "arm_meshes", tmp_path / "arm_meshes")
     assert volume(eg.load_robot(path).posed()) == pytest.approx(8.0)
 
@@ -260,7 +260,7 @@ def test_what_is_no_robot_is_named(case: str, tmp_path) -> None:
         eg.load_robot(robot(tmp_path, *parts))
 
 
-def test_limits_that_are_not_said_are_zero(tmp_path) -> None:
+def test_missing_limits_are_zero(tmp_path) -> None:
     limit = '<limit effort="1" velocity="1"{}/><axis xyz="0 0 1"/>'
     path = robot(
         tmp_path, LINKS, joint("j", "a", "b", "revolute", limit.format("")),

@@ -1,9 +1,8 @@
-"""Robots from URDF files: where their links are, and what is wrong with a file."""
+"""Links of robots from URDF files are in their places, and errors name what is wrong with a file."""
 
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from edgegrad.fit import fit_rig
 
 yourdfpy = pytest.importorskip("yourdfpy")
 pytest.importorskip("pytorch_kinematics")
-sys.path.append(str(Path(__file__).parents[2] / "examples"))
 import arm  # noqa: E402
 
 GRIPPER = """<?xml version="1.0"?>
@@ -48,7 +46,7 @@ def gripper(folder: Path, text: str = GRIPPER) -> Path:
 
 
 def check_links(path: Path, robot: eg.Rig, seed: int) -> None:
-    """Against yourdfpy's own kinematics."""
+    """Check links against yourdfpy's own kinematics."""
     control = robot.controls["angles"]
     random = torch.rand(len(control.rest), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     low, high = control.low.clamp(min=-3.0), control.high.clamp(max=3.0)
@@ -72,7 +70,7 @@ def test_links_are_where_another_library_has_them(tmp_path) -> None:
 
 
 def test_a_robot_of_a_package() -> None:
-    """With joints that mimic, colours, and meshes of OBJ files."""
+    """The robot has joints that mimic others, colours, and meshes of OBJ files."""
     models = pytest.importorskip("airo_models")
     path = Path(models.get_urdf_path("robotiq_2f_85"))
     robot = eg.load_robot(path)
@@ -109,11 +107,11 @@ def test_only_the_joints_that_are_named_turn(tmp_path) -> None:
     truth = 0.2 * torch.ones(7, dtype=torch.float64)
     with torch.no_grad():
         mask = eg.render_aovs(robot.posed(angles=truth), camera, ["alpha"], spp=16)["alpha"]
-    told = {"masks": [mask], "tries": 0, "steps": 2, "coarsest": 24, "progress": False}
-    found = fit_rig(robot, [camera], joints=[names[1]], **told).values["angles"]
+    options = {"masks": [mask], "tries": 0, "steps": 2, "coarsest": 24, "progress": False}
+    found = fit_rig(robot, [camera], joints=[names[1]], **options).values["angles"]
     assert float(found[1]) != 0.0 and float(found.abs().sum()) == float(found[1].abs())
     with pytest.raises(ValueError, match="angles: expected names among"):
-        fit_rig(robot, [camera], joints=["nope"], **told)
+        fit_rig(robot, [camera], joints=["nope"], **options)
 
 
 BAD = {

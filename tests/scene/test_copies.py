@@ -31,7 +31,7 @@ def pickled(thing: object) -> object:
 
 
 def saved(thing: object) -> object:
-    """Through a file of torch.save, as a whole object."""
+    """Return what torch.load reads from a file of torch.save, as a whole object."""
     stream = io.BytesIO()
     torch.save(thing, stream)
     stream.seek(0)
@@ -51,7 +51,7 @@ def tensors(thing: object) -> dict[str, Tensor]:
 
 
 def with_gradients(thing: object) -> object:
-    """The same, with leaves that require gradients in place of its floating-point tensors."""
+    """Return the same with leaves that require gradients in place of its floating-point tensors."""
     if isinstance(thing, eg.Scene):
         background = thing.background.clone().requires_grad_()
         return eg.Scene([with_gradients(mesh) for mesh in thing.meshes], background)
@@ -60,26 +60,26 @@ def with_gradients(thing: object) -> object:
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-@pytest.mark.parametrize("way", [copy.copy, copy.deepcopy, pickled, saved])
-def test_round_trip(name: str, way: Callable[[object], object]):
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickled, saved])
+def test_round_trip(name: str, copied: Callable[[object], object]):
     before = with_gradients(OBJECTS[name])
-    after = way(before)
+    after = copied(before)
     assert type(after) is type(before) and repr(after) == repr(before)
     old, new = tensors(before), tensors(after)
     assert old.keys() == new.keys() and len(old) >= 2
     for key in old:
         assert torch.equal(old[key], new[key]) and old[key].dtype == new[key].dtype
         assert old[key].requires_grad == new[key].requires_grad
-        assert (old[key].data_ptr() == new[key].data_ptr()) == (way is copy.copy)
+        assert (old[key].data_ptr() == new[key].data_ptr()) == (copied is copy.copy)
     assert torch.equal(image(after), image(before))
     image(after).sum().backward()
     assert any(t.grad is not None and bool(t.grad.any()) for t in new.values())
-    assert way is copy.copy or all(t.grad is None for t in old.values())
+    assert copied is copy.copy or all(t.grad is None for t in old.values())
 
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_detach_cuts_the_graph(name: str):
-    """Also what deepcopy needs: torch copies no tensor that was computed."""
+    """Deepcopy needs this, for torch copies no tensor that was computed."""
     leaves = with_gradients(OBJECTS[name])
     computed = leaves.to(torch.float32)
     with pytest.raises(RuntimeError, match="deepcopy"):
@@ -105,8 +105,8 @@ def test_detach_without_background_and_in_a_batch():
 
 def test_a_batch_of_cameras_round_trips():
     batch = eg.Camera.stack([CAMERA, CAMERA.crop(1, 2, 8, 8)])
-    for way in (copy.copy, copy.deepcopy, pickled, saved):
-        assert torch.equal(image(way(batch)), image(batch))
+    for copied in (copy.copy, copy.deepcopy, pickled, saved):
+        assert torch.equal(image(copied(batch)), image(batch))
 
 
 def test_malformed_values_in_a_pickle_do_not_pass():

@@ -19,7 +19,7 @@ from edgegrad.scene.tree import named_tensors
 
 VERTS, FACES = cube().verts.float(), cube().faces
 COLORS = torch.rand(8, 3, generator=torch.Generator().manual_seed(0))
-LOOKS = {
+APPEARANCES = {
     "plain": {},
     "colors": {"colors": COLORS},
     "grey": {"colors": COLORS[:, :1]},
@@ -34,7 +34,7 @@ LOOKS = {
 
 
 def close(a: eg.Mesh, b: eg.Mesh, linear: bool = False) -> None:
-    """The same faces with the same look, up to the rounding to 8 bit."""
+    """Assert the same faces and appearance, up to the rounding to 8 bit."""
     torch.testing.assert_close(a.verts[a.faces.long()], b.verts[b.faces.long()])
 
     def shown(mesh: eg.Mesh) -> torch.Tensor | None:
@@ -54,9 +54,9 @@ def close(a: eg.Mesh, b: eg.Mesh, linear: bool = False) -> None:
         torch.testing.assert_close(a.uvs[a.uv_faces.long()], b.uvs[b.uv_faces.long()])
 
 
-@pytest.mark.parametrize("look", LOOKS)
-def test_to_trimesh_and_back(look: str) -> None:
-    mesh = eg.Mesh(VERTS, FACES, **LOOKS[look])
+@pytest.mark.parametrize("appearance", APPEARANCES)
+def test_to_trimesh_and_back(appearance: str) -> None:
+    mesh = eg.Mesh(VERTS, FACES, **APPEARANCES[appearance])
     close(eg.io.from_trimesh(eg.io.to_trimesh(mesh)), mesh)
 
 
@@ -76,16 +76,16 @@ def test_trimesh_itself() -> None:
 
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "glb"])
-@pytest.mark.parametrize("look", LOOKS)
-def test_save_mesh(tmp_path: Path, look: str, ending: str) -> None:
-    mesh = eg.Mesh(VERTS, FACES, **LOOKS[look])
+@pytest.mark.parametrize("appearance", APPEARANCES)
+def test_save_mesh(tmp_path: Path, appearance: str, ending: str) -> None:
+    mesh = eg.Mesh(VERTS, FACES, **APPEARANCES[appearance])
     file = tmp_path / "new" / f"cube.{ending}"
-    if (ending, look) == ("ply", "texture"):  # trimesh writes none there
+    if (ending, appearance) == ("ply", "texture"):  # trimesh writes none there
         with pytest.warns(UserWarning, match=r"save_mesh: cube\.ply holds no uvs, no texture; torch\.save"):
             eg.save_mesh(file, mesh)
         return
     eg.save_mesh(file, mesh)
-    close(eg.load_mesh(file), mesh, linear=ending == "glb" and look != "texture")
+    close(eg.load_mesh(file), mesh, linear=ending == "glb" and appearance != "texture")
 
 
 def test_save_shapes_and_faults(tmp_path: Path) -> None:
@@ -103,10 +103,10 @@ def test_save_shapes_and_faults(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scale", [1e-30, 1e-6, 1.0, 1e12])
 def test_text_keeps_every_number(tmp_path: Path, ending: str, dtype: torch.dtype, scale: float) -> None:
-    """Of any size: vertices come back as they were, and so do texture coordinates."""
+    """Vertices and texture coordinates of any size come back as they were."""
     mesh = eg.Mesh((torch.rand(8, 3, generator=torch.Generator().manual_seed(5)).double() * scale).to(dtype), FACES)
     if ending == "obj":
-        mesh = mesh.replace(**LOOKS["texture"])
+        mesh = mesh.replace(**APPEARANCES["texture"])
     eg.save_mesh(tmp_path / f"a.{ending}", mesh)
     back = eg.load_mesh(tmp_path / f"a.{ending}", dtype=dtype)
     assert torch.equal(back.verts[back.faces.long()], mesh.verts[mesh.faces.long()])
@@ -115,10 +115,10 @@ def test_text_keeps_every_number(tmp_path: Path, ending: str, dtype: torch.dtype
 
 
 def test_what_a_file_does_not_hold_is_said(tmp_path: Path) -> None:
-    look = {"colors": torch.full((8, 3), 2.0), "material": eg.Material(0.5), "normals": torch.ones(8, 3)}
+    appearance = {"colors": torch.full((8, 3), 2.0), "material": eg.Material(0.5), "normals": torch.ones(8, 3)}
     for ending in ("ply", "obj"):
         with pytest.warns(UserWarning, match=rf"a\.{ending} holds no material, no normals, no colors beyond 0 … 1;"):
-            eg.save_mesh(tmp_path / f"a.{ending}", eg.Mesh(VERTS, FACES, **look))
+            eg.save_mesh(tmp_path / f"a.{ending}", eg.Mesh(VERTS, FACES, **appearance))
     with pytest.warns(UserWarning, match=r"a\.stl holds no colors;"):
         eg.save_mesh(tmp_path / "a.stl", eg.Mesh(VERTS, FACES, colors=torch.rand(8, 3)))
 

@@ -67,7 +67,7 @@ def test_derivatives_of_tangents() -> None:
 
 
 def test_nothing_without_a_direction() -> None:
-    """Of faces, edges, images and normals without a size: zeros, and finite derivatives."""
+    """Faces, edges, images and normals without a size give zeros, and finite derivatives."""
     position, normal, uv = (
         torch.rand(3, 3, 3, dtype=F64),
         torch.rand(3, 3, 3, dtype=F64),
@@ -93,8 +93,8 @@ def bowl(rows: int = 33) -> tuple[Tensor, Tensor, Tensor]:
 def test_a_mirrored_image() -> None:
     """Texture coordinates that run from the middle to both sides: what a map says bends to both sides, up to the middle."""
     verts, faces, normals = bowl()
-    bent = normalize(vector(0.3, 0.2, 1), dim=0)
-    image = eg.Texture(((bent + 1) / 2).expand(2, 2, 3))
+    tilted = normalize(vector(0.3, 0.2, 1), dim=0)
+    image = eg.Texture(((tilted + 1) / 2).expand(2, 2, 3))
     uvs = torch.stack([verts[:, 0].abs(), verts[:, 1]], 1)
     mesh = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, normals=normals, material=eg.Material(1.0, normal_map=image))
     towards = normalize(vector(0.3, 0.1, 1.0), dim=0)
@@ -103,7 +103,7 @@ def test_a_mirrored_image() -> None:
     hits = eg.trace(scene, torch.stack([x, 0.12 + 0 * x, 2 + 0 * x], 1), vector(0, 0, -1))
     n, side = normalize(torch.stack([x, 0 * x, 1 + 0 * x], 1), dim=1), x.sign()[:, None]
     along = side * torch.stack([n[:, 2], 0 * x, -n[:, 0]], 1)
-    expected = (bent[0] * along + bent[1] * vector(0, 1, 0) + bent[2] * n) @ towards / torch.pi
+    expected = (tilted[0] * along + tilted[1] * vector(0, 1, 0) + tilted[2] * n) @ towards / torch.pi
     torch.testing.assert_close(radiance(hits)[:, 0], expected, rtol=1e-3, atol=0)
 
 

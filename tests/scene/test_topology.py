@@ -121,7 +121,7 @@ def test_rotated_soup_welds(scale, shift):
 
 
 def test_copies_off_by_roundings_weld_at_their_own_precision_only():
-    """The same positions, once as float32 numbers and once as float64 numbers that mean to be apart."""
+    """The positions are equal, once as float32 numbers and once as float64 numbers that mean to be apart."""
     soup, index = split(CUBE.verts, CUBE.faces, torch.arange(12))
     noise = torch.from_numpy(random(len(soup), 3, seed=10)).clamp(-1, 1)
     moved = soup + 0.6 * EPS32 * noise

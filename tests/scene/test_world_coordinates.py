@@ -63,7 +63,7 @@ def test_vertices_stay_apart(tmp_path, kind, form):
 
 @pytest.mark.parametrize("kind", ["obj", "stl", "text-ply", "binary-ply"])
 def test_float32_where_it_is_asked_for_welds_first_and_warns(tmp_path, kind):
-    """In float32 no two vertices of the north that lie within half a metre differ."""
+    """No two vertices of the north that lie within half a metre differ in float32."""
     verts, faces = sphere()
     with pytest.warns(
         UserWarning,

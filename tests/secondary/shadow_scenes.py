@@ -228,7 +228,7 @@ CASES = {
         )
         for light, moves in ((spot, CASTER), (spot, LIGHT), (panel, LIGHT), (bulb, LIGHT))
     },
-    # Few rays see soft shadows change, and what grows and moves cancels: longer steps, another way.
+    # Few rays see soft shadows change, and what grows and moves cancels: longer steps in another direction.
     **{
         f"sphere of 1,280, {light.__name__}, caster moves": Case(
             above(sphere(3, 0.4, vector(0, 0, 1.0)), shift=-SHIFT), light, CASTER, samples=2, step=0.05

@@ -22,11 +22,11 @@ F64 = torch.float64
 
 
 class Strip(NamedTuple):
-    """Vertices of the three meshes: the receiver and the sender are triangles, the strip is two, or, for the oracle alone, any
+    """Vertices of the three meshes: the receiver and the reflector are triangles, the strip is two, or, for the oracle alone, any
     polygon of which nothing hides another part."""
 
     receiver: Tensor
-    sender: Tensor
+    reflector: Tensor
     strip: Tensor
     camera: eg.Camera
     light: Tensor  # the place of a point light of 4 W/sr
@@ -44,11 +44,11 @@ class Strip(NamedTuple):
             torch.tensor([-0.3, 0.5, 0.2], dtype=dtype),
         )
 
-    def scene(self, receiver: dict[str, Any], sender: dict[str, Any]) -> eg.Scene:
+    def scene(self, receiver: dict[str, Any], reflector: dict[str, Any]) -> eg.Scene:
         one, two = torch.tensor([[0, 1, 2]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
         meshes = [
             eg.Mesh(self.receiver, one, material=eg.Material(**receiver)),
-            eg.Mesh(self.sender, one, material=eg.Material(**sender)),
+            eg.Mesh(self.reflector, one, material=eg.Material(**reflector)),
             eg.Mesh(self.strip, two, material=eg.Material(torch.zeros(3, dtype=F64))),
         ]
         return eg.Scene(meshes, lights=[eg.PointLight(self.light, 4.0)])
@@ -56,7 +56,7 @@ class Strip(NamedTuple):
     @property
     def tensors(self) -> dict[str, Tensor]:
         return {
-            "receiver": self.receiver, "sender": self.sender, "strip": self.strip,
+            "receiver": self.receiver, "reflector": self.reflector, "strip": self.strip,
             "pose": self.camera.world_to_camera, "K": self.camera.K,
         }  # fmt: skip
 
@@ -64,7 +64,7 @@ class Strip(NamedTuple):
 def border(
     moving: Strip,
     receiver: dict[str, Any],
-    sender: dict[str, Any],
+    reflector: dict[str, Any],
     weights: Tensor,
     finer: tuple[int, int] = (1, 1),
     side: int | None = None,
@@ -73,11 +73,11 @@ def border(
     side of it alone. `finer`: how many times as many points of quadrature there are on each axis of a pixel, and along the
     border."""
     still = Strip(
-        moving.receiver.detach(), moving.sender.detach(), moving.strip.detach(), moving.camera.detach(), moving.light
+        moving.receiver.detach(), moving.reflector.detach(), moving.strip.detach(), moving.camera.detach(), moving.light
     )
     pixel, x = _pixels(moving.camera.size, 3 * finer[0])
     y, y_still = _seen(moving, x), _seen(still, x)
-    # (N, corners, 2): the last two barycentrics of the sender behind the corners, around which they run.
+    # (N, corners, 2): the last two barycentrics of the reflector behind the corners, around which they run.
     shadow = torch.stack([_behind(moving, y, corner) for corner in moving.strip], 1)
     own = weights.reshape(-1, 3)[pixel] / len(x) * len(weights.reshape(-1, 3))
     total, around = weights.new_zeros(()), torch.zeros_like(x[:, 0])
@@ -89,7 +89,7 @@ def border(
             continue
         for s, weight in zip(*_gauss(12 * finer[1]), strict=True):
             place = (1 - s) * a + s * b
-            h = (own * _integrand(still, y_still, place.detach(), receiver, sender)).sum(1)
+            h = (own * _integrand(still, y_still, place.detach(), receiver, reflector)).sum(1)
             moved = place - place.detach()
             total = total + weight * h @ (along[:, 0] * moved[:, 1] - along[:, 1] * moved[:, 0])
     assert bool((around > 0).all()) or bool((around < 0).all())
@@ -97,16 +97,17 @@ def border(
 
 
 def sent_from_line(
-    strip: Strip, a: Tensor, b: Tensor, receiver: dict[str, Any], sender: dict[str, Any], weights: Tensor
+    strip: Strip, a: Tensor, b: Tensor, receiver: dict[str, Any], reflector: dict[str, Any], weights: Tensor
 ) -> Tensor:
-    """Σ weights · image for light that the sender sends from a line between two places (2,) in its last two barycentrics, without
+    """Σ weights · image for light that the reflector scatters from a line between two places (2,) in its last two barycentrics,
+    without
     the strip, per unit of the other barycentrics: ∫ h ds, ds = |b − a| dt."""
     pixel, x = _pixels(strip.camera.size, 3)
     y, total = _seen(strip, x), weights.new_zeros(())
     own = weights.reshape(-1, 3)[pixel] / len(x) * len(weights.reshape(-1, 3))
     for s, weight in zip(*_gauss(24), strict=True):
         place = ((1 - s) * a + s * b).expand(len(x), 2)
-        total = total + weight * (b - a).norm() * (own * _integrand(strip, y, place, receiver, sender)).sum()
+        total = total + weight * (b - a).norm() * (own * _integrand(strip, y, place, receiver, reflector)).sum()
     return total
 
 
@@ -147,20 +148,20 @@ def _meet(face: Tensor, origin: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _behind(strip: Strip, y: Tensor, corner: Tensor) -> Tensor:
-    return _meet(strip.sender, y, corner - y)[1]
+    return _meet(strip.reflector, y, corner - y)[1]
 
 
-def _integrand(strip: Strip, y1: Tensor, b: Tensor, receiver: dict[str, Any], sender: dict[str, Any]) -> Tensor:
-    """(N, 3) by barycentrics b (N, 2) of the sender."""
-    e1, e2 = strip.sender[1] - strip.sender[0], strip.sender[2] - strip.sender[0]
-    y2 = strip.sender[0] + b[:, :1] * e1 + b[:, 1:] * e2
+def _integrand(strip: Strip, y1: Tensor, b: Tensor, receiver: dict[str, Any], reflector: dict[str, Any]) -> Tensor:
+    """(N, 3) by barycentrics b (N, 2) of the reflector."""
+    e1, e2 = strip.reflector[1] - strip.reflector[0], strip.reflector[2] - strip.reflector[0]
+    y2 = strip.reflector[0] + b[:, :1] * e1 + b[:, 1:] * e2
     pose = strip.camera.world_to_camera
     to_viewer = normalize(-(pose[:3, :3].T @ pose[:3, 3]) - y1, dim=1)
     d, e = y2 - y1, strip.light - y2
     l, to_light = normalize(d, dim=1), normalize(e, dim=1)
     n1 = _normal(strip.receiver, to_viewer)
-    n2 = _normal(strip.sender, -l)
-    L2 = _scattered(sender, -l, n2, to_light) * cosine(n2, to_light) * 4.0 / cosine(e, e)
+    n2 = _normal(strip.reflector, -l)
+    L2 = _scattered(reflector, -l, n2, to_light) * cosine(n2, to_light) * 4.0 / cosine(e, e)
     solid = cosine(n2, -l) / cosine(d, d) * torch.linalg.cross(e1, e2).norm()
     return _scattered(receiver, to_viewer, n1, l) * cosine(n1, l) * solid * L2
 
@@ -173,5 +174,5 @@ def _normal(face: Tensor, towards: Tensor) -> Tensor:
 def _scattered(material: dict[str, Any], v: Tensor, n: Tensor, l: Tensor) -> Tensor:
     base = torch.as_tensor(material["base_color"])[None]
     glossy = "roughness" in material
-    look = [torch.full((1, 1), material.get(name, 0.0), dtype=F64) for name in ("metallic", "roughness")]
-    return Scattering(base, *(look if glossy else (None, None))).evaluate(v, n, l).expand(len(v), 3)
+    parameters = [torch.full((1, 1), material.get(name, 0.0), dtype=F64) for name in ("metallic", "roughness")]
+    return Scattering(base, *(parameters if glossy else (None, None))).evaluate(v, n, l).expand(len(v), 3)

@@ -20,7 +20,7 @@ FACES = torch.tensor([[0, 2, 1], [0, 3, 2]])  # seen from below
 TEXELS = torch.rand((5, 4, 3), dtype=F64, generator=torch.Generator().manual_seed(2))
 FACTOR = vector(2.0, 1.0, 3.0)
 ALBEDO = 0.7
-# Askew, beyond the rim of the texture, and with a border of texels along an edge of the mesh and along the diagonal.
+# Askew, beyond the border of the texture, and with a border of texels along an edge of the mesh and along the diagonal.
 COORDINATES = {
     "askew": torch.tensor([[0.1, 0.2], [1.3, -0.2], [1.6, 0.9], [-0.1, 1.1]], dtype=F64),
     "along an edge": torch.tensor([[0.25, 0.1], [1.1, 0.3], [0.9, 1.3], [0.25, 0.8]], dtype=F64),
@@ -81,15 +81,11 @@ def scene(uvs: Tensor, wraps: tuple[str, str] = ("repeat", "repeat"), *others: e
     return eg.Scene([plane(4.0, material=eg.Material(ALBEDO)), emitter, *others])
 
 
-BESIDE = vector(1.0, 0.0, 0.3)  # from where the place is seen, below the light
-WEIGHTS = vector(1.0, -0.3, 0.5)
-
-
 def by_borders(uvs: Tensor, wraps: tuple[str, str], place: Tensor, weights: Tensor) -> Tensor:
     """(4, 2): the same by the borders that points are drawn from, integrated along each of them by the midpoint rule."""
     uvs = uvs.clone().requires_grad_()
     light = MeshLight(scene(uvs, wraps).meshes[1])
-    borders, n = light.borders((0.5, 0.5)), 40
+    borders, n = light.texel_edges((0.5, 0.5)), 40
     assert borders is not None
     measure = borders.running.diff(prepend=torch.zeros(1, dtype=F64)) / borders.running[-1]
     along = (torch.arange(n, dtype=F64) + 0.5) / n
@@ -104,7 +100,7 @@ def by_borders(uvs: Tensor, wraps: tuple[str, str], place: Tensor, weights: Tens
     return torch.autograd.grad((reaches * borders.motion(points)[:, 0]).sum(), uvs)[0]
 
 
-BESIDE = vector(1.0, 0.0, 0.3)  # from where places are seen, below the light
+ASIDE = vector(1.0, 0.0, 0.3)  # from where places are seen, below the light
 WEIGHTS = vector(1.0, -0.3, 0.5)
 PLACE = vector(0.3, -0.2, 0.0)
 
@@ -120,7 +116,7 @@ WRAPS = [("repeat", "mirror"), ("clamp", "repeat"), ("mirror", "clamp")]
         for k, wraps in enumerate(WRAPS)
     ],
 )
-def test_texture_coordinates_of_a_emitter(coordinates: str, wraps: tuple[str, str]) -> None:
+def test_texture_coordinates_of_an_emitter(coordinates: str, wraps: tuple[str, str]) -> None:
     uvs = COORDINATES[coordinates]
     exact = derivative(uvs, wraps, PLACE, WEIGHTS)
     assert torch.allclose(
@@ -129,9 +125,9 @@ def test_texture_coordinates_of_a_emitter(coordinates: str, wraps: tuple[str, st
 
 
 def test_radiance_itself_stays() -> None:
-    """What borders add is zero, and there is none where nothing moves."""
+    """Borders add zero, and there are none where nothing moves."""
     uvs = COORDINATES["askew"]
-    hits = [hits_of(scene(u), 50, PLACE, BESIDE) for u in (uvs, uvs.clone().requires_grad_())]
+    hits = [hits_of(scene(u), 50, PLACE, ASIDE) for u in (uvs, uvs.clone().requires_grad_())]
     still, moving = map(radiance, hits)
     assert not still.requires_grad
     assert torch.equal(still, moving)
@@ -140,7 +136,7 @@ def test_radiance_itself_stays() -> None:
 def test_an_emitter_in_shadow_and_its_back() -> None:
     uvs = COORDINATES["askew"].clone().requires_grad_()
     blocked = scene(uvs, ("repeat", "repeat"), plane(3.0).transformed(t=vector(0, 0, 1.5)))
-    hits = hits_of(blocked, 50, PLACE, BESIDE)
+    hits = hits_of(blocked, 50, PLACE, ASIDE)
     for shadows in (True, False):
         (found,) = torch.autograd.grad(radiance(hits, shadows).sum(), uvs)
         assert bool(found.any()) != shadows
@@ -148,14 +144,14 @@ def test_an_emitter_in_shadow_and_its_back() -> None:
     emitter = turned.meshes[1].replace(faces=FACES.flip(1), uv_faces=FACES.flip(1), material=eg.Material(
         0.0, emission=eg.Texture(TEXELS, filter="nearest"), two_sided=False
     ))  # fmt: skip
-    hits = hits_of(turned.replace(meshes=[turned.meshes[0], emitter]), 50, PLACE, BESIDE)
+    hits = hits_of(turned.replace(meshes=[turned.meshes[0], emitter]), 50, PLACE, ASIDE)
     assert not bool(radiance(hits).any())
     (found,) = torch.autograd.grad(radiance(hits).sum(), uvs)
     assert not bool(found.any())
 
 
 def test_borders_that_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there are too many, those that a number picks do, and the mean over that number is what all give."""
+    """Where there are too many, a number picks some. The mean over that number is what all give."""
     mesh = scene(COORDINATES["askew"]).meshes[1]
     assert mesh.material is not None
     texture = mesh.material.emission
@@ -186,12 +182,12 @@ def test_a_texture_of_one_colour_has_no_borders() -> None:
     mesh = scene(COORDINATES["askew"]).meshes[1]
     assert mesh.material is not None
     plain = mesh.replace(material=mesh.material.replace(emission=eg.Texture(TEXELS[:1, :1], filter="nearest")))
-    assert MeshLight(plain).borders((0.5, 0.5)) is None
+    assert MeshLight(plain).texel_edges((0.5, 0.5)) is None
 
 
 @pytest.mark.slow
 def test_images_in_reverse_and_forward_mode() -> None:
-    """Of the floor alone, by the kernel; the exact derivative is that of a fine grid of points."""
+    """The kernel shades the floor alone; the exact derivative is that of a fine grid of points."""
     wraps, uvs, motion = ("repeat", "repeat"), COORDINATES["askew"], torch.tensor([0.7, -0.7], dtype=F64)
     # Below the light, one above the floor, of which it sees a square with sides of 1.
     w2c = torch.tensor([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]], dtype=F64)
@@ -224,7 +220,7 @@ def test_images_in_reverse_and_forward_mode() -> None:
 
 
 def test_texture_coordinates_in_single_precision() -> None:
-    """The same scene in float32 has the same derivative."""
+    """The scene in float32 has the same derivative."""
     camera = eg.Camera.look_at((0.3, -2.0, 1.0), PLACE.tolist(), fov_y=30.0, size=(4, 4)).to(F64)
 
     def gradient(dtype: torch.dtype) -> Tensor:
@@ -240,8 +236,8 @@ def test_texture_coordinates_in_single_precision() -> None:
     torch.testing.assert_close(gradient(torch.float32).double(), exact, rtol=1e-3, atol=1e-3 * float(exact.abs().max()))
 
 
-def test_steps_are_declared_as_shading_looks_them_up() -> None:
-    """By declare_texel_edges() alone, in the same order."""
+def test_texel_edges_are_declared_as_shading_looks_them_up() -> None:
+    """declare_texel_edges() alone declares them in the same order."""
     draw = torch.Generator().manual_seed(5)
 
     def nearest(channels: int) -> eg.Texture:
@@ -262,7 +258,7 @@ def test_steps_are_declared_as_shading_looks_them_up() -> None:
 
 
 def test_an_emitter_that_is_masked_gives_no_light_there() -> None:
-    """By the kernel and in PyTorch, cut out or blending: that of the half which is left, in closed form."""
+    """The kernel and PyTorch give the light of the half that is left, masked or blended, in closed form."""
     alpha = torch.tensor([[0.2, 0.9]])
     uvs = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
     left = (SQUARE[[1, 2]] + SQUARE[[0, 3]]) / 2
@@ -277,7 +273,7 @@ def test_an_emitter_that_is_masked_gives_no_light_there() -> None:
         with torch.no_grad():
             found = [
                 torch.stack([eg.render(lit, camera, 1024, seed=s, light_samples=16) for s in range(4)]),
-                reference(hits_of(lit, 20_000, PLACE, BESIDE)),
+                reference(hits_of(lit, 20_000, PLACE, ASIDE)),
             ]
         for values in found:
             assert abs(4 * float(values.mean()) - exact) < 0.02 * exact, (mode, values.mean(), exact)

@@ -10,6 +10,7 @@ import torch
 from bounce_scenes import F64, QUAD, adjoint, indirect_change, indirect_gradient, mesh, seen_from
 from finite_differences import Case, right_ratio, rotation
 from room_scenes import vector
+from threads import check_threads
 from torch import Tensor
 
 import edgegrad as eg
@@ -68,7 +69,7 @@ def check(case: Case, spp: int, seeds: int, h: float = 0.2, bounces: int = 2, **
     print(right_ratio(change, indirect_gradient(case, h, seeds, bounces, **samples)))
 
 
-def test_emitter() -> None:
+def test_a_caster_before_an_emitter() -> None:
     check(case_of("emitter", "caster"), 128, 4, **FEW)
 
 
@@ -102,26 +103,18 @@ def test_glossy_floor(roughness: float) -> None:
     check(case, 2048, 8, **{name: 16 * n for name, n in FEW.items()})
 
 
-def derivatives(threads: int) -> tuple[Tensor, Tensor]:
-    """Of the image by θ at 0, in forward mode and in reverse."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
+def test_both_modes_and_any_number_of_threads() -> None:
     case, zero = case_of("emitter", "caster"), torch.zeros((), dtype=F64)
 
     def image(theta: Tensor) -> Tensor:
         return eg.render(*case(theta), 1, 0, bounces=3, surface_samples=2_000, edge_samples=1_000)
 
-    moved = torch.func.jvp(image, (zero,), (torch.ones_like(zero),))[1]
-    theta = zero.clone().requires_grad_()
-    (slope,) = torch.autograd.grad((adjoint()[:, :, None] * image(theta)).sum(), theta)
-    torch.set_num_threads(before)
-    return moved, slope
+    def derivatives() -> tuple[Tensor, Tensor]:
+        moved: Tensor = torch.func.jvp(image, (zero,), (torch.ones_like(zero),))[1]
+        theta = zero.clone().requires_grad_()
+        return moved, torch.autograd.grad((adjoint()[:, :, None] * image(theta)).sum(), theta)[0]
 
-
-def test_both_modes_and_any_number_of_threads() -> None:
-    forward, reverse = derivatives(1)
-    again = derivatives(3)
-    assert torch.equal(forward, again[0]) and torch.equal(reverse, again[1])
+    forward, reverse = check_threads(derivatives)
     assert float((adjoint()[:, :, None] * forward).sum() / reverse) == pytest.approx(1, abs=1e-9)
 
 

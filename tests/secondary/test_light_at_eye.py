@@ -127,9 +127,15 @@ def lit(kind: str, **options: object) -> Case:
     return Case(light=kind, projection="orthographic" if kind == "sun" else "perspective", **options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("kind", LIGHTS)
 @pytest.mark.parametrize(
-    ("offset", "dtype"), [(0.0, torch.float32), (1e-7, torch.float64), (-1e-6, torch.float64), (1e-5, torch.float32)]
+    ("kind", "offset", "dtype"),
+    [
+        ("point", 0.0, torch.float32),
+        ("point", 1e-7, torch.float64),
+        ("spot", -1e-6, torch.float64),
+        ("sun", 1e-5, torch.float32),
+        ("area", 0.0, torch.float32),
+    ],
 )
 def test_a_light_at_the_eye_adds_no_visible_shadow(kind: str, offset: float, dtype: torch.dtype) -> None:
     check(lit(kind, offset=offset, dtype=dtype))
@@ -137,16 +143,16 @@ def test_a_light_at_the_eye_adds_no_visible_shadow(kind: str, offset: float, dty
 
 @pytest.mark.parametrize("shape", ["box", "sphere"])
 @pytest.mark.parametrize("offset", [0.0, 1e-6])
-def test_of_closed_bodies(shape: str, offset: float) -> None:
+def test_a_light_at_the_eye_of_closed_bodies(shape: str, offset: float) -> None:
     check(lit("point", shape=shape, offset=offset, dtype=torch.float32))
 
 
 @pytest.mark.parametrize("moves", ["camera+light", "wall", "body+wall"])
-def test_of_other_motions(moves: str) -> None:
+def test_a_light_at_the_eye_and_other_motions(moves: str) -> None:
     check(lit("point", offset=1e-7, moves=moves), seeds=6)
 
 
-def test_of_a_fisheye() -> None:
+def test_a_light_at_the_eye_of_a_fisheye() -> None:
     check(Case(offset=1e-6, projection="fisheye"))
 
 
@@ -155,7 +161,7 @@ def test_of_a_fisheye() -> None:
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("kind", LIGHTS)
 @pytest.mark.parametrize("shape", ["grid", "box", "sphere"])
-def test_of_all_small_offsets(shape: str, kind: str, sign: int, dtype: torch.dtype) -> None:
+def test_a_light_at_all_small_offsets_from_the_eye(shape: str, kind: str, sign: int, dtype: torch.dtype) -> None:
     for offset in (1e-12, 1e-10, 1e-8, 1e-7, 3e-7, 1e-6, 3e-6, 1e-5, 3e-5, 1e-4):
         # What a light lights is noisier, for each sample of a boundary has one of its points.
         check(lit(kind, shape=shape, offset=sign * offset, dtype=dtype), 8, 40_000 if kind == "area" else 4_000)
@@ -164,8 +170,7 @@ def test_of_all_small_offsets(shape: str, kind: str, sign: int, dtype: torch.dty
 CLEARLY_APART = 3e-3  # world units: the derivative has changed by half a percent
 
 
-@pytest.mark.parametrize("shape", ["grid", "box"])
-@pytest.mark.parametrize("offset", [0.0, 1e-6, -1e-4])
+@pytest.mark.parametrize(("shape", "offset"), [("grid", 0.0), ("grid", -1e-4), ("box", 1e-6)])
 def test_a_light_above_the_eye_and_upright_edges(shape: str, offset: float) -> None:
     """The shadow of one edge lies on the silhouette of another one on the same line."""
     near, apart = (
@@ -179,7 +184,7 @@ def test_a_light_above_the_eye_and_upright_edges(shape: str, offset: float) -> N
 @pytest.mark.parametrize("shape", ["grid", "box"])
 @pytest.mark.parametrize("offset", [0.0, CLEARLY_APART, 0.1])
 def test_a_light_above_the_eye_against_differences(shape: str, offset: float) -> None:
-    """With a short step: within 0.01 the derivative by the box changes by 2 %."""
+    """The step is short, for within 0.01 the derivative by the box changes by 2 %."""
     case = Case(shape, above=2.0, offset=offset)
     found = estimate(gradients(case, 12, edge_samples=16_000, surface_samples=16_000))
     right_ratio(finite_difference(case, 0.003, 8192, 20), found)

@@ -1,5 +1,5 @@
-"""Shadows of alpha edges: of a rectangle of which a ramp of alpha leaves a part, in closed form, and of curved rims against
-finite differences."""
+"""Shadows of alpha edges: of a rectangle of which a ramp of alpha leaves a part, in closed form, and of curved alpha edges
+against finite differences."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from finite_differences import gradient as derivative
 from lit_scenes import by_quadrature, from_above, plane
 from test_shadows import LIGHTS, exact, gradient, of_panel, of_sky, panel, sky, vector
 from test_shadows import Setting as Whole
+from threads import check_threads
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -29,23 +30,23 @@ class Setting(Whole):
 
     def __init__(self) -> None:
         super().__init__()
-        self.u = vector(0.07, 0.9, 1.0, 0.15)  # of the corners: the rim is parallel to no side
+        self.u = vector(0.07, 0.9, 1.0, 0.15)  # of the corners: the alpha edge is parallel to no side
         self.alpha = vector(0.1, 0.8)
 
     def scene(self, lights: Callable[[Whole], object]) -> eg.Scene:
         scene = super().scene(lights)
         ground, caster, *others = scene.meshes
         uvs = torch.stack([self.u, vector(0.1, 0.1, 0.9, 0.9)], 1)
-        look = {"alpha": self.alpha.expand(1, 2), "filter": self.filter, "wrap": self.wrap}
-        return scene.replace(meshes=[ground, caster.replace(uvs=uvs, uv_faces=caster.faces, **look), *others])
+        masked = {"alpha": self.alpha.expand(1, 2), "filter": self.filter, "wrap": self.wrap}
+        return scene.replace(meshes=[ground, caster.replace(uvs=uvs, uv_faces=caster.faces, **masked), *others])
 
     def outline(self) -> Tensor:
-        """The rim runs from the side 01 over the diagonal 02 to the side 32."""
+        """The alpha edge runs from the side 01 over the diagonal 02 to the side 32."""
         c, u, (low, high) = self.corners, self.u, self.alpha
-        rim = vector(0.5) if self.filter == "nearest" else 0.25 + 0.5 * (0.5 - low) / (high - low)
+        edge = vector(0.5) if self.filter == "nearest" else 0.25 + 0.5 * (0.5 - low) / (high - low)
 
         def on(i: int, j: int) -> Tensor:
-            return c[i] + (rim - u[i]) / (u[j] - u[i]) * (c[j] - c[i])
+            return c[i] + (edge - u[i]) / (u[j] - u[i]) * (c[j] - c[i])
 
         return torch.stack([on(0, 1), c[1], c[2], on(3, 2), on(0, 2)])
 
@@ -55,7 +56,7 @@ class Nearest(Setting):
 
 
 class Repeated(Nearest):
-    """Between texels at the ends of the rectangle there is a border too, but nothing beyond."""
+    """The rectangle ends between texels: there is a border there, too, but nothing beyond."""
 
     wrap = "repeat"
 
@@ -65,7 +66,7 @@ class Repeated(Nearest):
 
 
 class Seam(Setting):
-    """Of the two triangles of the rectangle the first is there and the second cut out, up to the diagonal."""
+    """The first triangle of the rectangle is opaque and the second masked, up to the diagonal."""
 
     def scene(self, lights: Callable[[Whole], object]) -> eg.Scene:
         scene = super().scene(lights)
@@ -83,20 +84,24 @@ Setting.motions = {
     "u moves": lambda s, t: setattr(s, "u", s.u + t * vector(0.2, -0.7, -0.4, 0.5)),
 }
 FAST = ("one corner", "light moves", "ground rises", "alpha rises", "u moves")
-MOTIONS = [pytest.param(m, marks=[] if m in FAST else pytest.mark.slow) for m in Setting.motions]
+# All of them by one light, and what each light makes of its own.
+MOTIONS = [
+    pytest.param(m, light, marks=[] if (m in FAST and light == "point") or m == "light moves" else pytest.mark.slow)
+    for m in Setting.motions
+    for light in LIGHTS
+]
 
 
 @pytest.mark.unwatched
-@pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_shadow_of_a_rim(motion: str, light: str) -> None:
+@pytest.mark.parametrize(("motion", "light"), MOTIONS)
+def test_shadow_of_an_alpha_edge(motion: str, light: str) -> None:
     found = estimate([gradient(motion, LIGHTS[light], seed, Setting, edge_samples=6_000) for seed in range(4)])
     check(f"{light}, {motion}", exact(motion, infinite=light == "sun", kind=Setting), found)
 
 
 @pytest.mark.parametrize("kind", [Repeated, Seam])
 @pytest.mark.parametrize("motion", ["one corner", "light moves"])
-def test_shadow_of_rims_along_edges(motion: str, kind: type[Setting]) -> None:
+def test_shadow_of_alpha_edges_along_edges(motion: str, kind: type[Setting]) -> None:
     found = estimate([gradient(motion, LIGHTS["point"], seed, kind, edge_samples=12_000) for seed in range(4)])
     check(f"{kind.__name__}, {motion}", exact(motion, kind=kind), found)
 
@@ -111,13 +116,13 @@ def test_shadow_of_nearest_texels(motion: str) -> None:
     "motion",
     [m if m in ("light moves", "u moves") else pytest.param(m, marks=pytest.mark.slow) for m in Setting.motions],
 )
-def test_penumbra_of_a_rim(motion: str) -> None:
+def test_penumbra_of_an_alpha_edge(motion: str) -> None:
     found = estimate([gradient(motion, panel, seed, Setting, edge_samples=8_000) for seed in range(4)])
     check(f"panel, {motion}", of_panel(motion, Setting), found)
 
 
 @pytest.mark.parametrize("motion", ["alpha rises", "u moves"])
-def test_shadow_of_a_rim_before_an_even_sky(motion: str) -> None:
+def test_shadow_of_an_alpha_edge_before_an_even_sky(motion: str) -> None:
     found = estimate([gradient(motion, sky, seed, Setting, edge_samples=60_000) for seed in range(6)])
     check(f"sky, {motion}", of_sky(motion, Setting), found)
 
@@ -129,19 +134,19 @@ def noise(*shape: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
 
 
-BESIDE = eg.Camera.look_at((0.2, -2.6, 0.9), (0.0, 0, 0.0), up=(0, 0, 1), fov_y=40, size=(48, 32)).to(torch.float64)
+ASIDE = eg.Camera.look_at((0.2, -2.6, 0.9), (0.0, 0, 0.0), up=(0, 0, 1), fov_y=40, size=(48, 32)).to(torch.float64)
 
 
 ABOVE = from_above(32, 4.0)
 
 
-def case(what: str, light: str, look: str = "MASK", filter: str = "linear", camera: eg.Camera = ABOVE) -> Case:
+def case(what: str, light: str, mode: str = "MASK", filter: str = "linear", camera: eg.Camera = ABOVE) -> Case:
     """A curved leaf with a disc of it there, tilted over a floor; one camera sees it, the other its shadow alone."""
     leaf = quad(3, alpha=disc(12) if filter == "nearest" else disc(9), filter=filter)
     x, y, _ = leaf.verts.unbind(1)
     leaf = leaf.replace(
         verts=0.6 * torch.stack([x, y, 0.3 * x * x + 0.4 * x], 1) + vector(0.1, 0, 1),
-        material=eg.Material(0.3, alpha_mode=look),
+        material=eg.Material(0.3, alpha_mode=mode),
     )
     moved = {
         "verts": lambda t: leaf.replace(verts=leaf.verts + t * (0.1 * noise(len(leaf.verts), 3) + vector(0.2, 0.1, 0))),
@@ -168,25 +173,26 @@ FD_CASES = {
     "light, point": case("light", "point"),
     "verts, nearest, point": case("verts", "point", filter="nearest"),
 }
-QUICK = ("alpha, point",)
 
 
-@pytest.mark.unwatched
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FD_CASES])
-def test_curved_rims(name: str) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FD_CASES)
+def test_curved_alpha_edges(name: str) -> None:
     """Central differences of images by a regular grid of rays."""
     at = FD_CASES[name]
-    truth = by_quadrature(at, 0.02, 20 if name in QUICK else 24)
+    truth = by_quadrature(at, 0.02, 24)
     found = derivative(at, 4, step_spacing=1 / 8, edge_samples=8000, surface_samples=20_000)
     assert found.error < 0.005 * abs(truth), f"too noisy to decide: {found}"
     assert abs(found.mean - truth) < 0.02 * abs(truth), f"difference {truth}, gradient {found}"
 
 
-def test_what_blends_casts_the_shadow_of_what_is_masked_at_one_half() -> None:
+def test_a_blended_face_casts_the_shadow_of_a_masked_one() -> None:
     options = {"edge_samples": 8000, "surface_samples": 20_000}
-    blends, cut = (derivative(case("alpha", "point", look, camera=BESIDE), 2, **options) for look in ("BLEND", "MASK"))
-    assert abs(cut.mean) > 10
-    assert abs(blends.mean - cut.mean) < 0.005 * abs(cut.mean)
+    blended, masked = (
+        derivative(case("alpha", "point", mode, camera=ASIDE), 2, **options) for mode in ("BLEND", "MASK")
+    )
+    assert abs(masked.mean) > 10
+    assert abs(blended.mean - masked.mean) < 0.005 * abs(masked.mean)
 
 
 def seen(alpha: Tensor) -> Tensor:
@@ -194,7 +200,7 @@ def seen(alpha: Tensor) -> Tensor:
     floor, leaf = plane(2.0, material=eg.Material(0.8)), quad(alpha=alpha, material=eg.Material(0.3))
     leaf = leaf.replace(verts=0.6 * leaf.verts + vector(0, 0, 1))
     scene = eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0.3, -0.2, 2.6), 10.0)])
-    return eg.render(scene, BESIDE, spp=4) * torch.linspace(0, 1, 32, dtype=torch.float64)[:, None]
+    return eg.render(scene, ASIDE, spp=4) * torch.linspace(0, 1, 32, dtype=torch.float64)[:, None]
 
 
 def gradient_of_alpha() -> Tensor:
@@ -203,15 +209,7 @@ def gradient_of_alpha() -> Tensor:
 
 
 def test_same_bits_at_any_number_of_threads() -> None:
-    found, before = [], torch.get_num_threads()
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            found.append(gradient_of_alpha())
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(*found)
-    assert float(found[0].abs().sum()) > 1
+    check_threads(lambda: [gradient_of_alpha()])
 
 
 @pytest.mark.slow
@@ -222,7 +220,7 @@ def test_forward_mode_is_reverse_mode() -> None:
     assert float(forward.sum()) == pytest.approx(float((gradient_of_alpha() * moved).sum()), rel=1e-6)
 
 
-def test_plan_says_that_rims_move() -> None:
+def test_plan_says_that_alpha_edges_move() -> None:
     floor, leaf = plane(material=eg.Material()), quad(alpha=disc(9), material=eg.Material())
     scene = eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0, 0, 3))])
     assert not eg.plan(scene, ABOVE)["shadow boundaries"].on

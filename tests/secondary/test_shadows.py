@@ -1,4 +1,4 @@
-"""Borders of shadows, against exact areas: a rectangle casts its shadow on a plane, and a camera below it sees nothing else."""
+"""Shadow boundaries, against exact areas: a rectangle casts its shadow on a plane, and a camera below it sees nothing else."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from finite_differences import check, estimate
+from lit_scenes import vector
 from torch import Tensor
 
 import edgegrad as eg
@@ -18,10 +19,6 @@ pytestmark = [pytest.mark.quick, pytest.mark.watched]
 FOCAL, HEIGHT, SIZE = 45.0, 0.9, 96  # of the camera: px, world units above the plane, px
 CORNERS = ((-0.3, -0.2), (0.35, -0.2), (0.35, 0.25), (-0.3, 0.25))
 DOUBLE = torch.float64
-
-
-def vector(*numbers: float) -> Tensor:
-    return torch.tensor(numbers, dtype=DOUBLE)
 
 
 class Setting:
@@ -77,7 +74,7 @@ def moment(polygon: Tensor) -> Tensor:
 
 
 def adjoint() -> Tensor:
-    """Whose image through a tent filter is 1 + x / 40, away from the border."""
+    """Return an adjoint whose image through a tent filter is 1 + x / 40, away from the border."""
     x = torch.arange(SIZE, dtype=DOUBLE) + 0.5
     return (1 + x / 40).expand(SIZE, SIZE)[:, :, None]
 
@@ -134,7 +131,7 @@ def gradient(
 
 
 def exact(motion: str, points: Tensor | None = None, infinite: bool = False, kind: type[Setting] = Setting) -> float:
-    """Of what is lit, minus the shadow; the mean over points of a light as offsets (K, 3) if given."""
+    """Return the derivative of what is lit, minus the shadow; the mean over points of a light as offsets (K, 3) if given."""
     setting, theta = kind(), torch.zeros((), dtype=DOUBLE, requires_grad=True)
     setting.motions[motion](setting, theta)
     offsets = torch.zeros((1, 3), dtype=DOUBLE) if points is None else points
@@ -196,7 +193,8 @@ def sky(s: Setting) -> object:
 
 
 def of_sky(motion: str, kind: type[Setting] = Setting) -> float:
-    """Of all directions, the caster hides the solid angle that it is seen under (van Oosterom and Strackee 1983)."""
+    """Return the derivative of the sky's light: the caster hides the solid angle that it is seen under (van Oosterom and
+    Strackee 1983)."""
     setting, theta = kind(), torch.zeros((), dtype=DOUBLE, requires_grad=True)
     setting.motions[motion](setting, theta)
     pixel = torch.arange(SIZE, dtype=DOUBLE) + 0.5 - SIZE / 2
@@ -259,7 +257,7 @@ def test_triangles_of_directions() -> None:
 
 @pytest.mark.parametrize("mode", ["MASK", "BLEND"])
 @pytest.mark.parametrize("alpha", [0.4, 0.9])
-def test_what_is_masked_casts_no_shadow_whose_border_moves(mode, alpha):
+def test_masked_faces_cast_no_shadow(mode, alpha):
     """Shadow rays pass where alpha is below ½: the gradient is then that without shadows; above, it is another."""
     square = torch.tensor([[-0.8, -0.3, 1.0], [0.8, -0.3, 1.0], [0.8, 0.9, 1.0], [-0.8, 0.9, 1.0]])
     faces, uvs = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
@@ -269,9 +267,9 @@ def test_what_is_masked_casts_no_shadow_whose_border_moves(mode, alpha):
     found = []
     for shadows in (True, False):
         verts = square.clone().requires_grad_()
-        look = {"alpha": torch.full((2, 2), alpha), "material": eg.Material(0.5, alpha_mode=mode)}
-        pane = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, **look)
-        scene = eg.Scene([pane, floor], lights=[eg.PointLight(torch.tensor([1.2, 2.5, 2.5]), 15.0)])
+        appearance = {"alpha": torch.full((2, 2), alpha), "material": eg.Material(0.5, alpha_mode=mode)}
+        sheet = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, **appearance)
+        scene = eg.Scene([sheet, floor], lights=[eg.PointLight(torch.tensor([1.2, 2.5, 2.5]), 15.0)])
         image = eg.render(scene, camera, spp=16, shadows=shadows)
         (image * torch.linspace(-1, 1, 32)[:, None, None]).sum().backward()
         found.append(verts.grad)
@@ -282,8 +280,8 @@ def test_what_is_masked_casts_no_shadow_whose_border_moves(mode, alpha):
         assert float((with_shadows - without).norm()) > 0.2 * float(without.norm())
 
 
-def test_shadows_fall_on_each_of_the_panes_that_let_light_through():
-    """Panes of alpha 0.4, one behind the other as seen from the light, side by side as seen from the camera, before black: the
+def test_shadows_fall_on_each_of_two_transparent_sheets():
+    """Sheets of alpha 0.4, one behind the other as seen from the light, side by side as seen from the camera, before black: the
     image and its gradient are 0.4 of those of each as if it were opaque and the other were not there."""
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]], dtype=DOUBLE)
@@ -297,12 +295,15 @@ def test_shadows_fall_on_each_of_the_panes_that_let_light_through():
 
     near, far = upright(-1.5, 0.3, -1, 1, 0), upright(0.5, 3, -1.4, 1.4, -1.5)
 
-    def gradient(alpha: float | None, *panes: Tensor) -> Tensor:
+    def gradient(alpha: float | None, *sheets: Tensor) -> Tensor:
         caster, light = upright(-1.9, -1.4, -0.4, 0.3, 1.2).requires_grad_(), vector(-3.5, 0.3, 3.4).requires_grad_()
-        look = {"material": eg.Material(0.8)}
+        appearance = {"material": eg.Material(0.8)}
         if alpha is not None:
-            look = {"material": eg.Material(0.8, alpha_mode="BLEND"), "alpha": torch.full((2, 2), alpha, dtype=DOUBLE)}
-        meshes = [eg.Mesh(pane, faces, uvs=uvs, uv_faces=faces, **look) for pane in panes]
+            appearance = {
+                "material": eg.Material(0.8, alpha_mode="BLEND"),
+                "alpha": torch.full((2, 2), alpha, dtype=DOUBLE),
+            }
+        meshes = [eg.Mesh(sheet, faces, uvs=uvs, uv_faces=faces, **appearance) for sheet in sheets]
         scene = eg.Scene(
             [*meshes, eg.Mesh(caster, faces, material=eg.Material(0.3))], lights=[eg.PointLight(light, 30.0)]
         )

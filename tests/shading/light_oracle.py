@@ -26,7 +26,7 @@ AWAY = 1e-6  # where rays begin, along themselves
 
 
 class Ball(NamedTuple):
-    """Around what shines."""
+    """A ball around an emitter."""
 
     center: Tensor  # (3,)
     radius: float

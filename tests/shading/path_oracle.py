@@ -18,12 +18,13 @@ F64 = torch.float64
 
 
 class PathOracle:
-    """Of a scene whose materials are constants. `indirect()` is what light brings to a point after at least two scatterings."""
+    """Paths of a scene whose materials are constants. `indirect()` is what light brings to a point after at least two
+    scatterings."""
 
     def __init__(self, scene: eg.Scene, seed: int = 0) -> None:
         self._draw = torch.Generator().manual_seed(seed)
         self._lights = scene.lights
-        corners, self._of_face, self._looks = [], [], []
+        corners, self._of_face, self._materials = [], [], []
         for k, mesh in enumerate(scene.meshes):
             corners.append(mesh.verts.double()[mesh.faces.long()])
             self._of_face += [k] * len(mesh.faces)
@@ -32,8 +33,10 @@ class PathOracle:
             base, emission = (
                 torch.as_tensor(0.0 if x is None else x).double().expand(3) for x in (m.base_color, m.emission)
             )
-            look = [torch.as_tensor(d if x is None else x).double() for x, d in ((m.metallic, 0.0), (m.roughness, 1.0))]
-            self._looks.append((base, emission, *look, m.is_glossy, m.two_sided))
+            parameters = [
+                torch.as_tensor(d if x is None else x).double() for x, d in ((m.metallic, 0.0), (m.roughness, 1.0))
+            ]
+            self._materials.append((base, emission, *parameters, m.is_glossy, m.two_sided))
         self._corner = torch.cat(corners)
         edges = self._corner[:, 1:] - self._corner[:, :1]
         cross = torch.linalg.cross(edges[:, 0], edges[:, 1])
@@ -63,10 +66,10 @@ class PathOracle:
 
     def _scatter(self, face: Tensor, v: Tensor, n: Tensor, l: Tensor) -> Tensor:
         f = torch.zeros(len(face), 3, dtype=F64)
-        for k, (base, _, metallic, roughness, glossy, _) in enumerate(self._looks):
+        for k, (base, _, metallic, roughness, glossy, _) in enumerate(self._materials):
             some = (self._of_face[face] == k).nonzero()[:, 0]
-            look = (metallic[None, None], roughness[None, None]) if glossy else (None, None)
-            f[some] = Scattering(base[None], *look).evaluate(v[some], n[some], l[some]).expand(len(some), 3)
+            parameters = (metallic[None, None], roughness[None, None]) if glossy else (None, None)
+            f[some] = Scattering(base[None], *parameters).evaluate(v[some], n[some], l[some]).expand(len(some), 3)
         return f
 
     def _direct(self, face: Tensor, y: Tensor, v: Tensor, n: Tensor) -> Tensor:
@@ -79,7 +82,7 @@ class PathOracle:
             elif isinstance(light, Environment):
                 l, _ = self._above(n)
                 total += self._lit(face, y, v, n, l, torch.full((len(face),), math.inf)) * 2 * math.pi * light.radiance
-        emission = torch.stack([look[1] for look in self._looks])[self._of_face]  # (F, 3)
+        emission = torch.stack([material[1] for material in self._materials])[self._of_face]  # (F, 3)
         weight = self._area * (emission.sum(1) > 0)
         if float(weight.sum()) > 0:
             at = torch.multinomial(weight, len(face), replacement=True, generator=self._draw)
@@ -89,7 +92,7 @@ class PathOracle:
             d = (b[:, :, None] * self._corner[at]).sum(1) - y
             l, r = normalize(d, dim=1), d.norm(dim=1)
             facing = -(self._normal[at] * l).sum(1)
-            both = torch.tensor([look[5] for look in self._looks])[self._of_face[at]]
+            both = torch.tensor([material[5] for material in self._materials])[self._of_face[at]]
             facing = torch.where(both, facing.abs(), facing.clamp(min=0))
             reaches = emission[at] * (facing / r**2 * weight.sum())[:, None]
             total += self._lit(face, y, v, n, l, r - 1e-9) * reaches

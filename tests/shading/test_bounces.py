@@ -8,7 +8,7 @@ import pytest
 import torch
 from combinations import diagonal
 from kernel_parts import parts
-from test_lit_kernel import CAMERAS, Leaves, numbers_of, scene_of
+from lit_words import CAMERAS, Leaves, cotangents, numbers_of, scene_of
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -37,7 +37,7 @@ FEW = 30  # points of the image
 
 
 def numbers(words: str) -> Leaves:
-    """Those of test_lit_kernel.py, and of glossy walls around, so that light goes to and fro."""
+    """Return the numbers of lit_words.py, and those of glossy walls around, so that light goes to and fro."""
     corner = [(-2.0, -2.0), (2.0, -2.0), (2.0, 4.5), (-2.0, 4.5)]
     wall = [[x, y, z] for y in (-1.2, 3.0) for x, z in corner]
     own = {"wall": wall, "wall_color": [0.8, 0.3, 0.5], "wall_roughness": 0.5, "wall_metallic": 0.6}
@@ -69,9 +69,11 @@ class Point(NamedTuple):
 
 
 class Oracle:
-    """What PyTorch makes of paths in float64, point by point: the recursion of csrc/shading/lit/path_radiance.h by the surfaces,
-    materials and lights of edgegrad/light. Textures of points that no pixel sees are those of `unfiltered`, hits of
-    the same scene."""
+    """Paths in float64 by PyTorch, point by point.
+
+    It is the recursion of csrc/shading/lit/path_radiance.h by the surfaces, materials and lights of edgegrad/light. Textures of
+    points that no pixel sees are those of `unfiltered`, hits of the same scene.
+    """
 
     def __init__(self, hits: Hits, unfiltered: Hits, bounces: int) -> None:
         self._hits, self._unfiltered = hits, unfiltered
@@ -146,13 +148,8 @@ def test_values_and_cotangents(words: str, bounces: int) -> None:
     expected, radiance = oracle.radiance(), in_kernel.indirect(found, True, bounces)
     assert int(oracle.paths["points"].max()) == bounces and float(expected.detach().abs().max()) > 0.01
     assert torch.allclose(radiance, expected, rtol=1e-10, atol=1e-12)
-    bar = torch.randn(expected.shape, dtype=F64, generator=torch.Generator().manual_seed(1))
     tensors = {**leaves, "w2c": w2c}
-    wanted, got = (
-        torch.autograd.grad((L * bar).sum(), list(tensors.values()), allow_unused=True, materialize_grads=True)
-        for L in (expected, radiance)
-    )
-    for name, a, b in zip(tensors, wanted, got, strict=True):
+    for name, a, b in zip(tensors, cotangents(expected, tensors), cotangents(radiance, tensors), strict=True):
         assert float((a - b).abs().max()) <= 1e-9 * float(a.abs().max()) + 1e-13, name
         assert float(a.abs().max()) > 0 or name not in ("ground", "ground_color", "wall", "wall_color", "w2c"), name
 

@@ -58,7 +58,7 @@ def mean_gradient(floor: str) -> Estimate:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("floor", "spp"), [("even sky", 1024), ("nearly a mirror", 512)])
-def test_cube(floor: str, spp: int) -> None:
+def test_gradient_of_a_cube_that_shadows_itself(floor: str, spp: int) -> None:
     found, expected = mean_gradient(floor), change(floor, spp)
     print(found, expected)
     print(right_ratio(expected, found))

@@ -20,10 +20,6 @@ def check(scene: str, motion: str, spp: int, seeds: int, h: float = 0.1, bounces
 OPEN = {"surface_samples": 60_000, "edge_samples": 10_000}
 
 
-def test_paths_that_no_border_crosses() -> None:
-    check("open plates", "left y", 512, 4, **OPEN)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("bounces", [2, 3])
 @pytest.mark.parametrize("motion", ["right vertex", "left y", "light y"])

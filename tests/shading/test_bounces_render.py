@@ -63,7 +63,7 @@ def test_points_of_all_rooms(room: str, bounces: int) -> None:
 
 # Shares of the radiance are drawn in two ways where a path may meet a light (csrc/shading/lit/path.h); with two light samples
 # nothing is, each point has one path, and no pixel is asked again.
-@pytest.mark.parametrize("room", ["sky", "sky through an opening", "large light", "point"])
+@pytest.mark.parametrize("room", ["sky", "large light"])
 def test_images_whose_points_have_several_paths(room: str) -> None:
     scene, camera = ALL_ROOMS[room](), towards_room(12)
     with torch.no_grad():
@@ -84,7 +84,7 @@ def furnace(albedo: Tensor) -> eg.Scene:
     return eg.Scene([eg.Mesh(ball.verts.double(), ball.faces, material=eg.Material(albedo, emission=1.0))])
 
 
-@pytest.mark.parametrize("bounces", [1, 2, 16])
+@pytest.mark.parametrize("bounces", [1, 8])
 def test_white_furnace(bounces: int) -> None:
     albedo = torch.full((3,), 0.8, dtype=F64, requires_grad=True)
     camera = eg.Camera.look_at((0.3, 0.1, 0.2), (1.0, 0.4, 0.1), fov_y=60.0, size=(32, 32))
@@ -116,19 +116,6 @@ def test_gradients_of_a_room() -> None:
     with torch.no_grad():
         up, down = (loss(wall + sign * step, emission) for sign in (1, -1))
     assert abs(float((by_wall * step).sum() / ((up - down) / 2)) - 1) < 0.02
-
-
-def test_same_bits_at_any_number_of_threads() -> None:
-    found = []
-    threads = torch.get_num_threads()
-    for count in (1, 2, 3):
-        torch.set_num_threads(count)
-        color = vector(0.6, 0.5, 0.4).requires_grad_()
-        scene = box_room("emitter", floor={"base_color": color, "roughness": 0.4})
-        image = eg.render(scene, towards_room(12), 4, bounces=4)
-        found.append((image.detach(), *torch.autograd.grad((image * image).sum(), color)))
-    torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
 
 
 def test_one_bounce_is_direct_light_and_more_add_to_it() -> None:
@@ -175,12 +162,12 @@ def test_borders_without_samples_are_refused() -> None:
         lights = [scene.lights[0].replace(position=vector(0.5, -0.3, 1.7) if light is None else light)]
         return scene.replace(meshes=[mesh.replace(verts=verts, **fields), *others], lights=lights)
 
-    pane = {**uvs, "alpha": half, "material": eg.Material(0.5, alpha_mode="BLEND")}
+    sheet = {**uvs, "alpha": half, "material": eg.Material(0.5, alpha_mode="BLEND")}
     nearest = eg.Texture(torch.rand(2, 2, 3, dtype=F64), filter="nearest", uvs=leaf[:, :2], uv_faces=mesh.faces)
-    moved_light = room(mesh.verts, vector(0, 0, 1).requires_grad_(), **pane)
+    moved_light = room(mesh.verts, vector(0, 0, 1).requires_grad_(), **sheet)
     verts = r"meshes\[0\].verts"
     for other, name, why in (
-        (room(leaf, **pane), verts, "sees through"),
+        (room(leaf, **sheet), verts, "sees through"),
         (moved_light, r"lights\[0\].position", "sees through"),
         (room(mesh.verts, material=eg.Material(nearest)), r"uvs of a nearest texture of meshes\[0\]", "nearest texels"),
     ):
@@ -188,10 +175,10 @@ def test_borders_without_samples_are_refused() -> None:
             with pytest.raises(ValueError, match=f"bounces: {name} requires a gradient.*{why}"):
                 function(other, camera, 4, bounces=2)
     # Without borders there is nothing to leave out; and direct light has all of them.
-    assert eg.render(room(leaf, **pane), camera, 4, bounces=3, visibility=False).requires_grad
-    assert eg.render(room(leaf, **pane), camera, 4).requires_grad
+    assert eg.render(room(leaf, **sheet), camera, 4, bounces=3, visibility=False).requires_grad
+    assert eg.render(room(leaf, **sheet), camera, 4).requires_grad
     with torch.no_grad():
-        eg.render(room(leaf, **pane), camera, 4, bounces=3)
+        eg.render(room(leaf, **sheet), camera, 4, bounces=3)
     with pytest.raises(ValueError, match="bounces: expected an int from 1"):
         eg.render(scene, camera, 4, bounces=0)
 

@@ -27,7 +27,7 @@ SCENES = (
 
 
 def of_few_samples(case: Case) -> Estimate:
-    """By places of the motion in [−H, H], one for each seed, spread evenly."""
+    """Return the mean over places of the motion in [−H, H], one for each seed, spread evenly."""
     found = []
     for seed in range(SEEDS):
         at = H * ((2 * seed + 1) / SEEDS - 1)
@@ -44,7 +44,7 @@ def of_few_samples(case: Case) -> Estimate:
 
 
 @pytest.mark.slow
-def test_six_scenes() -> None:
+def test_few_samples_are_unbiased_in_six_scenes() -> None:
     chances = []
     for scene, motion in SCENES:
         case = case_of(scene, motion)

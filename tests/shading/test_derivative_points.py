@@ -1,5 +1,6 @@
-"""Points of environments for derivatives of glossy surfaces: directions in fours, whose density is that of all four, which are
-unbiased, and in which what a lobe's derivatives have of both signs cancels."""
+"""Points of environments for derivatives of glossy surfaces: antithetic sets of four directions.
+
+The density is that of all four. The estimates are unbiased, and parts of a lobe's derivatives of both signs cancel."""
 
 from __future__ import annotations
 
@@ -38,7 +39,7 @@ def four(l: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
     return antithetic_set(V.expand_as(l), N.expand_as(l), l.new_full((1, 1), alpha), l)
 
 
-def test_each_of_four_has_the_same_companions():
+def test_each_of_four_has_the_same_antithetic_set():
     """And their solid angles are what small changes of the half vector make of them."""
     alpha, step = 0.2, 1e-6
     l = Lobes.of(V[None], N[None], vector(0.45)[None]).repeated(200).draw(uniform(200, 2))
@@ -60,7 +61,7 @@ def test_each_of_four_has_the_same_companions():
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.5])
-def test_fours_have_the_density_that_is_said(roughness: float):
+def test_antithetic_sets_have_their_density(roughness: float):
     """χ² of the one of four that has tan θ ≤ α and an azimuth in [0, π), in rings and sectors, of directions that the lobe draws
     above the surface."""
     lobe, alpha = Lobes.of(V[None], N[None], vector(roughness)[None]), roughness**2
@@ -159,7 +160,7 @@ def test_derivatives_are_unbiased(roughness: float, emitters: bool):
 def test_what_has_both_signs_cancels():
     """At as many rays, under a smooth sky; without antithetic_set the first two ratios are one."""
     light = sky(False)
-    alone, together = (estimates(light, 0.2, 3000, antithetic=fours).var(0) for fours in (False, True))
+    alone, together = (estimates(light, 0.2, 3000, antithetic=antithetic).var(0) for antithetic in (False, True))
     gain = dict(zip(PARAMETERS, (alone / (4 * together)).tolist(), strict=True))
     assert gain["normal"] > 10 and gain["normal across"] > 10 and gain["roughness"] > 3, gain
     assert gain["base color"] > 0.1 and gain["texel"] > 0.1, gain
@@ -206,7 +207,7 @@ def test_kernel_and_twin_draw_the_same_points():
         assert float((value - got[name]).abs().max()) <= 1e-8 * float(value.abs().max()), name
 
 
-def test_values_take_no_companions():
+def test_values_take_no_antithetic_sets():
     """Shaders see the points that images do."""
     scene = eg.Scene([ball(2, material=eg.Material(metallic=1.0, roughness=0.2))], lights=[sky(True)])
     camera = eg.Camera.look_at((0.0, -2.0, 2.5), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 50.0, (16, 16))

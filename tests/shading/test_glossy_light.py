@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from finite_differences import Case, check_ratio
 from lit_scenes import F64, ball, directions, vector
 from oracles.lobes import Lobes
 from oracles.resampled import Glossy, resampled
@@ -149,57 +148,3 @@ def test_noise_under_an_even_sky(roughness: float, most: float):
     assert 0 < float((inside.std(0) / inside.mean(0)).mean()) < most
     # White metal gives back all but what it would scatter more than once.
     assert 0.85 < float(inside.mean()) < 1.001
-
-
-def test_the_same_bits_at_any_number_of_threads():
-    scene, camera, threads = metal(sky(1.0).replace(rotation=None), 0.3), from_front(24), torch.get_num_threads()
-    found = []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            verts = scene.meshes[0].verts.clone().requires_grad_()
-            image = eg.render(eg.Scene([scene.meshes[0].replace(verts=verts)], lights=scene.lights), camera, seed=4)
-            image.square().sum().backward()
-            assert verts.grad is not None
-            found.append((image.detach(), verts.grad))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
-
-
-def by(name: str) -> Case:
-    """A ball of brushed gold under a sky with lights, of which one number changes."""
-
-    def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        def moved(what: str, value: Tensor, by: Tensor) -> Tensor:
-            return value + theta * by if what == name else value
-
-        mesh = ball(2)
-        assert mesh.normals is not None
-        image = sky(2.0).radiance.clone()
-        image = torch.cat([image[:3], moved("texels", image[3:5], torch.full((1, 1, 3), 5.0, dtype=F64)), image[5:]])
-        turn = torch.linalg.matrix_exp(moved("rotation", torch.zeros(3, 3, dtype=F64), SPIN))
-        material = eg.Material(
-            moved("base color", vector(0.9, 0.6, 0.3), vector(-0.3, 0.2, 0.1)),
-            metallic=moved("metallic", vector(0.8), vector(0.5))[0],
-            roughness=moved("roughness", vector(0.35), vector(0.3))[0],
-        )
-        verts = moved("translation", mesh.verts.double(), vector(0.4, 0.2, 0.1))
-        normals = moved("normals", mesh.normals.double(), vector(0.2, -0.3, 0.0))
-        mesh = mesh.replace(verts=verts, normals=normals, material=material)
-        return eg.Scene([mesh], lights=[eg.Environment(image, rotation=turn)]), from_front(24)
-
-    return case
-
-
-SPIN = torch.tensor([[0.0, 0.5, -0.3], [-0.5, 0.0, 0.4], [0.3, -0.4, 0.0]], dtype=F64)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["base color", "metallic", "roughness", "normals", "translation", "texels", "rotation"]
-)
-def test_gradients_are_finite_differences(name: str):
-    samples = {"surface_samples": 5000, "edge_samples": 5000 if name == "translation" else 500}
-    # At a step of 0.1 differences by rotation are 1 % off for the step alone.
-    check_ratio(by(name), 0.05, spp=256, seeds=64, filter="box", light_samples=4, **samples)

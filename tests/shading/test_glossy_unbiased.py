@@ -72,7 +72,7 @@ def sums_and_gradients(problem: Problem, parts: list[str], render: Render, seed:
 
 
 class Component(NamedTuple):
-    """Of the image or of the gradient by a part."""
+    """A component of the image or of the gradient by a part."""
 
     part: str
     z: float

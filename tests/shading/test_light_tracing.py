@@ -39,7 +39,7 @@ def camera(kind: str) -> eg.Camera:
 
 
 def room(floor: dict[str, Any] | None = None) -> eg.Scene:
-    """With a point light, and a ball with smooth normals in place of the block."""
+    """Return a room with a point light, and a ball with smooth normals in place of the block."""
     scene = box_room("point", floor)
     ball = icosphere(1)
     verts = 0.45 * ball.verts.to(F64) + vector(-0.2, 0.1, 0.6)
@@ -101,18 +101,17 @@ def check(scene: eg.Scene, seen_from: eg.Camera, spp: int, bounces: int, seeds: 
     print(expected, found)
 
 
-@pytest.mark.parametrize("kind", ["perspective", "panorama"])
-def test_image(kind: str) -> None:
-    check(room(), camera(kind), 40 if kind == "perspective" else 24, 3)
+def test_light_tracing_gives_the_image_of_paths() -> None:
+    check(room(), camera("perspective"), 40, 3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["perspective", "distorted", "orthographic", "fisheye", "panorama"])
-def test_cameras(kind: str) -> None:
+def test_light_tracing_through_every_lens(kind: str) -> None:
     check(room({"base_color": vector(0.8, 0.6, 0.4), **GLOSSY}), camera(kind), 192, 2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bounces", [2, 3, 5])
-def test_bounces(bounces: int) -> None:
+def test_light_tracing_at_any_number_of_bounces(bounces: int) -> None:
     check(room({"base_color": vector(0.8, 0.6, 0.4), **GLOSSY}), camera("perspective"), 192, bounces)

@@ -132,7 +132,7 @@ def test_random_numbers_of_points():
 
 
 def test_random_numbers_of_a_pixel_are_its_own():
-    """So that with a constant seed what changes in one corner leaves the noise of all other pixels as it is."""
+    """A change in one corner leaves the noise of all other pixels as it is, with a constant seed."""
     emitter = eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0])
     floor, dot = plane(1.0, material=WHITE), ball(0, material=WHITE).transformed(scale=0.1, t=vector(-0.8, 0.8, 0.1))
     images = [eg.render(eg.Scene(m, lights=[emitter]), from_above(), shadows=False) for m in ([floor], [floor, dot])]
@@ -141,7 +141,7 @@ def test_random_numbers_of_a_pixel_are_its_own():
 
 
 def test_points_of_lights_are_well_spread_between_pixels():
-    """What a pixel misses of the light its neighbours find: blocks of 2 × 2 have less than the half of its noise that independent
+    """A pixel's neighbours find the light that it misses: blocks of 2 × 2 have less than half of the noise that independent
     points would leave."""
     scene = eg.Scene([plane(material=WHITE)], lights=[eg.Environment(torch.ones(16, 32, 1, dtype=F64))])
     images = torch.stack([eg.render(scene, from_above(32), spp=1, seed=seed) for seed in range(4)])[..., 0]
@@ -262,7 +262,7 @@ def test_forward_mode_is_reverse_mode():
 
 
 def test_one_number_for_all_channels():
-    """Of lights of every kind: as much as of each channel."""
+    """One number counts for each channel of lights of every kind."""
     make: list[Callable[[Any], Any]] = [
         lambda c: eg.PointLight([1.0, 0, 1], c) if isinstance(c, float) else eg.PointLight([1.0, 0, 1], color=c),
         eg.Environment,
@@ -323,7 +323,7 @@ def test_a_visible_environment_is_the_background():
 
 @pytest.mark.parametrize("kind", ["lit", "mipmap", "shader"])
 def test_second_derivatives_raise_before_a_background(kind: str) -> None:
-    """Of the part through coverage, too, which the image's own graph does not have."""
+    """The part through coverage, which the image's own graph does not have, raises, too."""
     uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     texture = torch.rand(8, 8, 3, dtype=F64)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
@@ -343,7 +343,7 @@ def test_second_derivatives_raise_before_a_background(kind: str) -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_gradient_of_the_image_that_is_not_finite_is_named(bad: float) -> None:
-    """As without lights, whether or not a sample looks there."""
+    """It is named as without lights, whether or not a sample lies there."""
     verts = QUAD.clone().requires_grad_()
     mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=WHITE)
     camera = eg.Camera.look_at((0.0, 0, -2), (0.0, 0, 1), size=(16, 16))
@@ -361,7 +361,7 @@ def test_leaves_of_lights_stay_leaves() -> None:
 
 @pytest.mark.parametrize("filter", ["linear", "mipmap"])
 def test_nothing_in_view_has_gradients_of_zero(filter: str):
-    """As without lights: a loop goes on where the mesh has left the image, or no light falls on it."""
+    """A loop goes on where the mesh has left the image, or no light falls on it, as without lights."""
     for place, light in ((100, eg.PointLight), (100, eg.SphericalHarmonics), (0, eg.PointLight)):
         verts, texels = ball(1).verts.clone().requires_grad_(), picture().requires_grad_()
         uvs, faces = torch.rand(3, 2), torch.arange(3).expand(len(ball(1).faces), 3)

@@ -1,4 +1,4 @@
-"""Light that nearby surfaces scatter on what is seen, as that slides on its face: gradients by the camera in corners."""
+"""The near-field term: gradients by the camera in corners, where nearby surfaces light what is seen."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from both_modes import check_both_modes
 from bounce_scenes import QUAD, SCENES, BounceScene, indirect_change, indirect_gradient, mesh
 from finite_differences import Case, estimate
 from torch import Tensor
@@ -69,11 +70,7 @@ def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
         lit = eg.Scene(list(scene.meshes.values()), lights=list(scene.lights))
         return eg.render(lit, moved, 1, bounces=2, surface_samples=2_000, edge_samples=1_000)
 
-    own = pose.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad((weights * image(own)).sum(), own)
-    moved: Tensor = torch.func.jvp(image, (pose,), (tangent,))[1]
-    expected = float((gradient * tangent).sum())
-    assert abs(float((weights * moved).sum()) - expected) < 1e-9 * abs(expected)
+    check_both_modes(image, [pose], [tangent], weights)
 
 
 COUNTS = {"surface_samples": 100_000, "edge_samples": 100_000}
@@ -91,7 +88,8 @@ def check(case: Case, h: float) -> None:
 
 
 def test_all_light_is_near_or_not() -> None:
-    """Of all that is near values are whole, and no derivatives by places are left; of what is not, none and all of them."""
+    """Values of the near field are whole, and no derivatives by places are left; elsewhere there are no values and all
+    derivatives."""
     scene, camera = camera_of(corner())(torch.zeros((), dtype=F64))
     frame = ImageContext(scene, make_request(scene, camera, 1, 0))
     ((_, found),) = frame.sampler.pixel_hits(1 << 20)
@@ -114,19 +112,19 @@ def test_all_light_is_near_or_not() -> None:
 
 
 @pytest.mark.slow
-def test_a_corner() -> None:
+def test_gradient_in_a_corner() -> None:
     check(camera_of(corner()), 0.2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["cornell", "standing", "ball"])
-def test_rooms(scene: str) -> None:
+def test_gradient_in_rooms(scene: str) -> None:
     check(camera_of(SCENES[scene][0](), ROLLED), 0.15)
 
 
 @pytest.mark.slow
 def test_a_wider_filter_has_the_same_slope() -> None:
-    """Of the mean of an image, which compares within a quarter of a pixel."""
+    """Compare the slope of the mean of an image, which agrees within a quarter of a pixel."""
     scene, camera = camera_of(corner())(torch.zeros((), dtype=F64))
     slopes: dict[str, list[float]] = {"box": [], "tent": []}
     for seed in range(24):

@@ -80,7 +80,7 @@ def values(*shape: int) -> Tensor:
     )
 
 
-LOOKS = {
+APPEARANCES = {
     "colors": {"colors": values(4, CHANNELS)},
     "face_colors": {"face_colors": values(2, CHANNELS)},
     "corner_colors": {"corner_colors": values(2, 3, CHANNELS)},
@@ -97,8 +97,10 @@ LOOKS = {
 VIEWS = ["perspective", "orthographic"]
 
 
-def mesh(look: str, verts: Tensor = VERTS) -> eg.Mesh:
-    return eg.Mesh(verts, FACES, uv_faces=UV_FACES if "uvs" in LOOKS[look] else None, **LOOKS[look])
+def mesh(appearance: str, verts: Tensor = VERTS) -> eg.Mesh:
+    return eg.Mesh(
+        verts, FACES, uv_faces=UV_FACES if "uvs" in APPEARANCES[appearance] else None, **APPEARANCES[appearance]
+    )
 
 
 def skewed_camera(view: str) -> eg.Camera:
@@ -126,7 +128,8 @@ STEP, ATOL, RTOL = 1e-6, 1e-6, 1e-6
 
 
 def check_gradient(scene: eg.Scene, camera: eg.Camera, inputs: dict[str, Tensor]) -> None:
-    """In fields of the scene's first mesh, and in the upper rows of "world_to_camera" and "K"; the last are fixed."""
+    """Check gradients in fields of the first mesh, and in the upper rows of "world_to_camera" and "K"; their last rows are
+    fixed."""
     faces, points = samples(scene, camera)
     names = list(inputs)
 
@@ -145,29 +148,33 @@ def check_gradient(scene: eg.Scene, camera: eg.Camera, inputs: dict[str, Tensor]
 
 
 @pytest.mark.parametrize(
-    ("look", "view"),
+    ("appearance", "view"),
     [
-        pytest.param(look, view, marks=[pytest.mark.slow] if "uvs" in LOOKS[look] and view != VIEWS[k % 2] else [])
-        for k, look in enumerate(LOOKS)
+        pytest.param(
+            appearance,
+            view,
+            marks=[pytest.mark.slow] if "uvs" in APPEARANCES[appearance] and view != VIEWS[k % 2] else [],
+        )
+        for k, appearance in enumerate(APPEARANCES)
         for view in VIEWS
     ],
 )
-def test_gradcheck(look, view):
-    """Every input at once: vertices, what the mesh looks like, the pose's entries and those of K."""
+def test_gradcheck(appearance, view):
+    """Every input at once: vertices, its appearance, the pose's entries and those of K."""
     camera = skewed_camera(view)
-    tensors = {name: value for name, value in LOOKS[look].items() if isinstance(value, Tensor)}
+    tensors = {name: value for name, value in APPEARANCES[appearance].items() if isinstance(value, Tensor)}
     inputs = {"verts": VERTS, **tensors, "world_to_camera": camera.world_to_camera[:3], "K": camera.K[:2]}
-    check_gradient(eg.Scene(mesh(look)), camera, inputs)
+    check_gradient(eg.Scene(mesh(appearance)), camera, inputs)
 
 
-@pytest.mark.parametrize("look", ["colors", "texture"])
-def test_gradcheck_of_a_face_that_reaches_behind_the_camera(look):
+@pytest.mark.parametrize("appearance", ["colors", "texture"])
+def test_gradcheck_of_a_face_that_reaches_behind_the_camera(appearance):
     """A floor under the camera, of which the part before it is seen."""
     camera = skewed_camera("perspective")
     to_world = torch.linalg.inv(camera.world_to_camera)
     q = torch.tensor([[-3.0, 0.9, 6.0], [3.0, 1.0, 6.0], [2.0, 0.8, -4.0], [-2.0, 1.1, -5.0]], dtype=F64)
     verts = q @ to_world[:3, :3].mT + to_world[:3, 3]
-    scene = eg.Scene(mesh(look, verts))
+    scene = eg.Scene(mesh(appearance, verts))
     faces = torch.tensor([0, 0, 1])
     points = torch.tensor([[12.0, 16.5], [15.2, 18.1], [10.3, 19.2]], dtype=F64)
     torch.testing.assert_close(shade(scene, camera, faces, points), reference.radiance(scene, camera, points, faces))
@@ -184,7 +191,7 @@ def test_gradcheck_rejects_a_wrong_gradient():
     """Colours taken for those of the mesh turned by one face: the check must not be blind to it."""
     scene, camera = eg.Scene(mesh("corner_colors")), skewed_camera("perspective")
     faces, points = samples(scene, camera)
-    right = LOOKS["corner_colors"]["corner_colors"].clone().requires_grad_()
+    right = APPEARANCES["corner_colors"]["corner_colors"].clone().requires_grad_()
 
     def wrong(colors: Tensor) -> Tensor:
         value = shade(eg.Scene(scene.meshes[0].replace(corner_colors=colors)), camera, faces, points)
@@ -199,8 +206,10 @@ def test_gradcheck_rejects_a_wrong_gradient():
 
 
 def mixed_scene() -> eg.Scene:
-    """Every look at once, two textures of different size, and a mesh without any, at different places."""
-    meshes = [mesh(look, VERTS + torch.tensor([0.1 * i, 0.0, -0.2 * i])) for i, look in enumerate(LOOKS)]
+    """All appearances at once, two textures of different size, and a mesh without any, at different places."""
+    meshes = [
+        mesh(appearance, VERTS + torch.tensor([0.1 * i, 0.0, -0.2 * i])) for i, appearance in enumerate(APPEARANCES)
+    ]
     other = mesh("texture", VERTS * 0.7).replace(
         texture=values(5, 2, CHANNELS), uvs=UVS + 0.1, uv_faces=UV_FACES.flip(0)
     )
@@ -208,7 +217,7 @@ def mixed_scene() -> eg.Scene:
 
 
 def leaves_of(scene: eg.Scene, camera: eg.Camera) -> tuple[eg.Scene, eg.Camera, dict[str, Tensor]]:
-    """The same, all their floating-point tensors made leaves that require gradients."""
+    """Return the same, with leaves that require gradients for all floating-point tensors."""
     leaves = {}
 
     def leaf(name: str, tensor: Tensor) -> Tensor:
@@ -224,10 +233,10 @@ def leaves_of(scene: eg.Scene, camera: eg.Camera) -> tuple[eg.Scene, eg.Camera, 
 
 
 @pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("look", [*LOOKS, "mixed"])
-def test_equals_the_twin(look, view):
+@pytest.mark.parametrize("appearance", [*APPEARANCES, "mixed"])
+def test_equals_the_twin(appearance, view):
     """Value and gradient, to what rounding in double leaves: two formulas for the same barycentrics."""
-    scene = mixed_scene() if look == "mixed" else eg.Scene(mesh(look))
+    scene = mixed_scene() if appearance == "mixed" else eg.Scene(mesh(appearance))
     scene, camera, leaves = leaves_of(scene, skewed_camera(view))
     faces, points = samples(scene, camera)
     ours, twin = shade(scene, camera, faces, points), reference.radiance(scene, camera, points, faces)

@@ -90,14 +90,9 @@ def compare(name: str, case: Case, seeds: int, directions: int, samples: int) ->
         check(f"{name}, {what}", truth.mean, Estimate(found.mean, error))
 
 
-@pytest.mark.parametrize(("seed", "level", "tilt"), [(7, -1.6, 0.15), (9, -0.5, 0.15)], ids=["above", "through"])
-def test_gradient_of_triangles_with_normals(seed: int, level: float, tilt: float) -> None:
-    compare(f"seed {seed}", Case(seed, level, tilt), 4, 1024, 30_000)
-
-
-def test_gradient_of_a_sliver_with_its_own_normal() -> None:
-    """Central differences with usual steps are off here (docs/limits.md); the derivative is not."""
-    compare("sliver", Case(21, -1.4, 0.0, width=0.005), 4, 1024, 30_000)
+def test_gradient_of_triangles_with_normals() -> None:
+    """They pass through the ground."""
+    compare("through", Case(9, -0.5, 0.15), 4, 1024, 30_000)
 
 
 @pytest.mark.slow
@@ -109,6 +104,7 @@ def test_gradient_of_many_triangles_with_normals(seed: int, level: float, tilt: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 7])
+@pytest.mark.parametrize("seed", [1, 2, 7, 21])
 def test_gradient_of_many_slivers_with_their_own_normals(seed: int) -> None:
+    """Central differences with usual steps are off here (docs/limits.md); the derivative is not."""
     compare(f"sliver {seed}", Case(seed, -1.4, 0.0, width=0.005), 8, 4096, 100_000)

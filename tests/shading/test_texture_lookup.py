@@ -56,14 +56,14 @@ def test_texture_eval_vjp(uv, shape):
 
 
 def test_texture_far_out():
-    """Beyond what an integer holds a coordinate has no fraction left, and must still find a texel."""
+    """A coordinate beyond what an integer holds has no fraction left, and must still find a texel."""
     for uv in ([1e30, 0.5], [-1e30, 1e25], [2.0**62, -(2.0**63)]):
         assert np.isfinite(parts.texture_eval(texels(), uv)).all()
 
 
 @pytest.mark.parametrize("wraps", [("repeat", "mirror"), ("clamp", "repeat"), ("mirror", "clamp")])
 def test_pyramids(wraps: tuple[str, str]) -> None:
-    """Between the two levels of each point, as lookups in images of their own say; beyond the last it is one texel."""
+    """Each point lies between two levels, as lookups in images of their own say; beyond the last level it is one texel."""
     draw = torch.Generator().manual_seed(2)
     image = torch.rand((5, 12, 2), dtype=torch.float64, generator=draw).requires_grad_()
     uv = (5 * torch.rand((40, 2), dtype=torch.float64, generator=draw) - 2).requires_grad_()

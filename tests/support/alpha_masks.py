@@ -20,7 +20,7 @@ def disc(n: int = 33, radius: float = 0.35) -> Tensor:
     return 0.5 + 2.0 * (radius - (x[None] ** 2 + x[:, None] ** 2).sqrt())
 
 
-def quad(side: int = 1, **look: object) -> eg.Mesh:
+def quad(side: int = 1, **fields: object) -> eg.Mesh:
     """The square [−1, 1]² at z = 0 with texture coordinates from 0 to 1, as 2 · side² faces."""
     x = torch.linspace(-1.0, 1.0, side + 1, dtype=F64)
     verts = torch.stack([*torch.meshgrid(x, x, indexing="xy"), torch.zeros(side + 1, side + 1, dtype=F64)], -1)
@@ -28,7 +28,7 @@ def quad(side: int = 1, **look: object) -> eg.Mesh:
     i, j = (k.reshape(-1) for k in torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij"))
     a = i * (side + 1) + j
     faces = torch.cat([torch.stack([a, a + 1, a + side + 2], 1), torch.stack([a, a + side + 2, a + side + 1], 1)])
-    return eg.Mesh(verts.reshape(-1, 3), faces, uvs=uvs.reshape(-1, 2), uv_faces=faces, **look)  # type: ignore[arg-type]
+    return eg.Mesh(verts.reshape(-1, 3), faces, uvs=uvs.reshape(-1, 2), uv_faces=faces, **fields)  # type: ignore[arg-type]
 
 
 def checkerboard(n: int, seed: int = 0) -> Tensor:

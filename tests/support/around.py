@@ -20,16 +20,16 @@ Place = tuple[float, float, float]  # before the camera at pose(), in its coordi
 BACKGROUND = torch.tensor([0.1, 0.3, 0.2], dtype=F64)
 
 
-def check_boxes(window: object, shown_whole: bool) -> None:
-    """Places in boxes of a window's plane are seen in the boxes of the image that the kernel says; all of them, or those that
+def check_boxes(sub_camera: object, shown_whole: bool) -> None:
+    """Places in boxes of a sub-camera's plane are seen in the boxes of the image that the kernel says; all of them, or those that
     are shown."""
     rng = np.random.default_rng(1)
-    box = np.array(parts.view_box(window))
+    box = np.array(parts.view_box(sub_camera))
     for _ in range(30):
         low, high = np.sort(rng.uniform(box[0], box[1], (2, 2)), 0)
-        image_low, image_high = (np.array(p) for p in parts.image_box(window, low, high))
+        image_low, image_high = (np.array(p) for p in parts.image_box(sub_camera, low, high))
         for u in rng.uniform(low, high, (20, 2)):
-            x, area_scale, _ = parts.distort(window, u, [0.0, 0.0])
+            x, area_scale, _ = parts.distort(sub_camera, u, [0.0, 0.0])
             assert area_scale > 0 or not shown_whole
             if area_scale > 0:
                 assert (np.array(x) >= image_low - 1e-9).all() and (np.array(x) <= image_high + 1e-9).all()
@@ -43,7 +43,7 @@ def pose() -> Tensor:
 
 
 def world(q: Tensor) -> Tensor:
-    """Of points in the coordinates of the camera at pose()."""
+    """Return points in the world from their coordinates in the camera at pose()."""
     M = pose()
     return (q - M[:3, 3]) @ M[:3, :3]
 
@@ -57,7 +57,7 @@ def ball(place: Place, radius: float = 1.0, one_colour: bool = False) -> eg.Mesh
 
 
 def room(dx: Tensor | float = 0.0) -> eg.Mesh:
-    """Around the camera, of few large faces; moved askew by dx."""
+    """Return a room of few large faces around the camera, moved askew by dx."""
     box = cube(4.0)
     verts = box.verts @ rotation((0.6, 0.0, 0.8), torch.tensor(0.7, dtype=F64)).mT
     colors = torch.rand(verts.shape, generator=torch.Generator().manual_seed(2), dtype=F64)
@@ -93,7 +93,7 @@ def traced(scene: eg.Scene, view: eg.Camera, grid: int, directions: Callable[[np
 
 
 def area(view: eg.Camera, corners: Tensor) -> Tensor:
-    """Pixels that a triangle covers: its sides bent point by point, chord by chord. Differentiable."""
+    """Pixels that a triangle covers: its sides distorted point by point, chord by chord. Differentiable."""
     steps = torch.linspace(0, 1, 4001, dtype=F64)[:-1, None]
     sides = [(1 - steps) * corners[i] + steps * corners[(i + 1) % 3] for i in range(3)]
     outline = view.project(torch.cat(sides))

@@ -1,4 +1,4 @@
-"""Scenes that show light which came by way of other surfaces, what moves in them, and how images of that light alone change.
+"""Scenes that show light that other surfaces scatter, what moves in them, and how images of that light alone change.
 
 A change over [−h, h] is compared with the mean of the derivative there (Gauss and Legendre, three points), so that h may be large
 and the difference quiet.
@@ -41,7 +41,7 @@ class BounceScene(NamedTuple):
     lights: tuple[Light, ...] = ()
 
     def moving(self, name: str, by: Sequence[float], vertex: int | None = None) -> Case:
-        """As a mesh, or one of its vertices, moves by θ times a direction."""
+        """Return the scene as a mesh, or one of its vertices, moves by θ times a direction."""
 
         def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
             mesh = self.meshes[name]
@@ -54,7 +54,7 @@ class BounceScene(NamedTuple):
 
 
 def mesh(verts: Places, faces: list[list[int]], albedo: float | list[float], emission: float = 0.0) -> eg.Mesh:
-    """With albedos of its faces; one that emits does so from its front."""
+    """Return a mesh with albedos of its faces; one that emits does so from its front."""
     colors = torch.as_tensor(albedo, dtype=F64).expand(len(faces)).reshape(-1, 1).clone()
     shines: dict[str, Any] = {"emission": torch.tensor([emission], dtype=F64), "two_sided": False} if emission else {}
     material = eg.Material(**shines)
@@ -162,7 +162,7 @@ def plates() -> BounceScene:
 
 
 def open_plates() -> BounceScene:
-    """The same without the strip: no border on the way of light moves."""
+    """Return the same scene without the strip: no secondary edge moves."""
     found = plates()
     return found._replace(meshes={name: mesh for name, mesh in found.meshes.items() if name != "strip"})
 
@@ -191,7 +191,7 @@ def shelf() -> BounceScene:
 
 
 def leaf() -> BounceScene:
-    """A sheet in the room of which alpha leaves a leaf."""
+    """A sheet in the room of which alpha masks all but a leaf."""
     corners = torch.tensor([[-0.4, -0.6, 0.4], [0.6, -0.65, 0.35], [0.6, 0.05, -0.4], [-0.4, 0.0, -0.35]], dtype=F64)
     at = (torch.arange(6, dtype=F64) + 0.5) / 6
     away = ((at[:, None] - 0.52) ** 2 + (at[None, :] - 0.45) ** 2).sqrt()
@@ -207,9 +207,9 @@ def texels() -> BounceScene:
     """The block has texels of which the nearest is taken."""
     found = cornell()
     own = found.meshes["block"]
-    look = eg.Texture(torch.rand(4, 4, 1, dtype=F64, generator=torch.Generator().manual_seed(1)), filter="nearest")
+    texture = eg.Texture(torch.rand(4, 4, 1, dtype=F64, generator=torch.Generator().manual_seed(1)), filter="nearest")
     uvs = 1.5 * own.verts[:, :2]
-    own = own.replace(face_colors=None, uvs=uvs, uv_faces=own.faces, material=eg.Material(look))
+    own = own.replace(face_colors=None, uvs=uvs, uv_faces=own.faces, material=eg.Material(texture))
     return found._replace(meshes=found.meshes | {"block": own})
 
 

@@ -37,7 +37,8 @@ def _magnitude(r: np.random.Generator) -> float:
 
 
 def _numbers(r: np.random.Generator, n: int, width: int) -> np.ndarray:
-    """Of ordinary size, all of another size, each of its own, on a lattice, or with zeros and copies among them."""
+    """Return numbers of ordinary size, all of another size, each of its own, on a lattice, or with zeros and copies among
+    them."""
     x = r.normal(size=(n, width))
     match r.integers(7):
         case 0:
@@ -70,9 +71,9 @@ def _topology(r: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         return _numbers(r, 3 * n, 3), np.arange(3 * n).reshape(n, 3)
     if kind == 2:  # a fan
         a = np.linspace(0, 2 * math.pi, n + 1)[:-1]
-        rim = np.stack([np.cos(a), np.sin(a), np.full(n, r.choice([0.0, 1.0]))], -1)
+        ring = np.stack([np.cos(a), np.sin(a), np.full(n, r.choice([0.0, 1.0]))], -1)
         i = np.arange(n)
-        return np.concatenate([np.zeros((1, 3)), rim]), np.stack([0 * i, 1 + i, 1 + (i + 1) % n], -1)
+        return np.concatenate([np.zeros((1, 3)), ring]), np.stack([0 * i, 1 + i, 1 + (i + 1) % n], -1)
     if kind == 3:  # pages of a book, on one edge
         i = np.arange(n)
         return _numbers(r, n + 2, 3), np.stack([0 * i, 0 * i + 1, i + 2], -1)
@@ -104,18 +105,18 @@ def _mesh(r: np.random.Generator, unit: float) -> eg.Mesh:
         x = r.normal(size=(n, C))
         return _tensor(x * _magnitude(r) if r.random() < 0.1 else x, dtype)
 
-    look: dict[str, Any] = {}
+    appearance: dict[str, Any] = {}
     match r.integers(5):
         case 0:
-            look["colors"] = radiance(V)
+            appearance["colors"] = radiance(V)
         case 1:
-            look["face_colors"] = radiance(F)
+            appearance["face_colors"] = radiance(F)
         case 2:
-            look["corner_colors"] = radiance(3 * F).reshape(F, 3, C)
+            appearance["corner_colors"] = radiance(3 * F).reshape(F, 3, C)
         case 3:
-            look["texture"] = radiance(12).reshape(3, 4, C)
-            look["uvs"], look["uv_faces"] = _tensor(_numbers(r, V, 2), dtype), torch.from_numpy(faces)
-    return eg.Mesh(_tensor(verts, dtype), torch.from_numpy(faces), **look)
+            appearance["texture"] = radiance(12).reshape(3, 4, C)
+            appearance["uvs"], appearance["uv_faces"] = _tensor(_numbers(r, V, 2), dtype), torch.from_numpy(faces)
+    return eg.Mesh(_tensor(verts, dtype), torch.from_numpy(faces), **appearance)
 
 
 def _camera(r: np.random.Generator, meshes: list[eg.Mesh], unit: float) -> eg.Camera:
@@ -162,7 +163,7 @@ def _adjoint(r: np.random.Generator, image: Tensor) -> Tensor:
 
 
 def most_samples(scene: eg.Scene, camera: eg.Camera) -> int:
-    """What the defaults may come to: every face over the whole view, and all of its sides across it."""
+    """Return what the defaults may come to: every face over the whole view, and all of its sides across it."""
     faces = sum(len(mesh.faces) for mesh in scene.meshes)
     h, w = (n + 3 for n in camera.size)  # with the filter
     return int(faces * (4 * (h * w + math.hypot(h, w)) + 3 * 24 * math.hypot(h, w)) + 4 * h * w + 2)

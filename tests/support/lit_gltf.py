@@ -19,7 +19,8 @@ def png(texels, kind="PNG"):
 
 
 def file(folder, material=None, images=(), positions=SQUARE, nodes=None, uvs=(CORNERS,), **more):
-    """A GLB file of one square: images are texels, one texture each; `attributes`, `samplers` and `lights` are the format's."""
+    """Write a GLB file of one square: images are texels, one texture each; `attributes`, `samplers` and `lights` are
+    the format's."""
     arrays = [np.array(positions, "<f4"), np.array(TRIANGLES, "<u2").reshape(-1)]
     given = {f"TEXCOORD_{k}": uv for k, uv in enumerate(uvs)} | more.pop("attributes", {})
     attributes = {"POSITION": 0} | {name: 2 + k for k, name in enumerate(given)}
@@ -49,7 +50,8 @@ def loaded(*arguments, **options):
 
 
 def shown(mesh, size=8):
-    """What the square looks like from the front, row 0 on top; where it emits, and nothing else lights it, its emission."""
+    """Return the square from the front, row 0 on top; where it emits, and nothing else lights it, this is its
+    emission."""
     camera = eg.Camera.look_at([0.5, 0.5, 100.0], [0.5, 0.5, 0.0], size=(size, size), fov_y=math.degrees(0.01))
     return eg.render(eg.Scene([mesh]), camera, spp=16).detach().numpy()
 
@@ -58,8 +60,14 @@ TURN = [0.0, 2**-0.5, 0.0, 2**-0.5]  # a quarter turn about y, as (x, y, z, w): 
 
 
 def places(tree):
-    """Every value of a JSON tree by what holds it and the key."""
+    """Yield every value of a JSON tree by its holder and key."""
     keys = list(tree) if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ()
     for key in keys:
         yield tree, key
         yield from places(tree[key])
+
+
+CAMERAS = [
+    {"type": "perspective", "perspective": {"yfov": 0.8, "aspectRatio": 3.0, "znear": 0.1}},
+    {"type": "orthographic", "orthographic": {"xmag": 1.0, "ymag": 2.0, "znear": 0.1, "zfar": 10.0}},
+]

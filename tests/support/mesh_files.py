@@ -3,9 +3,11 @@
 import io
 import json
 import struct
+import warnings
 import zlib
 
 import numpy as np
+import pytest
 from PIL import Image
 
 import edgegrad as eg
@@ -16,13 +18,13 @@ TEXELS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [128, 64, 32]]], np
 
 
 def linear(value):
-    """The definition in IEC 61966-2-1, in float64."""
+    """Return linear values by the definition in IEC 61966-2-1, in float64."""
     s = np.asarray(value, np.float64) / 255.0
     return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
 
 
 def texel_at(mesh, face, corner):
-    """The texel of a small texture in whose cell a corner's texture coordinate lies, v running up."""
+    """Return the texel of a small texture in whose cell a corner's texture coordinate lies, with v upwards."""
     u, v = mesh.uvs[mesh.uv_faces[face, corner]].tolist()
     h, w, _ = mesh.texture.shape
     return mesh.texture[int((1.0 - v) * h), int(u * w)].numpy()
@@ -38,17 +40,33 @@ def load(path):
     return eg.load_camera(path) if path.suffix == ".json" else eg.load_scene(path)
 
 
+def quietly(path, **options):
+    """Return the mesh of a file that causes no warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return eg.load_mesh(path, **options)
+
+
 def write(folder, name, content):
     path = folder / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return path
 
 
+def check_refused(path, fault, *loaders):
+    """Check that loaders, by default those of meshes and of scenes, refuse a file by an error that begins with its path."""
+    for function in loaders or (eg.load_mesh, eg.load_scene):
+        with pytest.raises((ValueError, FileNotFoundError), match=fault) as caught:
+            function(path)
+        assert str(caught.value).startswith(str(path))
+
+
 TEXTURED = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
 
 
 def write_obj(folder, name="quad.obj", mtl="newmtl skin\nmap_Kd skin.png\n", body=None):
-    """A square of two triangles whose corners lie in the middles of the four texels; indices of their own."""
+    """Write a square of two triangles whose corners lie in the middles of the four texels, with indices of their
+    own."""
     Image.fromarray(TEXELS).save(folder / "skin.png")
     (folder / "quad.mtl").write_text(mtl)
     body = body or (
@@ -60,7 +78,7 @@ def write_obj(folder, name="quad.obj", mtl="newmtl skin\nmap_Kd skin.png\n", bod
 
 
 def glb(tree, *arrays):
-    """A GLB file; accessors and buffer views follow from the arrays, bytes become buffer views only."""
+    """Return a GLB file whose accessors and buffer views follow from the arrays; bytes become buffer views only."""
     views, accessors, blob = [], [], b""
     for array in arrays:
         content = array if isinstance(array, bytes) else array.tobytes()
@@ -92,7 +110,7 @@ def glb(tree, *arrays):
 
 
 def square_glb(material=None, nodes=None, colors=None, uv=False, extra=(), **more):
-    """The square as a GLB file, with attributes and nodes as a test needs them."""
+    """Return the square as a GLB file, with attributes and nodes as a test needs them."""
     arrays = [np.array(SQUARE, "<f4"), np.array(TRIANGLES, "<u2").reshape(-1)]
     attributes = {"POSITION": 0}
     if uv:
@@ -166,3 +184,20 @@ OFF = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 STL = (
     "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
 )
+
+
+def ply_header(vertex="", face="property list uchar int vertex_indices\n", more=""):
+    """Return the header of a text PLY of three vertices and a face, with more properties and elements."""
+    return (
+        f"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n{vertex}"
+        f"element face 1\n{face}{more}end_header\n"
+    )
+
+
+CORNERS = [[SQUARE[i] for i in face] for face in TRIANGLES]
+
+
+def binary_stl(attribute=0, name=b"x"):
+    """Return the square as a binary STL."""
+    body = b"".join(struct.pack("<12fH", 0, 0, 1, *np.ravel(face), attribute) for face in CORNERS)
+    return name.ljust(80, b"\0") + struct.pack("<I", len(CORNERS)) + body

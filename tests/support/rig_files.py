@@ -1,4 +1,5 @@
-"""glTF samples that bend, written after the descriptions of Khronos' own, and where their vertices are, in float64 numpy."""
+"""glTF samples with skins and morph targets, after the descriptions of Khronos' own, and their vertices in float64
+numpy."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ class Sample:
         return len(self.tree["bufferViews"]) - 1
 
     def add(self, rows: Any, dtype: str = "<f4", normalized: bool = False, sparse: bool = False) -> int:
-        """Rows (N, K) or (N,); of matrices (N, 4, 4). Normalised: numbers from −1 or 0 to 1. Sparse: without those that are 0."""
+        """Add rows (N, K) or (N,), or matrices (N, 4, 4). Normalised ones hold numbers from −1 or 0 to 1; sparse ones
+        leave out zeros."""
         array = np.asarray(rows)
         if array.ndim == 3 and array.shape[1:] == (4, 4):
             array = array.transpose(0, 2, 1).reshape(-1, 16)  # column by column
@@ -52,7 +54,7 @@ class Sample:
         return len(self.numbers) - 1
 
     def animation(self, name: str, *channels: tuple[int, str, Any, Any, str]) -> None:
-        """Channels are (node, path, times, values, interpolation)."""
+        """Add an animation of channels (node, path, times, values, interpolation)."""
         samplers, targets = [], []
         for node, path, times, values, interpolation in channels:
             values = np.asarray(values, np.float64)
@@ -87,7 +89,7 @@ def quaternion_matrix(q: np.ndarray) -> np.ndarray:
 
 
 def sampled(sample: Sample, sampler: dict, path: str, columns: int, t: float) -> np.ndarray:
-    """Appendix C of glTF 2.0."""
+    """Return the sampled value, by appendix C of glTF 2.0."""
     times, values = sample.numbers[sampler["input"]], sample.numbers[sampler["output"]]
     kind = sampler["interpolation"]
     values = values.reshape(len(times), 3, columns) if kind == "CUBICSPLINE" else values.reshape(len(times), columns)
@@ -122,7 +124,7 @@ def sampled(sample: Sample, sampler: dict, path: str, columns: int, t: float) ->
 
 
 def places(sample: Sample, animation: int | None = None, t: float = 0.0) -> list[Place]:
-    """Every primitive in the order of nodes from the scene's roots down, depth first."""
+    """Return every primitive in the order of nodes from the scene's roots down, depth first."""
     tree = sample.tree
     nodes = [dict(node) for node in tree["nodes"]]
     if animation is not None:
@@ -207,7 +209,7 @@ def turn(axis: str, degrees: float) -> list[float]:
 
 
 def simple_skin() -> Sample:
-    """A strip of eight triangles on two joints; the upper one turns about z to and fro."""
+    """Return a strip of eight triangles on two joints, of which the upper one rotates about z and back."""
     sample = Sample()
     positions = [[x, 0.5 * k, 0.0] for k in range(5) for x in (0.0, 1.0)]
     triangles = [[2 * k + a, 2 * k + b, 2 * k + c] for k in range(4) for a, b, c in ((0, 1, 3), (0, 3, 2))]
@@ -238,7 +240,7 @@ def simple_skin() -> Sample:
 
 
 def simple_morph() -> Sample:
-    """A triangle with two targets, the second of which is sparse."""
+    """Return a triangle with two morph targets, the second of which is sparse."""
     sample = Sample()
     primitive = {
         "attributes": {"POSITION": sample.add([[0, 0, 0], [1, 0, 0], [0.5, 0.5, 0]])},
@@ -258,7 +260,7 @@ def simple_morph() -> Sample:
 
 
 def simple_sparse() -> Sample:
-    """Fourteen vertices in two rows of which three are moved, as differences to zeros."""
+    """Return fourteen vertices in two rows, three of which are moved as differences to zeros."""
     sample = Sample()
     positions = np.array([[k % 7, k // 7, 0.0] for k in range(14)])
     positions[[8, 10, 12]] = [[1, 2, 0], [3, 3, 0], [5, 4, 0]]
@@ -283,7 +285,7 @@ CUBE_FACES = np.array([
 
 
 def morph_cube() -> Sample:
-    """A cube of 24 vertices with normals and two targets that move both."""
+    """Return a cube of 24 vertices with normals and two morph targets that move both."""
     sample = Sample()
     corners = CUBE[CUBE_FACES.reshape(-1)]
     a, b, c = corners.reshape(-1, 3, 3).transpose(1, 0, 2)
@@ -313,7 +315,7 @@ def morph_cube() -> Sample:
 
 
 def interpolation() -> Sample:
-    """Nine cubes without a skin: scale, rotation and translation by steps, lines and splines."""
+    """Return nine cubes without a skin, which have scale, rotation and translation by steps, lines and splines."""
     sample = Sample()
     mesh = {
         "primitives": [
@@ -338,7 +340,7 @@ def interpolation() -> Sample:
 
 
 def tube(segments: int, around: int, length: float, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, normals and triangles of an open tube along y."""
+    """Return positions, normals and triangles of an open tube along y."""
     y, angle = np.meshgrid(np.linspace(0, length, segments + 1), np.arange(around) * math.tau / around, indexing="ij")
     normals = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
     positions = radius * normals + np.stack([0 * y, y, 0 * y], -1)
@@ -349,8 +351,8 @@ def tube(segments: int, around: int, length: float, radius: float) -> tuple[np.n
 
 
 def walk() -> Sample:
-    """After CesiumMan and RiggedSimple: nineteen joints under turned and scaled nodes, two meshes on one skin, weights in bytes,
-    up to eight joints a vertex, and a walk that turns, shifts and scales them."""
+    """Return a walk after CesiumMan and RiggedSimple: nineteen joints under rotated and scaled nodes, two meshes on one
+    skin, weights in bytes, up to eight joints a vertex, and an animation that rotates, shifts and scales them."""
     sample, random = Sample(), np.random.default_rng(7)
     J = 19
     parents = [-1, 0, 1, 2, 3, 2, 5, 6, 2, 8, 9, 0, 11, 12, 13, 0, 15, 16, 17]
@@ -408,7 +410,7 @@ def walk() -> Sample:
 
 
 def rigged_simple() -> Sample:
-    """A cylinder of 96 corners on two joints, without inverse bind matrices, under a turned root."""
+    """Return a cylinder of 96 corners on two joints, without inverse bind matrices, under a rotated root."""
     sample = Sample()
     positions, _, triangles = tube(4, 12, 4.0, 0.5)
     upper = np.clip((positions[:, 1] - 1.5), 0.0, 1.0)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from lit_scenes import vector
 from scenes import icosphere
 from torch import Tensor
 
@@ -13,10 +14,6 @@ import edgegrad as eg
 
 F64 = torch.float64
 _QUAD = torch.tensor([[0, 1, 2], [0, 2, 3]])
-
-
-def vector(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=F64)
 
 
 def quad(*corners: tuple[float, float, float], **material: Any) -> eg.Mesh:
@@ -69,14 +66,14 @@ def towards_room(size: int = 32) -> eg.Camera:
 
 
 def _with(room: eg.Scene, number: int, **fields: Any) -> eg.Scene:
-    """As one of its meshes is changed."""
+    """Return the room with one of its meshes changed."""
     meshes = list(room.meshes)
     meshes[number] = meshes[number].replace(**fields)
     return room.replace(meshes=meshes)
 
 
 def _square_uvs(mesh: eg.Mesh) -> dict[str, Tensor]:
-    """Of a quad: its first side is along u."""
+    """Return texture coordinates of a quad whose first side is along u."""
     return {"uvs": torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64), "uv_faces": mesh.faces}
 
 
@@ -175,10 +172,10 @@ ROOMS: dict[str, Callable[[], eg.Scene]] = {
     "large light": lambda: room_lit_by(_ball(0.35, (0.3, -0.2, 1.4), 2, base_color=0.5, emission=2.0)),
     "metal ball": metal_room,
     "two sheets": sheets_room,
-    "cut-out": striped_room,
+    "alpha-tested": striped_room,
 }
 
 
 def without_alpha(name: str) -> eg.Scene:
-    """The same room for those who know no alpha-tested faces."""
-    return striped_room(as_quads=True) if name == "cut-out" else ROOMS[name]()
+    """Return the same room for renderers that know no alpha-tested faces."""
+    return striped_room(as_quads=True) if name == "alpha-tested" else ROOMS[name]()

@@ -36,7 +36,7 @@ def mixed_scene() -> eg.Scene:
 
 
 def with_leaves(scene: eg.Scene, camera: eg.Camera) -> tuple[eg.Scene, eg.Camera, list[Tensor]]:
-    """The same, with leaves of their own that require gradients."""
+    """Return the same, with leaves of their own that require gradients."""
     leaves = []
 
     def leaf(tensor: Tensor) -> Tensor:

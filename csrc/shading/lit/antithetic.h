@@ -20,7 +20,7 @@ struct AntitheticSet {
     static constexpr int most = 4;
     int count = 1;
     Vec3 l[most];
-    double measure[most] = {1};  // It is the solid angle of each direction, over that of the first one's normal.
+    double measure[most] = {1};  // solid angle of each direction, over that of the first one's normal
 
     AntitheticSet(Vec3 v, Vec3 n, double alpha, Vec3 first) : l{first} {
         const Vec3 h = unit(v + first), sine = cross(n, h);

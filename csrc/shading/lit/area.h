@@ -9,9 +9,9 @@ namespace edgegrad {
 // Refers to the faces of a mesh that emits.
 struct EmissiveFaces {
     const int32_t* faces;  // (F, 3) of the scene
-    int64_t first;         // It is the first face of the mesh.
+    int64_t first;         // first face of the mesh
     int32_t first_vertex;
-    int verts;  // It is the table of vertices.
+    int verts;  // table of vertices
     const Source& emission;
     bool two_sided;
 

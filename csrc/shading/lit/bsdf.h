@@ -19,6 +19,8 @@ struct Scattering {
 
     // Returns the diffuse albedo.
     S diffuse(int c) const { return lambertian ? base[c] : base[c] * (S(1) - metallic); }
+    // Returns the specular reflectance at normal incidence, F0 of Schlick's approximation.
+    S f0(int c) const { return S(reflectance_of_dielectrics) + (base[c] - S(reflectance_of_dielectrics)) * metallic; }
 };
 inline void diffuse_vjp(const Scattering<double>& s, int c, double bar, Scattering<double>& s_bar) {
     s_bar.base[c] += bar * (s.lambertian ? 1 : 1 - s.metallic);
@@ -69,7 +71,7 @@ void scatter(const Scattering<S>& s, Vector<S> v, Vector<S> n, Vector<S> l, int 
     const Lobe<S> o = lobe(s.roughness, v, n, l);
     const S specular = o.specular();
     for (int c = 0; c < channels; ++c) {
-        const S f0 = S(reflectance_of_dielectrics) + (s.base[c] - S(reflectance_of_dielectrics)) * s.metallic;
+        const S f0 = s.f0(c);
         const S fresnel = f0 + (S(1) - f0) * o.grazing5;
         f[c] = (S(1) - fresnel) * S(1 / M_PI) * s.diffuse(c) + fresnel * specular;
     }
@@ -85,8 +87,7 @@ inline void scatter_vjp(const Scattering<double>& s, Vec3 v, Vec3 n, Vec3 l, int
     const double specular = o.specular();
     double specular_bar = 0, grazing5_bar = 0;
     for (int c = 0; c < channels; ++c) {
-        const double f0 = reflectance_of_dielectrics + (s.base[c] - reflectance_of_dielectrics) * s.metallic;
-        const double fresnel = f0 + (1 - f0) * o.grazing5, diffuse = s.diffuse(c);
+        const double f0 = s.f0(c), fresnel = f0 + (1 - f0) * o.grazing5, diffuse = s.diffuse(c);
         specular_bar += f_bar[c] * fresnel;
         const double fresnel_bar = f_bar[c] * (specular - diffuse / M_PI);
         diffuse_vjp(s, c, f_bar[c] * (1 - fresnel) / M_PI, s_bar);

@@ -41,7 +41,6 @@ class ResampledAntitheticSets {
     }
 
    private:
-    static constexpr int candidates_for_one = 8;  // This many candidates are drawn for each set that is kept.
     struct AntitheticPoints {
         LightPoint point[AntitheticSet::most] = {{0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}};
         double target = 0, running = 0;  // `pdf` of a point holds its measure.

@@ -169,7 +169,7 @@ class EmissiveFaceTree {
         for (const Triangle& t : triangles_)
             if (area(t) > area(*largest)) largest = &t;
         flat_ = is_side(*largest, 1) && is_side(*largest, -1);
-        constexpr int64_t most_tests = 1 << 22;  // It counts pairs of vertices and faces.
+        constexpr int64_t most_tests = 1 << 22;  // number of pairs of vertices and faces
         convex_ = !flat_ && n_verts * int64_t(triangles_.size()) <= most_tests &&
                   std::all_of(triangles_.begin(), triangles_.end(), [&](const Triangle& t) { return is_side(t, 1); }) &&
                   is_closed(verts, faces);

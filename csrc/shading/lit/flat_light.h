@@ -25,7 +25,7 @@ struct FlatFaces {
 struct PunctualLight {
     Vec3 place;  // At infinity, it is the unit direction towards the light.
     bool infinite;
-    double power;  // Its unit is W/sr, or W/m² at infinity.
+    double power;  // W/sr, or W/m² at infinity
 
     // Returns the irradiance at normal incidence, divided by the distance |l|.
     double arriving_over_distance(Vec3 at) const {

@@ -18,7 +18,7 @@ struct Light {
     int position = no_table, direction = no_table, intensity = no_table, color = no_table;
     int inner_angle = no_table, outer_angle = no_table, rotation = no_table, radiance = no_table;
     int mesh = -1;                  // This mesh emits.
-    int64_t height = 1, width = 1;  // They are the size of the environment's image.
+    int64_t height = 1, width = 1;  // size of the environment's image
     bool is_image = false;          // Without an image, radiance is the same in all directions.
     // Lights with an extent have the running sum of the probabilities of their faces or texels, and the pdfs.
     const double *running = nullptr, *pdf = nullptr;
@@ -33,7 +33,7 @@ struct Light {
     // has one number that is added to its brightness, which keeps it above zero.
     const double *brightness = nullptr, *cosines = nullptr;
     uint64_t stream[3] = {};  // The light, its lobes, and the choice each have a random stream.
-    double eps = 0;           // It is the relative spacing of positions on the light.
+    double eps = 0;           // relative spacing of positions on the light
 
     bool is_infinite() const {
         return kind == Kind::directional || kind == Kind::environment || kind == Kind::harmonics;
@@ -79,14 +79,14 @@ inline LightPoint draw(const Light& light, Vec2 u) {
         return {texel.part, texel.within, row.within, light.pdf[texel.part]};
     }
     const PickedPart face = pick(light.running, 0, light.size, 1, u.x);
-    const double root = std::sqrt(face.within);  // This is uniform in a triangle (Turk 1990).
+    const double root = std::sqrt(face.within);  // uniform in a triangle (Turk 1990)
     return {face.part, root * (1 - u.y), root * u.y, light.pdf[face.part]};
 }
 
 // Holds the direction of arriving light, and its unoccluded irradiance at normal incidence over the point's pdf.
 template <class S>
 struct Arriving {
-    Vector<S> l;  // It is a unit vector.
+    Vector<S> l;  // unit vector
     S E[most_lit_channels];
 };
 

@@ -126,14 +126,15 @@ void draw_candidates(const LitScene& lit, const Light& light, const DrawnLobe& l
         add);
 }
 
+// This many candidates are drawn for each point, or each antithetic set of points, that is kept.
+constexpr int candidates_for_one = 8;
+
 // Samples points of a light for a glossy surface by resampled importance sampling (Talbot et al. 2005). The target is
 // the unoccluded radiance that a point adds. The light and the lobe draw candidates, weighted by the power heuristic
 // (Veach and Guibas 1995). `count` candidates are kept in proportion to target / pdf. Their pdf is the target over its
 // integral, which the candidates estimate.
 class Resampled {
    public:
-    static constexpr int candidates_for_one = 8;  // This many candidates are drawn for each one that is kept.
-
     template <class S>
     Resampled(const LitScene& lit, const Light& light, const RandomNumbers& numbers, const Surface<S>& o, int count,
               double dark)

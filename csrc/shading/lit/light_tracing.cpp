@@ -45,9 +45,9 @@ class LightPaths {
     // Holds the current vertex of a path.
     struct PathVertex {
         int64_t arrival, seed;
-        double throughput;  // It is the throughput up to this vertex, in its largest channel.
+        double throughput;  // throughput up to this vertex, in its largest channel
         Vec3 in;
-        double carried[most_lit_channels];  // It is B t (n · in) / |g · in| once the vertex is placed.
+        double carried[most_lit_channels];  // B t (n · in) / |g · in| once the vertex is placed
         Surface<double> o;
         int64_t face;
     };
@@ -163,7 +163,7 @@ class LightPaths {
     const RayCaster& caster_;
     const CameraConnections& camera_;
     const int C_;
-    double eps_ = 0;  // It is the relative spacing of positions.
+    double eps_ = 0;  // relative spacing of positions
     bool filtered_ = false;
     std::vector<PathVertex> vertices_, extended_;
     struct {

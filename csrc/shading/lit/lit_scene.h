@@ -31,14 +31,14 @@ struct LitMesh {
 
 struct LitScene {
     std::vector<Table> tables;
-    std::vector<LitMesh> meshes;  // They ascend by first face.
+    std::vector<LitMesh> meshes;  // ascending by first face
     std::vector<Light> lights;
     const int32_t* faces = nullptr;  // (F, 3) rows of `verts`
     int verts = no_table;
-    int eye = no_table;  // It is the position, or the unit direction towards the eye in an orthographic view.
+    int eye = no_table;  // position, or the unit direction towards the eye in an orthographic view
     bool perspective = true;
     int channels = 0;
-    Vec3 center;  // It is the centre of a bounding sphere of all vertices.
+    Vec3 center;  // centre of a bounding sphere of all vertices
     double radius = 0;
 
     const LitMesh& mesh_of(int64_t face) const {
@@ -101,13 +101,13 @@ constexpr int paths_of_point = 4;
 
 struct LitOptions {
     bool shadows = true;
-    int samples = 1;  // It counts the points of each light with an extent.
+    int samples = 1;  // number of points of each light with an extent
     int only = -1;    // Only this light contributes; −1 means all.
     // Only derivatives are wanted. Glossy surfaces then sample environments in antithetic sets.
     bool antithetic = false;
     // Light sampling treats darker glossy surfaces as this dark, because black ones have derivatives, too.
     double dark = 0;
-    int bounces = 1;  // It bounds how often light is scattered (path.h).
+    int bounces = 1;  // bound on how often light is scattered (path.h)
     // The radius of the near field in world units, 0: none. Derivatives of indirect light with respect to positions on
     // faces then leave out the near part (near_field.h). With `only_near_field`, values are those of the near part.
     double near = 0;
@@ -119,7 +119,7 @@ struct LitOptions {
 constexpr int8_t not_sampled = -1;
 
 struct LightSample {
-    int light, sample, count;  // It is one of `count` samples of a light.
+    int light, sample, count;  // one of `count` samples of a light
 };
 // Counts the antithetic sets that replace one sample of a light. The image has many more points that are lit, and
 // derivatives have both signs (docs/tried.md).

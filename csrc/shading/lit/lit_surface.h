@@ -15,9 +15,9 @@ struct Surface {
     const LitMesh* mesh;
     FacePoint<S> at;
     FaceFrame<Vector<S>> frame;
-    Vector<S> y, v;  // They are the position, and the unit direction to the viewer.
-    Vector<S> g, n;  // They are the unit normals of the face and for shading, on the viewer's side.
-    double side;     // It is 1 in front of the face, −1 behind it.
+    Vector<S> y, v;  // position, and the unit direction to the viewer
+    Vector<S> g, n;  // unit normals of the face and for shading, on the viewer's side
+    double side;     // 1 in front of the face, −1 behind it
     Scattering<S> scattering;
 
     bool is_black() const { return side < 0 && mesh->has_material && !mesh->two_sided; }

@@ -20,16 +20,16 @@ namespace edgegrad {
 // Holds a point of a light that may be kept.
 struct Candidate {
     LightPoint point;
-    Vec3 l;                  // It is the unit direction towards the point.
-    double brightness = 0;   // It is approximate, but zero nowhere.
-    double solid_angle = 1;  // It is |dl/dq| of the coordinates that its pdf counts.
+    Vec3 l;                  // unit direction towards the point
+    double brightness = 0;   // approximate, but zero nowhere
+    double solid_angle = 1;  // |dl/dq| of the coordinates that its pdf counts
 };
 
 // These decide whether the lobe draws directions, too. They would only miss a light that lies within a part of the
 // lobe. Far from its centre, the lobe scatters evenly to all of the light.
-constexpr double least_emitter = 0.25;  // It is a solid angle over the lobe's.
+constexpr double least_emitter = 0.25;  // solid angle over the lobe's
 constexpr double least_round = 1;       // The limit is higher for round lights, which sample themselves better.
-constexpr double farthest_lobe = 4;     // It is the distance of both, in half angles of the lobe.
+constexpr double farthest_lobe = 4;     // distance of both, in half angles of the lobe
 constexpr double smallest_emitter =
     0.1;  // Below this solid angle over the lobe's, points of a flat light are equivalent.
 // It bounds the largest pdf of points over the mean, for lights of about even emission.

@@ -19,13 +19,13 @@ struct NormalSource {
 template <class V>
 struct FaceFrame {
     V corner[3];
-    V g;  // It is the unit normal of the side from which the corners run counter-clockwise.
+    V g;  // unit normal of the side from which the corners run counter-clockwise
 };
 
 // Holds the interpolated normal on the side of g.
 template <class S>
 struct SmoothNormal {
-    Vector<S> sum;  // It is not normalised.
+    Vector<S> sum;  // not normalised
     bool exists = false, turned = false;
     Vector<S> n;
 };
@@ -66,10 +66,10 @@ constexpr double faintest_normal = 1.0 / 128;
 // Holds the frame of texture coordinates at the point, and the map's normal in it.
 template <class S>
 struct MappedNormal {
-    S d1 = 0, d2 = 0;                       // They are the change of v along the edges from the first corner.
-    Vector<S> e1, e2;                       // They are these edges.
-    double hand = 1;                        // It is −1 where the image is mirrored.
-    Vector<S> along, across, t, bitangent;  // They are ∂x/∂u of any length, its part normal to n, and unit vectors.
+    S d1 = 0, d2 = 0;                       // change of v along the edges from the first corner
+    Vector<S> e1, e2;                       // these edges
+    double hand = 1;                        // −1 where the image is mirrored
+    Vector<S> along, across, t, bitangent;  // ∂x/∂u of any length, its part normal to n, and unit vectors
     S mapped[3], scale;
     Vector<S> m;
     bool exists = false;

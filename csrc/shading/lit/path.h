@@ -273,9 +273,7 @@ class Paths {
         const Light& light = lit_.lights[environment_];
         LightPoint p = point_towards(lit_.tables, light, {l[0], l[1], l[2]});
         if (light.is_image) p = above(lit_.tables, light, p, o.g);
-        else
-            p.pdf =
-                k == 0 && by_paths_ >= 0 ? 0 : rays_.pdf[r];  // draw_constant_environment() also samples by the cosine.
+        else p.pdf = k == 0 && by_paths_ >= 0 ? 0 : rays_.pdf[r];  // draw_constant_environment() samples by the cosine.
         p.pdf += paths_at(k) * rays_.pdf[r] * rays_.russian_roulette_probability[r];
         emitter_hits_[k * n_ + i] = {environment_, p};
     }
@@ -322,14 +320,14 @@ class Paths {
     const LitScene& lit_;
     LitOptions options_;
     const int C_;
-    double eps_ = 0;                    // It is the relative spacing of positions.
+    double eps_ = 0;                    // relative spacing of positions
     std::vector<int> light_of_;         // Maps meshes to their lights, −1: none.
     int environment_ = -1;              // Escaping rays hit this environment.
     bool counts_emitter_hits_ = false;  // Says whether emitters that paths hit count.
     int paths_of_point_ = 1;            // This many paths start at one point.
     int by_paths_ = -1;                 // These paths sample this light well enough alone.
     std::vector<LightSample> lights_;
-    int64_t n_ = 0;  // It counts paths.
+    int64_t n_ = 0;  // number of paths
     // Rows hold the points of all paths after no step, one step, …, and the light samples of each.
     std::vector<Surface<double>> surfaces_;
     std::vector<double> pdf_, b_;

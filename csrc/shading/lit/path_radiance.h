@@ -46,7 +46,7 @@ inline void step_vjp(const LitScene& lit, const Surface<double>& o, const Surfac
     // The next lines differentiate |M · d| / |d|³.
     const Vec3 e1 = next.frame.corner[1] - next.frame.corner[0], e2 = next.frame.corner[2] - next.frame.corner[0];
     const Vec3 M = cross(e1, e2);
-    const double whole_bar = factor_bar * factor;  // This is the cotangent of the factor's logarithm.
+    const double whole_bar = factor_bar * factor;  // cotangent of the factor's logarithm
     dot_vjp(M, step.d, whole_bar / dot(M, step.d), M_bar, d_bar);
     d_bar -= 3 * whole_bar / dot(step.d, step.d) * step.d;
     Vec3 e1_bar, e2_bar;

@@ -19,8 +19,7 @@ class PathSample {
         const double grazing = std::pow(1 - std::clamp(dot(o.n, o.v), 0.0, 1.0), 5);
         double specular = 0, diffuse = 0;
         for (int c = 0; c < channels; ++c) {
-            const double f0 = reflectance_of_dielectrics + (s.base[c] - reflectance_of_dielectrics) * s.metallic;
-            const double fresnel = f0 + (1 - f0) * grazing;
+            const double f0 = s.f0(c), fresnel = f0 + (1 - f0) * grazing;
             specular += std::fabs(fresnel), diffuse += std::fabs((1 - fresnel) * s.diffuse(c));
         }
         // Both keep a part: what one technique misses has derivatives, too, and channels differ in brightness.

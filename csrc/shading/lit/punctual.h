@@ -23,7 +23,7 @@ inline void from_direction_vjp(const std::vector<Table>& tables, const Light& li
 constexpr double least_ramp = 1e-3;  // glTF limits the denominator to this.
 template <class S>
 struct Cone {
-    Vector<S> direction, away;  // They are unit vectors.
+    Vector<S> direction, away;  // unit vectors
     S inner, outer, cosine, scale, x;
 
     S ramp() const { return x * x; }

@@ -21,7 +21,7 @@ struct Source {
     const int32_t* uv_faces = nullptr;
     int64_t height = 0, width = 0;
     Sampler sampler = {};
-    int levels = 1;  // This counts the levels of the image's pyramid (pyramid.h).
+    int levels = 1;  // number of levels of the image's pyramid (pyramid.h)
 
     bool exists() const { return value != no_table; }
     // Returns whether the footprint of a pixel selects the level.
@@ -43,9 +43,9 @@ constexpr int spread_size = 4;
 // Identifies a point on a face of a mesh.
 template <class S>
 struct FacePoint {
-    int64_t face;               // It is a number among the mesh's own faces.
+    int64_t face;               // number among the mesh's own faces
     const int32_t* vertex;      // (3,) vertices of the scene
-    int32_t first_vertex;       // It is the mesh's first one.
+    int32_t first_vertex;       // first vertex of the mesh
     S b[3];                     // barycentrics
     const S* spread = nullptr;  // Null means unknown; textures are then looked up unfiltered.
     int64_t row(int i) const { return vertex[i] - first_vertex; }
@@ -81,8 +81,8 @@ inline Footprint footprint(const Source& source, Vec2 uv) { return footprint(sou
 // larger distance of both directions counts. edgegrad/points/footprints.py does the same.
 template <class S>
 struct MipLevel : PyramidLevel<S> {
-    int axis = 0;            // It is the direction with the larger distance.
-    S across = 0, down = 0;  // They are that distance in texels.
+    int axis = 0;            // direction with the larger distance
+    S across = 0, down = 0;  // larger distance in texels
 };
 template <class S>
 MipLevel<S> level_of(const std::vector<Table>& tables, const Source& source, const FacePoint<S>& at) {
@@ -161,7 +161,7 @@ inline void value_vjp(const std::vector<Table>& tables, const Source& source, co
                       const double* bar, FacePointBar& at_bar, Cotangents& to) {
     const Table& table = tables[source.value];
     const int n = table.width == 1 ? 1 : channels;
-    double own[most_lit_channels];  // It is the cotangent of the value before the factor.
+    double own[most_lit_channels];  // cotangent of the value before the factor
     if (source.factor != no_table) {
         const Table& factor = tables[source.factor];
         Source plain_source = source;

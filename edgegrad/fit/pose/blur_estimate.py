@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from .robust_loss import Comparison
-from .task import PoseTask, PyramidLevel, blurred
+from .target_images import blurred
+from .task import PoseTask, PyramidLevel
 
 CANDIDATE_BLURS = (0.0, 0.5, 0.7, 1.0, 1.4)  # pixels
 OUTLIER_WIDTH = (

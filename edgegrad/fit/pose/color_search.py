@@ -24,7 +24,8 @@ from .replay_log import DescentState, ReplayLog
 from .residuals import PoseResiduals
 from .result import Step
 from .robust_loss import LOSS_NOISE, MIN_WIDTH, Comparison
-from .task import ROTATION, SCALE, STEP_PARTS, TRANSLATION, PoseTask, PyramidLevel, blurred
+from .target_images import blurred
+from .task import ROTATION, SCALE, STEP_PARTS, TRANSLATION, PoseTask, PyramidLevel
 from .uncertainty import CORRELATION_LENGTH
 
 TILT, TILT_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each

@@ -14,7 +14,7 @@ from torch import Tensor
 from ...aovs import render_aovs
 from ...camera.camera import Camera
 from ...camera.poses import rotation
-from ...check import as_tensor, check_finite, check_float, check_shape
+from ...check import check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..region import VISIBLE
@@ -22,14 +22,13 @@ from ..views import area_mean, check_image, check_without_alpha, has_levels, ove
 from .inputs import MIN_PICTURE_SIDE, ArgumentNames, depth_of, shots_of
 from .jacobian import Motion, cross_matrices
 from .pose import Pose
+from .target_images import background_of, blurred, is_clutter, scaled
 
 COARSEST_OBJECT = 24  # Pixels across the object on the coarsest level, where 15 % of its size is a few pixels.
 SMALLEST_SIDE = 12  # pixels on the shorter side of the coarsest level
 PYRAMID_BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on finer ones
 MAX_COARSE_SPP = 64  # samples a pixel on coarse levels
 BACKGROUND_BRIGHTNESS = 0.25  # brightness of the picture behind a render, where the background is unknown
-# A border is clutter when more than 0.3 of it is further from its median than 0.1 of the range.
-UNIFORM_BORDER = (0.1, 0.3)
 
 # A step has these entries, and a constant for the first of each: a rotation vector about the centre and a shift, both along
 # the first camera's axes, logarithms of scale and focal length, the principal point in widths of the image, and distortion.
@@ -140,7 +139,7 @@ class PoseTask:
                 clutter = clutter or plain  # Unknown colours cannot be compared.
                 if behind is None:
                     clutter = clutter or is_clutter(image)
-                behind = _background(behind, image)
+                behind = background_of(behind, image)
             shots.append(TargetView(view.to("cpu", torch.float64, copy=True), image, behind, count))
         warn_of_faint(names.mask, masks)
         if all(shot.weight is not None and not bool((shot.weight > 0).any()) for shot in shots):
@@ -400,55 +399,8 @@ def focal_of(camera: Camera) -> float:
     return float(torch.linalg.det(camera.K[:2, :2].double()).abs().sqrt())
 
 
-def is_clutter(picture: Tensor) -> bool:
-    """Return whether the border of a picture (H, W, C) has many colours, so that none of them is the background."""
-    border = _border(picture)
-    extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
-    off = ((border - border.median(dim=0).values).abs() / extent).amax(1)
-    return float((off > UNIFORM_BORDER[0]).float().mean()) > UNIFORM_BORDER[1]
-
-
-def _border(picture: Tensor) -> Tensor:
-    return torch.cat([picture[0], picture[-1], picture[1:-1, 0], picture[1:-1, -1]])
-
-
-def _background(value: Tensor | float | None, picture: Tensor) -> Tensor:
-    """Return the background (C,) or (H, W, C). Raises TypeError or ValueError."""
-    H, W, C = picture.shape
-    if value is None:
-        return _border(picture).median(dim=0).values
-    behind = as_tensor("background", value, like=picture).detach().cpu()
-    if behind.dim() == 0:
-        behind = behind.expand(C)
-    check_float("background", behind)
-    check_shape("background", behind, (C,), (H, W, C), fix="it needs the picture's size and channels")
-    check_finite("background", behind)
-    return behind.float()
-
-
-def scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
-    """Return the size of a picture whose sides are multiplied by a factor, at least one pixel."""
-    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-
-
 def zoomed(K: Tensor, factor: Tensor) -> Tensor:
     """Return K with its focal lengths multiplied; the principal point stays."""
     lens = torch.zeros_like(K)
     lens[:2, :2] = K[:2, :2].detach()
     return K + (factor - 1.0) * lens
-
-
-def blurred(image: Tensor, sigma: float) -> Tensor:
-    """Return a Gaussian blur of images (…, h, w, C) by `sigma` pixels, which repeats the border's pixels outwards."""
-    if sigma == 0.0:
-        return image
-    radius = math.ceil(3.0 * sigma)
-    kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1).to(image) / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    # Channels are groups of one image: as images of a batch, their backward pass takes up to seven times as long.
-    rows = image.movedim(-1, -3).flatten(0, -3)[None]
-    count = rows.shape[1]
-    rows = F.pad(rows, (radius, radius, radius, radius), mode="replicate")
-    for shape in ((-1, 1), (1, -1)):
-        rows = F.conv2d(rows, kernel.reshape(1, 1, *shape).expand(count, -1, -1, -1), groups=count)
-    return rows[0].reshape(*image.movedim(-1, -3).shape).movedim(-3, -1)

@@ -32,7 +32,7 @@ from .photo.depth import warn_of_units
 from .photo.level import PhotoLevel, PictureComparison, photo_levels
 from .photo.light_history import LightHistory
 from .photo.match import VIEW_PIXELS, places
-from .photo.photo_search import PHOTO_SUPPORT, enough_support
+from .photo.photo_descent import PHOTO_SUPPORT, enough_support
 from .photo.picture import Picture
 from .photo.template_views import TemplateViews, across, ball
 from .pose import Pose, angle, pose_from_matrix

@@ -32,7 +32,8 @@ from ..gauss_newton import NormalEquations
 from ..inputs import without_colors
 from ..jacobian import Motion, Rendered
 from ..pose import Pose
-from ..task import FOCAL_LENGTH, PoseTask, PyramidLevel, TargetView, scaled
+from ..target_images import scaled
+from ..task import FOCAL_LENGTH, PoseTask, PyramidLevel, TargetView
 from .contour import contour_loss, contour_term
 from .depth import depth_term
 from .light import HARMONICS, FittedLight

@@ -19,7 +19,8 @@ from ....camera.poses import rotation
 from ....files.image import linear_to_srgb
 from ...views import area_mean
 from ..pose import Pose
-from ..task import PoseTask, scaled
+from ..target_images import scaled
+from ..task import PoseTask
 from .occluders import at_one_side
 from .template_views import TemplateViews, across, all_sides, pose_at
 from .templates import Templates, surprise

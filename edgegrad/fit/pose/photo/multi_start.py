@@ -18,7 +18,8 @@ from ..replay_log import ReplayLog
 from ..result import Step
 from ..task import PoseTask
 from .level import photo_levels
-from .photo_search import SURE_SUPPORT, PhotoSearch
+from .photo_descent import SURE_SUPPORT
+from .photo_search import PhotoSearch
 from .template_views import ball, spread
 
 Report = Callable[[str], Any]

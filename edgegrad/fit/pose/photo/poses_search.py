@@ -21,19 +21,15 @@ from ..uncertainty import Uncertainty
 from .joint_level import JointLevel, joint_levels, without_fronts
 from .level import MAX_PHOTO_STEP
 from .nearby import turns
-from .photo_search import (  # fmt: skip
-    DISTINCT_ANGLE,
+from .photo_descent import (  # fmt: skip
     FULL_LENGTH_STEPS,
-    LAST_LEVEL_ROUNDS,
-    REFINED_STARTS,
-    SHARP_DEGREES,
     SHORT_STEP_NATS,
     SURE_SUPPORT,
     UNOCCLUDED,
-    PhotoSearch,
     enough_support,
     most_steps,
 )
+from .photo_search import DISTINCT_ANGLE, LAST_LEVEL_ROUNDS, REFINED_STARTS, SHARP_DEGREES, PhotoSearch
 
 
 class PosesSearch:

@@ -1,5 +1,5 @@
-"""Steps within faces, rims of what alpha cuts out and borders of nearest texels: exact areas, finite differences of the image,
-and what other parts see of them."""
+"""Discontinuities within faces, which are alpha edges and texel edges: exact areas, finite differences of the image, and
+what other parts see of them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from alpha_masks import F64, checkerboard, disc, quad
 from finite_differences import Case, check_ratio, estimate, gradient, loss, right_ratio, rotation
 from oracles import reference
 from scenes import cube, front_camera, icosphere, smooth_adjoint
+from threads import check_threads
 from torch import Tensor
 
 import edgegrad as eg
@@ -25,7 +26,7 @@ FLAT = eg.Camera(
     torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=F64)),
     torch.tensor([[8.7, 0.0, 16.2], [0.0, 8.7, 15.9], [0.0, 0.0, 1.0]], dtype=F64), (SIZE, SIZE), "orthographic",
 )  # fmt: skip
-BENT = CAMERA.replace(distortion=torch.tensor([-0.4, 0.3, 0.02, -0.01], dtype=F64))
+DISTORTED = CAMERA.replace(distortion=torch.tensor([-0.4, 0.3, 0.02, -0.01], dtype=F64))
 BACK = torch.tensor([0.1, 0.3, 0.2], dtype=F64)
 TINT = torch.tensor([0.9, 0.4, 0.3], dtype=F64)
 
@@ -39,9 +40,9 @@ def tilted(mesh: eg.Mesh, angle: float = 0.5, z: float = 0.0) -> eg.Mesh:
     return mesh.transformed(R=rotation((0.6, 0.8, 0.0), torch.tensor(angle, dtype=F64)), t=t)
 
 
-def cut(side: int = 1, **look: object) -> eg.Mesh:
+def masked(side: int = 1, **fields: object) -> eg.Mesh:
     """A tilted square with a disc of it there."""
-    return tilted(quad(side, **{"alpha": disc(), "face_colors": TINT.expand(2 * side * side, 3), **look}))
+    return tilted(quad(side, **{"alpha": disc(), "face_colors": TINT.expand(2 * side * side, 3), **fields}))
 
 
 def board() -> eg.Mesh:
@@ -109,40 +110,40 @@ def ball() -> eg.Mesh:
 
 
 CASES = {
-    "disc verts": case([cut()], "verts"),
-    "disc uvs": case([cut()], "uvs"),
-    "disc alpha": case([cut()], "alpha"),
-    "disc pose": case([cut(), behind()], "pose"),
-    "disc K": case([cut()], "K"),
-    "disc before a surface": case([cut(), behind()], "verts"),
-    "surface behind a disc": case([behind(), cut()], "verts"),
-    "disc of many faces": case([cut(5)], "verts"),
-    "disc and a cube through it": case([cut(), through()], "verts"),
-    "cube through a disc": case([through(), cut()], "pose"),
-    "two layers": case([cut(), tilted(cut(2), -0.6, -0.6)], "verts"),
-    "layer behind a layer": case([tilted(cut(2), -0.6, -0.6), cut()], "alpha"),
-    "disc cut by the view": case([cut()], "alpha", CAMERA.crop(9, 11, 14, 13)),
-    "orthographic verts": case([cut(), behind()], "verts", FLAT),
-    "orthographic pose": case([cut(), behind()], "pose", FLAT),
-    "bent verts": case([cut(), behind()], "verts", BENT),
-    "bent alpha": case([cut(), behind()], "alpha", BENT),
-    "bent lens": case([cut(), behind()], "lens", BENT),
+    "disc verts": case([masked()], "verts"),
+    "disc uvs": case([masked()], "uvs"),
+    "disc alpha": case([masked()], "alpha"),
+    "disc pose": case([masked(), behind()], "pose"),
+    "disc K": case([masked()], "K"),
+    "disc before a surface": case([masked(), behind()], "verts"),
+    "surface behind a disc": case([behind(), masked()], "verts"),
+    "disc of many faces": case([masked(5)], "verts"),
+    "disc and a cube through it": case([masked(), through()], "verts"),
+    "cube through a disc": case([through(), masked()], "pose"),
+    "two layers": case([masked(), tilted(masked(2), -0.6, -0.6)], "verts"),
+    "layer behind a layer": case([tilted(masked(2), -0.6, -0.6), masked()], "alpha"),
+    "disc clipped by the view": case([masked()], "alpha", CAMERA.crop(9, 11, 14, 13)),
+    "orthographic verts": case([masked(), behind()], "verts", FLAT),
+    "orthographic pose": case([masked(), behind()], "pose", FLAT),
+    "distorted verts": case([masked(), behind()], "verts", DISTORTED),
+    "distorted alpha": case([masked(), behind()], "alpha", DISTORTED),
+    "distorted lens": case([masked(), behind()], "lens", DISTORTED),
     "ball verts": case([ball()], "verts"),
     "ball pose": case([ball(), behind()], "pose"),
     "board verts": case([board()], "verts"),
     "board uvs": case([board()], "uvs"),
     "board pose": case([board(), behind()], "pose"),
     "board orthographic": case([board()], "pose", FLAT),
-    "board bent": case([board()], "pose", BENT),
+    "board distorted": case([board()], "pose", DISTORTED),
     "borders of texels along edges": case(
         [tilted(quad(2, texture=checkerboard(4), filter="nearest", wrap="clamp"))], "pose"
     ),
-    "nearest alpha": case([cut(alpha=disc(9), filter="nearest")], "verts"),
+    "nearest alpha": case([masked(alpha=disc(9), filter="nearest")], "verts"),
     "nearest alpha and texture": case(
         [tilted(quad(1, alpha=disc(9), texture=checkerboard(9), filter="nearest", wrap="clamp"))], "pose"
     ),
 }
-FAST = ("disc before a surface", "disc alpha", "board pose")
+FAST = ("disc before a surface", "board pose")
 
 
 @pytest.mark.unwatched
@@ -162,8 +163,8 @@ def test_all_finite_differences(name):
 LINE = torch.tensor([[0.0, 1.0], [0.0, 1.0]], dtype=F64)  # α rises from ¼ to ¾ of the width of a square
 
 
-def front(**look: object) -> eg.Mesh:
-    return quad(2, **{"face_colors": torch.ones(8, 1, dtype=F64), **look})
+def front(**fields: object) -> eg.Mesh:
+    return quad(2, **{"face_colors": torch.ones(8, 1, dtype=F64), **fields})
 
 
 def area() -> float:
@@ -172,7 +173,7 @@ def area() -> float:
 
 
 @pytest.mark.parametrize("cutoff, share", [(0.5, 0.5), (0.25, 0.625), (0.0, 0.75), (-0.1, 1.0), (1.1, 0.0)])
-def test_area_that_is_left(cutoff, share):
+def test_area_of_a_masked_square(cutoff, share):
     mesh = front(alpha=LINE, alpha_cutoff=cutoff, wrap="clamp")
     found = eg.render_aovs(mesh, FLAT, ["image", "alpha"], 256)
     if cutoff == 0.0:  # the square is there where α is exactly its cutoff, in a quarter of it
@@ -183,7 +184,7 @@ def test_area_that_is_left(cutoff, share):
 
 @pytest.mark.parametrize("side", [1, 2], ids=["within faces", "along their edge"])
 def test_derivatives_of_an_area(side):
-    """By alpha, by uvs and by a scale of the square; each known, and met by every seed: the rim is parallel to the lines."""
+    """The alpha edge is parallel to the lines, so every seed meets the derivatives by alpha, uvs and a scale of the square."""
     mesh = quad(side, alpha=LINE, wrap="clamp", face_colors=torch.ones(2 * side * side, 1, dtype=F64))
     assert mesh.alpha is not None and mesh.uvs is not None
     verts, uvs, alpha = (t.clone().requires_grad_() for t in (mesh.verts, mesh.uvs, mesh.alpha))
@@ -191,7 +192,7 @@ def test_derivatives_of_an_area(side):
     options = {"step_spacing": 1 / 8, "edge_samples": 20_000}
     eg.render(moving, FLAT, 4, **options).sum().backward()
     assert verts.grad is not None and uvs.grad is not None and alpha.grad is not None
-    # α = 2u − ½, so the rim is at u = ½ + δ/2 where the cutoff rises by δ, and at ½ − δ where u does.
+    # α = 2u − ½, so the alpha edge is at u = ½ + δ/2 where the cutoff rises by δ, and at ½ − δ where u does.
     assert alpha.grad.sum().item() == pytest.approx(0.5 * area(), rel=0.01)
     assert uvs.grad[:, 0].sum().item() == pytest.approx(area(), rel=0.01)
     assert uvs.grad[:, 1].sum().item() == pytest.approx(0.0, abs=1e-9)
@@ -199,7 +200,7 @@ def test_derivatives_of_an_area(side):
     assert (verts.grad[:, 0] * verts[:, 0].detach()).sum().item() == pytest.approx(0.5 * area(), rel=0.01)
 
 
-def test_borders_of_texels_in_a_known_place():
+def test_texel_edge_in_a_known_place():
     """Two texels side by side: the border moves with u."""
     texture = torch.tensor([[[0.25], [1.0]]], dtype=F64)
     mesh = quad(1, texture=texture, filter="nearest", wrap="clamp")
@@ -212,8 +213,8 @@ def test_borders_of_texels_in_a_known_place():
 
 @pytest.mark.parametrize("repeats", [3, 1500])
 def test_texels_much_smaller_than_pixels(repeats):
-    """Where not all cells of a texture are looked at, some stand for all: what is left is a share of the area that grows with
-    alpha as it does in a single copy of the texture."""
+    """Some cells of a texture stand for all where not all are searched. The area that alpha leaves grows with alpha as in a
+    single copy of the texture."""
     u = (torch.arange(8, dtype=F64) + 0.5) / 8
     alpha = 1.0 - 2.0 * (u - 0.5).abs().expand(2, 8)  # a tent: there in the middle half
     mesh = front(alpha=alpha)
@@ -238,15 +239,15 @@ def test_texels_much_smaller_than_pixels(repeats):
     "camera", [pytest.param(CAMERA, id="perspective"), pytest.param(FLAT, id="orthographic", marks=pytest.mark.slow)]
 )
 def test_equals_the_twin(camera):
-    """Which is brute force over all faces."""
-    scene = eg.Scene([cut(2), ball(), behind()], BACK)
+    """The twin is brute force over all faces."""
+    scene = eg.Scene([masked(2), ball(), behind()], BACK)
     ours, twin = eg.render(scene, camera, 256), reference.render(scene, camera, 8)
     assert (ours - twin).abs().mean().item() < 0.004
 
 
 def test_parts_that_are_masked_are_seen_by_nobody():
     """Channels, ids, and shaders."""
-    mesh = cut()
+    mesh = masked()
     scene = eg.Scene([mesh, behind()], BACK)
     found = eg.render_aovs(scene, CAMERA, ["image", "alpha", "mesh_id"], 64)
     ids = found["mesh_id"][..., 0]
@@ -273,8 +274,8 @@ SHADER = {
 
 @pytest.mark.parametrize("move", ["verts", "uvs", "alpha", "K"])
 def test_forward_mode_is_reverse_mode(move):
-    """The same samples, but for controls: what differs is noise."""
-    at, found = case([cut(), behind()], move), {}
+    """Both modes have the same samples, but for controls: they differ by noise."""
+    at, found = case([masked(), behind()], move), {}
     options = {"step_spacing": 1 / 8, "spp": 16, "edge_samples": 50_000, "surface_samples": 50_000}
     for seed in range(4):
         zero = torch.zeros((), dtype=F64)
@@ -290,7 +291,7 @@ def test_forward_mode_is_reverse_mode(move):
 
 
 @pytest.mark.parametrize("move", ["verts", "uvs", "alpha", "pose", "K"])
-def test_shaders_have_the_same_steps(move):
+def test_shaders_have_the_same_discontinuities(move):
     """The scene's own colours written as a shader."""
     first = tilted(quad(1, alpha=disc(), colors=noise(4, 3).abs()))
     at = case([first], move)
@@ -307,7 +308,7 @@ def test_shaders_have_the_same_steps(move):
     assert error < 0.02 * abs(fused.mean)
 
 
-@pytest.mark.parametrize("mesh", [cut(), board()], ids=["disc", "board"])
+@pytest.mark.parametrize("mesh", [masked(), board()], ids=["disc", "board"])
 def test_gradient_by_place(mesh):
     """Its sum is the derivative for moving all in the image."""
     scene, A = eg.Scene([mesh]), smooth_adjoint(SIZE, SIZE, 3)
@@ -323,20 +324,14 @@ def test_gradient_by_place(mesh):
 
 
 def test_same_bits_at_any_number_of_threads():
-    mesh, found = cut(3), []
-    before = torch.get_num_threads()
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            leaves = {n: getattr(mesh, n).clone().requires_grad_() for n in ("verts", "uvs", "alpha")}
-            image = eg.render(eg.Scene([mesh.replace(**leaves), behind()]), CAMERA, 8)
-            found.append(
-                [image, *torch.autograd.grad((image * smooth_adjoint(*image.shape)).sum(), [*leaves.values()])]
-            )
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+    mesh = masked(3)
+    leaves = {n: getattr(mesh, n).clone().requires_grad_() for n in ("verts", "uvs", "alpha")}
+
+    def compute() -> list[Tensor]:
+        image = eg.render(eg.Scene([mesh.replace(**leaves), behind()]), CAMERA, 8)
+        return [image, *torch.autograd.grad((image * smooth_adjoint(*image.shape)).sum(), [*leaves.values()])]
+
+    check_threads(compute)
 
 
 # -- the plan ---------------------------------------------------------------------------------------------------------
@@ -347,13 +342,13 @@ def test_plan_says_what_is_looked_for():
         mesh = mesh.replace(**{what: getattr(mesh, what).clone().requires_grad_()})
         return eg.plan(mesh, CAMERA, **options)["discontinuities"]
 
-    for mesh, what in ((cut(), "verts"), (cut(), "uvs"), (cut(), "alpha"), (board(), "uvs")):
+    for mesh, what in ((masked(), "verts"), (masked(), "uvs"), (masked(), "alpha"), (board(), "uvs")):
         assert of(mesh, what).on
         assert not of(mesh, what, visibility=False).on
-    assert not of(cut(), "face_colors").on
-    assert not of(cut().replace(alpha=None), "verts").on
+    assert not of(masked(), "face_colors").on
+    assert not of(masked().replace(alpha=None), "verts").on
     assert not of(board().replace(filter="linear"), "verts").on
-    assert eg.plan(cut(), CAMERA)["alpha masks"].on and not eg.plan(board(), CAMERA)["alpha masks"].on
+    assert eg.plan(masked(), CAMERA)["alpha masks"].on and not eg.plan(board(), CAMERA)["alpha masks"].on
 
 
 @pytest.mark.parametrize(
@@ -367,4 +362,4 @@ def test_plan_says_what_is_looked_for():
 )
 def test_spacing_that_is_none(value, error, message):
     with pytest.raises(error, match=message):
-        eg.render(cut(), CAMERA, step_spacing=value)
+        eg.render(masked(), CAMERA, step_spacing=value)

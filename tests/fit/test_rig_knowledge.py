@@ -1,4 +1,4 @@
-"""What a fit of a rig says of its joints: which the pictures show, and how exactly; and light that is sought with a pose."""
+"""What a fit of a rig says of its joints: which the pictures show, and how exactly; and light that is found with a pose."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from test_fit_rig import arm, shown, views
+from arms import arm, shown, views
 
 import edgegrad as eg
 from edgegrad.fit import Options, Parameter, fit_rig
@@ -27,7 +27,7 @@ def objective(rig: eg.Rig, cameras: list[eg.Camera], **pictures: list[torch.Tens
     return Objective(build, views_of(cameras, pictures.get("images"), pictures.get("masks"), None), Options(spp=64))
 
 
-def test_a_hand_in_a_wrong_place_is_told() -> None:
+def test_a_misplaced_hand_has_low_edge_support() -> None:
     rig, cameras = arm(3), views(48, 2)
     judged = objective(rig, cameras, masks=shown(rig.posed(TRUTH), cameras))
     names = {"rotations": rig.joints.names}
@@ -38,8 +38,8 @@ def test_a_hand_in_a_wrong_place_is_told() -> None:
     assert off["bone 2"] < 0.5 < 0.6 < off["bone 0"] and off["bone 2"] < off["bone 1"] < off["bone 0"]
 
 
-def test_a_hand_that_hides_is_told() -> None:
-    """Folded back onto its arm it has hardly edges of its own, and the masks show what nothing covers."""
+def test_a_hidden_hand_leaves_pixels_uncovered() -> None:
+    """A hand that is folded onto its arm has hardly edges of its own, and the masks show what nothing covers."""
     rig, cameras = arm(3), views(48, 2)
     hidden = TRUTH.clone()
     hidden[2, 2] = math.pi
@@ -50,7 +50,7 @@ def test_a_hand_that_hides_is_told() -> None:
 
 
 def test_uncertainty_is_that_of_noise() -> None:
-    """Of pictures with noise of a known deviation σ, the covariance is σ² (JᵀJ)⁻¹, with J of a derivative of its own."""
+    """For noise of a known deviation σ the covariance is σ² (JᵀJ)⁻¹, with J by a derivative of its own."""
     rig, cameras, sigma = arm(2, colored=True), views(32, 2), 0.1
     truth = TRUTH[:2]
     g = torch.Generator().manual_seed(2)
@@ -72,7 +72,7 @@ def test_uncertainty_is_that_of_noise() -> None:
 
 
 def test_curvature_of_views_in_one_call(monkeypatch) -> None:
-    """As of each by itself."""
+    """It is the sum of the curvatures of each view by itself."""
     rig, cameras = arm(2), views(32, 3)
     judged, values = objective(rig, cameras, masks=shown(rig.posed(TRUTH[:2]), cameras)), {"rotations": 0.9 * TRUTH[:2]}
     ((_, group, images, slopes),) = derivatives(judged, values, 0)
@@ -87,7 +87,7 @@ def test_curvature_of_views_in_one_call(monkeypatch) -> None:
 
 
 def test_what_no_picture_shows_is_unknown() -> None:
-    """A joint of a limb that lies out of sight."""
+    """A joint belongs to a limb that lies out of sight."""
     rig, cameras = arm(2), views(32, 1)
     camera = cameras[0].replace(world_to_camera=cameras[0].world_to_camera.clone())
     camera.world_to_camera[1, 3] += 2.2  # of the upper limb hardly anything is seen
@@ -105,7 +105,7 @@ def test_what_no_picture_shows_is_unknown() -> None:
     assert "bone 1 known to ±" in fit.uncertainty.unknown
 
 
-def test_light_is_sought_with_the_pose() -> None:
+def test_light_is_found_with_the_pose() -> None:
     rig, cameras = arm(2, colored=True), views(32, 2)
 
     def lit(posed: eg.Mesh, light: torch.Tensor) -> eg.Scene:
@@ -119,11 +119,11 @@ def test_light_is_sought_with_the_pose() -> None:
     pictures = [eg.render(lit(rig.posed(truth), light), camera, 64, 9) for camera in cameras]
     start = torch.zeros_like(light)
     start[0] = 2.0
-    told = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
-    found = fit_rig(rig, cameras, pictures, parameters={"light": Parameter(0.2, start)}, **told)
+    options = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
+    found = fit_rig(rig, cameras, pictures, parameters={"light": Parameter(0.2, start)}, **options)
     assert math.degrees(float((found.values["rotations"] - truth).norm(dim=1).max())) < 5.0
     assert torch.allclose(found.fit.values["light"][:4], light[:4], atol=0.3) and "light" not in found.values
     with pytest.raises(ValueError, match="parameters: expected names that the rig does not have, got 'rotations'"):
-        fit_rig(rig, cameras, pictures, parameters={"rotations": Parameter(0.2, start)}, **told)
+        fit_rig(rig, cameras, pictures, parameters={"rotations": Parameter(0.2, start)}, **options)
     with pytest.raises(TypeError, match=r"parameters\['light'\]: expected a Parameter, got float"):
-        fit_rig(rig, cameras, pictures, parameters={"light": 0.2}, **told)
+        fit_rig(rig, cameras, pictures, parameters={"light": 0.2}, **options)

@@ -1,4 +1,4 @@
-"""Steps that a shader declares: where they are found, and their gradients next to exact ones."""
+"""Discontinuities that a shader declares: where they are found, and their gradients against exact ones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from both_modes import check_both_modes
 from scenes import front_camera, icosphere, smooth_adjoint, smooth_colors
 from torch import Tensor
 
@@ -32,7 +33,7 @@ def flat_camera(size: int) -> eg.Camera:
     return eg.Camera(torch.eye(4, dtype=F64), K, (size, size), "orthographic")
 
 
-def test_a_straight_step_is_exact():
+def test_a_straight_discontinuity_is_exact():
     """The area next to a line x = a across a square of side 2 is 2 (1 − a) scale² pixels; its derivative is −2 scale²."""
     a = torch.tensor(0.137, dtype=F64, requires_grad=True)
     image = eg.render(
@@ -85,7 +86,7 @@ def test_texels_between_neighbouring_points_all_count():
     assert float(found.mean()) == pytest.approx(exact, abs=4 * error + 5e-3 * exact)
 
 
-def test_a_step_that_is_said_twice_counts_once():
+def test_a_discontinuity_declared_twice_counts_once():
     def gradient(twice: bool) -> Tensor:
         a = torch.tensor(0.137, dtype=F64, requires_grad=True)
 
@@ -99,8 +100,8 @@ def test_a_step_that_is_said_twice_counts_once():
     assert torch.allclose(gradient(True), gradient(False))
 
 
-def test_a_jump_of_the_function_is_no_step():
-    """Where s jumps over zero, at a silhouette before another surface or by itself, nothing is said to move."""
+def test_a_jump_of_the_function_is_not_declared():
+    """Nothing is said to move where s jumps over zero, at a silhouette before another surface or by itself."""
     a = torch.tensor(0.0, dtype=F64, requires_grad=True)
     back, front = square(), square(0.4)
     scene = eg.Scene([back, front.replace(verts=0.5 * front.verts - torch.tensor([0.0, 0.0, 1.0], dtype=F64))])
@@ -114,8 +115,8 @@ def test_a_jump_of_the_function_is_no_step():
     assert float(grad) == 0
 
 
-def test_steps_beside_silhouettes_are_found():
-    """A step that runs into the shadow line of another surface: the part next to it counts as well."""
+def test_discontinuities_next_to_silhouettes_are_found():
+    """A discontinuity that runs into the shadow line of another surface: the part next to it counts as well."""
 
     def gradient(seed: int) -> Tensor:
         a = torch.tensor(0.1, dtype=F64, requires_grad=True)
@@ -142,7 +143,7 @@ def test_steps_beside_silhouettes_are_found():
     assert float(found.mean()) == pytest.approx(exact, abs=4 * error + 0.005 * abs(exact))
 
 
-def test_steps_in_forward_mode_and_under_transforms():
+def test_forward_mode_and_transforms():
     adjoint = smooth_adjoint(SIZE, SIZE, 3)
     mesh, camera = ball(), front_camera(SIZE)
 
@@ -155,17 +156,13 @@ def test_steps_in_forward_mode_and_under_transforms():
     a, verts = torch.tensor(0.2, dtype=F64), mesh.verts
     a_dot = torch.tensor(0.7, dtype=F64)
     verts_dot = 0.1 * torch.sin(3 * verts)
-    leaves = a.clone().requires_grad_(), verts.clone().requires_grad_()
-    bars = torch.autograd.grad((image(*leaves) * adjoint).sum(), leaves)
-    expected = (bars[0] * a_dot).sum() + (bars[1] * verts_dot).sum()
-    dot = torch.func.jvp(image, (a, verts), (a_dot, verts_dot))[1]
-    assert torch.allclose((dot * adjoint).sum(), expected, rtol=1e-6)
+    bars = check_both_modes(image, [a, verts], [a_dot, verts_dot], adjoint, rel=1e-6)
     func = torch.func.grad(lambda a, v: (image(a, v) * adjoint).sum(), argnums=(0, 1))(a, verts)
     for x, y in zip(func, bars, strict=True):
         assert torch.allclose(x, y, rtol=1e-6, atol=1e-9)
 
 
-def test_steps_that_differ_within_a_batch_are_refused():
+def test_discontinuities_that_differ_within_a_batch_are_refused():
     def image(a: Tensor, color: Tensor) -> Tensor:
         return eg.render(
             ball(), front_camera(SIZE), shader=lambda hits: hits.where(hits.position[:, 0] - a, color, 0.0)
@@ -180,7 +177,7 @@ def test_steps_that_differ_within_a_batch_are_refused():
 
 
 @pytest.mark.parametrize(("wide", "least", "most"), [(30.0, 0.97, 1.02), (1.0, 0.97, 1.02), (0.5, 0.5, 0.7)])
-def test_a_step_along_a_strip_of_surface(wide: float, least: float, most: float):
+def test_a_discontinuity_along_a_strip_of_surface(wide: float, least: float, most: float):
     """0.1 px next to the silhouette of what is wide, and along the middle of what is narrow, as the documents show."""
     turn = torch.linalg.matrix_exp(0.4 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=F64))
     corner = torch.tensor([[0.0, -20, 0], [wide, -20, 0], [wide, 20, 0], [0, 20, 0]], dtype=F64)
@@ -201,7 +198,7 @@ def test_a_step_along_a_strip_of_surface(wide: float, least: float, most: float)
     assert least < float(found.mean()) < most
 
 
-def test_steps_that_are_not_always_asked_for():
+def test_calls_that_are_not_always_made_are_refused():
     def shader(hits: eg.Hits) -> Tensor:
         return hits.where(hits.depth - 3, 1.0, 0.0) if len(hits) > 50 else torch.ones(len(hits), 1)
 
@@ -212,7 +209,7 @@ def test_steps_that_are_not_always_asked_for():
         )
 
 
-def test_what_steps_are_given_is_checked():
+def test_bad_arguments_are_refused():
     def refused(shader: object, message: str, kind: type[Exception] = ValueError) -> None:
         with pytest.raises(kind, match=message):
             eg.render(ball(), front_camera(SIZE), shader=shader)  # type: ignore[arg-type]
@@ -232,14 +229,10 @@ def test_what_steps_are_given_is_checked():
     )
     refused(lambda hits: hits.select(hits.depth).normal, r"index: expected integers", TypeError)
     refused(lambda hits: hits.floor(hits.face), r"t: ", TypeError)
-    with pytest.raises(ValueError, match=r"step_spacing: expected a number from 0\.015625 to 64, got 0"):
-        eg.render(ball(), front_camera(SIZE), step_spacing=0)
-    with pytest.raises(TypeError, match=r"step_spacing: expected a number, got str"):
-        eg.render(ball(), front_camera(SIZE), step_spacing="1")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["where", "floor", "nearest"])
-def test_borders_along_edges(kind: str):
+def test_discontinuities_along_edges(kind: str):
     """A border that runs exactly along edges of the mesh, of a grid of 4 × 4 squares: x = θ, with an edge at 0."""
     grid = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, 5, dtype=F64)] * 2, indexing="ij"), -1).reshape(-1, 2)
     corner = torch.tensor(
@@ -266,7 +259,7 @@ def test_borders_along_edges(kind: str):
     assert float(found) == pytest.approx(-2 * (0.4 * 32) ** 2, rel=0.03)
 
 
-def test_steps_of_some_points_are_steps_of_all():
+def test_discontinuities_of_some_points_are_those_of_all():
     """Two materials, each asked for its own points."""
 
     def gradient(selected: bool) -> Tensor:
@@ -296,7 +289,7 @@ def test_steps_of_some_points_are_steps_of_all():
     assert float(one) == pytest.approx(float(all), rel=1e-6)
 
 
-def test_many_directions_of_steps_in_one_pass():
+def test_many_directions_in_one_pass():
     mesh, camera = ball(), front_camera(SIZE)
 
     def shader(hits: eg.Hits) -> Tensor:

@@ -1,4 +1,4 @@
-"""Pixels that a shader's steps run through, shaded at several points: unbiased, less noise, and nothing else is changed."""
+"""Pixels that a shader's discontinuities cross, shaded at several points: unbiased, with less noise, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def without_borders(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def dots(hits: eg.Hits) -> Tensor:
-    """In the middle of every third pixel, 0.6 px wide: no other pixel knows of them."""
+    """Paint a dot of 0.6 px in the middle of every third pixel: no other pixel knows of it."""
     x = hits.pixel % 3 - 1.5
     return hits.where(0.3 - x.norm(dim=1), 1.0, 0.0)
 
@@ -67,7 +67,7 @@ def test_means_are_exact_and_noise_is_less(monkeypatch: pytest.MonkeyPatch):
     assert float(variance.mean()) < 0.2 * float(once.mean())
 
 
-def test_shaders_without_steps_keep_their_bits(monkeypatch: pytest.MonkeyPatch):
+def test_shaders_without_discontinuities_keep_their_bits(monkeypatch: pytest.MonkeyPatch):
     camera = front_camera(SIZE)
     one = images(1, lambda hits: hits.position, quad(), camera, 16)
     without_borders(monkeypatch)
@@ -75,7 +75,7 @@ def test_shaders_without_steps_keep_their_bits(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_bound_of_what_is_shaded():
-    """Where every pixel is a border, four times the points of the first look more."""
+    """Every pixel is a border, so at most four times the points of the first pass are shaded more."""
     counts = []
 
     def shader(hits: eg.Hits) -> Tensor:

@@ -1,0 +1,282 @@
+"""Arguments of pose searches: arrays of any kind that work, and errors and warnings that name what is wrong with the others."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from brackets import BACKGROUND, START, about_center, bracket, camera, picture, silhouette
+from photographs import coverage, depth_of, photograph
+
+import edgegrad as eg
+from edgegrad.fit import fit_camera, fit_pose, fit_poses, fit_scene, track
+from edgegrad.fit.pose.fit_poses import _masks
+from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
+from edgegrad.fit.pose.photo.depth import warn_of_units
+from edgegrad.fit.pose.photo.photo_descent import CONTOUR_SUPPORT, most_steps
+
+SIZE = 48
+QUICK = {"init": START, "search": False, "progress": False, "steps": 1, "spp": 2, "max_size": 24}
+
+
+@pytest.fixture(scope="module")
+def taken():
+    view = camera(SIZE)
+    return view, photograph(view)
+
+
+def one_pixel(value=1.0):
+    mask = torch.zeros(SIZE, SIZE)
+    mask[20, 20] = value
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"weight": torch.zeros(SIZE, SIZE)}, r"weight: expected numbers above 0 somewhere, got zero"),
+        ({"mask": one_pixel()}, r"mask: expected the object in 10 pixels or more, got it in 1;"),
+        ({"mask": one_pixel(), "init": None}, r"mask: expected the object in 10 pixels"),
+        ({"max_size": 1}, r"max_size: expected an int from 8 "),
+    ],
+)
+def test_what_shows_nothing_is_named(taken, given, message):
+    view, image = taken
+    with pytest.raises(ValueError, match=message):
+        fit_pose(bracket(), image, view, **{**QUICK, **given})
+    if "mask" in given:
+        given = {**given, "mask": given["mask"].int()}
+    with pytest.raises(ValueError, match=message.replace("mask:", r"mask\[0\]:")):
+        fit_poses([bracket()], image, view, **{**QUICK, **given, "init": [START]})
+
+
+@pytest.mark.parametrize("side", [1, 3, 7])
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_tiny_picture_is_named(side, plain):
+    picture = torch.rand(side, side, 3, generator=torch.Generator().manual_seed(0))
+    message = rf"{{}}: expected a picture of 8 × 8 pixels or more, got {side} × {side}"
+    with pytest.raises(ValueError, match=message.format("target")):
+        fit_pose(bracket(plain), picture, camera(side), **QUICK)
+    with pytest.raises(ValueError, match=message.format("image")):
+        fit_camera(bracket(plain), picture, camera(side), progress=False)
+
+
+def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
+    """Labels and masks as tensors, as arrays and as lists of one all come to a mask for each mesh and camera."""
+    view, _ = taken
+    labels = (torch.arange(SIZE) // 20).expand(SIZE, SIZE)
+    masks = [(labels == 1).float(), (labels == 2).float()]
+    one, several = labels.numpy(), [view]
+    for mask, cameras in (
+        (labels, view), (one, view), (one.astype(np.uint16), view), (masks, view), ([m.numpy() for m in masks], view),
+        (labels, several), (one, several), (one[..., None], several), ([one.astype(np.uint8)], several), (one[None], several),
+        (masks, several), ([[m] for m in masks], several), ([m[None].numpy() for m in masks], several),
+    ):  # fmt: skip
+        for own, expected in zip(_masks(mask, 2, cameras), masks, strict=True):
+            picture = torch.zeros(SIZE, SIZE, 3)
+            ((_, _, _, found, _),) = shots_of(cameras, picture, own, None, ArgumentNames())
+            assert torch.equal(torch.as_tensor(found).reshape(SIZE, SIZE), expected), (type(mask), cameras)
+    for target in (torch.zeros(SIZE, SIZE, 3), np.zeros((1, SIZE, SIZE, 3)), [np.zeros((SIZE, SIZE, 3))]):
+        ((_, _, found, _, _),) = shots_of([view], target, None, None, ArgumentNames())
+        assert found.shape == (SIZE, SIZE, 3)
+
+
+def test_poses_to_start_from_may_be_an_array(taken):
+    view, image = taken
+    labels = (coverage(view)[..., 0] > 0.5).numpy().astype(np.int32)
+    (fit,) = fit_poses([bracket()], image, view, labels, **{**QUICK, "init": START[None].numpy()})
+    assert fit.steps > 0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"mask": torch.ones(9, 9).int()}, r"mask: expected shape \(48, 48\) .*, got \(9, 9\); an image of labels"),
+        ({"mask": np.ones((9, 9), int)}, r"mask: expected shape \(48, 48\) .*, got \(9, 9\)"),
+        ({"mask": np.ones((SIZE, SIZE))}, r"mask: expected an image of labels, of integers.*float64"),
+        ({"init": START}, r"init: expected a list with one for each mesh, got Tensor; give \[init\]"),
+    ],
+)
+def test_errors_of_labels(taken, given, message):
+    view, image = taken
+    with pytest.raises((TypeError, ValueError), match=message):
+        fit_poses([bracket()], image, view, **{**QUICK, "init": [START], **given})
+
+
+def test_one_picture_for_two_cameras(taken):
+    view, image = taken
+    with pytest.raises(ValueError, match=r"target: expected 2, one for each camera, got one of shape \(48, 48, 3\)"):
+        fit_pose(bracket(), image, [view, view], **QUICK)
+    mask = coverage(view)[..., 0]
+    for given in (mask, [mask]):
+        with pytest.raises(ValueError, match=r"mask.*: expected 2, one for each camera, got one of shape \(48, 48\)"):
+            fit_poses([bracket()], [image] * 2, [view] * 2, given, **{**QUICK, "init": [START]})
+
+
+def test_units_of_depth(taken):
+    view, _ = taken
+    depth, scene = depth_of(view)[..., 0], eg.Scene([bracket()])
+    depth[depth == 0.0] = torch.nan
+    for factor, scale in ((1e-3, r"1e\+03"), (10.0, r"0\.1"), (6.56, r"0\.15")):
+        with pytest.warns(UserWarning, match=rf"depth: expected distances in world units.* multiply it by {scale}"):
+            warn_of_units(scene, [view], [factor * depth], "at the start")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for given in (depth, 1.5 * depth, None, torch.full_like(depth, torch.nan)):
+            warn_of_units(scene, [view], [given], "at the start")
+
+
+@pytest.mark.parametrize("fit", [fit_pose, fit_poses, track])
+def test_depth_in_other_units_is_warned_of(taken, fit):
+    view, image = taken
+    depth = 1000.0 * depth_of(view)[..., 0]
+    with pytest.warns(UserWarning, match=r"depth: expected .* multiply it by 0\.001"):
+        if fit is track:
+            next(track(bracket(), [image], view, START, depth=[depth]))
+        elif fit is fit_poses:
+            fit_poses([bracket()], image, view, depth=depth, **{**QUICK, "init": [START]})
+        else:
+            fit_pose(bracket(), image, view, depth=depth, **QUICK)
+
+
+@pytest.mark.parametrize(
+    ("along", "message"),
+    [(0, "init: expected a pose at which the camera sees the mesh"), (2, "init: expected the object in front of")],
+)
+def test_a_film_begins_where_the_object_is_seen(taken, along, message):
+    view, image = taken
+    init = START.clone()
+    init[:3, 3] -= 50.0 * view.world_to_camera[along, :3].double()
+    with pytest.raises(ValueError, match=message):
+        track(bracket(), [image], view, init)  # at once
+
+
+def test_more_steps_are_taken_where_they_are_asked_for():
+    levels = (False, True), (False, False), (True, False)
+    assert [most_steps(40, *level) for level in levels] == [12, 8, 20]
+    assert [most_steps(5, *level) for level in levels] == [5, 5, 5]
+    assert most_steps(80, True, False) == 40 and most_steps(80, False, True) == 24
+
+
+def test_what_is_not_explained_is_not_blamed_on_steps(taken):
+    """A plain mesh has to show more of its edges than one with colours."""
+    view, image = taken
+    fit = fit_pose(bracket(True), image, view, init=START, search=False, progress=False, steps=2)
+    assert 0.6 < fit.explained < CONTOUR_SUPPORT and not fit.converged, fit.explained
+    assert fit.reason.startswith("edges not explained"), fit.reason
+
+
+@pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_picture_from_the_bottom_up_is_named(masked):
+    view = camera(24)
+    target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
+    options = {"mask": mask} if masked else {"background": BACKGROUND}
+    with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
+        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=3, **options)
+    assert not fit.converged
+
+
+def test_masks_from_the_bottom_up_are_named():
+    views = [camera(32), camera(32, distance=5.0)]
+    masks = [silhouette(view).flip(0) for view in views]
+    parameters = {"verts": 1e-4}
+    options = {"masks": masks, "steps": 2, "spp": 2, "progress": False}
+    with pytest.warns(UserWarning, match=r"^masks: expected the upper row first.*IoU of \d+%, as given at \d+%"):
+        fit_scene(bracket(), views, None, parameters, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        fit_scene(bracket(), views, None, parameters, **options | {"masks": [mask.flip(0) for mask in masks]})
+
+
+BLANK = torch.zeros(64, 64, 3)
+
+
+@pytest.mark.parametrize(
+    "change, error, message",
+    [
+        ({"mesh": "bracket.obj"}, TypeError, "mesh: expected a Mesh or a Scene, got str"),
+        ({"target": torch.zeros(32, 64, 3)}, ValueError, "target: expected shape (64, 64, C), got (32, 64, 3)"),
+        ({"target": torch.zeros(64, 64, 4)}, ValueError, "target: expected 3 channels"),
+        ({"target": [BLANK] * 2}, ValueError, "target: expected one, for the one camera, got a list of 2"),
+        ({"target": BLANK}, ValueError, "target: expected a picture of the object, got the same in every"),
+        ({"target": BLANK, "mask": torch.ones(64, 64)}, ValueError, "mask: expected a picture of the object"),
+        ({"target": torch.full((64, 64, 3), math.nan)}, ValueError, "target: expected finite"),
+        ({"target": "photo.png"}, TypeError, "target: expected an image (H, W, C) of numbers, got the path 'photo.png'; read"),
+        ({"target": None}, TypeError, "target: expected an image (H, W, C) of numbers, got None; read one with read_image"),
+        ({"camera": np.eye(4)}, TypeError, "camera: expected a Camera, got ndarray"),
+        ({"camera": eg.Camera.stack([camera(), camera()])}, ValueError, "camera: expected one camera, got 2"),
+        ({"camera": []}, ValueError, "camera: expected at least one"),
+        ({"mask": torch.ones(8, 8)}, ValueError, "mask: expected shape (64, 64) or (64, 64, 1), got (8, 8)"),
+        ({"camera": [camera()], "target": [BLANK], "mask": [torch.ones(4, 4)]}, ValueError, "mask[0]: expected"),
+        ({"mask": torch.ones(64, 64), "background": 0.0}, ValueError, "background: expected None with a mask"),
+        ({"background": torch.ones(2)}, ValueError, "background: expected shape (3,) or (64, 64, 3), got (2,)"),
+        ({"weight": -torch.ones(64, 64)}, ValueError, "weight: expected numbers from 0 up"),
+        ({"weight": torch.ones(64, 64, 3)}, ValueError, "weight: expected shape (64, 64) or (64, 64, 1)"),
+        ({"init": torch.eye(3)}, ValueError, "init: expected shape (4, 4), got (3, 3)"),
+        ({"init": about_center(torch.eye(3).double(), (20.0, 0.0, -8.0))}, ValueError, "init: expected a pose at which"),
+        ({"init": about_center(torch.eye(3).double(), (3.0, 3.0, 9.0))}, ValueError, "init: expected the object in front"),
+        ({"steps": 0}, ValueError, "steps: expected an int from 1"),
+        ({"spp": 1.5}, TypeError, "spp: expected an int"),
+        ({"tolerance": 0.0}, ValueError, "tolerance: expected a number above 0 and below 1, got 0"),
+    ],
+)  # fmt: skip
+def test_errors_name_the_argument(change, error, message):
+    something = torch.eye(64)[..., None].expand(-1, -1, 3)
+    with pytest.raises(error) as caught:
+        fit_pose(**{"mesh": bracket(), "target": something, "camera": camera(), "progress": False, **change})
+    assert message in str(caught.value)
+
+
+def test_pictures_and_masks_of_bytes_are_named():
+    view = camera(16)
+    image = picture(view)
+    bytes_ = (255 * image / image.max()).round()
+    with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
+        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, steps=1, search=False, progress=False)
+    resized = 40.0 + 0.7 * bytes_  # no whole numbers any more
+    with pytest.warns(
+        UserWarning, match=r"target: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
+    ):
+        fit_pose(bracket(), resized, view, silhouette(view), init=START, steps=1, search=False, progress=False)
+    with pytest.raises(
+        ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
+    ):
+        fit_pose(bracket(), image, view, 255.0 * torch.eye(16), progress=False)
+    with pytest.raises(ValueError, match=r"masks\[0\]: expected numbers from 0 to 1"):
+        masks = [255.0 * torch.eye(16)]
+        fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
+
+
+def test_alpha_is_no_colour_of_a_picture():
+    """Alpha would show nothing of what surrounds the object, or more than a photograph knows."""
+    view = camera(16)
+    image = torch.cat([picture(view), silhouette(view)[..., None].reshape(16, 16, 1)], -1)
+    words = (
+        r"expected grey or colours, got 4 channels.*read_image\(path, channels=3\), or, .* x\[\.\.\., -1:\] as its mask"
+    )
+    with pytest.raises(ValueError, match="target: " + words):
+        fit_pose(bracket(plain=True), image, view, progress=False)
+    with pytest.raises(ValueError, match="images: " + words):
+        fit_scene(bracket(plain=True), view, image, {"verts": 0.01}, loss="region", progress=False)
+
+
+def test_faint_masks_are_named():
+    def stop(_):
+        raise KeyboardInterrupt
+
+    view, other = camera(16), camera(16, distance=2.6)
+    mask, options = silhouette(view), {"callback": stop, "progress": False}
+    with pytest.warns(
+        UserWarning, match=r"mask: expected 1 where the object covers .* got at most 0\.216; .* read_mask"
+    ):
+        fit_pose(bracket(), picture(view), view, 0.216 * mask, init=START, **options)
+    what = {"verts": 0.01}
+    with pytest.warns(UserWarning, match=r"masks: expected 1 where the object covers .* got at most 0\.00392"):
+        fit_scene(bracket(), view, None, what, masks=mask / 255, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # In one of two views the object is hardly seen.
+        fit_scene(bracket(), [view, other], None, what, masks=[mask, 0.1 * silhouette(other)], **options)
