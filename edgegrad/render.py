@@ -67,11 +67,11 @@ def render(
                      little over them, ⅛ to 1/64 where they are most likely occluded. Large textured triangles, and large
                      ones under a rough loss, take whole samples a pixel, at least one. In lit scenes ½ a unit, and one a pixel
                      of textured triangles that are no slivers
-    edge_samples     samples of the gradient at edges and where faces pass through each other, for each camera: an int in all,
-                     and as many on the borders of the shadows of each light; or None for 24 a pixel of curve, 6 in lit
-                     scenes, 1/16 where it is
-                     most likely occluded; creases by the size of their jump, and few where all of one is visible. Default
-                     samples of both kinds together take about as long as the image at most: plan() says where that bound
+    edge_samples     samples of the gradient on curves, for each camera: an int in all on silhouettes, borders, creases, lines
+                     where faces pass through each other and the lens boundary, and as many on the borders of the shadows of
+                     each light; or None for 24 a pixel of curve, 6 in lit scenes, 1/16 where it is most likely occluded;
+                     creases by the size of their jump, and few where all of one is visible. Default samples of both kinds
+                     together take about as long as the image at most: plan() says where that bound holds
     visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone
     filter           "box" (1 px wide), "tent" (2 px) or "gaussian" (σ ½ px, 3 px)
     grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which

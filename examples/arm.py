@@ -1,4 +1,4 @@
-"""A seven-joint arm of boxes and cylinders, as URDF, which examples/robot.py takes when it is given none."""
+"""Used by robot.py where it is given no robot: a seven-joint arm of boxes and cylinders, as URDF."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ LIMITS = 2.8, 2.0, 2.8, 2.2, 2.8, 2.0, 2.9  # radians, on both sides
 
 
 def link(name: str, length: float, width: float, color: str) -> str:
-    """Return a bar along z with a bolt across, which looks the same from no two sides."""
+    """A bar along z with a bolt across, so that it looks the same from no two sides."""
     return f"""
   <link name="{name}">
     <visual><origin xyz="0 0 {length / 2}"/><geometry><box size="{width} {0.7 * width} {length}"/></geometry>

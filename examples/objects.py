@@ -1,4 +1,4 @@
-"""An object that needs no file, and cameras around it, for the examples of fits."""
+"""Used by other examples: a painted stone that needs no file, and cameras around it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ import edgegrad as eg
 
 
 def pebble(texels: int = 256, subdivisions: int = 4) -> eg.Mesh:
-    """Return a bumpy stone, some 2 units long, with a pattern of blotches; each face of a cube around it is a sixth of
-    the texture."""
+    """A bumpy stone, some 2 units long, with a pattern of blotches; each face of a cube around it is a sixth of the texture."""
     cube = trimesh.creation.box().subdivide_loop(iterations=0)
     for _ in range(subdivisions):
         cube = cube.subdivide()
@@ -40,7 +39,7 @@ def pebble(texels: int = 256, subdivisions: int = 4) -> eg.Mesh:
 
 
 def blotches(size: int, seed: int = 0) -> Tensor:
-    """Return smooth noise (size, size, 3) of two scales, as radiance."""
+    """(size, size, 3) smooth noise of two scales, as radiance."""
     generator = torch.Generator().manual_seed(seed)
     total = torch.zeros(1, 3, size, size)
     for cells, height in ((9, 0.7), (36, 0.3)):
@@ -50,7 +49,7 @@ def blotches(size: int, seed: int = 0) -> Tensor:
 
 
 def around(mesh: eg.Mesh, count: int, size: int, distance: float = 1.5) -> list[eg.Camera]:
-    """Return cameras on a spiral around a mesh, so many diagonals of its box away."""
+    """Cameras on a spiral around a mesh, so many diagonals of its box away."""
     low, high = mesh.verts.detach().double().aminmax(dim=0)
     middle, diagonal = (low + high) / 2, float((high - low).norm())
     cameras = []
@@ -66,5 +65,5 @@ def around(mesh: eg.Mesh, count: int, size: int, distance: float = 1.5) -> list[
 
 
 def load(path: str | None) -> eg.Mesh:
-    """Load a mesh file, or return the stone."""
+    """A mesh file, or the stone."""
     return pebble() if path is None else eg.load_mesh(path)

@@ -1,4 +1,4 @@
-"""Matrices to clip space, rotations, a cube, and a descent, for the examples of edgegrad.raster."""
+"""Used by the other raster_*.py: matrices to clip space, rotations, a cube, and how they descend."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from tqdm import tqdm
 
 
 def perspective(f: float = 2.0, near: float = 1.0, far: float = 20.0) -> Tensor:
-    """Return OpenGL's matrix (4, 4) for an eye that looks along −z; f is 1 / tan of half the angle of view."""
+    """(4, 4): OpenGL's, for an eye that looks along −z; f is 1 / tan of half the angle of view."""
     a, b = -(far + near) / (far - near), -2 * far * near / (far - near)
     return torch.tensor([[f, 0, 0, 0], [0, f, 0, 0], [0, 0, a, b], [0, 0, -1, 0]])
 
 
 def rotations(count: int, generator: torch.Generator) -> Tensor:
-    """Return uniform rotations (count, 3, 3), by random quaternions."""
+    """(count, 3, 3), uniform: of random quaternions."""
     return of_quaternions(torch.randn(count, 4, generator=generator))
 
 
 def of_quaternions(q: Tensor) -> Tensor:
-    """Return the rotations (B, 3, 3) of quaternions (B, 4) of any length, the real part first."""
+    """(B, 3, 3) of quaternions (B, 4) of any length, the real part first."""
     w, x, y, z = (q / q.norm(dim=1, keepdim=True)).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -32,8 +32,7 @@ def of_quaternions(q: Tensor) -> Tensor:
 
 
 def in_clip_space(verts: Tensor, R: Tensor, distance: Tensor | float, projection: Tensor) -> Tensor:
-    """Return (B, V, 4): vertices (V, 3) rotated by R (B, 3, 3), as far before the eye as `distance`, a number or
-    (B,)."""
+    """(B, V, 4): vertices (V, 3) turned by R (B, 3, 3), as far before the eye as `distance`, a number or (B,)."""
     turned = verts @ R.mT
     away = torch.as_tensor(distance).expand(len(R))[:, None]
     moved = torch.stack([turned[..., 0], turned[..., 1], turned[..., 2] - away], 2)
@@ -41,7 +40,7 @@ def in_clip_space(verts: Tensor, R: Tensor, distance: Tensor | float, projection
 
 
 def cube() -> tuple[Tensor, Tensor, Tensor]:
-    """Return vertices (8, 3), triangles (12, 3), and for each triangle three times the number of its side (12, 3)."""
+    """Vertices (8, 3), triangles (12, 3), and for each triangle three times the number of its side (12, 3)."""
     corners = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
     sides = torch.tensor([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     triangles = torch.stack([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]], 1).reshape(-1, 3)
@@ -51,8 +50,8 @@ def cube() -> tuple[Tensor, Tensor, Tensor]:
 def descend(
     optimizer: torch.optim.Optimizer, loss: Callable[[], Tensor], steps: int, last: float, name: str | None = None
 ) -> None:
-    """Take steps along the gradient of a loss that is made anew for each. Learning rates fall to the share `last` of
-    what they were, by the same factor at each step. A bar of this name is shown."""
+    """Steps along the gradient of a loss that is made anew for each. Learning rates fall to the share `last` of what they were,
+    by the same factor at each step. A bar of this name is shown."""
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: last ** (step / steps))
     bar = tqdm(range(steps), desc=name, disable=name is None)
     for _ in bar:

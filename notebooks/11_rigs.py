@@ -5,7 +5,7 @@
 # one from a glTF file, `Rig.from_function` takes any function, `load_robot` a URDF. Here a body of twenty joints is made from
 # arrays, bent, and its pose found again from four silhouettes.
 #
-# It needs `pip install 'edgegrad[rigs]'`, and a clone of the repository for the body of `examples/figure.py`.
+# It needs `pip install '.[rigs]'`, and a clone of the repository for the body of `examples/figure.py`.
 
 # %%
 import sys

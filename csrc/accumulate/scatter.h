@@ -1,4 +1,5 @@
-// Adds the gradients of samples, with the same bits at any number of threads.
+// Adds up the gradients of samples, with the same bits at any number of threads. Gradients that come from no sample are
+// added elsewhere: backward/backward.cpp has the background, world.h vertices and cameras, raster/sums.h the rasteriser.
 //
 // Samples are processed in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own, one for
 // each owner of destinations. Each thread then adds, chunk after chunk, the rows whose destination it owns. Each sum
@@ -107,14 +108,14 @@ class RowBuffer {
 struct LightMotion {
     int32_t part = -1;
     Vec2 uv;
-    Vec3 by_place;  // in camera coordinates
+    Vec3 by_place;  // It is in camera coordinates.
 };
 
 // Holds the thread-local gradients of one chunk of samples.
 struct LocalGradients {
     RowBuffer q, x, colors, uvs, texels, alphas;  // Vertices have q in camera coordinates and x in the image.
     RowBuffer vertex_attributes, face_attributes;
-    RowBuffer pixels;  // rows of an array of the image's size
+    RowBuffer pixels;  // They belong to an array of the image's size.
     IntrinsicsGrad k;
     LightMotion light;
     Records records;
@@ -124,13 +125,13 @@ struct LocalGradients {
 struct GradientSink {
     double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *alphas = nullptr;
     double *vertex_attributes = nullptr, *face_attributes = nullptr, *pixels = nullptr;
-    int pixel_width = 0;  // numbers per pixel
+    int pixel_width = 0;  // It counts numbers per pixel.
     IntrinsicsGrad k = {};
     bool want_k = false;
     RecordList* records = nullptr;
 };
 
-struct RowSlot;  // rows of both, with their width
+struct RowSlot;  // It pairs the rows of both with their width.
 
 // Limits samples per chunk, chunks in memory per thread, and owners. More owners would only split the buffers further.
 constexpr int64_t scatter_chunk = 512, chunks_in_flight = 16;

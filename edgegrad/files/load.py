@@ -63,12 +63,15 @@ def load_mesh(
     Vertices that the file repeats (at texture seams, for normals, in triangle soups) are welded where their positions are
     equal; unused ones are left out. Convex polygons become fans of triangles, concave ones triangles that cover them. Texture
     coordinates are indexed apart, v running up, and are kept without a texture, too. Where welded vertices had different
-    colours, they become `corner_colors`. STL gives the shape only. The top of this module says what colours mean. Parts of one
-    appearance (all plain, all with vertex colours, all with face colours, all on one texture; lit, all with one material)
-    become one Mesh. Files that the file names are read from its folder and below, and from nowhere else. Raises
-    FileNotFoundError (the file, or one that it names), ValueError (another kind of file, damaged, without triangles, bad
-    indices or positions, or parts of different appearance: use load_scene), TypeError, or ImportError without trimesh, or
-    without mapbox_earcut where a file has concave faces with more than four corners.
+    colours, they become `corner_colors`. STL gives the shape only. Colours become linear radiance, or base colours with `lit`.
+    In the file, colour textures and the colours of vertices and faces of OBJ, PLY and 3MF are sRGB; factors of materials and
+    vertex colours of glTF are linear. Texture, factor and vertex colours of a glTF are multiplied, and so are map_Kd and Kd of
+    an OBJ; otherwise the first of texture, vertex colours, face colours and material counts. Parts of one appearance (all
+    plain, all with vertex colours, all with face colours, all on one texture; lit, all with one material) become one Mesh.
+    Files that the file names are read from its folder and below, and from nowhere else. Raises FileNotFoundError (the file, or
+    one that it names), ValueError (another kind of file, damaged, without triangles, bad indices or positions, or parts of
+    different appearance: use load_scene), TypeError, or ImportError without trimesh, or without mapbox_earcut where a file has
+    concave faces with more than four corners.
 
     Parameters
     ----------

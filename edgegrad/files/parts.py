@@ -22,7 +22,6 @@ from .formats.part import FormatError, LoadOptions, MeshFile, Part
 from .paths import PathLike, check_readable
 
 GLTFS = (".gltf", ".glb")
-MESHES = (".obj", *GLTFS, ".ply", ".stl", ".off", ".3mf")
 Appearance = Callable[[dict[str, Any]], dict[str, Any]]  # the fields of a part, from the arrays of a file
 
 
@@ -171,3 +170,4 @@ def _errors_with_part(name: str, alone: bool) -> Iterator[None]:
 
 PART_READERS = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "off": off.read}
 READERS = {"gltf": _read_gltf, "glb": _read_gltf, "3mf": _read_3mf, **dict.fromkeys(PART_READERS, _read_parts)}
+MESHES = tuple(f".{kind}" for kind in READERS)

@@ -13,6 +13,7 @@ import io
 import pkgutil
 import re
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import get_args, get_type_hints
@@ -184,6 +185,41 @@ def test_files_that_a_page_names_exist(page: str) -> None:
     names |= {f"{name}.py" for name in re.findall(r"`(test_[\w*]+)`", text)}
     lost = [name for name in names if not any(fnmatch("/" + path, "*/" + name) for path in paths)]
     assert not lost
+
+
+SOURCES = ("*.py", "*.pyi", "*.cpp", "*.h", "*.yml", "*.toml", "Makefile", "CMakeLists.txt", "mutants.txt")
+
+
+@cache
+def words_of_sources() -> frozenset[str]:
+    """All words of the sources but this file, and the names of files without their endings."""
+    root = FOLDER.parent
+    tops = ("csrc", "edgegrad", "tests", "benchmarks", "examples", "docs", "notebooks", ".github")
+    files = [*root.iterdir(), *(path for top in tops for path in (root / top).rglob("*"))]
+    files = [path for path in files if path.is_file() and path != Path(__file__)]
+    known = {path.name.partition(".")[0] for path in files}
+    for path in files:
+        if any(fnmatch(path.name, pattern) for pattern in SOURCES):
+            known |= set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
+    return frozenset(known)
+
+
+def unknown_identifiers(text: str) -> list[str]:
+    """Return the names in code spans that the sources do not have. NAME and VERSION stand for others, * for any ending."""
+    spans = " ".join(re.findall(r"`([^`\n]+)`", FENCE.sub("", text)))
+    names = re.findall(r"(?<!\w)[A-Za-z_]\w*(?![\w*])", spans)
+    return [name for name in names if name not in words_of_sources() and not re.search("NAME|VERSION", name)]
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("page", [page for page in MAINTAINERS if page != "checks.md"])
+def test_identifiers_are_those_of_the_sources(page: str) -> None:
+    assert not unknown_identifiers((FOLDER / page).read_text(encoding="utf-8"))
+
+
+def test_made_up_identifiers_are_found() -> None:
+    text = "`Camera.look_at()` and `with_cube_face_lens`, not `with_side_lens` nor `csrc/camera/side_lens.h`"
+    assert unknown_identifiers(text) == ["with_side_lens", "side_lens"]
 
 
 @pytest.mark.quick

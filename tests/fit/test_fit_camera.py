@@ -102,7 +102,7 @@ def test_a_camera_is_saved(tmp_path):
     history = json.loads((tmp_path / "history.json").read_text())
     assert [record["loss"] for record in history] == [record.loss for record in fit.history]
     assert history[0]["values"] == {"cameras.0.world_to_camera": view.world_to_camera.tolist()}
-    assert {axes.get_ylabel() for axes in fit.plot_history().axes} == {"mean squared difference", "|gradient|"}
+    assert {axes.get_ylabel() for axes in fit.plot_history().axes} == {"loss", "|gradient|"}
     torch.testing.assert_close(eg.load_camera(tmp_path / "camera.json").K.double(), view.K.double())
 
 

@@ -1,8 +1,9 @@
 """fit_pose(): the pose of a known mesh in one or several pictures.
 
-The loss is the squared difference between blurred pictures and renders, on an image pyramid from coarse to fine; what covers
-the object hardly counts. Each Gauss-Newton step rotates the object about its centre, shifts it in units of its size, and
-changes logarithms of scale and focal length.
+An image pyramid is searched from coarse to fine. Colours as they are, or the mask of a plain mesh, are compared by a robust
+squared difference of blurred pictures and renders (color_search.py); photographs by a sum of likelihoods (photo/level.py). In
+both, what covers the object hardly counts. Each Gauss-Newton step rotates the object about its centre, shifts it in units of
+its size, and changes logarithms of scale and focal length.
 """
 
 from __future__ import annotations
@@ -107,8 +108,8 @@ def fit_pose(
                 shows 85 % of the render's edges. Around `init` they are rotated by up to 45°; without it they are rotated in
                 all ways, at the place that `init` has for None. "global" searches for the object in the whole first picture,
                 seen by a perspective or orthographic camera, from all sides and at sizes from 0.25 to 1.25 of the picture's
-                shorter side, or in the mask, in 5 … 40 s of processor time; `init` is None then. 1: the start alone, and what
-                `search` adds; more starts ignore `search`
+                shorter side, in 20 … 40 s of processor time, or in the mask, in 4 … 10 s; `init` is None then. 1: the start
+                alone, and what `search` adds; more starts ignore `search`
     progress    show a bar with the loss on standard error
     callback    called after each step with the best fit so far
     checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
@@ -117,19 +118,21 @@ def fit_pose(
     symmetries  of the mesh: of the equivalent poses, the one nearest to the start is reported, by its rotation. "find" computes
                 them with find_symmetries(). They do not change the search itself
 
-    Something unknown may cover about a quarter of the object; fit_poses() is for meshes that cover one another. The picture
-    may be blurred by up to 1.4 pixels, and compressed: renders get the same blur. The start is refined first. The fit is
-    `converged` if its last step was short and the pictures show at least 60 % of the render's edges (`explained`). Where they
-    do not, it searches for better poses further off, which takes a few times as long, less where nothing in the picture
-    matches the object. Where they do, but the object is covered or of another colour, it searches nearby, in about the same
-    time again. Another pose is the answer only if its loss is lower than that of `init` in the final comparison, and the
-    picture shows its edges as well. `uncertainty` says how exactly the pictures show the pose: a rotation known less exactly
-    than to 5° (of a plain mesh 2°), or a place than to 5 % of the object's size, is not `converged`, and `reason` names the
-    direction; a continuous one of the `symmetries` counts as known. A plain mesh has its contour alone: it always takes other
-    starts, as do meshes with colours whose rotation is known less exactly than to 1°. A pose is not `converged` if another
-    one is about as likely. KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with
-    `interrupted` set. Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the
-    argument, also when the object leaves no trace in the picture at the start.
+    Something unknown may cover about a quarter of the object; fit_poses() is for meshes that cover one another. The picture may
+    be blurred by up to 1.4 pixels, and compressed: renders get the same blur. The start is refined first. The fit is
+    `converged` if its last step was short and the pictures show enough of the render's edges (`explained`): 60 % where its
+    colours as they are, or the mask of a plain mesh, were compared; 65 % by the terms for photographs; 85 % by these terms
+    where the mesh is plain, or where its colours were compared first and did not fit. Where the pictures show less, it searches
+    for better poses further off, which takes a few times as long, less where nothing in the picture matches the object. Where
+    they show enough, but the object is covered or of another colour, it searches nearby, in about the same time again. Another
+    pose is the answer only if its loss is lower than that of `init` in the final comparison, and the picture shows its edges as
+    well. `uncertainty` says how exactly the pictures show the pose: a rotation known less exactly than to 5° (of a plain mesh
+    2°), or a place than to 5 % of the object's size, is not `converged`, and `reason` names the direction; a continuous one of
+    the `symmetries` counts as known. A plain mesh has its contour alone: it always takes other starts, as do meshes with
+    colours whose rotation is known less exactly than to 1°. A pose is not `converged` if another one is about as likely.
+    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set. Works in
+    torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when the object
+    leaves no trace in the picture at the start.
     """
     lens = Unknowns(check_flag("fit_scale", fit_scale), check_flag("fit_focal", fit_focal))
     return search_pose(

@@ -67,7 +67,7 @@ def curves_of(fit: PoseFit) -> Figure:
         labelled.add((h, w))
         above.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
     above.set_yscale("log")
-    above.set_ylabel("loss" if fit.task is not None and fit.task.clutter else "mean squared difference")
+    above.set_ylabel("loss")
     above.spines[["top", "right"]].set_visible(False)
     above.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)
     draw_gradients(below, [step.gradient for step in history])

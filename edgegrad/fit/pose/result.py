@@ -36,7 +36,7 @@ class Step(NamedTuple):
     """One render of the fit."""
 
     size: tuple[int, int]  # pixels (H, W) of this level of the pyramid
-    loss: float  # mean squared difference of equally blurred images; comparable within one level
+    loss: float  # what the steps lower, see PoseFit; comparable within one level
     pose: Pose
     best: bool  # It was the best so far.
     # Norms of the loss's gradient by sought part: rotation (radians), shift (object sizes), scale and focal (logarithms),
@@ -49,9 +49,13 @@ class PoseFit:
     """The result of fit_pose().
 
     R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given one
-    (of several the first), with the focal length found when that was asked for. `loss` is the mean squared difference to the
-    picture over pixels and channels, at the finest level, in linear radiance of which 1 is the picture's white; where a pixel
-    is far off, it counts no more than a tenth of the picture's range does.
+    (of several the first), with the focal length found when that was asked for.
+
+    `loss` belongs to the finest level, and compares only fits to the same pictures that ended by the same terms. By colours as
+    they are, or by the mask of a plain mesh, it is the mean over pixels and channels of Geman and McClure's ρ(r) = r² / (1 +
+    r²/c²): r is the difference of a pixel to the picture, in linear radiance of which 1 is the picture's white, and c a tenth of
+    the picture's range. Before an unknown background a reward for what the object covers is subtracted. By the terms for
+    photographs it is the region term alone: the mean of −log(likelihood) over the pixels around the object, in nats.
     """
 
     R: Tensor
