@@ -169,5 +169,7 @@ def _errors_with_part(name: str, alone: bool) -> Iterator[None]:
 
 
 PART_READERS = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "off": off.read}
-READERS = {"gltf": _read_gltf, "glb": _read_gltf, "3mf": _read_3mf, **dict.fromkeys(PART_READERS, _read_parts)}
+READERS = {
+    "obj": _read_parts, "gltf": _read_gltf, "glb": _read_gltf, **dict.fromkeys(PART_READERS, _read_parts), "3mf": _read_3mf
+}  # fmt: skip
 MESHES = tuple(f".{kind}" for kind in READERS)

@@ -313,7 +313,7 @@ def test_gradient_by_place(mesh):
     """Its sum is the derivative for moving all in the image."""
     scene, A = eg.Scene([mesh]), smooth_adjoint(SIZE, SIZE, 3)
     options = {"step_spacing": 1 / 16, "edge_samples": 50_000}
-    total = torch.stack([eg.screen_gradient(scene, CAMERA, A, 16, s, **options).sum((0, 1)) for s in range(4)])  # type: ignore[arg-type]
+    total = torch.stack([eg.screen_gradient(scene, CAMERA, A, 16, s, **options).sum((0, 1)) for s in range(8)])  # type: ignore[arg-type]
     for axis in range(2):
         shift = torch.zeros(3, 3, dtype=F64)
         shift[axis, 2] = 1.0
