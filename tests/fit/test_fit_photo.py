@@ -2,6 +2,7 @@
 
 import math
 import re
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -30,6 +31,29 @@ def test_an_ambiguous_pose_may_be_shifted(taken):
         others = [pose, pose._replace(t=pose.t + far * task.size * torch.tensor([0.0, 0.6, 0.8]))]
         said = ambiguity(pose, others, None, task)
         assert words in said and bool(said) == bool(words)
+
+
+@pytest.mark.parametrize("photograph_share", [0.5, 0.7])
+def test_a_result_is_judged_by_the_limit_of_the_terms_that_it_is_from(photograph_share, monkeypatch):
+    """Colours that show 62 % of the edges converged, though the terms of photographs would need more."""
+    view = camera(48)
+    image = eg.render(eg.Scene([bracket()], torch.tensor([0.1, 0.2, 0.3])), view, spp=16)
+    search = photo_search.PhotoSearch(task_of(image, view), pose_from_matrix("pose", START), [None], 48, 8, 10, 1e-3, 0)
+    assert search.colors_first
+    colors = SimpleNamespace(
+        best=search.start, loss=1.0, edge_support=0.62, converged=True, information=None, enough=0.6, history=[]
+    )
+    monkeypatch.setattr(search, "_by_colors", lambda *_: colors)
+    search.run()
+    assert search.converged and search.edge_support >= search.enough == 0.6
+    # Where colours show too little, the better of both is judged by its own limit.
+    colors.edge_support, colors.converged = 0.55, False
+    photographs = SimpleNamespace(edge_support=photograph_share)
+    monkeypatch.setattr(search, "_photograph", lambda: photographs)
+    monkeypatch.setattr(search, "_take", lambda best: None)
+    search.enough = photo_descent.PHOTO_SUPPORT
+    search.run()
+    assert search.enough == (photo_search.SURE_SUPPORT if photograph_share > photo_descent.PHOTO_SUPPORT else 0.6)
 
 
 @pytest.fixture(scope="module")

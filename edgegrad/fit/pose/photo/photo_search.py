@@ -70,6 +70,7 @@ class PhotoSearch(PhotoDescent):
         colors = self._by_colors(self.start, self.task.pyramid(self.start, self.max_size, self.spp), self.further)
         self._adopt(colors)
         if colors.edge_support >= colors.enough or not self.further:
+            self.enough = colors.enough
             return
         begins = len(self.history)
         best = self._photograph()
@@ -80,7 +81,7 @@ class PhotoSearch(PhotoDescent):
             self.enough = SURE_SUPPORT
             self._take(best)
         else:
-            self.ambiguous = []
+            self.enough, self.ambiguous = colors.enough, []
 
     def _photograph_first(self) -> None:
         """Search by the terms of photographs; colours refine an unlit result, or search a mask where the terms find
@@ -96,6 +97,7 @@ class PhotoSearch(PhotoDescent):
             return
         if better:
             self._adopt(colors)
+            self.enough = colors.enough
         else:
             self._forget(slice(len(self.history) - len(colors.history) + 1, None))
 
