@@ -48,7 +48,7 @@ namespace {
 
 // Removes the near part from the cotangent of the first point's position on its face.
 template <class At>
-void remove_near_field(const LitScene& lit, const LitOptions& options, const Path& path, At at, const double* total_bar,
+void remove_near_field(const LitScene& lit, const LitOptions& options, At at, const double* total_bar,
                        const PathBuffers& found, FacePointBar& at_bar) {
     const NearField near(options.near);
     const Surface<double>& o = at(0);
@@ -117,7 +117,7 @@ void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
                 path_radiance_vjp(lit, paths.lights(), path, at, bar + (first + i) * lit.channels, buffers, at_bar,
                                   chunk);
                 if (options.near > 0)
-                    remove_near_field(lit, options, path, at, bar + (first + i) * lit.channels, buffers, at_bar);
+                    remove_near_field(lit, options, at, bar + (first + i) * lit.channels, buffers, at_bar);
                 write(at_bar, places, first + i);
             }
         }
