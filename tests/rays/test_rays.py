@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from kernel_parts import parts
 import edgegrad as eg
 from edgegrad.kernel.flat import flatten
 from edgegrad.kernel.operators import kernel_scene
+from edgegrad.library import core
 from edgegrad.scene.scene import Scene
 
 pytestmark = [pytest.mark.quick, pytest.mark.watched]
@@ -116,3 +118,17 @@ def test_any_rays(far: float, infinite: bool, scale: float) -> None:
     # Without ends and ignored faces the answers differ: they were heeded.
     free = rays._replace(ends=np.full(len(rays.ends), np.inf), ignored=[np.empty(0, int)] * len(rays.ends))
     assert (brute_force(corners, free).face != truth.face).mean() > 0.04
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="Linux tells the state of threads")
+def test_threads_of_embree_sleep_while_a_process_forks() -> None:
+    """A child that is forked while one of them holds a lock would wait for it for ever."""
+    corners = triangle_soup(50_000, 1.0, np.zeros(3))
+    cast(corners, rays_through(corners, 10, 3.0, False))
+    core.before_fork()
+    try:
+        lines = [(task / "stat").read_text() for task in Path("/proc/self/task").iterdir()]
+    finally:
+        core.after_fork(child=False)
+    states = [line.rpartition(") ")[2][0] for line in lines if "(embree)" in line]
+    assert set(states) <= {"S"}, states

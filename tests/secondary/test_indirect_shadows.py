@@ -103,6 +103,7 @@ def test_glossy_floor(roughness: float) -> None:
     check(case, 2048, 8, **{name: 16 * n for name, n in FEW.items()})
 
 
+@pytest.mark.watched
 def test_both_modes_and_any_number_of_threads() -> None:
     case, zero = case_of("emitter", "caster"), torch.zeros((), dtype=F64)
 

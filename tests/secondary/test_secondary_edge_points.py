@@ -121,6 +121,7 @@ def test_light_that_is_followed_to_the_camera(monkeypatch: pytest.MonkeyPatch) -
         assert abs(ratio - 1) < MOST[name], (name, ratio)
 
 
+@pytest.mark.watched
 @pytest.mark.usefixtures("alone")
 def test_lines_of_floats() -> None:
     """Lines are the same in float32, but for rounding."""
@@ -130,6 +131,7 @@ def test_lines_of_floats() -> None:
         assert float((coarse[name] - exact).norm() / exact.norm()) < 1e-3
 
 
+@pytest.mark.watched
 @pytest.mark.usefixtures("alone")
 def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
     strip, weights = Strip.standard(), weights_of(Strip.standard())

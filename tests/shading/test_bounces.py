@@ -137,6 +137,7 @@ class Oracle:
         return total
 
 
+@pytest.mark.watched
 @pytest.mark.parametrize(("words", "bounces"), diagonal(SCENES, BOUNCES))
 def test_values_and_cotangents(words: str, bounces: int) -> None:
     leaves = {name: value.clone().requires_grad_() for name, value in numbers(words).items()}
@@ -154,6 +155,7 @@ def test_values_and_cotangents(words: str, bounces: int) -> None:
         assert float(a.abs().max()) > 0 or name not in ("ground", "ground_color", "wall", "wall_color", "w2c"), name
 
 
+@pytest.mark.watched
 @pytest.mark.parametrize(("words", "bounces"), diagonal(SCENES, BOUNCES))
 def test_tangents_are_cotangents(words: str, bounces: int) -> None:
     values = {**numbers(words), "w2c": CAMERAS["perspective"].world_to_camera.double()}

@@ -63,7 +63,8 @@ def test_points_of_all_rooms(room: str, bounces: int) -> None:
 
 # Shares of the radiance are drawn in two ways where a path may meet a light (csrc/shading/lit/path.h); with two light samples
 # nothing is, each point has one path, and no pixel is asked again.
-@pytest.mark.parametrize("room", ["sky", "large light"])
+@pytest.mark.watched
+@pytest.mark.parametrize("room", ["sky", "sky through an opening", "large light"])
 def test_images_whose_points_have_several_paths(room: str) -> None:
     scene, camera = ALL_ROOMS[room](), towards_room(12)
     with torch.no_grad():
@@ -96,6 +97,7 @@ def test_white_furnace(bounces: int) -> None:
     assert abs(float(gradient.sum()) / slope - 1) < 0.01
 
 
+@pytest.mark.watched
 def test_gradients_of_a_room() -> None:
     """Radiance is linear in the emission, and each colour's derivative is that of images with other colours."""
     leaves = {"wall": vector(0.7, 0.15, 0.1), "emission": vector(6.0, 5.4, 4.2)}

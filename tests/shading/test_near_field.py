@@ -59,6 +59,7 @@ def test_without_differences_noise_has_no_bound(monkeypatch: pytest.MonkeyPatch)
     assert noise() > 5 * quiet
 
 
+@pytest.mark.watched
 def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
     scene, weights = corner(), torch.rand(32, 32, 1, dtype=F64, generator=torch.Generator().manual_seed(0))
     pose = scene.camera.world_to_camera
