@@ -122,9 +122,9 @@ class EdgeLineSampler {
         places.each(first, last, [&](int64_t i, int64_t piece, double along, double weight) {
             if (piece != current) edge.set(current = piece);
             const auto [t, w, area] = edge.at(along, sequence(uint64_t(i)), to_unit(hash(random, 1, uint64_t(i))));
+            if (area == 0) return;
             const int64_t cell = edge.cell(w);
             drawn(cell);
-            if (area == 0) return;
             traced.add(piece, t, w, cell, weight * area);
             if (traced.is_full()) traced.cast(body);
         });
