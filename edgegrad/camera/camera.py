@@ -12,7 +12,7 @@ to the pixel position (x, y), x to the right and y down, the corner of the image
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,8 +54,9 @@ class Camera(Viewpoints, Conventions):
     @classmethod
     def stack(cls, cameras: Sequence[Camera]) -> Camera:
         """Return one batch of cameras of the same size and projection."""
-        if isinstance(cameras, Camera):
-            raise TypeError("cameras: expected a sequence of cameras, got one Camera; put it in a list")
+        if isinstance(cameras, Camera) or not isinstance(cameras, Iterable):
+            got = "one Camera; put it in a list" if isinstance(cameras, Camera) else type(cameras).__name__
+            raise TypeError(f"cameras: expected a sequence of cameras, got {got}")
         cameras = list(cameras)
         if not cameras:
             raise ValueError("cameras: expected at least one camera, got none")

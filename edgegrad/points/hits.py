@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..check import as_tensor, check_finite, check_float, check_shape, values_visible
+from ..check import as_tensor, check_finite, check_float, check_int, check_positive_int, check_shape, values_visible
 from ..scene.lights import Light, LightPoints
 from ..scene.material import WRAPS
 from ..scene.mesh import FILTERS
@@ -375,11 +375,16 @@ class Hits:
         index = self._index(light)
         if by is not None and not callable(by):
             raise TypeError(f"by: expected a function such as eg.lights.points_by_material, or None, got {by!r}")
-        if not 0 <= sample < samples:
-            raise ValueError(f"sample: expected a number from 0 to {samples - 1}, below samples, got {sample}")
+        samples = check_positive_int("samples", samples)
+        sample = check_int("sample", sample, 0, samples - 1)
         if by is not None:
             if (by, index, samples) not in self._drawn:
-                self._drawn[by, index, samples] = by(self, light, samples)
+                drawn = by(self, light, samples)
+                if not (isinstance(drawn, list) and len(drawn) == samples and isinstance(drawn[0], LightPoints)):
+                    raise TypeError(
+                        f"by: expected a function that returns a list of {samples} LightPoints, got {drawn!r}"
+                    )
+                self._drawn[by, index, samples] = drawn
             return self._drawn[by, index, samples][sample]
         points = light.draw(sobol(self._seed, key_of(index, 0), sample, samples))
         forced = self._forced

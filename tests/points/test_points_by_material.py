@@ -109,6 +109,10 @@ def test_arguments():
     hits = eg.trace(scene(**leaves()), vector(0, 0, 3)[None], vector(0, 0, -1))
     with pytest.raises(TypeError, match=r"by: expected a function such as eg\.lights\.points_by_material"):
         hits.light_points(hits.lights[0], by="lobe")
-    with pytest.raises(ValueError, match="sample: expected a number from 0 to 1"):
+    with pytest.raises(ValueError, match="sample: expected an int from 0 to 1"):
         hits.light_points(hits.lights[0], 2, 2)
     assert len(hits.light_points(hits.lights[1], 1, 2, by=eg.lights.points_by_material).index) == 1
+    with pytest.raises(TypeError, match="samples: expected an int, got"):
+        hits.light_points(hits.lights[0], 0, 1.5)
+    with pytest.raises(TypeError, match="by: expected a function that returns a list of 1 LightPoints, got None"):
+        hits.light_points(hits.lights[0], by=lambda *_: None)
