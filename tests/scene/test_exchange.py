@@ -153,6 +153,19 @@ def test_a_state_dict_holds_all_of_a_scene(tmp_path: Path) -> None:
         assert tensor.dtype == before[name].dtype and torch.equal(tensor, before[name]) and not tensor.requires_grad
 
 
+def test_words_of_a_state_dict_are_plain(tmp_path: Path) -> None:
+    """torch.load(weights_only=True) refuses numpy's strings."""
+    clamp, nearest = np.str_("clamp"), np.str_("nearest")
+    texture = eg.Texture(torch.rand(2, 2, 3), wrap=clamp, filter=nearest)
+    material = eg.Material(texture, alpha_mode=np.str_("BLEND"))
+    mesh = eg.Mesh(VERTS, FACES, uvs=COLORS[:, :2], uv_faces=FACES, material=material, name=np.str_("cube"),
+                   wrap=(clamp, np.str_("mirror")), filter=nearest)  # fmt: skip
+    torch.save(eg.Scene(mesh).state_dict(), tmp_path / "a.pt")
+    (again,) = eg.Scene.from_state_dict(torch.load(tmp_path / "a.pt", weights_only=True)).meshes
+    assert (again.name, again.wrap, again.filter) == ("cube", ("clamp", "mirror"), "nearest")
+    assert type(mesh.replace(wrap=clamp).wrap) is type(mesh.name) is str
+
+
 class Own(eg.lights.PointLight):
     """A light of a class of its own."""
 
