@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,23 @@ def test_what_a_file_does_not_hold_is_said(tmp_path: Path) -> None:
             eg.save_mesh(tmp_path / f"a.{ending}", eg.Mesh(VERTS, FACES, **appearance))
     with pytest.warns(UserWarning, match=r"a\.stl holds no colors;"):
         eg.save_mesh(tmp_path / "a.stl", eg.Mesh(VERTS, FACES, colors=torch.rand(8, 3)))
+
+
+def test_an_obj_clamps_and_names_other_wraps_and_filters(tmp_path: Path) -> None:
+    mesh = eg.Mesh(VERTS, FACES, **APPEARANCES["texture"], wrap=("clamp", "clamp"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        eg.save_mesh(tmp_path / "a.obj", mesh)
+    assert eg.load_mesh(tmp_path / "a.obj").wrap == "clamp"
+    for fields, message in (
+        ({"filter": "nearest"}, r"no filter 'nearest'"),
+        ({"wrap": "mirror"}, r"no wrap 'mirror'"),
+        ({"wrap": ("clamp", "repeat"), "filter": "mipmap"}, r"no wrap \('clamp', 'repeat'\), no filter 'mipmap'"),
+    ):
+        with pytest.warns(UserWarning, match=rf"a\.obj holds {message}; torch\.save"):
+            eg.save_mesh(tmp_path / "a.obj", mesh.replace(**fields))
+    with pytest.warns(UserWarning, match=r"a\.ply holds no uvs, no texture, no wrap 'clamp', no filter 'nearest';"):
+        eg.save_mesh(tmp_path / "a.ply", mesh.replace(wrap="clamp", filter="nearest"))
 
 
 def test_parts_keep_their_names(tmp_path: Path) -> None:
