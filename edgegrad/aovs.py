@@ -15,7 +15,7 @@ from torch import Tensor
 from .camera.camera import Camera
 from .kernel.autograd import faces_at_centers, render_image
 from .kernel.flat import image_dtype
-from .kernel.request import Channels, Request, make_request
+from .kernel.request import Channels, Request, check_camera, make_request
 from .light.lit_operator import lit_image
 from .light.radiance import Lighting
 from .light.unused_options import warn_of_unused
@@ -78,6 +78,7 @@ def render_aovs(
     """
     names = check_aovs(aovs)
     scene = as_scene(scene)
+    check_camera(camera)
     lighting = Lighting.from_options(shadows, light_samples, bounces)
     if "image" in names:
         warn_of_unused(scene, False, lighting.options)

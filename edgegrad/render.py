@@ -21,7 +21,7 @@ from .check import as_int, as_tensor, check_finite, check_float, check_not_meta,
 from .kernel.autograd import render_image
 from .kernel.batch import render_images
 from .kernel.operators import forward_kernel, screen_gradient_kernel
-from .kernel.request import Request, make_request
+from .kernel.request import Request, check_camera, make_request
 from .light.lit_operator import lit_image
 from .light.radiance import LIGHTING, Lighting, check_unlit
 from .light.unused_options import warn_of_unused
@@ -161,10 +161,7 @@ def render_batch(
             raise TypeError(f"pairs[{k}]: expected (scene, camera), got {type(pair).__name__}")
         with _of_pair(k):
             scene, camera = as_scene(pair[0]), pair[1]
-            if not isinstance(camera, Camera):
-                raise TypeError(
-                    f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)"
-                )
+            check_camera(camera)
             if camera.batch is not None:
                 raise ValueError(
                     f"camera: expected one camera, got a batch of {camera.batch}; give camera[i] one by one"
@@ -239,6 +236,7 @@ def jvp(
     which torch loads its own rules of forward mode. The same as torch.func.jvp of render(), under torch.vmap; what it returns is
     not in the graph. Raises what render() raises.
     """
+    check_options("jvp", options)
     own = {n: v for n, v in options.items() if n not in SHADING}
     make_request(scene, camera, spp, seed, **own)  # checks them
     scene = as_scene(scene)
@@ -246,7 +244,10 @@ def jvp(
         if name in IDS:
             raise ValueError(f"aovs: expected channels with derivatives, got {name!r}; ask render_aovs() for ids")
     if not isinstance(tangents, Mapping) or not tangents:
-        raise TypeError("tangents: expected a mapping of tensors of the scene and the camera to their tangents")
+        raise TypeError(
+            "tangents: expected a mapping of tensors of the scene and the camera to their tangents, got "
+            f"{type(tangents).__name__ if not isinstance(tangents, Mapping) else 'an empty one'}"
+        )
     owned = {id(tensor) for thing in (scene, camera) for tensor in tensors_in(thing)}
     leaves, values = [], []
     for leaf, tangent in tangents.items():
@@ -298,6 +299,7 @@ def screen_gradient(
     does is not in it. The other arguments are those of render(). Raises what render() raises.
     """
     check_unlit("screen_gradient", as_scene(scene), "detach the materials, or take the gradient of render()")
+    check_options("screen_gradient", options, without=SHADING)
     request = make_request(scene, camera, spp, seed, **options)
     adjoint = as_tensor("adjoint", adjoint, floating=True).detach()
     check_float("adjoint", adjoint)
@@ -311,8 +313,10 @@ def screen_gradient(
     return (gradient if camera.batch is not None else gradient[0]).to(adjoint.device)
 
 
-def check_options(function: str, options: Mapping[str, Any]) -> None:
-    """Raise TypeError if a `function` that takes the options of render() was given others."""
-    known = [name for name, p in inspect.signature(render).parameters.items() if p.kind is p.KEYWORD_ONLY]
+def check_options(function: str, options: Mapping[str, Any], without: Sequence[str] = ()) -> None:
+    """Raise TypeError if a `function` that takes the options of render(), but for those `without`, was given others."""
+    known = [
+        n for n, p in inspect.signature(render).parameters.items() if p.kind is p.KEYWORD_ONLY and n not in without
+    ]
     if unknown := [name for name in options if name not in known]:
         raise TypeError(f"{function}: expected only the options {', '.join(known)}, got {unknown[0]!r}")

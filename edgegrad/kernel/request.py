@@ -168,6 +168,12 @@ class WantedTerms(NamedTuple):
 # -- from what the user gives -------------------------------------------------------------------------------------------
 
 
+def check_camera(camera: object) -> None:
+    """Raise TypeError for what is no camera."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
+
+
 def make_request(
     scene: Scene | Mesh,
     camera: Camera,
@@ -185,8 +191,7 @@ def make_request(
     """Return the arguments of render(), checked; and whether texture coordinates that nothing needs are taken along. Raises
     TypeError or ValueError."""
     scene = as_scene(scene)
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
+    check_camera(camera)
     spp = check_positive_int("spp", spp, most=1 << 20)
     seed = _check_seed("seed", seed)
     grad_seed = derived_seed(seed) if grad_seed is None else _check_seed("grad_seed", grad_seed)

@@ -12,7 +12,7 @@ from brackets import BACKGROUND, START, about_center, bracket, camera, picture, 
 from photographs import coverage, depth_of, photograph
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera, fit_pose, fit_poses, fit_scene, track
+from edgegrad.fit import fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
 from edgegrad.fit.pose.photo.depth import warn_of_units
@@ -280,3 +280,20 @@ def test_faint_masks_are_named():
         warnings.simplefilter("error")
         # In one of two views the object is hardly seen.
         fit_scene(bracket(), [view, other], None, what, masks=[mask, 0.1 * silhouette(other)], **options)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 4])
+@pytest.mark.parametrize("method", ["adam", "gauss-newton"])
+def test_pictures_of_scenes_have_the_channels_of_the_scene(channels, method):
+    image = torch.rand(16, 16, channels)
+    with pytest.raises(ValueError, match=f"images: expected 3 channels like the scene's colours, got {channels}"):
+        fit_scene(bracket(), camera(16), image, parameters={"verts": 0.1}, method=method, steps=1, progress=False)
+
+
+def test_pictures_of_a_texture_have_its_channels():
+    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    faces = torch.tensor([[0, 1, 2]])
+    verts = torch.cat([corners, torch.zeros(3, 1)], 1)
+    mesh = eg.Mesh(verts, faces, texture=torch.rand(4, 4, 3), uvs=corners, uv_faces=faces)
+    with pytest.raises(ValueError, match="images: expected 3 channels like the mesh's texture, got 4"):
+        fit_texture(mesh, camera(16), torch.rand(16, 16, 4), steps=1, progress=False)

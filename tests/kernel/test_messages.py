@@ -277,3 +277,20 @@ def test_index_into_another_mesh_in_place() -> None:
             meshes[changed].faces[2, 1] = bad
             with pytest.raises(ValueError, match="faces: expected indices from 0 to"):
                 eg.render(eg.Scene(meshes), CAMERA)
+
+
+@pytest.mark.parametrize(
+    "call, parts",
+    [
+        (lambda: eg.render_aovs(mesh(colors=VERTS), None, ["depth"]), ["camera: expected a Camera, got NoneType"]),
+        (lambda: eg.jvp(mesh(colors=VERTS), camera(), {VERTS: VERTS[None]}, sp=3), ["jvp: expected only", "got 'sp'"]),
+        (lambda: eg.jvp(mesh(colors=VERTS), camera(), None), ["tangents: expected a mapping", "got NoneType"]),
+        (
+            lambda: eg.screen_gradient(mesh(colors=VERTS), camera(), torch.zeros(8, 8, 3), bounces=2),
+            ["screen_gradient: expected only", "got 'bounces'"],
+        ),
+    ],
+    ids=["camera", "jvp", "tangents", "screen_gradient"],
+)
+def test_calls_of_other_entry_points(call, parts):
+    check_message(call, TypeError, *parts)

@@ -67,6 +67,11 @@ def fit_texture(
         raise ValueError("images: expected pictures to take the colours from, got none")
     C = pictures[0].shape[-1]
     shape = mesh.to("cpu").detach()
+    if shape.texture is not None and shape.texture.shape[-1] != C:
+        raise ValueError(
+            f"images: expected {shape.texture.shape[-1]} channels like the mesh's texture, got {C}; read them with "
+            f"read_image(path, channels={shape.texture.shape[-1]}), and give their alpha as masks"
+        )
     first = torch.full((h, w, C), 0.5) if shape.texture is None else resampled(shape.texture, (h, w))
     behind = None if masks is not None else background
 

@@ -118,6 +118,11 @@ class Objective:
     def group_loss(self, name: str, group: Sequence[int], render: Tensor) -> Tensor:
         """Return the sum of these views' losses in the channel `name`, rendered as (B, H, W, c)."""
         target = torch.stack([self.views[i].wanted[name] for i in group])
+        if render.shape[-1] != target.shape[-1]:
+            raise ValueError(
+                f"images: expected {render.shape[-1]} channels like the scene's colours, got {target.shape[-1]}; read them with "
+                f"read_image(path, channels={render.shape[-1]}), and give their alpha as masks"
+            )
         return len(group) * self.losses[name](render, target, self._weight(name, group)).double()
 
     def _weight(self, name: str, group: Sequence[int]) -> Tensor | None:
