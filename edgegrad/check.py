@@ -303,10 +303,11 @@ def check_dtype(dtype: torch.dtype | None) -> torch.dtype | None:
     return dtype
 
 
-def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """Check for one of some words. Raises ValueError."""
+def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
+    """Return one of some words as a plain str. Raises ValueError."""
     if value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+    return choices[choices.index(value)]
 
 
 def check_flag(name: str, flag: object) -> bool:

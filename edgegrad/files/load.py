@@ -10,8 +10,8 @@ face colours, the material's colour.
 
 lit=False, the default, takes these colours for radiance. Lights, normals and everything of a material but its base colour are
 dropped. Alpha is dropped, too, except where a material of a glTF has the alphaMode MASK: the alpha of its texture, or of its
-vertices (COLOR_0), times that of its factor becomes the mesh's, with its alphaCutoff. Wrap and filter are those of a glTF's
-sampler.
+vertices (COLOR_0), times that of its factor becomes the mesh's, with its alphaCutoff. The wrap is that of a glTF's
+sampler, the filter that of its magnification, without mipmaps.
 
 lit=True takes them for base colours:
 

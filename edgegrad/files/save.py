@@ -30,6 +30,7 @@ from .welding import to_mesh
 
 WRITTEN = (".ply", ".obj", ".glb", ".stl", ".off")
 SCENES = (".glb", ".gltf")
+CLAMPED = ("clamp", "clamp")  # an MTL clamps both coordinates or neither
 
 
 def from_trimesh(given: Any) -> Mesh:
@@ -101,10 +102,10 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as `load_scene(path, lit=True)`
     reads them: factors and vertex colours in full, textures in 8 bit (colour as sRGB), clipped to 0 … 1. Metallic, roughness
     and emission of vertices become their mean, because glTF has none. A Lambertian material is one without a highlight
-    (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an OBJ also a texture, which is written next to it with
-    its .mtl; STL and OFF hold the shape alone. Positions in PLY, STL and GLB are float32; those in OBJ and OFF have all digits
-    of the mesh's type. A warning names what is left out, rounded or clipped. Missing folders are made. Raises TypeError or
-    ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+    (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an OBJ also a texture, repeated or clamped, which is
+    written next to it with its .mtl; STL and OFF hold the shape alone. Positions in PLY, STL and GLB are float32; those in OBJ
+    and OFF have all digits of the mesh's type. A warning names what is left out, rounded or clipped. Missing folders are made.
+    Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
     """
     file = check_suffix(path, WRITTEN)
     if not isinstance(mesh, Mesh):
@@ -118,7 +119,7 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
         made, lost = to_trimesh(mesh, faces_colored=kind != "obj"), _left_out(mesh, kind)
         dtype = _array(mesh.verts).dtype
         if kind == "obj":
-            content, extra_files = to_obj(made, dtype, file.stem)
+            content, extra_files = to_obj(made, dtype, file.stem, clamp=mesh.wraps == CLAMPED)
         else:
             content = to_off(made, dtype) if kind == "off" else made.export(file_type=kind)
     if kind in ("ply", "stl", "glb") and rounding(mesh.verts.detach().cpu().numpy())[1]:
@@ -212,6 +213,12 @@ def _left_out(mesh: Mesh, kind: str) -> list[str]:
             found.append(name)
         elif bool((value < 0).any() | (value > 1).any()):
             found.append(f"{name} beyond 0 … 1")
+    if mesh.texture is not None or mesh.alpha is not None:
+        held = kind == "obj" and mesh.texture is not None and mesh.wraps == CLAMPED
+        if mesh.wraps != ("repeat", "repeat") and not held:
+            found.append(f"wrap {mesh.wrap!r}")
+        if mesh.filter != "linear":
+            found.append(f"filter {mesh.filter!r}")
     return found
 
 

@@ -59,7 +59,7 @@ class Texture:
             self._keep("uvs", as_real("uvs", self.uvs, ("T", 2), largest=LARGEST_UV))
             self._keep("uv_faces", as_index("uv_faces", self.uv_faces, ("F", 3), len(self.uvs), "uvs"))
         self._keep("wrap", checked_wrap(self.wrap))
-        check_choice("filter", self.filter, LOOKUPS)
+        self._keep("filter", check_choice("filter", self.filter, LOOKUPS))
         if self.factor is not None:
             factor = numbers("factor", self.factor)
             self._keep("factor", factor)
@@ -85,11 +85,12 @@ class Texture:
 
 
 def checked_wrap(wrap: str | tuple[str, str] | list[str]) -> str | tuple[str, str]:
-    """Return a wrap, or a pair of these. Raises ValueError."""
+    """Return a wrap, or a pair of these, as plain str. Raises ValueError."""
     pair = (wrap, wrap) if isinstance(wrap, str) else tuple(wrap) if isinstance(wrap, list) else wrap
     if not isinstance(pair, tuple) or len(pair) != 2 or any(w not in WRAPS for w in pair):
         raise ValueError(f"wrap: expected one of {', '.join(WRAPS)}, or a pair of them for u and v, got {wrap!r}")
-    return wrap if isinstance(wrap, str) else pair
+    u, v = (WRAPS[WRAPS.index(w)] for w in pair)
+    return u if isinstance(wrap, str) else (u, v)
 
 
 Parameter = Tensor | Texture
@@ -171,7 +172,7 @@ class Material:
         object.__setattr__(self, "normal_scale", scale if scale.dim() == 0 else scale.reshape(()))
         if not isinstance(self.two_sided, bool):
             raise TypeError(f"two_sided: expected True or False, got {type(self.two_sided).__name__}")
-        check_choice("alpha_mode", self.alpha_mode, ALPHA_MODES)
+        object.__setattr__(self, "alpha_mode", check_choice("alpha_mode", self.alpha_mode, ALPHA_MODES))
 
     @property
     def channels(self) -> int | None:

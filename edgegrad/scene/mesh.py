@@ -193,13 +193,15 @@ class Mesh:
     def _check_settings(self) -> None:
         if self.name is not None and not isinstance(self.name, str):
             raise TypeError(f"name: expected a str or None, got {type(self.name).__name__}")
+        if self.name is not None:  # torch.load(weights_only=True) refuses subclasses such as numpy.str_
+            object.__setattr__(self, "name", str.__str__(self.name))
         if isinstance(self.alpha_cutoff, bool) or not isinstance(self.alpha_cutoff, (int, float)):
             raise TypeError(f"alpha_cutoff: expected a number, got {type(self.alpha_cutoff).__name__}")
         if not math.isfinite(self.alpha_cutoff):
             raise ValueError(f"alpha_cutoff: expected a finite number, got {self.alpha_cutoff}")
         object.__setattr__(self, "alpha_cutoff", float(self.alpha_cutoff))
         object.__setattr__(self, "wrap", checked_wrap(self.wrap))
-        check_choice("filter", self.filter, LOOKUPS)
+        object.__setattr__(self, "filter", check_choice("filter", self.filter, LOOKUPS))
 
     @property
     def has_textures(self) -> bool:

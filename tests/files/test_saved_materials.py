@@ -172,6 +172,14 @@ def test_what_gltf_does_not_hold_is_named(material, look, message, tmp_path):
     assert eg.load_scene(tmp_path / "a.glb", lit=True).meshes[0].material is not None  # the rest is there
 
 
+def test_mipmaps_of_a_lit_texture_come_back(tmp_path):
+    mesh = box(eg.Material(), texture=color(), filter="mipmap")
+    assert saved(tmp_path, mesh).material.base_color.filter == "mipmap"
+    for name, save in (("save_mesh", eg.save_mesh), ("save_scene", eg.save_scene)):
+        with pytest.warns(UserWarning, match=rf"{name}: a\.glb holds no filter 'mipmap' without a material"):
+            save(tmp_path / "a.glb", mesh.replace(material=None))
+
+
 def test_means_stand_for_numbers_of_vertices(tmp_path):
     rough = torch.tensor([0.2, 0.4] * 4)[:, None]
     with pytest.warns(UserWarning, match="of vertices"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,23 @@ def test_what_a_file_does_not_hold_is_said(tmp_path: Path) -> None:
         eg.save_mesh(tmp_path / "a.stl", eg.Mesh(VERTS, FACES, colors=torch.rand(8, 3)))
 
 
+def test_an_obj_clamps_and_names_other_wraps_and_filters(tmp_path: Path) -> None:
+    mesh = eg.Mesh(VERTS, FACES, **APPEARANCES["texture"], wrap=("clamp", "clamp"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        eg.save_mesh(tmp_path / "a.obj", mesh)
+    assert eg.load_mesh(tmp_path / "a.obj").wrap == "clamp"
+    for fields, message in (
+        ({"filter": "nearest"}, r"no filter 'nearest'"),
+        ({"wrap": "mirror"}, r"no wrap 'mirror'"),
+        ({"wrap": ("clamp", "repeat"), "filter": "mipmap"}, r"no wrap \('clamp', 'repeat'\), no filter 'mipmap'"),
+    ):
+        with pytest.warns(UserWarning, match=rf"a\.obj holds {message}; torch\.save"):
+            eg.save_mesh(tmp_path / "a.obj", mesh.replace(**fields))
+    with pytest.warns(UserWarning, match=r"a\.ply holds no uvs, no texture, no wrap 'clamp', no filter 'nearest';"):
+        eg.save_mesh(tmp_path / "a.ply", mesh.replace(wrap="clamp", filter="nearest"))
+
+
 def test_parts_keep_their_names(tmp_path: Path) -> None:
     box = trimesh.creation.box()
     trimesh.Scene({"wheel": box, "door": box}).export(tmp_path / "a.glb")
@@ -151,6 +169,19 @@ def test_a_state_dict_holds_all_of_a_scene(tmp_path: Path) -> None:
     assert before.keys() == after.keys()
     for name, tensor in after.items():
         assert tensor.dtype == before[name].dtype and torch.equal(tensor, before[name]) and not tensor.requires_grad
+
+
+def test_words_of_a_state_dict_are_plain(tmp_path: Path) -> None:
+    """torch.load(weights_only=True) refuses numpy's strings."""
+    clamp, nearest = np.str_("clamp"), np.str_("nearest")
+    texture = eg.Texture(torch.rand(2, 2, 3), wrap=clamp, filter=nearest)
+    material = eg.Material(texture, alpha_mode=np.str_("BLEND"))
+    mesh = eg.Mesh(VERTS, FACES, uvs=COLORS[:, :2], uv_faces=FACES, material=material, name=np.str_("cube"),
+                   wrap=(clamp, np.str_("mirror")), filter=nearest)  # fmt: skip
+    torch.save(eg.Scene(mesh).state_dict(), tmp_path / "a.pt")
+    (again,) = eg.Scene.from_state_dict(torch.load(tmp_path / "a.pt", weights_only=True)).meshes
+    assert (again.name, again.wrap, again.filter) == ("cube", ("clamp", "mirror"), "nearest")
+    assert type(mesh.replace(wrap=clamp).wrap) is type(mesh.name) is str
 
 
 class Own(eg.lights.PointLight):

@@ -67,6 +67,8 @@ class GltfAppearance:
         mesh, given, texture = self.mesh, material.base_color, None
         if mesh.texture is not None:
             texture = Texture(mesh.texture, mesh.uvs, mesh.uv_faces, mesh.wrap, mesh.filter)
+            if mesh.material is None and mesh.filter == "mipmap":  # which is read as linear where it is not lit
+                self.lost.append("filter 'mipmap' without a material")
         each, corners = _colors(mesh)
         if isinstance(given, Texture):
             if texture is None:

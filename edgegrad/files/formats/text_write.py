@@ -18,9 +18,9 @@ def to_off(made: Any, dtype: np.dtype) -> str:
     return f"OFF\n{len(verts)} {len(faces)} 0\n{_rows('', verts, dtype)}{_rows('3 ', faces, faces.dtype)}"
 
 
-def to_obj(made: Any, dtype: np.dtype, stem: str) -> tuple[str, dict[str, bytes]]:
+def to_obj(made: Any, dtype: np.dtype, stem: str, clamp: bool = False) -> tuple[str, dict[str, bytes]]:
     """Return the file, and the material library of this stem and the image by name, so that two files in one folder have their
-    own."""
+    own. With `clamp`, the texture does not repeat."""
     faces, rows, visual = made.faces + 1, made.vertices, made.visual
     if visual.kind != "texture":
         if visual.kind is not None:
@@ -29,7 +29,8 @@ def to_obj(made: Any, dtype: np.dtype, stem: str) -> tuple[str, dict[str, bytes]
     # Names of materials and images end at a space for many readers.
     extra_files, material = visual.material.to_simple().to_obj(name="_".join(stem.split()))
     name = f"{stem}.mtl"
-    extra_files[name] = extra_files.pop(f"{material}.mtl")
+    library = extra_files.pop(f"{material}.mtl")
+    extra_files[name] = library.replace(b"map_Kd ", b"map_Kd -clamp on ") if clamp else library
     corners = np.repeat(faces, 2, axis=1)  # a vertex has one texture coordinate
     text = (
         f"mtllib {name}\nusemtl {material}\n{_rows('v ', rows, dtype)}{_rows('vt ', visual.uv, dtype)}"
