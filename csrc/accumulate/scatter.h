@@ -1,5 +1,6 @@
 // Adds up the gradients of samples, with the same bits at any number of threads. Gradients that come from no sample are
-// added elsewhere: backward/backward.cpp has the background, world.h vertices and cameras, raster/sums.h the rasteriser.
+// added elsewhere: backward/backward.cpp has the background, world.h vertices and cameras, raster/sums.h the
+// rasteriser.
 //
 // Samples are processed in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own, one for
 // each owner of destinations. Each thread then adds, chunk after chunk, the rows whose destination it owns. Each sum
