@@ -285,7 +285,8 @@ def test_command_line_messages(
     bop.write_results("results.csv", estimates())
     bop.write_results("longer.csv", estimates())
     bop.write_results("other.csv", estimates()[1:])
-    assert run("bop", arguments[0], ".", *arguments[1:]) == 2
+    command, *rest = arguments
+    assert run("bop", command, ".", *rest) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("edgegrad: error: ")
     with pytest.raises(ValueError, match=words):

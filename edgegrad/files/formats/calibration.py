@@ -88,7 +88,8 @@ def read(file: Path, size: tuple[int, int] | None, unread: UnreadLog) -> dict[st
         projection = next(
             (matrix(n, values[n]) for n in ("projection_matrix", "P", "p") if n in values), np.zeros((3, 4))
         )
-        if projection.size == 12 and projection.flat[3]:
+        # Its entry (0, 3) is −fx times the baseline of a stereo pair.
+        if projection.size == 12 and projection.reshape(3, 4)[0, 3]:
             unread.note("the projection matrix's shift to the other camera", "this one stands at the origin")
     note_unread(values, known, unread)
     return views
