@@ -172,8 +172,8 @@ class Geometry:
         if len(flat) < 3:
             return np.zeros((0, 3), np.int64)
         if mode == FAN:
-            hub, rim = flat[:1], flat[1:]
-            return np.stack([rim[:-1], rim[1:], np.repeat(hub, len(rim) - 1)], 1)
+            hub, around = flat[:1], flat[1:]
+            return np.stack([around[:-1], around[1:], np.repeat(hub, len(around) - 1)], 1)
         first = np.arange(len(flat) - 2)
         odd = first % 2
         strip = np.stack([flat[first], flat[first + 1 + odd], flat[first + 2 - odd]], 1)
