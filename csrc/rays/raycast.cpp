@@ -7,6 +7,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "core/thread_sanitizer.h"
 #include "rays/embree_library.h"
 
 namespace edgegrad {
@@ -35,8 +36,12 @@ RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
     rtc.rtcSetSceneBuildQuality(scene, BUILD_QUALITY_LOW);
     rtc.rtcSetSceneFlags(scene, SCENE_FLAG_DYNAMIC | SCENE_FLAG_ROBUST | SCENE_FLAG_FILTER_FUNCTION_IN_ARGUMENTS);
     rtc.rtcAttachGeometry(scene, geometry);
-    rtc.rtcSetSceneProgressMonitorFunction(
-        scene, [](void* stop, double) { return !static_cast<const std::atomic<bool>*>(stop)->load(); }, &stop_);
+    const auto go_on = [](void* stop, double) {
+        const bool on = !static_cast<const std::atomic<bool>*>(stop)->load();
+        __tsan_release(stop);  // build() goes on after Embree's threads read it, which ThreadSanitizer cannot see.
+        return on;
+    };
+    rtc.rtcSetSceneProgressMonitorFunction(scene, go_on, &stop_);
     throw_on_error("making a scene");
 }
 
@@ -77,6 +82,7 @@ void RayCaster::build() {
         const NamedWorkers named;
         rtc.rtcCommitGeometry(static_cast<Geometry>(geometry_));
         rtc.rtcCommitScene(static_cast<Scene>(scene_));
+        __tsan_acquire(&stop_);
     }
     note_build();
     throw_on_error("building the ray structure");
