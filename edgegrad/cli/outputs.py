@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..fit import CameraFit, Fit, PoseFit
-    from ..live import Viewer
+    from ..live.view import Viewer
 
 
 def make_folder(folder: Path) -> None:

@@ -59,7 +59,7 @@ class Shape(NamedTuple):
 class Rig:
     """Meshes that bend: a differentiable function from few numbers to vertices.
 
-    It is made by load_rig(path), Rig.from_arrays(…), Rig.from_function(…) or load_robot(path).
+    It is made by eg.rig.load(path), Rig.from_arrays(…) or Rig.from_function(…).
 
     Attributes
     ----------

@@ -14,7 +14,7 @@ from edgegrad.camera.camera import Camera
 from edgegrad.camera.poses import rotation
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import AreaLight, DirectionalLight, Light, PointLight, SpotLight
-from edgegrad.scene.material import Material, vertex_normals
+from edgegrad.scene.material import Material
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
@@ -251,7 +251,7 @@ def rough(roughness: float, metallic: float) -> Problem:
 def opposed() -> Problem:
     ball = icosphere(2).transformed(scale=0.4).transformed(t=vector(0.0, 0.0, 0.8))
     ball = Mesh(ball.verts, ball.faces)
-    return stage(point(), caster=ball.replace(normals=-vertex_normals(ball.verts, ball.faces)))
+    return stage(point(), caster=ball.replace(normals=-ball.vertex_normals()))
 
 
 @group.add("million", "a caster of 3.1 M faces", slow=True)
@@ -322,7 +322,7 @@ def torus(major: float = 0.55, minor: float = 0.22, around: int = 32, across: in
     a, b, c, d = index(0, 0), index(1, 0), index(1, 1), index(0, 1)
     faces = torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])
     verts = verts @ rotation(vector(0.9, 0.3, 0.0)).mT + vector(0.0, 0.0, 0.75)
-    return Mesh(verts, faces, normals=vertex_normals(verts, faces))
+    return Mesh(verts, faces, normals=Mesh(verts, faces).vertex_normals())
 
 
 def _sun(at: Tensor, level: Tensor) -> DirectionalLight:

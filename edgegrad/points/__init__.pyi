@@ -1,0 +1,5 @@
+from .hits import Hits
+from .rays import trace
+from .samples import attach_boundary, edge_samples, primary_hits, surface_samples
+
+__all__ = ["Hits", "attach_boundary", "edge_samples", "primary_hits", "surface_samples", "trace"]
