@@ -341,7 +341,9 @@ def _lit_point(size: int, subdivisions: int = 6) -> Built:
 
 def _lit_area(size: int, subdivisions: int = 6) -> Built:
     at, u, v = (torch.tensor(x, dtype=torch.float64) for x in (LIGHT_AT, (0.0, 0.3, 0.0), (0.4, 0.0, 0.1)))
-    panel = AreaLight.rectangle(at, u, v, 8.0, two_sided=False)  # u × v points down
+    panel = shapes.rectangle(
+        at, u, v, material=Material(base_color=0.0, emission=8.0, two_sided=False)
+    )  # u × v points down
     return _lit(size, panel, "area light", subdivisions)
 
 

@@ -22,7 +22,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 import edgegrad as eg
-from edgegrad.fit import Fit, fit_shape
+from edgegrad.fit import fit_shape
+from edgegrad.fit.descent.result import Fit
 
 # Radiance by the normal: constant, and a colour for each axis. Vertex colours, so no light has to be sampled.
 EVEN = 0.5
@@ -30,7 +31,7 @@ LIGHT = torch.tensor([[0.30, 0.10, 0.02], [0.05, 0.25, 0.10], [0.12, 0.02, 0.30]
 
 
 def lit(mesh: eg.Mesh) -> eg.Mesh:
-    normals = F.normalize(eg.vertex_normals(mesh.verts, mesh.faces), dim=1)
+    normals = F.normalize(mesh.vertex_normals(), dim=1)
     return mesh.replace(colors=EVEN + normals @ LIGHT.to(normals))
 
 

@@ -27,7 +27,7 @@ class Paint(NamedTuple):
     radius: Tensor
     stripe: Tensor  # width
 
-    def __call__(self, hits: eg.Hits) -> Tensor:
+    def __call__(self, hits: eg.points.Hits) -> Tensor:
         p = hits.position
         stripes = hits.floor(p[:, 1] / self.stripe)[:, None] % 2
         ground = stripes * WHITE + (1 - stripes) * BLUE

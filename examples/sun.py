@@ -49,7 +49,7 @@ def knot(along: int = 160, around: int = 20) -> eg.Mesh:
         texture=stripes * hue + (1 - stripes) * 0.85,
         uvs=uvs,
         uv_faces=uv_index[:, halves].reshape(-1, 3),
-        normals=eg.vertex_normals(verts, faces),
+        normals=eg.Mesh(verts, faces).vertex_normals(),
         material=eg.Material(),
     )
 
@@ -78,11 +78,11 @@ class Guess(NamedTuple):
 
     def scene(self) -> eg.Scene:
         sky = torch.zeros(9, 3).index_fill(0, torch.tensor(0), 1.0) * torch.tensor([0.9, 1.1, 1.4])
-        sunlight = eg.DirectionalLight(self.sun, 2.6, torch.tensor([1.0, 0.93, 0.8]))
+        sunlight = eg.lights.DirectionalLight(self.sun, 2.6, torch.tensor([1.0, 0.93, 0.8]))
         return eg.Scene(
             [knot().transformed(self.R, self.shift), ground()],
             background=torch.tensor([0.35, 0.5, 0.75]),
-            lights=[sunlight, eg.SphericalHarmonics(sky)],
+            lights=[sunlight, eg.lights.SphericalHarmonics(sky)],
         )
 
     def errors(self, truth: Guess) -> tuple[float, float, float]:

@@ -17,7 +17,8 @@ import torch
 import torch.nn.functional as F
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene
+from edgegrad.fit import Parameter, PoseParameter, fit_scene
+from edgegrad.fit.placement import Pose
 from edgegrad.image import linear_to_srgb, srgb_to_linear
 
 photo = srgb_to_linear(torch.tensor(skimage.data.coffee() / 255.0).float())

@@ -45,7 +45,7 @@ B = torch.tensor([[0.30, 0.10, 0.02], [0.05, 0.25, 0.10], [0.12, 0.02, 0.30]])
 
 
 def lit(mesh):
-    normals = F.normalize(eg.vertex_normals(mesh.verts, mesh.faces), dim=1)
+    normals = F.normalize(mesh.vertex_normals(), dim=1)
     return mesh.replace(colors=0.5 + normals @ B)
 
 

@@ -320,7 +320,7 @@ class Rig:
         names the argument.
 
             model = anny.Anny(skinning_method="lbs")
-            rig = eg.Rig.from_function(body, model.get_triangular_faces(), {"age": torch.tensor(0.5), …})
+            rig = eg.rig.Rig.from_function(body, model.get_triangular_faces(), {"age": torch.tensor(0.5), …})
 
         Parameters
         ----------

@@ -296,7 +296,7 @@ def test_shaders_have_the_same_discontinuities(move):
     first = tilted(quad(1, alpha=disc(), colors=noise(4, 3).abs()))
     at = case([first], move)
 
-    def own(hits: eg.Hits) -> Tensor:
+    def own(hits: eg.points.Hits) -> Tensor:
         colors = first.colors
         assert colors is not None
         return hits.interpolate(colors)

@@ -155,8 +155,8 @@ def textures_of(kind: type) -> list[str]:
 def test_names_of_parameters_are_those_of_the_classes() -> None:
     """The table of docs/fits.md can be copied from the message of a failure."""
     lights = (
-        edgegrad.PointLight, edgegrad.SpotLight, edgegrad.DirectionalLight, edgegrad.Environment,
-        edgegrad.SphericalHarmonics,
+        edgegrad.lights.PointLight, edgegrad.lights.SpotLight, edgegrad.lights.DirectionalLight, edgegrad.lights.Environment,
+        edgegrad.lights.SphericalHarmonics,
     )  # fmt: skip
     rows = [("", edgegrad.Scene), ("meshes.0.", edgegrad.Mesh), ("meshes.0.material.", edgegrad.Material)]
     rows += [(f"meshes.0.material.{name}.", edgegrad.Texture) for name in textures_of(edgegrad.Material)]

@@ -11,9 +11,11 @@ from brackets import task_of
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, Uncertainty, fit_pose
+from edgegrad.fit import fit_pose
 from edgegrad.fit.pose.pose import Pose
+from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask
+from edgegrad.fit.pose.uncertainty import Uncertainty
 from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
 
 pytestmark = pytest.mark.quick
@@ -42,7 +44,7 @@ def picture(mesh: eg.Mesh) -> Tensor:
     coarse = 0.05 + 0.3 * torch.rand(1, 3, 9, 9, generator=torch.Generator().manual_seed(3))
     clutter = torch.nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bilinear")[0].movedim(0, -1)
     lit = mesh.replace(colors=torch.full((len(mesh.verts), 3), 0.8), material=eg.Material())
-    lights = [eg.Environment(torch.tensor([0.9, 0.9, 1.0]), visible=False)]
+    lights = [eg.lights.Environment(torch.tensor([0.9, 0.9, 1.0]), visible=False)]
     with torch.no_grad():
         return eg.render(eg.Scene([lit], background=clutter, lights=lights), camera(), spp=32)
 

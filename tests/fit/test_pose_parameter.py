@@ -11,8 +11,8 @@ from brackets import BACKGROUND, CENTER, bracket, camera, rotation
 from brackets import START as START_MATRIX
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene
-from edgegrad.fit.placement import Coordinates
+from edgegrad.fit import Parameter, PoseParameter, fit_scene
+from edgegrad.fit.placement import Coordinates, Pose
 
 F64 = torch.float64
 QUIET = {"progress": False, "spp": 4}

@@ -38,7 +38,7 @@ for wrong in ("rendr", "fit.fit_pos"):
     except AttributeError as error: assert wrong.split(".")[-1] in str(error) and error.obj is not None
 assert "torch" not in sys.modules
 import edgegrad.render
-assert callable(eg.render) and callable(eg.plan) and callable(eg.profile) and callable(eg.bake)
+assert callable(eg.render) and callable(eg.plan) and callable(eg.profile) and callable(eg.textures.bake)
 assert "edgegrad.fit.rig" not in sys.modules and callable(eg.fit.fit_pose)
 assert pickle.loads(pickle.dumps(eg.Camera)) is eg.Camera
 from edgegrad import *

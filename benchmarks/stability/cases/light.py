@@ -47,7 +47,7 @@ def point(power: float = 10.0) -> MakeLight:
 
 def panel(power: float = 8.0, **fields: Any) -> MakeLight:
     u, v = vector(0.4, 0.0, 0.1), vector(0.0, 0.3, 0.0)
-    return lambda at, level: AreaLight.rectangle(at, u, v, power * level, **fields)
+    return lambda at, level: shapes.rectangle(**fields, material=Material(base_color=0.0, emission=power * level))
 
 
 def ground(size: float = 4.0) -> Mesh:
@@ -290,7 +290,7 @@ def touching() -> Problem:
 @group.add("panel-1e-3", "a panel of 1e-3 of the scene's size")
 def small_panel() -> Problem:
     u, v = vector(4e-4, 0.0, 1e-4), vector(0.0, 3e-4, 0.0)
-    return stage(lambda at, level: AreaLight.rectangle(at, u, v, 8e6 * level))
+    return stage(lambda at, level: shapes.rectangle(at, u, v, material=Material(base_color=0.0, emission=8e6 * level)))
 
 
 @group.add("sky-bright", "an environment with a texel 1e6 times as bright as the others")
