@@ -203,11 +203,12 @@ def box(
     >>> eg.shapes.box(size=(1, 2, 3)).verts.amax(0)
     tensor([0.5000, 1.0000, 1.5000])
     """
-    if not isinstance(size, Tensor):
-        size = [size] * 3 if isinstance(size, (int, float)) else size
-    elif size.dim() == 0:
-        size = size.expand(3)
-    center, size = _vectors(dtype, center=center, size=size)
+    edges: object = size
+    if isinstance(size, Tensor):
+        edges = size.expand(3) if size.dim() == 0 else size
+    elif isinstance(size, (int, float)):
+        edges = (size, size, size)
+    center, size = _vectors(dtype, center=center, size=edges)
     _check_positive("size", size)
     signs = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]).to(size)
     # Corners of each side from the lower left, counter-clockwise as seen from outside.

@@ -33,8 +33,8 @@ def scene(colors: dict[str, Tensor]) -> eg.Scene:
         eg.Mesh(torch.tensor(corners, dtype=torch.float32), faces, material=eg.Material(colors[name]))
         for name, (_, corners) in WALLS.items()
     ]
-    along = torch.tensor([0.25, 0.0, 0.0]), torch.tensor([0.0, -0.25, 0.0])
-    emitter = eg.shapes.rectangle(*along, material=eg.Material(base_color=0.0, emission=60.0))
+    emitting = eg.Material(base_color=0.0, emission=60.0)
+    emitter = eg.shapes.rectangle((1.1, 1.1, 3.2), (0.25, 0.0, 0.0), (0.0, -0.25, 0.0), material=emitting)
     return eg.Scene([*walls, emitter])
 
 

@@ -13,7 +13,6 @@ import argparse
 import math
 
 import torch
-import trimesh
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 from tqdm import tqdm
@@ -70,10 +69,9 @@ def roughness(image: Tensor) -> Tensor:
 
 def fit(steps: int = 200, size: int = SIZE) -> tuple[list[Tensor], Tensor]:
     """Return pictures of the ball (target, end), and the environment that was found."""
-    made = trimesh.creation.icosphere(4)
     material = eg.Material(torch.full((3,), BASE), metallic=1.0, roughness=ALPHA**0.5)  # by which points are drawn
-    verts, faces = torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces)
-    ball = eg.Mesh(verts, faces, normals=eg.Mesh(verts, faces).vertex_normals(), material=material)
+    ball = eg.shapes.sphere(subdivisions=4, material=material)
+    ball = ball.replace(normals=ball.vertex_normals())
     places = [(3.3, 1.2, 1.1), (-1.9, -1.0, 2.9), (-1.5, 1.0, -3.1), (2.0, -1.2, -2.9)]
     cameras = [eg.Camera.look_at(place, (0.0, 0.0, 0.0), fov_y=34.0, size=(size, size)) for place in places]
 

@@ -90,7 +90,8 @@ shape.apply_translation([0, 0, 0.85])
 verts, faces = torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces)
 colors = 0.5 + 0.3 * torch.sin(3.0 * verts + torch.tensor([0.0, 1.0, 2.0]))
 matt, plastic = eg.Material(), eg.Material(metallic=0.0, roughness=0.25)
-ring = eg.Mesh(verts, faces, colors=colors, normals=eg.Mesh(verts, faces).vertex_normals(), material=matt)
+ring = eg.Mesh(verts, faces, colors=colors, material=matt)
+ring = ring.replace(normals=ring.vertex_normals())
 square = torch.tensor([[-3.0, -3.0, 0.0], [3.0, -3.0, 0.0], [3.0, 3.0, 0.0], [-3.0, 3.0, 0.0]])
 gray = eg.Material(base_color=torch.tensor([0.6, 0.6, 0.6]))
 ground = eg.Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=gray)
@@ -99,9 +100,8 @@ camera = eg.Camera.look_at((0.9, -3.4, 2.6), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0), 4
 position = torch.tensor([1.3, -0.9, 3.2])
 light = eg.lights.PointLight(position, 25.0)
 vector = torch.tensor
-panel = eg.shapes.rectangle(
-    position, vector([0.6, 0.0, 0.2]), vector([0.0, 0.5, 0.1]), material=eg.Material(base_color=0.0, emission=16.0)
-)
+emitting = eg.Material(base_color=0.0, emission=16.0)
+panel = eg.shapes.rectangle(position, (0.6, 0.0, 0.2), (0.0, 0.5, 0.1), material=emitting)
 height = torch.linspace(1, -1, 16)[:, None, None].expand(16, 32, 3)
 up_is_z = vector([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 sky = eg.lights.Environment(0.5 + 0.4 * height * vector([0.2, 0.6, 1.0]), rotation=up_is_z)
@@ -254,12 +254,8 @@ plt.tight_layout()
 colors = {"floor": vector([0.75, 0.75, 0.75]), "left": vector([0.7, 0.2, 0.15]), "right": vector([0.25, 0.35, 0.7])}
 o, x, y, z, xy, yz, xz = ([2.0 * float(axis in name) for axis in "xyz"] for name in ("", *"xyz", "xy", "yz", "xz"))
 walls = {"floor": vector([o, x, xy, y]), "left": vector([o, y, yz, z]), "right": vector([o, z, xz, x])}
-bulb = eg.shapes.rectangle(
-    vector([1.1, 1.1, 3.2]),
-    vector([0.25, 0.0, 0.0]),
-    vector([0.0, -0.25, 0.0]),
-    material=eg.Material(base_color=0.0, emission=60.0),
-)
+emitting = eg.Material(base_color=0.0, emission=60.0)
+bulb = eg.shapes.rectangle((1.1, 1.1, 3.2), (0.25, 0.0, 0.0), (0.0, -0.25, 0.0), material=emitting)
 halves = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 

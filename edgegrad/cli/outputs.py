@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..fit import CameraFit, Fit, PoseFit
+    from ..fit.descent.result import Fit
+    from ..fit.pose.fit_camera import CameraFit
+    from ..fit.pose.result import PoseFit
     from ..live.view import Viewer
 
 

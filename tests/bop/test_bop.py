@@ -16,6 +16,7 @@ from PIL import Image
 
 import edgegrad as eg
 from edgegrad import bop, cli
+from edgegrad.bop.dataset import Target
 
 pytest_plugins = "bop_fixtures"
 
@@ -48,7 +49,7 @@ def test_written_data_sets_are_read_back(made: Path) -> None:
     again = eg.render(five.mesh.transformed(truth[:3, :3], truth[:3, 3]), frame.camera, spp=32)
     inside = torch.nn.functional.max_pool2d(1.0 - own.float()[None, None], 3, 1, 1)[0, 0] == 0
     assert float((frame.picture() - again)[inside].abs().mean()) < 0.004
-    assert data.targets() == [bop.Target(3, 0, 1, 1), bop.Target(3, 0, 5, 1), bop.Target(3, 1, 5, 2)]
+    assert data.targets() == [Target(3, 0, 1, 1), Target(3, 0, 5, 1), Target(3, 1, 5, 2)]
 
 
 def test_pictures_are_read_as_they_are_stored(folder: Path) -> None:
@@ -71,7 +72,7 @@ def test_targets_without_a_file_are_the_visible_instances(folder: Path) -> None:
     content = json.loads(info.read_text())
     content["1"][0]["visib_fract"] = 0.09
     info.write_text(json.dumps(content))
-    assert bop.Dataset(folder).targets() == [bop.Target(3, 0, 1, 1), bop.Target(3, 0, 5, 1), bop.Target(3, 1, 5, 1)]
+    assert bop.Dataset(folder).targets() == [Target(3, 0, 1, 1), Target(3, 0, 5, 1), Target(3, 1, 5, 1)]
 
 
 def test_covered_instances_have_visible_masks_and_shares(tmp_path: Path) -> None:
@@ -163,7 +164,7 @@ def test_split_is_chosen_or_must_be_named(folder: Path) -> None:
     data = bop.Dataset(folder, "train")
     assert bop.Dataset(folder).split == "test_other" and data.split == "train"
     (folder / "test_targets_bop19.json").write_text("[]")  # says nothing of another split
-    assert data.targets()[-1] == bop.Target(3, 1, 5, 2) and bop.Dataset(folder).targets() == []
+    assert data.targets()[-1] == Target(3, 1, 5, 2) and bop.Dataset(folder).targets() == []
     (folder / "test_other").rename(folder / "val")
     with pytest.raises(ValueError, match="expected the name of a split, got train, val; name one"):
         bop.Dataset(folder)

@@ -188,8 +188,11 @@ def test_missing_and_surplus_estimates(made: Path) -> None:
     far = pose((0.1, 0, 0), (0.0, 0.0, 900.0))
     # One instance has no estimate; a second one of object 1 with a lower score is ignored, as is an object that is not there.
     found = bop.evaluate(
-        data, [*given[:3], bop.files.Estimate(3, 0, 1, 0.1, far), bop.files.Estimate(3, 1, 1, 0.9, far)], with_vsd=False, progress=False
-    )  # fmt: skip
+        data,
+        [*given[:3], bop.files.Estimate(3, 0, 1, 0.1, far), bop.files.Estimate(3, 1, 1, 0.9, far)],
+        with_vsd=False,
+        progress=False,
+    )
     assert (
         found.overall.ar_mssd == 0.75
         and found.overall.ar_vsd is None

@@ -30,6 +30,7 @@ def ground(**look):
     return eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), **look)
 
 
+EMITTING = eg.Material(base_color=0.0, emission=torch.tensor([9.0, 5.0, 2.0]))
 WOOD = eg.Material(eg.Texture(color(), filter="mipmap"), roughness=eg.Texture(data(1, least=60)), metallic=0.2)
 SCENES = {
     "plain": eg.Scene([eg.Mesh(VERTS, FACES)]),
@@ -48,7 +49,7 @@ SCENES = {
     ),
     "a light": eg.Scene(
         [ground(material=eg.Material(0.7))],
-        lights=[eg.shapes.rectangle((0.0, 3.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 0.5), material=eg.Material(base_color=0.0, emission=torch.tensor([9.0, 5.0, 2.0])))],
+        lights=[eg.shapes.rectangle((0.0, 3.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 0.5), material=EMITTING)],
     ),
     "normals and alpha-tested faces": eg.Scene(
         [
@@ -170,7 +171,11 @@ K = CAMERA.K
     ("scene", "cameras", "message"),
     [
         (eg.Scene([ball()], lights=[SUN, eg.lights.Environment(torch.ones(3))]), None, r"no Environment \(lights\[1\]\)"),
-        (eg.Scene([ball()], lights=[eg.lights.SphericalHarmonics(torch.ones(9, 3))]), None, r"no SphericalHarmonics \(lights\[0\]\)"),
+        (
+            eg.Scene([ball()], lights=[eg.lights.SphericalHarmonics(torch.ones(9, 3))]),
+            None,
+            r"no SphericalHarmonics \(lights\[0\]\)",
+        ),
         (eg.Scene([ball()], torch.ones(3)), None, "no background"),
         (eg.Scene([ball()], lights=[SUN.replace(intensity=-1.0)]), None, r"no what takes light away of DirectionalLight"),
         (eg.Scene([ball(), ball(colors=torch.full((42, 3), 2.0))]), None, r"no colors beyond 0 … 1 of meshes\[1\]"),

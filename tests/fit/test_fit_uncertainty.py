@@ -16,7 +16,7 @@ from edgegrad.fit.pose.pose import Pose
 from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask
 from edgegrad.fit.pose.uncertainty import Uncertainty
-from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
+from edgegrad.scene.symmetries import Symmetries
 
 pytestmark = pytest.mark.quick
 
@@ -85,10 +85,10 @@ def test_a_continuous_symmetry_makes_its_axis_known() -> None:
     information[3:, 3:] = 1e6 * torch.eye(3)
     known = Uncertainty.from_information(given, standing(), information, list(range(6)), None)
     assert known.degrees > 45.0 and abs(float(known.axis[1])) > 0.999
-    spun = Symmetries(continuous=[SymmetryAxis(torch.tensor([0.0, 1.0, 0.0]))])
+    spun = Symmetries(continuous=[Symmetries.Axis(torch.tensor([0.0, 1.0, 0.0]))])
     free = Uncertainty.from_information(given, standing(), information, list(range(6)), spun)
     assert free.degrees < 1.0 and free.unknown == ""
-    other = Symmetries(continuous=[SymmetryAxis(torch.tensor([1.0, 0.0, 0.0]))])
+    other = Symmetries(continuous=[Symmetries.Axis(torch.tensor([1.0, 0.0, 0.0]))])
     assert Uncertainty.from_information(given, standing(), information, list(range(6)), other).unknown != ""
 
 
@@ -113,7 +113,7 @@ def test_a_vase_is_not_converged_about_its_axis_unless_that_is_a_symmetry() -> N
     shot = picture(vase())
     start = torch.eye(4, dtype=torch.float64)
     start[0, 3] = 0.05
-    spun = Symmetries(continuous=[SymmetryAxis(torch.tensor([0.0, 1.0, 0.0]))])
+    spun = Symmetries(continuous=[Symmetries.Axis(torch.tensor([0.0, 1.0, 0.0]))])
 
     def fitted(symmetries: Symmetries | None) -> PoseFit:
         return fit_pose(vase(), shot, camera(), init=start, search=False, symmetries=symmetries, progress=False)

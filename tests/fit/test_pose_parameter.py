@@ -191,7 +191,7 @@ def test_coordinates_without_poses_are_the_values():
         (
             {"meshes.0.pose": PoseParameter(torch.eye(4))},
             TypeError,
-            "meshes.0.pose: start: expected a Pose, got Tensor",
+            "meshes.0.pose: start: expected a tuple",
         ),
         (
             {"meshes.0.pose": PoseParameter(Pose(2.0 * torch.eye(3), torch.zeros(3)))},

@@ -280,7 +280,7 @@ def test_same_bits_at_any_number_of_threads() -> None:
 @pytest.mark.parametrize(
     "change, error, words",
     [
-        ({"ctx": None}, TypeError, "ctx: expected a RasterizeContext"),
+        ({"ctx": None}, TypeError, "ctx: expected a RasterizeCudaContext or RasterizeGLContext"),
         ({"pos": torch.zeros(3, 4)}, ValueError, "ranges: expected .* use pos\\[None\\]"),
         ({"pos": torch.zeros(1, 3, 3)}, ValueError, "pos: expected shape"),
         ({"pos": torch.full((1, 3, 4), torch.nan)}, ValueError, "pos: expected finite"),

@@ -15,6 +15,7 @@ from rig_files import Sample, quaternion_matrix, simple_morph, simple_skin
 from scipy.spatial.transform import Rotation, Slerp
 
 import edgegrad as eg
+from edgegrad.rig.animation import Channel
 
 
 def load(sample: Sample, folder: Path, message: str) -> eg.rig.Rig:
@@ -93,9 +94,9 @@ def test_rotations_of_other_lengths_are_named(tmp_path) -> None:
 def test_channels_take_unit_quaternions_alone() -> None:
     times, keys = torch.tensor([0.0, 1.0]), torch.tensor(KEYS[:2])
     with pytest.raises(ValueError, match=r"values: expected unit quaternions x, y, z, w, got one of length 2 at key 1"):
-        eg.Channel("rotation", 0, times, keys * torch.tensor([[1.0], [2.0]]))
-    assert torch.allclose(eg.Channel("rotation", 0, times, 1.009 * keys).values, keys)
-    assert torch.allclose(eg.Channel("scale", 0, times, 2.0 * keys[:, :3]).values, 2.0 * keys[:, :3])
+        Channel("rotation", 0, times, keys * torch.tensor([[1.0], [2.0]]))
+    assert torch.allclose(Channel("rotation", 0, times, 1.009 * keys).values, keys)
+    assert torch.allclose(Channel("scale", 0, times, 2.0 * keys[:, :3]).values, 2.0 * keys[:, :3])
 
 
 # -- skins ------------------------------------------------------------------------------------------------------------

@@ -41,9 +41,11 @@ def test_the_check_rejects_what_is_off(tmp_path) -> None:
 
 
 def test_plain_loaders_name_load_rig(tmp_path) -> None:
-    with pytest.warns(UserWarning, match=r"animations \(shown at rest; load_rig\(\) has them\).*skins .*load_rig"):
+    with pytest.warns(
+        UserWarning, match=r"animations \(shown at rest; eg.rig.load\(\) has them\).*skins .*eg.rig.load"
+    ):
         eg.load_scene(simple_skin().write(tmp_path))
-    with pytest.warns(UserWarning, match=r"morph targets \(shown without; load_rig"):
+    with pytest.warns(UserWarning, match=r"morph targets \(shown without; eg.rig.load"):
         eg.load_scene(simple_morph().write(tmp_path, "b.gltf"))
 
 

@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 import edgegrad as eg
+from edgegrad.fit.pose.result import PoseFit
 from edgegrad.scene.symmetries import about
 
 DISPLACED = trimesh.transformations.random_rotation_matrix(np.array([0.2, 0.5, 0.9]))
@@ -233,7 +234,7 @@ def test_fit_pose_reports_the_nearest() -> None:
     shown = eg.render_aovs(cylinder.transformed(truth[:3, :3], truth[:3, 3]), camera, ["image", "alpha"])
     start = truth @ rigid((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)) @ rigid((0.1, 0.05, 0.0), (0.05, 0.0, 0.0))
 
-    def fitted(symmetries: eg.Symmetries | None, mesh: eg.Mesh = cylinder) -> eg.fit.PoseFit:
+    def fitted(symmetries: eg.Symmetries | None, mesh: eg.Mesh = cylinder) -> PoseFit:
         return eg.fit.fit_pose(
             mesh, shown["image"], camera, shown["alpha"][..., 0], start, steps=2, progress=False, symmetries=symmetries
         )  # fmt: skip
@@ -281,7 +282,7 @@ def test_transforms_are_those_of_bop() -> None:
         (lambda: eg.Symmetries(torch.eye(3)[None]), ValueError, r"discrete: expected shape \(N, 4, 4\)"),
         (lambda: eg.Symmetries(torch.diag(torch.tensor([1.0, 1, -1, 1]))[None]), ValueError, r"discrete\[0\]: .*mirror"),
         (lambda: eg.Symmetries(torch.ones(1, 4, 4)), ValueError, r"discrete\[0\]: expected the last row"),
-        (lambda: eg.Symmetries(continuous=[torch.eye(3)]), TypeError, r"continuous\[0\]: expected a SymmetryAxis"),
+        (lambda: eg.Symmetries(continuous=[torch.eye(3)]), TypeError, r"continuous\[0\]: expected a Symmetries.Axis"),
         (lambda: eg.Symmetries.Axis([0.0, 0, 0]), ValueError, "direction: expected a length above zero"),
         (lambda: eg.Symmetries.from_bop({"symmetries_discrete": [[1, 2]]}), ValueError, "symmetries_discrete: .*16"),
         (lambda: eg.Symmetries.from_bop({"symmetries_continuous": [{"axis": [0, 0, 1]}]}), ValueError, "axis and offset"),

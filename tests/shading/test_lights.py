@@ -305,13 +305,7 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: eg.lights.Environment([1.0], visible=1), TypeError, "visible: expected True or False"),
     (lambda: eg.lights.SphericalHarmonics(torch.ones(4, 3)), ValueError, r"coefficients: expected shape \(9, C\)"),
     (lambda: eg.lights.SphericalHarmonics(torch.ones(9)), ValueError, r"of one, coefficients\[:, None\]"),
-    (
-        lambda: eg.shapes.disc(
-            [0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], 2, material=eg.Material(base_color=0.0, emission=1.0)
-        ),
-        ValueError,
-        "segments: expected at least 3",
-    ),
+    (lambda: eg.shapes.disc(segments=2), ValueError, "segments: expected an int from 3"),
     (lambda: eg.Scene([MESH], lights=3), TypeError, "lights: expected a sequence"),
     (lambda: eg.Scene([MESH], lights=[3]), TypeError, r"lights\[0\]: expected a light"),
     (

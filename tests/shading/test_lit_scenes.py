@@ -27,6 +27,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.points.shadow_rays import Forced
 
+EMITTING = eg.Material(base_color=0.0, emission=[3.0, 2.0, 1.0])
 WHITE = eg.Material(base_color=1.0)
 
 
@@ -142,12 +143,7 @@ def test_random_numbers_of_points():
 
 def test_random_numbers_of_a_pixel_are_its_own():
     """A change in one corner leaves the noise of all other pixels as it is, with a constant seed."""
-    emitter = eg.shapes.rectangle(
-        [0.0, -0.5, 1.5],
-        [0.2, 0.0, 0.1],
-        [0.0, -0.2, 0.0],
-        material=eg.Material(base_color=0.0, emission=[3.0, 2.0, 1.0]),
-    )
+    emitter = eg.shapes.rectangle((0.0, -0.5, 1.5), (0.2, 0.0, 0.1), (0.0, -0.2, 0.0), material=EMITTING, dtype=F64)
     floor, dot = plane(1.0, material=WHITE), ball(0, material=WHITE).transformed(scale=0.1, t=vector(-0.8, 0.8, 0.1))
     images = [eg.render(eg.Scene(m, lights=[emitter]), from_above(), shadows=False) for m in ([floor], [floor, dot])]
     same = (images[0] == images[1]).all(2)
@@ -171,7 +167,7 @@ def all_lights() -> list[Any]:
         eg.lights.DirectionalLight([0.3, 0.2, -1.0]), eg.lights.PointLight([0.5, 0.5, 1.5], 2.0),
         eg.lights.SpotLight([-0.5, 0.5, 1.5], [0.2, -0.2, -1.0], 2.0), eg.lights.Environment(picture()),
         eg.lights.SphericalHarmonics(0.1 * picture(3, 3).reshape(9, 3)),
-        eg.shapes.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], material=eg.Material(base_color=0.0, emission=[3.0, 2.0, 1.0])),
+        eg.shapes.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], material=EMITTING, dtype=F64),
     ]  # fmt: skip
 
 

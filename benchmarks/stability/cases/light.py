@@ -13,10 +13,11 @@ from torch import Tensor
 from edgegrad.camera.camera import Camera
 from edgegrad.camera.poses import rotation
 from edgegrad.scene.environment import Environment
-from edgegrad.scene.lights import AreaLight, DirectionalLight, Light, PointLight, SpotLight
+from edgegrad.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from edgegrad.scene.material import Material
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
+from edgegrad.shapes import rectangle
 
 from ...scenes import cube, icosphere
 from .camera import ORIGIN, vector
@@ -45,9 +46,11 @@ def point(power: float = 10.0) -> MakeLight:
     return lambda at, level: PointLight(at, power * level)
 
 
-def panel(power: float = 8.0, **fields: Any) -> MakeLight:
+def panel(power: float = 8.0, two_sided: bool = True) -> MakeLight:
     u, v = vector(0.4, 0.0, 0.1), vector(0.0, 0.3, 0.0)
-    return lambda at, level: shapes.rectangle(**fields, material=Material(base_color=0.0, emission=power * level))
+    return lambda at, level: rectangle(
+        at, u, v, material=Material(base_color=0.0, emission=power * level, two_sided=two_sided)
+    )
 
 
 def ground(size: float = 4.0) -> Mesh:
@@ -290,7 +293,7 @@ def touching() -> Problem:
 @group.add("panel-1e-3", "a panel of 1e-3 of the scene's size")
 def small_panel() -> Problem:
     u, v = vector(4e-4, 0.0, 1e-4), vector(0.0, 3e-4, 0.0)
-    return stage(lambda at, level: shapes.rectangle(at, u, v, material=Material(base_color=0.0, emission=8e6 * level)))
+    return stage(lambda at, level: rectangle(at, u, v, material=Material(base_color=0.0, emission=8e6 * level)))
 
 
 @group.add("sky-bright", "an environment with a texel 1e6 times as bright as the others")
