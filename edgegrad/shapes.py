@@ -59,8 +59,8 @@ def rectangle(
     Examples
     --------
     >>> import edgegrad as eg
-    >>> lamp = eg.Material(base_color=0.0, emission=8.0, two_sided=False)
-    >>> eg.shapes.rectangle((0, 3, 0), (0, 0, 0.5), (0.5, 0, 0), material=lamp)
+    >>> emitting = eg.Material(base_color=0.0, emission=8.0, two_sided=False)
+    >>> eg.shapes.rectangle((0, 3, 0), (0, 0, 0.5), (0.5, 0, 0), material=emitting)
     Mesh(4 vertices, 2 faces, plain, lit, torch.float32)
     """
     center, u, v = _vectors(dtype, center=center, u=u, v=v)

@@ -10,7 +10,7 @@ import trimesh
 
 import edgegrad as eg
 from edgegrad import bop
-from edgegrad.scene.symmetries import about
+from edgegrad.scene.symmetry_axis import about
 
 SIZE = (72, 96)
 K = torch.tensor([[120.0, 0.0, 47.5], [0.0, 120.0, 35.5], [0.0, 0.0, 1.0]])

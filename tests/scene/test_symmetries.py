@@ -11,7 +11,7 @@ import trimesh
 
 import edgegrad as eg
 from edgegrad.fit.pose.result import PoseFit
-from edgegrad.scene.symmetries import about
+from edgegrad.scene.symmetry_axis import about
 
 DISPLACED = trimesh.transformations.random_rotation_matrix(np.array([0.2, 0.5, 0.9]))
 DISPLACED[:3, 3] = 3.0, -2.0, 5.0
