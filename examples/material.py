@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import objects
 import torch
 import torch.nn.functional as F
-import trimesh
 from torch import Tensor
 
 import edgegrad as eg
@@ -40,9 +39,8 @@ def sky() -> eg.lights.Environment:
 
 
 def ball() -> eg.Mesh:
-    shape = trimesh.creation.icosphere(subdivisions=4)
-    verts = torch.tensor(shape.vertices, dtype=torch.float32)
-    return eg.Mesh(verts, torch.tensor(shape.faces), normals=verts)
+    sphere = eg.shapes.sphere()
+    return sphere.replace(normals=sphere.verts)
 
 
 class Made(NamedTuple):

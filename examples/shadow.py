@@ -51,9 +51,8 @@ class Shape:
 
 def ground() -> eg.Mesh:
     """Return the white plane z = 0."""
-    corners = torch.tensor([[-6.0, -6.0, 0.0], [6.0, -6.0, 0.0], [6.0, 6.0, 0.0], [-6.0, 6.0, 0.0]])
     white = eg.Material(base_color=torch.tensor([0.8, 0.8, 0.8]))
-    return eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=white)
+    return eg.shapes.rectangle(u=(6.0, 0.0, 0.0), v=(0.0, 6.0, 0.0), material=white)
 
 
 def lights(count: int = 12) -> list[eg.lights.DirectionalLight]:

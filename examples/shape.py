@@ -58,8 +58,7 @@ def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures"
     ]
     low, high = mesh.verts.aminmax(dim=0)
     diagonal = float((high - low).norm())
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.35 * diagonal)
-    start = eg.Mesh(torch.tensor(ball.vertices).float() + (low + high) / 2, torch.tensor(ball.faces))
+    start = eg.shapes.sphere((low + high) / 2, 0.35 * diagonal, subdivisions=3)
     options = {"levels": 3, "steps": 150, "spp": 4} | options
     images, masks = ([found[name] for found in seen] for name in ("image", "alpha"))
     if given == "pictures":

@@ -56,11 +56,9 @@ def knot(along: int = 160, around: int = 20) -> eg.Mesh:
 
 def ground() -> eg.Mesh:
     """Return a checkerboard at z = 0."""
-    corners = torch.tensor([[-4.0, -4.0, 0.0], [4.0, -4.0, 0.0], [4.0, 4.0, 0.0], [-4.0, 4.0, 0.0]])
-    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     board = 0.42 + 0.1 * ((torch.arange(8)[:, None] + torch.arange(8)) % 2)[..., None] * torch.ones(3)
     board = board.repeat_interleave(16, 0).repeat_interleave(16, 1)
-    return eg.Mesh(corners, faces, texture=board, uvs=corners[:, :2] / 8 + 0.5, uv_faces=faces, material=eg.Material())
+    return eg.shapes.rectangle(u=(4.0, 0.0, 0.0), v=(0.0, 4.0, 0.0), material=eg.Material()).replace(texture=board)
 
 
 class Guess(NamedTuple):

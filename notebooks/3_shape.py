@@ -60,8 +60,7 @@ with torch.no_grad():
 images, masks = [s["image"] for s in seen], [s["alpha"] for s in seen]
 show(images, [f"view {k + 1}" for k in range(8)], rows=2)
 
-ball = trimesh.creation.icosphere(subdivisions=4)
-sphere = eg.Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces))
+sphere = eg.shapes.sphere(subdivisions=4)
 
 # %% [markdown]
 # ## The gradient of the vertices

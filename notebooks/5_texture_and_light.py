@@ -92,9 +92,8 @@ colors = 0.5 + 0.3 * torch.sin(3.0 * verts + torch.tensor([0.0, 1.0, 2.0]))
 matt, plastic = eg.Material(), eg.Material(metallic=0.0, roughness=0.25)
 ring = eg.Mesh(verts, faces, colors=colors, material=matt)
 ring = ring.replace(normals=ring.vertex_normals())
-square = torch.tensor([[-3.0, -3.0, 0.0], [3.0, -3.0, 0.0], [3.0, 3.0, 0.0], [-3.0, 3.0, 0.0]])
 gray = eg.Material(base_color=torch.tensor([0.6, 0.6, 0.6]))
-ground = eg.Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=gray)
+ground = eg.shapes.rectangle(u=(3.0, 0.0, 0.0), v=(0.0, 3.0, 0.0), material=gray)
 camera = eg.Camera.look_at((0.9, -3.4, 2.6), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0), 40.0, (80, 80))
 
 position = torch.tensor([1.3, -0.9, 3.2])
@@ -210,9 +209,8 @@ show(
 # mirrors shows how rough it is; what it mirrors at its outline, how much of a metal.
 
 # %%
-ball = trimesh.creation.icosphere(subdivisions=3)
-verts = torch.tensor(ball.vertices, dtype=torch.float32)
-ball = eg.Mesh(verts, torch.tensor(ball.faces), normals=verts)
+ball = eg.shapes.sphere(subdivisions=3)
+ball = ball.replace(normals=ball.verts)
 image = torch.linspace(0.9, 0.2, 32)[:, None, None].repeat(1, 64, 3)
 for row, column, radiance in ((6, 10, 6.0), (10, 42, 9.0), (17, 26, 4.0)):
     image[row : row + 4, column : column + 4] = radiance
