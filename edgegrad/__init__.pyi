@@ -11,6 +11,7 @@ from .live.view import viewer
 from .plan import plan
 from .profile import profile
 from .render import jvp, render, render_batch, screen_gradient
+from .sampling import Sampling
 from .scene.material import Material, Texture
 from .scene.mesh import Mesh
 from .scene.scene import Scene
@@ -22,6 +23,7 @@ __all__ = [
     "Camera",
     "Material",
     "Mesh",
+    "Sampling",
     "Scene",
     "Symmetries",
     "Texture",
