@@ -325,3 +325,12 @@ def test_gradients_of_bodies_that_occlude_each_other(depth: float) -> None:
         expected = torch.stack([(loss(angles + s, 2048, 2) - loss(angles - s, 2048, 2)) / (2 * h) for s in steps])
     assert (found - expected).norm() < 0.02 * expected.norm()
     assert not (1.05 * found - expected).norm() < 0.02 * expected.norm()
+
+
+def test_options_for_files_of_the_other_kind_are_refused() -> None:
+    with pytest.raises(ValueError, match="package_dirs: expected none with a glTF file"):
+        eg.rig.load("a.glb", package_dirs=["."])
+    with pytest.raises(ValueError, match="lit: expected the default with a URDF file"):
+        eg.rig.load("a.urdf", lit=True)
+    with pytest.raises(TypeError, match="path: expected a str or Path, got int"):
+        eg.rig.load(3)  # type: ignore[arg-type]
