@@ -67,8 +67,8 @@ def bake(
 ) -> Tensor:
     """Return a texture (h, w, C) for a mesh, of what another surface has where the two lie on each other.
 
-    The result is `mesh.replace(texture=…)`'s: row 0 on top. It has no gradient. Nearest points and margins need SciPy
-    (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError that names the argument, ImportError.
+    It is for `mesh.replace(texture=…)`: row 0 on top. It has no gradient. Nearest points and margins need SciPy (`pip install
+    'edgegrad[fit]'`), else ImportError; TypeError and ValueError name a wrong argument.
 
     Parameters
     ----------
@@ -84,8 +84,8 @@ def bake(
         with MikkTSpace's frames where `mesh` has normals. "visibility" (C = 1): the share of the sky above a point of `mesh`,
         weighed by the cosine, that the source does not cover.
     by : "rays" or "nearest", default "rays"
-        "rays" go along the normals of `mesh`, from outside, as far as `reach` on both sides. Where these meet nothing, and with
-        "nearest" everywhere, it is the source's nearest point.
+        "rays" go along the normals of `mesh`, from outside, as far as `reach` on both sides. Where these meet nothing, and
+        with "nearest" everywhere, it is the source's nearest point.
     reach : float, world units, default a twentieth of the diagonal of the mesh's box
     rays : int, default 64
         Rays for each texel, of visibility.
@@ -136,12 +136,11 @@ def bake_pictures(
     *,
     masks: Sequence[Tensor] | None = None,
 ) -> Tensor:
-    """Return a texture (h, w, C) for a mesh, from pictures of it.
+    """Return a texture (h, w, C) for a mesh, from pictures of it; without a gradient.
 
     Each texel is the mean over the pictures that see it, weighed by the square of the cosine at which they do. It is a start
-    for fit_texture(), which finds what pictures say together: `fit_texture(mesh.replace(texture=…), …)`. Texels that no picture
-    sees take the nearest colour. It has no gradient. Needs SciPy (`pip install 'edgegrad[fit]'`). Raises TypeError or
-    ValueError that names the argument, ImportError.
+    for fit_texture(), which finds what pictures say together: `fit_texture(mesh.replace(texture=…), …)`. Texels that no
+    picture sees take the nearest colour. Errors are those of bake().
 
     Parameters
     ----------

@@ -115,6 +115,14 @@ def plan(
     ------
     TypeError, ValueError, MemoryError
         What render() raises.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> box, camera = eg.shapes.box(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(64, 64))
+    >>> plan = eg.plan(box.replace(verts=box.verts.requires_grad_()), camera)
+    >>> plan["boundary"].on, plan.samples > 64 * 64
+    (True, True)
     """
     check_options("plan", options)
     scene = as_scene(scene)

@@ -54,8 +54,7 @@ def render(
     ----------
     scene : Scene or Mesh
         With a light, or a mesh that has a material, it is lit; else colours and textures are the radiance.
-    camera : Camera
-        One camera, or a batch of B cameras.
+    camera : Camera, or a batch of B cameras
     spp : int, default 16
         Samples per pixel. Four times as many at least halve the noise of the image, and that of the gradient.
     seed : int, optional
@@ -64,33 +63,31 @@ def render(
     shader : callable, optional
         Function of Hits that returns the radiance (N, C) of N points, in place of colours, textures, materials and lights.
         Each point is shaded by itself. Discontinuities within faces are declared by hits.where(), hits.floor() or textures.
-    filter : {"box", "tent", "gaussian"}, default "box"
-        Pixel filter: 1 px wide, 2 px wide, or of σ = ½ px cut off at 3 px.
-    visibility : bool, default True
-        False leaves out what moves at silhouettes and other discontinuities: the gradient is then that of the shading alone.
-    shadows : bool, default True
-        False lets light pass through all surfaces. Lit scenes only.
+    filter : "box" (1 px wide), "tent" (2 px wide) or "gaussian" (σ = ½ px, cut off at 3 px), default "box"
+    visibility, shadows : bool, default True
+        visibility=False leaves out what moves at silhouettes and other discontinuities, so the gradient is that of the
+        shading. In lit scenes, shadows=False lets light pass through all surfaces.
     bounces : int, default 1
         Largest number of times that light is scattered on a path, 1 … 64; 1 is direct light. Lit scenes only.
-    sampling : Sampling, optional
-        Sample counts of the gradient and of lights, instead of those that follow from `spp`.
-    generator : torch.Generator, optional
-        Draws the seed instead of torch's default generator.
+    sampling, generator : Sampling, torch.Generator, optional
+        Sample counts of the gradient and of lights; and what draws the seed instead of torch's default generator.
 
     Returns
     -------
     Tensor
-        (H, W, C), or (B, H, W, C) for a batch of cameras; row 0 on top, on the scene's device, in the dtype of the colours (lit
-        scenes: of the vertices).
+        (H, W, C), or (B, H, W, C) for a batch; row 0 on top, on the scene's device, of the colours' dtype (lit: vertices').
 
     Raises
     ------
-    TypeError, ValueError
-        An argument is wrong; the message names it.
-    MemoryError
-        The image, or later its gradient, does not fit into memory.
-    RuntimeError
-        A second derivative is asked for: the image is differentiable once, in reverse and in forward mode.
+    TypeError, ValueError, MemoryError, RuntimeError
+        The message names a wrong argument. Image or gradient do not fit into memory. A second derivative is asked for: there
+        is the first alone, in reverse and in forward mode.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> eg.render(eg.shapes.box(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(48, 64)), seed=0).shape
+    torch.Size([48, 64, 3])
     """
     scene = as_scene(scene)
     if shader is not None or scene.is_shaded:

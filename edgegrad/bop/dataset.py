@@ -37,15 +37,21 @@ class Target(NamedTuple):
 
 
 class Dataset:
-    """A data set in a folder.
+    """A data set in a folder, whose files are read when they are asked for.
 
-    folder  with models/ and one folder for each split
-    split   name, such as "test", "val" or "train_pbr"; None: "test", or the only one that begins with it, or the only one
-    models  folder of meshes, such as "models_cad" or "models_reconst" of T-LESS; None: "models", or the only one but
-            "models_eval"
+    Parameters
+    ----------
+    folder : str or Path
+        With models/ and one folder for each split.
+    split : str, default "test", or the only one that begins with it, or the only one
+        Name, such as "test", "val" or "train_pbr".
+    models : str, default "models", or the only one but "models_eval"
+        Folder of meshes, such as "models_cad" or "models_reconst" of T-LESS.
 
-    Files are read when they are asked for. Raises FileNotFoundError or ValueError that names what is missing and lists what is
-    there.
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        The message names what is missing and lists what is there.
     """
 
     def __init__(self, folder: PathLike, split: str | None = None, models: str | None = None) -> None:
@@ -81,7 +87,7 @@ class Dataset:
 
     @cached_property
     def objects(self) -> list[int]:
-        """Ids of the objects in models/models_info.json."""
+        """Return the ids of the objects in models/models_info.json."""
         return sorted(self._model_infos(self._models_folder(False)))
 
     def model(self, obj_id: int, evaluation: bool = False) -> Model:
@@ -117,7 +123,7 @@ class Dataset:
 
     @property
     def scenes(self) -> list[int]:
-        """Ids of the split's scenes."""
+        """Return the ids of the split's scenes."""
         return sorted(self._paths)
 
     def images(self, scene_id: int) -> list[int]:

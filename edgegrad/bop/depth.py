@@ -13,11 +13,14 @@ MARGIN = 2  # pixels around the box of the projected vertices
 
 
 def depth_image(mesh: Mesh, pose: Tensor, camera: Camera) -> Tensor:
-    """Return the depth (H, W) float64 along the optical axis at the pixels' centres, in units of the mesh, 0 where it is not
-    seen.
+    """Return the depth (H, W) float64 along the optical axis at the pixels' centres, 0 where the mesh is not seen.
 
-    pose    (4, 4) rigid, mesh to camera
-    camera  pinhole camera at the origin, as Frame.camera
+    Parameters
+    ----------
+    mesh, pose : Mesh, (4, 4)
+        The pose is rigid, from the mesh to the camera. Depth is in units of the mesh.
+    camera : Camera
+        Pinhole camera at the origin, as Frame.camera.
     """
     H, W = camera.size
     depth = torch.zeros(H, W, dtype=torch.float64)

@@ -27,13 +27,26 @@ BOUND_POINTS = 256  # for lower bounds
 
 
 def add(estimate: Tensor, truth: Tensor, points: Tensor) -> float:
-    """Return the average distance of points, for objects without symmetries: the mean over the points of |E x − T x|."""
+    """Return the average distance of points, for objects without symmetries: the mean over the points of |E x − T x|.
+
+    Parameters
+    ----------
+    estimate, truth : (4, 4)
+        Poses E and T from the mesh to the camera, mm.
+    points : (N, 3)
+        Points x of the mesh, mm.
+    """
     return float((_moved(estimate, points) - _moved(truth, points)).norm(dim=-1).mean())
 
 
 def adi(estimate: Tensor, truth: Tensor, points: Tensor) -> float:
     """Return the average distance to the nearest point, for objects with symmetries: the mean over x of the least |E y − T x|.
-    Raises ImportError without SciPy."""
+
+    Parameters
+    ----------
+    estimate, truth, points
+        As of add(). ImportError without SciPy.
+    """
     spatial: Any = require("scipy.spatial", "edgegrad[fit]", "ADI")
     tree = spatial.cKDTree(_moved(estimate, points).numpy())
     return float(tree.query(_moved(truth, points).numpy())[0].mean())
@@ -42,7 +55,12 @@ def adi(estimate: Tensor, truth: Tensor, points: Tensor) -> float:
 def mssd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor) -> float:
     """Return the maximum symmetry-aware surface distance: the least over symmetries S of the largest |E x − T S x|.
 
-    symmetries  (T, 4, 4) with the identity, as Symmetries.transforms() returns them
+    Parameters
+    ----------
+    estimate, truth, points
+        As of add().
+    symmetries : (T, 4, 4)
+        With the identity, as Symmetries.transforms() returns them.
     """
 
     def apart(some: Tensor, x: Tensor) -> Tensor:
@@ -52,7 +70,14 @@ def mssd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor) ->
 
 
 def mspd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor, camera: Camera) -> float:
-    """Return the maximum symmetry-aware projection distance in pixels: as mssd, of the points' projections."""
+    """Return the maximum symmetry-aware projection distance in pixels: as mssd, of the points' projections.
+
+    Parameters
+    ----------
+    estimate, truth, points, symmetries
+        As of mssd().
+    camera : Camera
+    """
 
     def apart(some: Tensor, x: Tensor) -> Tensor:
         return (camera.project(_moved(estimate, x)) - camera.project(_moved(truth @ some, x))).norm(dim=-1)
@@ -68,10 +93,16 @@ def vsd(
     Of the pixels in which the object is visible in either pose, it is the share in which it is not visible in both, or the
     distances differ by tau diameters or more. Symmetries need no mention, for only what is visible counts.
 
-    estimate, truth  (H, W) depth images of the object in the two poses, by depth_image()
-    measured         (H, W) depth image of the scene; 0 where the sensor measured nothing: the object counts as visible there,
-                     as in BOP19
-    delta            mm; the object is visible where it is at most so far behind the measured depth
+    Parameters
+    ----------
+    estimate, truth : (H, W)
+        Depth images of the object in the two poses, by depth_image().
+    measured : (H, W)
+        Depth image of the scene; 0 where the sensor measured nothing: the object counts as visible there, as in BOP19.
+    camera, diameter, taus : Camera, float in mm, sequence of float
+        Tolerances are shares of the diameter.
+    delta : float, default 15
+        The object is visible where it is at most so many mm behind the measured depth.
     """
     length = pixel_rays(camera).norm(dim=-1)  # distances from the eye are compared, not depths
     mine, theirs, scene = (depth.double() * length for depth in (estimate, truth, measured))

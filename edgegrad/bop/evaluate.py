@@ -77,7 +77,7 @@ class Recalls:
 
     @property
     def ar(self) -> float | None:
-        """The mean of the three average recalls."""
+        """Return the mean of the three average recalls."""
         return None if self.ar_vsd is None else (self.ar_vsd + self.ar_mssd + self.ar_mspd) / 3.0
 
 
@@ -129,13 +129,21 @@ def evaluate(
 ) -> Evaluation:
     """Compute errors and recalls of estimates.
 
-    targets   what is to be found; None: dataset.targets()
-    with_vsd  False leaves out VSD, which needs depth images and takes most of the time
-    delta     of VSD, in mm: BOP19 takes 15, and 5 for ITODD
-    progress  show a bar on standard error
-
     Errors are measured on models_eval/, if there is one. Raises FileNotFoundError or ValueError that names what the data set
     lacks, ImportError without SciPy.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    estimates : iterable of Estimate
+    targets : sequence of Target, default dataset.targets()
+        What is to be found.
+    with_vsd : bool, default True
+        False leaves out VSD, which needs depth images and takes most of the time.
+    delta : float, default 15
+        Of VSD, in mm: BOP19 takes 15, and 5 for ITODD.
+    progress : bool, default True
+        Whether a bar is shown on standard error.
     """
     check_flag("with_vsd", with_vsd)
     check_positive("delta", delta, least=0.0, most=1e9)

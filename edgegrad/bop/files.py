@@ -40,18 +40,31 @@ DEPTH_SCALE = 0.1  # mm per level of the depth images, which reach 6.5 m
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A row of a result file."""
+    """A row of a result file.
+
+    Parameters
+    ----------
+    scene_id, im_id, obj_id, score : int, int, int, float
+    pose : (4, 4) float64, mesh to camera, mm
+    seconds : float, default −1: unknown
+        Of all estimates of the image together.
+    """
 
     scene_id: int
     im_id: int
     obj_id: int
     score: float
-    pose: Tensor  # (4, 4) float64, mesh to camera, mm
-    seconds: float = -1.0  # of all estimates of the image together; −1: unknown
+    pose: Tensor
+    seconds: float = -1.0
 
 
 def read_results(path: PathLike) -> list[Estimate]:
-    """Return the rows in the order of the file. Raises FileNotFoundError, or ValueError that names file, line and column."""
+    """Return the rows of a result file in their order.
+
+    Parameters
+    ----------
+    path : str or Path; raises FileNotFoundError, or ValueError that names file, line and column
+    """
     file = check_readable(path, (".csv",))
     found = []
     with file.open(newline="", encoding="utf-8-sig") as stream:
@@ -75,8 +88,12 @@ def read_results(path: PathLike) -> list[Estimate]:
 
 
 def write_results(path: PathLike, estimates: Iterable[Estimate]) -> None:
-    """Write rows as read_results reads them, to the last bit; the file is written whole or not at all. Raises ValueError or
-    OSError."""
+    """Write rows as read_results reads them, to the last bit; the file is written whole or not at all.
+
+    Parameters
+    ----------
+    path, estimates : str or Path, iterable of Estimate; wrong ones raise ValueError or OSError
+    """
     file = check_suffix(path, (".csv",))
     with replacing(file) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
@@ -108,10 +125,14 @@ def _floats(where: str, name: str, text: str, count: int) -> list[float]:
 class Shot:
     """An image to write.
 
-    camera      pinhole camera at the origin, as Camera.from_opencv makes it of the identity, zeros and K
-    objects     (obj_id, pose) of each instance; the pose (4, 4) is from the mesh to the camera, in mm
-    picture     (H, W, C) linear radiance; None: the meshes are rendered with their colours
-    background  radiance behind rendered meshes: one number, or a background of Scene
+    Parameters
+    ----------
+    camera : Camera
+        Pinhole camera at the origin, as Camera.from_opencv makes it of the identity, zeros and K.
+    objects : sequence of (obj_id, pose)
+        Instances; the pose (4, 4) is from the mesh to the camera, in mm.
+    picture : (H, W, C) linear radiance, default the meshes, rendered with their colours
+    background : float, or as of Scene, default 0.5; radiance behind rendered meshes
     """
 
     camera: Camera
@@ -123,8 +144,13 @@ class Shot:
 def write_models(
     folder: PathLike, meshes: Mapping[int, Mesh], symmetries: Mapping[int, Symmetries] | None = None
 ) -> None:
-    """Write models/obj_000001.ply … and models_info.json with boxes, diameters and symmetries, for meshes in mm by their ids.
-    Missing folders are made. Raises TypeError, ValueError, OSError, or ImportError without SciPy."""
+    """Write models/obj_000001.ply … and models_info.json with boxes, diameters and symmetries. Missing folders are made.
+
+    Parameters
+    ----------
+    folder, meshes, symmetries : str or Path, mapping of ids to Mesh, in mm, mapping of ids to Symmetries
+        Wrong ones raise TypeError, ValueError, OSError, or ImportError without SciPy.
+    """
     info = {}
     for obj_id, mesh in meshes.items():
         check_int("obj_id", obj_id, 0, 999_999)
@@ -144,8 +170,16 @@ def write_scene(
     """Write SPLIT/000001/ with rgb/, depth/, mask/, mask_visib/, scene_camera.json, scene_gt.json and scene_gt_info.json.
 
     Images are numbered from 0; masks and depth are those at the pixels' centres. In a test split, test_targets_bop19.json gets
-    the scene's targets, the instances that are visible by 10 % or more, in place of earlier ones of this scene. Raises
-    TypeError, ValueError or OSError.
+    the scene's targets, the instances that are visible by 10 % or more, in place of earlier ones of this scene.
+
+    Parameters
+    ----------
+    folder, scene_id : str or Path, int
+    shots, meshes : sequence of Shot, mapping from ids to Mesh
+        Wrong arguments raise TypeError, ValueError or OSError.
+    split : str, default "test"
+    spp : int, default 64
+        Samples per pixel of rendered images.
     """
     check_int("scene_id", scene_id, 0, 999_999)
     base = Path(folder) / split / f"{scene_id:06d}"

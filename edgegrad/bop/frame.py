@@ -32,8 +32,12 @@ class Truth:
 class Frame:
     """An image of a scene, whose files are read when they are asked for.
 
-    scene_id, im_id  numbers of scene and image
-    truths           the instances in it, in the order of scene_gt.json
+    Attributes
+    ----------
+    scene_id, im_id : int
+        Numbers of scene and image.
+    truths : list of Truth
+        The instances in it, in the order of scene_gt.json.
     """
 
     def __init__(self, scene: SceneFiles, im_id: int) -> None:
@@ -45,18 +49,18 @@ class Frame:
 
     @property
     def K(self) -> Tensor:
-        """K (3, 3) float64 as the file has it: the centre of the first pixel is at (0, 0)."""
+        """Return K (3, 3) float64 as the file has it: the centre of the first pixel is at (0, 0)."""
         return numbers(self._where, self._camera, "cam_K", 3, 3)
 
     @cached_property
     def camera(self) -> Camera:
-        """The camera at the origin, looking along +Z, in float64, for poses from the mesh to it. It has the picture's size."""
+        """Return the camera at the origin, looking along +Z, in float64, for poses from the mesh to it, of the picture's size."""
         one = torch.eye(3, dtype=torch.float64)
         return Camera.from_opencv(one, one.new_zeros(3), self.K, read_size(self.picture_path))
 
     @cached_property
     def truths(self) -> list[Truth]:
-        """The instances in the image. Raises FileNotFoundError if the split has no public poses."""
+        """Return the instances in the image. Raises FileNotFoundError if the split has no public poses."""
         return self._scene.truths(self.im_id)
 
     def truths_of(self, obj_id: int) -> list[Truth]:
@@ -65,7 +69,7 @@ class Frame:
 
     @property
     def picture_path(self) -> Path:
-        """The path of the colour image, or else of the grey one, or else of the depth image. Raises FileNotFoundError."""
+        """Return the path of the colour image, or else of the grey one, or else of the depth image. Raises FileNotFoundError."""
         return self._file(("rgb", "gray", "depth"), f"{self.im_id:06d}")
 
     def picture(self) -> Tensor:

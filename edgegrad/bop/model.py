@@ -20,10 +20,13 @@ from .json_files import numbers
 class Model:
     """An object: its mesh in millimetres, its diameter and its symmetries.
 
-    obj_id      its number
-    path        of its PLY file
-    diameter    mm, the largest distance between two vertices
-    symmetries  of the object
+    Attributes
+    ----------
+    obj_id, path : int, Path
+        Its number, and its PLY file.
+    diameter : float
+        The largest distance between two vertices, mm.
+    symmetries : Symmetries
     """
 
     def __init__(self, obj_id: int, path: Path, info: dict[str, Any], where: str) -> None:
@@ -36,13 +39,15 @@ class Model:
 
     @cached_property
     def mesh(self) -> Mesh:
-        """The mesh with its colours or texture as radiance, read once. Raises what load_mesh raises."""
+        """Return the mesh with its colours or texture as radiance, read once. Raises what load_mesh raises."""
         return load_mesh(self.path)
 
     @cached_property
     def points(self) -> Tensor:
-        """The vertices (N, 3) float64 in mm as the file has them, with repetitions, for means over them. Raises what load_mesh
-        raises."""
+        """Return the vertices (N, 3) float64 in mm as the file has them, with repetitions, for means over them.
+
+        Raises what load_mesh raises.
+        """
         with errors_with_path(self.path):
             model = read_mesh_file(self.path, LoadOptions(materials=False))
         return torch.cat([torch.from_numpy(part.verts).double() for part in model.parts])

@@ -48,14 +48,22 @@ def refine(
 ) -> Refined:
     """Fit the object's mesh, with its colours, to the image around the estimate.
 
-    margin       part of the image around the object that is used, in sizes of the object's box in the image
-    size         largest number of pixels on the longer side of that part; a larger one is reduced
-    steps, seed, progress, callback  as in fit_pose
-    unconverged  take the pose also of a fit that did not converge; False: keep the estimate's own
-
     Of the poses that symmetries make equal, the one nearest to the estimate's is returned. If no fit can be made, since the
     object is outside the image, say, the pose is kept with the reason. Raises FileNotFoundError or ValueError that names what
     the data set lacks.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    estimate : Estimate
+    margin : float, default 0.5
+        Part of the image around the object that is used, in sizes of the object's box in the image.
+    size : int, default 256
+        Largest number of pixels on the longer side of that part; a larger one is reduced.
+    steps, seed, progress, callback
+        As of fit_pose().
+    unconverged : bool, default False
+        True takes the pose also of a fit that did not converge; False keeps the estimate's own.
     """
     check_positive("margin", margin, least=0.0, most=100.0)
     for name, value in (("size", size), ("steps", steps)):

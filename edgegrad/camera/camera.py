@@ -32,23 +32,27 @@ class Camera(Viewpoints, Conventions):
     """One camera, or a batch of B that look at one scene.
 
     A fisheye shows up to all around, 180° from its axis, a perspective lens what lies less than 88° from it. Where the
-    distortion folds the image over, it ends: beyond there is background, and a render warns with the radius. The motion of that
-    lens boundary with the distortion and with K has its gradient. All tensors are differentiable. Numbers reach up to 3.4e38,
-    the range of float32, also in float64, and so do those of the inverse of K. Raises TypeError for a wrong type, ValueError
-    for a wrong shape or value.
+    distortion folds the image over, it ends: beyond there is background, and a render warns with the radius. The motion of
+    that lens boundary with the distortion and with K has its gradient. All tensors are differentiable. Numbers reach up to
+    3.4e38, the range of float32, also in float64, and so do those of the inverse of K.
 
     Parameters
     ----------
     world_to_camera : (4, 4) or (B, 4, 4) float
-        Rigid: a rotation and a translation, last row (0, 0, 0, 1).
+        Rigid: a rotation and a translation, last row (0, 0, 0, 1); +X right, +Y down, +Z forward.
     K : (3, 3) or (B, 3, 3) float
         Pixels (orthographic: pixels a world unit; panorama: pixels a radian), last row (0, 0, 1); skew is allowed.
     size : (H, W)
         Image size in pixels.
     projection : "perspective", "fisheye", "panorama" or "orthographic", default "perspective"
-    distortion : (4,), (5,), (8,) or (B, ·)
+    distortion : (4,), (5,), (8,) or (B, ·), default none
         Of a perspective lens, Brown–Conrady: k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV has them (12 or 14 if zeros follow). Of
         a fisheye (4,): k1, k2, k3, k4. None is a pinhole, or a fisheye without.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A field has another type, or another shape or value.
     """
 
     @classmethod
@@ -157,8 +161,10 @@ class Camera(Viewpoints, Conventions):
         return self.K.new_zeros(4) if self.distortion is None else self.distortion
 
     def crop(self, top: int, left: int, height: int, width: int) -> Camera:
-        """Return the camera of a part of the image, in pixels; it may reach beyond the image. Raises TypeError or
-        ValueError."""
+        """Return the camera of a part of the image, in pixels; it may reach beyond the image.
+
+        Other types and values raise TypeError or ValueError.
+        """
         shift = torch.zeros_like(self.K)
         shift[..., 0, 2] = check_int("left", left, -(2**31), 2**31)
         shift[..., 1, 2] = check_int("top", top, -(2**31), 2**31)
@@ -176,12 +182,21 @@ class Camera(Viewpoints, Conventions):
         return dataclasses.replace(self, **fields)
 
     def project(self, points: Tensor) -> Tensor:
-        """Return pixel positions (…, 2) of world points (…, 3), differentiable; of a batch (B, …, 2), all points in each
-        camera.
+        """Return the pixel positions of world points, differentiable.
 
         Positions are not finite in the plane of a perspective camera, nor right behind a fisheye. Points that a lens does not
-        show, beyond a fold or behind it, may have a position, too. Of all positions in a panorama, the one within ±180° is
-        returned. Raises TypeError or ValueError.
+        show, beyond a fold or behind it, may have a position, too. In a panorama the position within ±180° is returned.
+
+        Parameters
+        ----------
+        points : (…, 3) float
+            World units. Other types and values raise TypeError or ValueError.
+
+        Returns
+        -------
+        Tensor
+            (…, 2): x to the right and y down, the corner of the image at (0, 0). Of a batch (B, …, 2), all points in each
+            camera.
         """
         points = as_tensor("points", points, like=self.K)
         check_float("points", points)
@@ -211,12 +226,12 @@ class Camera(Viewpoints, Conventions):
         return self._map(Tensor.detach)
 
     def state_dict(self) -> dict[str, Any]:
-        """The camera, or batch, as a dictionary of tensors, strings and numbers; see Scene.state_dict()."""
+        """Return the camera, or batch, as a dictionary of tensors, strings and numbers; see Scene.state_dict()."""
         return to_state(self, (Camera,))
 
     @staticmethod
     def from_state_dict(state: dict[str, Any]) -> Camera:
-        """The camera of a state_dict(), with the same tensors. Raises TypeError or ValueError."""
+        """Return the camera of a state_dict(), with the same tensors. Raises TypeError or ValueError."""
         return from_state(state, Camera, (Camera,))
 
     def _map(self, f: Callable[[Tensor], Tensor]) -> Camera:

@@ -60,8 +60,16 @@ class Conventions(CameraFields):
         t : (3,)
             With `q = R p + t`.
         K : (3, 3) in pixels
-        size : (H, W)
-        distortion : k1, k2, p1, p2[, k3[, k4, k5, k6]]
+        size : (H, W) in pixels
+        distortion : k1, k2, p1, p2[, k3[, k4, k5, k6]], default none
+
+        Examples
+        --------
+        >>> import torch, edgegrad as eg
+        >>> K = [[80.0, 0.0, 31.5], [0.0, 80.0, 23.5], [0.0, 0.0, 1.0]]
+        >>> camera = eg.Camera.from_opencv(torch.eye(3), (0, 0, 4), K, size=(48, 64))
+        >>> camera.project(torch.zeros(3))
+        tensor([32., 24.])
         """
         return _from_opencv(cls, R, t, K, size, "perspective", distortion)
 
@@ -69,8 +77,16 @@ class Conventions(CameraFields):
     def fisheye(
         cls: type[CameraT], R: Vector, t: Vector, K: Vector, size: tuple[int, int], distortion: Vector | None = None
     ) -> CameraT:
-        """Return a fisheye from OpenCV's R (3, 3) or (3,), t (3,), K (3, 3) in pixels and k1, k2, k3, k4, as
-        cv2.fisheye.calibrate returns them. It may show more than a half space, up to 180° from the axis. See from_opencv."""
+        """Return a fisheye from what cv2.fisheye.calibrate returns.
+
+        It may show more than a half space, up to 180° from the axis.
+
+        Parameters
+        ----------
+        R, t, K, size
+            As of from_opencv().
+        distortion : k1, k2, k3, k4, default none
+        """
         return _from_opencv(cls, R, t, K, size, "fisheye", distortion)
 
     @classmethod
@@ -88,9 +104,9 @@ class Conventions(CameraFields):
         ----------
         camera_to_world : (4, 4) or (B, 4, 4)
             +X right, +Y up, looking along −Z.
-        size : (H, W)
-        fov_y, fov_x : float, degrees
-            Full field of view of square pixels, centred. Give one of these or K.
+        size : (H, W) in pixels
+        fov_y, fov_x : float
+            Full field of view of square pixels, centred, in degrees. Give one of these or K.
         K : (3, 3) or (B, 3, 3) in pixels, pixel centres at +0.5
         """
         pose = as_real("camera_to_world", camera_to_world, (4, 4), ("B", 4, 4))
@@ -118,20 +134,22 @@ class Conventions(CameraFields):
         principal_point: Vector = (0.0, 0.0),
         in_ndc: bool = True,
     ) -> CameraT:
-        """Return a camera from PyTorch3D's PerspectiveCameras: points are rows, `p R + T`, +X left, +Y up, +Z forward. Raises
-        TypeError or ValueError.
+        """Return a camera from PyTorch3D's PerspectiveCameras: points are rows, `p R + T`, +X left, +Y up, +Z forward.
+
+        Other types and values raise TypeError or ValueError.
 
         Parameters
         ----------
         R, T : (3, 3) or (N, 3, 3), and (3,) or (N, 3)
             As its cameras hold them.
-        size : (H, W)
+        size : (H, W) in pixels
         focal_length : float, (2,), (N,) or (N, 2), default 1
             Of x and y. In normalised coordinates, where the shorter side of the image is from −1 to 1; with in_ndc=False in
             pixels. Of FoVPerspectiveCameras it is 1 / tan(fov / 2).
         principal_point : (2,) or (N, 2), default zeros
             Likewise; in normalised coordinates x runs to the left and y up.
         in_ndc : bool, default True
+            Whether focal length and principal point are in normalised coordinates.
         """
         rotation = as_real("R", R, (3, 3), ("N", 3, 3))
         check_rotation("R", rotation)
@@ -158,20 +176,21 @@ class Conventions(CameraFields):
     def from_colmap(
         cls: type[CameraT], rotation: Vector, translation: Vector, model: str, params: Vector, size: tuple[int, int]
     ) -> CameraT:
-        """Return a camera from an image's pose and its camera in COLMAP; load_cameras() reads whole reconstructions. Raises
-        TypeError or ValueError.
+        """Return a camera from an image's pose and its camera in COLMAP; load_cameras() reads whole reconstructions.
+
+        Other types and values raise TypeError or ValueError.
 
         Parameters
         ----------
         rotation : (4,) quaternion w, x, y, z, as in images.txt, or (3, 3)
             World to camera, +X right, +Y down, +Z forward.
-        translation : (3,)
+        translation : (3,) in world units
         model : str
-            SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, SIMPLE_FISHEYE, FISHEYE, SIMPLE_RADIAL_FISHEYE,
-            RADIAL_FISHEYE or OPENCV_FISHEYE.
+            SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, SIMPLE_FISHEYE, FISHEYE,
+            SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE or OPENCV_FISHEYE.
         params : (n,)
             Its parameters, in COLMAP's order; pixel centres at +0.5, as here.
-        size : (H, W)
+        size : (H, W) in pixels
         """
         pose = as_real("rotation", rotation, (4,), (3, 3))
         if pose.dim() == 1:
@@ -202,10 +221,10 @@ class Conventions(CameraFields):
     def from_projection(
         cls: type[CameraT], projection: Vector, size: tuple[int, int], view: Vector | None = None
     ) -> CameraT:
-        """Return a camera from OpenGL's matrices: `clip = projection · view · p`, with x/w to the right and y/w up, from −1 to
-        1 over the image.
+        """Return a camera from OpenGL's matrices, perspective or orthographic; differentiable.
 
-        It is perspective or orthographic; how depth is mapped does not matter. Differentiable. Raises TypeError or ValueError.
+        `clip = projection · view · p`, with x/w to the right and y/w up, from −1 to 1 over the image. How depth is mapped does
+        not matter. Other types and values raise TypeError or ValueError.
 
         Parameters
         ----------

@@ -24,17 +24,29 @@ class Viewpoints(CameraFields):
         size: tuple[int, int] = (256, 256),
         fov_x: float | Tensor | None = None,
     ) -> CameraT:
-        """Return a perspective camera at `eye` (3,) aimed at `target` (3,), with `up` (3,) upwards in the image.
+        """Return a perspective camera at `eye` aimed at `target`, with `up` upwards in the image.
 
-        Pixels are square, with the principal point in the middle. Raises TypeError or ValueError.
+        Pixels are square, with the principal point in the middle.
 
         Parameters
         ----------
-        eye, target, up : (3,)
-            up is +Y by default.
+        eye, target : (3,)
+            World units.
+        up : (3,), default +Y
         fov_y, fov_x : float, degrees in (0, 180)
             Full vertical or horizontal field of view; fov_y is 40 when neither is given.
-        size : (H, W), default (256, 256)
+        size : (H, W) in pixels, default (256, 256)
+
+        Raises
+        ------
+        TypeError, ValueError
+            An argument has another type or shape, or is out of range.
+
+        Examples
+        --------
+        >>> import edgegrad as eg
+        >>> eg.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, size=(48, 64))
+        Camera(perspective, 48 × 64 pixels, torch.float32)
         """
         if fov_x is not None and fov_y is not None:
             raise TypeError("look_at: expected one of fov_y and fov_x, got both; leave one out")
@@ -52,7 +64,15 @@ class Viewpoints(CameraFields):
         height: float | Tensor = 2.0,
         size: tuple[int, int] = (256, 256),
     ) -> CameraT:
-        """Return an orthographic camera from `eye` towards `target` that shows `height` world units from top to bottom."""
+        """Return an orthographic camera from `eye` towards `target`.
+
+        Parameters
+        ----------
+        eye, target, up, size
+            As of look_at().
+        height : float, default 2
+            World units that are seen from top to bottom.
+        """
         world_to_camera = looking_at(eye, target, up)
         height = as_scalar("height", height, like=world_to_camera)
         if values_visible(height) and not 0.0 < float(height.detach()) < math.inf:

@@ -24,9 +24,17 @@ SINGLE_EYE_ROUNDING = 1e-4  # units by which float32 may move the eyes of camera
 
 
 def save_camera(path: PathLike, camera: Camera) -> None:
-    """Write a camera, or a batch, as JSON. The keys are world_to_camera, K (rows, in pixels), size [H, W], projection and, of a
-    lens that distorts, distortion. Missing folders are made. Raises ValueError for a name that does not end in .json, TypeError
-    or OSError."""
+    """Write a camera, or a batch, as JSON. Missing folders are made.
+
+    The keys are world_to_camera, K (rows, in pixels), size [H, W], projection and, of a lens that distorts, distortion.
+
+    Parameters
+    ----------
+    path : str or Path
+        It ends in .json, else ValueError; OSError where it cannot be written.
+    camera : Camera
+        Others raise TypeError.
+    """
     file = check_suffix(path, (".json",))
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
@@ -132,38 +140,37 @@ def load_cameras(
 ) -> dict[str, View]:
     """Return the cameras of a file or folder by name, each with its image: `View(camera, image)`.
 
-    A camera describes the pixels that its image stores: read_image(view.image) applies no EXIF orientation, unless the camera's
-    size shows that it describes the upright image. Where an image has another size than the file of cameras says, a warning
-    tells which. The camera is then scaled to the image, or View.image is None where the sizes are not in proportion.
+    A camera describes the pixels that its image stores: read_image(view.image) applies no EXIF orientation, unless the
+    camera's size shows that it describes the upright image. Where an image has another size than the file of cameras says, a
+    warning tells which. The camera is then scaled to the image, or View.image is None where the sizes are not in proportion.
 
-    - A folder with COLMAP's cameras and images, text or binary, or with sparse/0 in it; names are the images'.
+    - COLMAP: a folder with cameras and images, text or binary, or with sparse/0 in it; names are the images'.
     - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path. A frame's own keys take precedence
       over the file's, whatever the key: its camera_angle_x over the file's fl_x. Keys that are null count as absent.
     - .yml, .yaml or .xml of OpenCV's calibration program: camera_matrix, distortion_coefficients, image_width, image_height,
-      fisheye_model and extrinsic_parameters. A stereo pair is named by its matrices, "M1" and "M2": the first is at the origin,
-      the second at R and T, which may stand in extrinsics.yml next to intrinsics.yml.
+      fisheye_model and extrinsic_parameters. A stereo pair is named by its matrices, "M1" and "M2": the first is at the
+      origin, the second at R and T, which may stand in extrinsics.yml next to intrinsics.yml.
     - .yaml of ROS (camera_info), by camera_name; and of Kalibr (camchain), pinhole with radtan or equidistant: "cam0", "cam1"
       …, the first at the origin.
-    - .gltf and .glb; names are the nodes'.
-    - .json of save_camera(); names are numbers.
+    - .gltf and .glb; names are the nodes'. And .json of save_camera(); names are numbers.
 
     Cameras of one size can be joined by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the
-    error names it. One warning names all keys that nothing reads, unless cameras do not depend on them. Raises
-    FileNotFoundError, TypeError, ValueError that names the file, or ImportError without PyYAML (edgegrad[cameras]).
+    error names it. One warning names all keys that nothing reads, unless cameras do not depend on them. FileNotFoundError,
+    TypeError and ValueError name the file; ImportError says that PyYAML is missing (edgegrad[cameras]).
 
     Parameters
     ----------
     path : str or Path
-    size : (H, W) in pixels
-        Needed where the file does not state it.
+    size : (H, W)
+        Pixels, where the file does not state them.
     images : str or Path
         Folder of COLMAP's images, by default `images` next to the reconstruction or up to two folders above it. Or the folder
         of a transforms.json's images, found by as much of the end of file_path as leads to a file; by default they are next to
         the file or below it.
     dtype : torch.float32, torch.float64 or None
-        Type of the cameras. None: float64 where float32 would move an eye by more than a millionth of the extent of all eyes,
-        as in map coordinates, or by more than 1e-4 units where all eyes are at one place; else float32. A warning tells where
-        the requested type rounds more than that.
+        None: float64 where float32 would move an eye by more than a millionth of the extent of all eyes, as in map
+        coordinates, or by more than 1e-4 units where all eyes are at one place; else float32. A warning tells where the
+        requested type rounds more than that.
     """
     unread = UnreadLog()
     views = matched(_views(path, size, images, unread), unread)

@@ -16,16 +16,21 @@ def read_depth(path: PathLike, scale: float | None = None) -> Tensor:
     """Return depth (H, W) float32 from an image file of one channel.
 
     Values are distances along +Z of the camera in world units, 0 or NaN where there is none, as `depth=` of fits takes them.
-    Row 0 is on top, upright as the EXIF orientation says. Raises TypeError or ValueError for more than one channel, for whole
-    numbers of 8 bits, for whole numbers without a scale, or for a scale that is not above 0; and what read_image() raises.
+    Row 0 is on top, upright as the EXIF orientation says.
 
     Parameters
     ----------
     path : str or Path
-    scale : float
+    scale : float, default none
         Length of one unit of the file in world units: 0.001 where it has millimetres and the mesh is in metres. Data sets call
         it `depth_scale`; that of BOP is in millimetres. Whole numbers (PNG, TIFF of 16 or 32 bits) need it; floating-point
         numbers (EXR, float TIFF) count as they are without it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The file has more than one channel, or whole numbers of 8 bits, or whole numbers without a scale; or the scale is not
+        above 0. And what read_image() raises.
     """
     if scale is not None:
         if not isinstance(scale, (int, float)) or isinstance(scale, bool):

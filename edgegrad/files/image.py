@@ -25,14 +25,26 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRG
 
 
 def srgb_to_linear(values: Tensor) -> Tensor:
-    """Return linear radiance of sRGB values of any shape, 0 … 1; differentiable. The curve is IEC 61966-2-1's."""
+    """Return the linear radiance of sRGB values, differentiable; the curve is IEC 61966-2-1's.
+
+    Parameters
+    ----------
+    values : Tensor
+        Of any shape, 0 … 1. The result has the same shape.
+
+    Examples
+    --------
+    >>> import torch, edgegrad as eg
+    >>> eg.image.srgb_to_linear(torch.tensor([0.0, 0.5, 1.0]))
+    tensor([0.0000, 0.2140, 1.0000])
+    """
     # The clamp keeps the power's unused branch, and its gradient, finite.
     curve = ((values.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(values <= 0.04045, values / 12.92, curve)
 
 
 def linear_to_srgb(values: Tensor) -> Tensor:
-    """Return sRGB values of linear radiance of any shape, 0 … 1; differentiable. It inverts srgb_to_linear()."""
+    """Return the sRGB values of linear radiance of any shape, 0 … 1; differentiable. It inverts srgb_to_linear()."""
     curve = 1.055 * values.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(values <= 0.0031308, values * 12.92, curve)
 
@@ -106,10 +118,9 @@ def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb
 
     A path that load_cameras() found is read as it is stored, because its camera describes these pixels. Integer pixels (PNG,
     JPEG, BMP, WebP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1; floating-point pixels (EXR, HDR,
-    float TIFF) are linear already. Alpha is the last channel, not gamma-corrected and not multiplied into the colours: a TIFF's
-    associated alpha is divided out where it is above 0. EXR files hold colours times alpha, and these stay so. At most 2³⁰
-    pixels times channels are read. read_mask() reads masks. Raises FileNotFoundError, PermissionError, TypeError, ValueError
-    (another kind of file, damaged, too large, colours that do not convert) or ImportError without OpenImageIO.
+    float TIFF) are linear already. Alpha is the last channel, not gamma-corrected and not multiplied into the colours: a
+    TIFF's associated alpha is divided out where it is above 0. EXR files hold colours times alpha, and these stay so. At most
+    2³⁰ pixels times channels are read. read_mask() reads masks.
 
     Parameters
     ----------
@@ -118,10 +129,16 @@ def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb
         None keeps the channels of the file. 1 gives the luminance and 3 the colours, both without alpha; 4 adds an alpha of 1
         where the file has none.
     curve : "srgb", float, table or function, default "srgb"
-        How integer pixels, as values v from 0 to 1, become radiance. A number γ means vᵞ, 1 for pixels that are linear already.
-        A table (N,), or (N, 3) with a column for each colour, has the radiances of N values evenly spaced from 0 to 1, as
-        calibrations of a camera's response give it, and must rise. A function maps a tensor (n, C), float64, as those of
+        How integer pixels, as values v from 0 to 1, become radiance. A number γ means vᵞ, 1 for pixels that are linear
+        already. A table (N,), or (N, 3) with a column for each colour, has the radiances of N values evenly spaced from 0 to
+        1, as calibrations of a camera's response give it, and must rise. A function maps a tensor (n, C), float64, as those of
         colour-science do. Floating-point pixels take no curve.
+
+    Raises
+    ------
+    FileNotFoundError, PermissionError, ValueError, TypeError, ImportError
+        ValueError: the file is of another kind, damaged or too large, or its colours do not convert. ImportError: OpenImageIO
+        is missing.
     """
     if channels not in (None, 1, 3, 4):
         raise ValueError(f"channels: expected None, 1, 3 or 4, got {channels!r}")
@@ -172,17 +189,29 @@ def _header(path: PathLike) -> Any:
 def write_image(path: PathLike, img: Tensor) -> None:
     """Write linear radiance to an image file.
 
-    PNG, JPEG, BMP and TIFF are clipped to 0 … 1, sRGB, 8 bit, rounded to nearest, with up to 4 channels (of 2 and 4 the last is
-    alpha, not gamma-corrected; JPEG holds 1 or 3). HDR is linear with 3 channels. EXR is linear float32 with any number. The
-    file appears whole or not at all; an existing one is replaced, and missing folders are made. Raises ValueError (unknown
-    ending, wrong shape, NaN or infinity), TypeError (not floating-point), OSError (cannot write) or ImportError without
-    OpenImageIO.
+    PNG, JPEG, BMP and TIFF are clipped to 0 … 1, sRGB, 8 bit, rounded to nearest, with up to 4 channels (of 2 and 4 the last
+    is alpha, not gamma-corrected; JPEG holds 1 or 3). HDR is linear with 3 channels. EXR is linear float32 with any number.
+    The file appears whole or not at all; an existing one is replaced, and missing folders are made.
 
     Parameters
     ----------
     path : str or Path
     img : (H, W) or (H, W, C) tensor of any floating dtype, on any device
         Radiance, row 0 on top.
+
+    Raises
+    ------
+    ValueError, TypeError, OSError, ImportError
+        ValueError: unknown ending, wrong shape, NaN or infinity. TypeError: not floating-point. OSError: it cannot be written.
+        ImportError: OpenImageIO is missing.
+
+    Examples
+    --------
+    >>> import tempfile, torch, edgegrad as eg
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     eg.write_image(f"{folder}/grey.png", torch.full((2, 3, 3), 0.2140))
+    ...     eg.read_image(f"{folder}/grey.png").shape
+    torch.Size([2, 3, 3])
     """
     file = check_suffix(path, IMAGES)
     image = as_tensor("img", img).detach()

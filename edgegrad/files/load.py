@@ -62,21 +62,14 @@ def load_mesh(
 
     Vertices that the file repeats (at texture seams, for normals, in triangle soups) are welded where their positions are
     equal; unused ones are left out. Convex polygons become fans of triangles, concave ones triangles that cover them. Texture
-    coordinates are indexed apart, v running up, and are kept without a texture, too. Where welded vertices had different
-    colours, they become `corner_colors`. STL gives the shape only. Colours become linear radiance, or base colours with `lit`.
-    In the file, colour textures and the colours of vertices and faces of OBJ, PLY and 3MF are sRGB; factors of materials and
-    vertex colours of glTF are linear. Texture, factor and vertex colours of a glTF are multiplied, and so are map_Kd and Kd of
-    an OBJ; otherwise the first of texture, vertex colours, face colours and material counts. Parts of one appearance (all
-    plain, all with vertex colours, all with face colours, all on one texture; lit, all with one material) become one Mesh.
-    Files that the file names are read from its folder and below, and from nowhere else. Raises FileNotFoundError (the file, or
-    one that it names), ValueError (another kind of file, damaged, without triangles, bad indices or positions, or parts of
-    different appearance: use load_scene), TypeError, or ImportError without trimesh, or without mapbox_earcut where a file has
-    concave faces with more than four corners.
+    coordinates run up, and are kept without a texture, too. Where welded vertices had different colours, they become
+    `corner_colors`. Parts of one appearance become one Mesh. Files that the file names are read from its folder and below, and
+    from nowhere else.
 
     Parameters
     ----------
     path : str or Path
-    texture : str, Path or (h, w, C) tensor
+    texture : str, Path or (h, w, C) tensor, default the file's
         Image file, or linear radiance, for the file's texture coordinates in place of its colours. Like textures that the file
         names, an image is read as it is stored: its EXIF orientation is not applied.
     materials : bool, default True
@@ -87,6 +80,20 @@ def load_mesh(
     dtype : torch.float32, torch.float64 or None
         Type of all tensors. None: float64 where float32 would move vertices by more than a millionth of the extent, as it does
         in map coordinates; else float32. Vertices are welded before they are rounded to less than that, which a warning tells.
+
+    Raises
+    ------
+    FileNotFoundError, TypeError, ValueError, ImportError
+        The file, or one that it names, is not there. ValueError: it is of another kind, damaged, without triangles, or has bad
+        indices or positions; or its parts differ in appearance: use load_scene(). ImportError: trimesh is missing, or
+        mapbox_earcut for concave faces of more than four corners.
+
+    Notes
+    -----
+    Colours become linear radiance, or base colours with `lit`; STL gives the shape only. Colour textures and the colours of
+    vertices and faces of OBJ, PLY and 3MF are sRGB; factors of materials and vertex colours of glTF are linear. Texture,
+    factor and vertex colours of a glTF are multiplied, and so are map_Kd and Kd of an OBJ; otherwise the first of texture,
+    vertex colours, face colours and material counts.
     """
     options = LoadOptions(materials and texture is None, check_flag("lit", lit), dtype=check_dtype(dtype))
     with errors_with_path(path):
@@ -103,7 +110,12 @@ def load_scene(path: PathLike, materials: bool = True, lit: bool = False, dtype:
 
     A part is a primitive at a node of a glTF, a material in an object of an OBJ, a solid of an STL, or an item of a 3MF.
     Transformations are applied to the vertices. With `lit`, the scene has materials, normals and the lights of the file;
-    without lights it is black. See load_mesh() for everything else, and for the errors.
+    without lights it is black.
+
+    Parameters
+    ----------
+    path, materials, lit, dtype
+        As of load_mesh(), and so are the errors.
     """
     options = LoadOptions(materials, check_flag("lit", lit), split=True, dtype=check_dtype(dtype))
     with errors_with_path(path):

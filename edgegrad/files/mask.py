@@ -32,21 +32,25 @@ def read_mask(path: PathLike, label: int | None = None) -> Tensor:
     applies counts:
 
     - The alpha channel, unless it is 1 everywhere.
-    - Grey: 1, 8 and 16 bit from black to white, floating point (EXR, float TIFF) from 0 to 1. Whole numbers up to 1 are labels:
-      0 off the object, 1 on it. There are several labels where few numbers, none of which is 0 or the largest, fill areas, as
-      the greys of a smooth border do not.
+    - Grey: 1, 8 and 16 bit from black to white, floating point (EXR, float TIFF) from 0 to 1. Whole numbers up to 1 are
+      labels: 0 off the object, 1 on it. There are several labels where few numbers, none of which is 0 or the largest, fill
+      areas, as the greys of a smooth border do not.
     - Black and one other colour, or number 0 of a palette and another: 1 at the other.
 
-    Raises ValueError for several labels without label=, for one that does not occur (the message names those that do) and for a
-    picture in colours; and what read_image() raises. Warns of what appears to be an inverted mask. Palettes need Pillow
-    (edgegrad[files]).
+    A warning tells of what appears to be an inverted mask. Palettes need Pillow (edgegrad[files]).
 
     Parameters
     ----------
     path : str or Path
-    label : int
+    label : int, default none
         Number of the object in an image of labels: grey of whole numbers, or a palette's numbers. The mask is 1 at this label
         and 0 elsewhere; add masks for several objects.
+
+    Raises
+    ------
+    ValueError
+        There are several labels without label=, or not this one (the message names those that occur), or a picture in colours.
+        And what read_image() raises.
     """
     if label is not None:
         check_int("label", label, 0, 2**32 - 1)

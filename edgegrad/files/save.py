@@ -36,9 +36,13 @@ CLAMPED = ("clamp", "clamp")  # an MTL clamps both coordinates or neither
 def from_trimesh(given: Any) -> Mesh:
     """Return the mesh of a trimesh.Trimesh with equal vertices welded.
 
-    It has the vertex or face colours or the texture, which are sRGB there, or the colour of its material, which is linear.
-    It is float64 where float32 would move vertices by more than a millionth of the extent, else float32. Raises TypeError,
-    ValueError or ImportError.
+    It has the vertex or face colours or the texture, which are sRGB there, or the colour of its material, which is linear. It
+    is float64 where float32 would move vertices by more than a millionth of the extent, else float32.
+
+    Parameters
+    ----------
+    given : trimesh.Trimesh
+        Others raise TypeError, those without faces ValueError.
     """
     trimesh = require("trimesh", "trimesh", "from_trimesh")
     if isinstance(given, trimesh.Scene):
@@ -61,8 +65,14 @@ def from_trimesh(given: Any) -> Mesh:
 def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
     """Return a trimesh.Trimesh of a mesh, with colours or texture as 8-bit sRGB.
 
-    Vertices are split where texture coordinates or the colours of corners differ. Without `faces_colored`, colours of faces
-    become colours of vertices, which are split for them. Raises ValueError for other than 1 or 3 channels, ImportError.
+    Vertices are split where texture coordinates or the colours of corners differ.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Of 1 or 3 channels, else ValueError; ImportError without trimesh.
+    faces_colored : bool, default True
+        False: colours of faces become colours of vertices, which are split for them.
     """
     trimesh = require("trimesh", "trimesh", "to_trimesh")
     _check_channels(mesh)
@@ -97,15 +107,34 @@ def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
 
 
 def save_mesh(path: PathLike, mesh: Mesh) -> None:
-    """Write a mesh as PLY, OBJ, GLB, STL or OFF by the name's ending.
+    """Write a mesh as PLY, OBJ, GLB, STL or OFF by the name's ending. Missing folders are made.
 
-    A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as `load_scene(path, lit=True)`
-    reads them: factors and vertex colours in full, textures in 8 bit (colour as sRGB), clipped to 0 … 1. Metallic, roughness
-    and emission of vertices become their mean, because glTF has none. A Lambertian material is one without a highlight
-    (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an OBJ also a texture, repeated or clamped, which is
-    written next to it with its .mtl; STL and OFF hold the shape alone. Positions in PLY, STL and GLB are float32; those in OBJ
-    and OFF have all digits of the mesh's type. A warning names what is left out, rounded or clipped. Missing folders are made.
-    Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+    A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as `load_scene(path,
+    lit=True)` reads them: factors and vertex colours in full, textures in 8 bit (colour as sRGB), clipped to 0 … 1. Metallic,
+    roughness and emission of vertices become their mean, because glTF has none. A Lambertian material is one without a
+    highlight (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an OBJ also a texture, repeated or clamped,
+    which is written next to it with its .mtl; STL and OFF hold the shape alone. Positions in PLY, STL and GLB are float32;
+    those in OBJ and OFF have all digits of the mesh's type. A warning names what is left out, rounded or clipped.
+
+    Parameters
+    ----------
+    path : str or Path
+    mesh : Mesh
+
+    Raises
+    ------
+    TypeError, ValueError, OSError, ImportError
+        ValueError: another ending, or channels that are not 1 or 3. OSError: it cannot be written. ImportError: trimesh is
+        missing.
+
+    Examples
+    --------
+    >>> import tempfile, torch, edgegrad as eg
+    >>> box = eg.shapes.box().replace(colors=torch.ones(8, 3))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     eg.save_mesh(f"{folder}/box.ply", box)
+    ...     eg.load_mesh(f"{folder}/box.ply")
+    Mesh(8 vertices, 12 faces, colors (8, 3), torch.float32)
     """
     file = check_suffix(path, WRITTEN)
     if not isinstance(mesh, Mesh):
@@ -138,12 +167,11 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
 def save_scene(
     path: PathLike, scene: Scene | Mesh, cameras: Camera | Sequence[Camera] | Mapping[str, Camera] | None = None
 ) -> None:
-    """Write a scene as GLB or glTF by the name's ending; a .gltf embeds its arrays and images.
+    """Write a scene as GLB or glTF by the name's ending; a .gltf embeds its arrays and images. Missing folders are made.
 
     `load_scene(path, lit=True)` reads the meshes in their order and the lights, load_cameras(path, size) the cameras. A glTF
     has no environments, spherical harmonics, backgrounds or lenses, and no cameras whose principal point is off the middle or
-    whose pixels are not square: a warning names what is left out, rounded or clipped. Missing folders are made. Raises
-    TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+    whose pixels are not square: a warning names what is left out, rounded or clipped.
 
     Parameters
     ----------
@@ -151,7 +179,8 @@ def save_scene(
     scene : Scene or Mesh
         Each mesh becomes a node, with its material as save_mesh() writes it; one without a material is marked as unlit
         (KHR_materials_unlit). Directional, point and spot lights are KHR_lights_punctual. What meshes share is written once.
-    cameras : Camera, a batch, a sequence, or a mapping by name
+    cameras : Camera, a batch, a sequence, or a mapping by name, default none
+        Nodes, too. Errors are those of save_mesh().
     """
     file = check_suffix(path, SCENES)
     if not isinstance(scene, Scene | Mesh):

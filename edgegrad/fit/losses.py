@@ -31,17 +31,41 @@ def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
 
 
 def l1(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return the mean of |r|, r = image − target: outliers count less than with l2."""
+    """Return the mean of |r|, r = image − target: outliers count less than with l2.
+
+    Parameters
+    ----------
+    image, target : (..., H, W, C)
+    weight : (..., H, W, 1), default ones
+        Weight of each pixel in the mean.
+
+    Examples
+    --------
+    >>> import torch, edgegrad as eg
+    >>> eg.fit.losses.l1(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.5))
+    tensor(0.5000)
+    """
     return _mean((image - target).abs(), weight)
 
 
 def l2(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return the mean of r², r = image − target: the best loss where the differences are noise alone."""
+    """Return the mean of r², r = image − target: the best loss where the differences are noise alone.
+
+    Parameters
+    ----------
+    image, target, weight : as of l1()
+    """
     return _mean((image - target).square(), weight)
 
 
 def huber(image: Tensor, target: Tensor, weight: Tensor | None = None, scale: float = 0.1) -> Tensor:
-    """Return the mean of ½ r² up to |r| = scale, and scale (|r| − ½ scale) beyond (Huber 1964)."""
+    """Return the mean of ½ r² up to |r| = scale, and scale (|r| − ½ scale) beyond (Huber 1964).
+
+    Parameters
+    ----------
+    image, target, weight : as of l1()
+    scale : float, default 0.1
+    """
     return _mean(F.huber_loss(image, target, reduction="none", delta=scale), weight)
 
 
@@ -50,10 +74,17 @@ def robust(
 ) -> Tensor:
     """Return the mean of ρ(r) = |α−2|/α (((r/scale)² / |α−2| + 1)^(α/2) − 1), a general robust loss (Barron 2019).
 
-    With x = r/scale, alpha 2 is l2, 1 a smooth l1, 0 Cauchy's log(½ x² + 1), −2 Geman and McClure's 2x² / (x² + 4), and −∞
-    Welsch's 1 − exp(−½ x²). At 0 and below, residuals far beyond `scale` hardly count, whatever hides the object there. The
-    noise of the render must be well below `scale`: rare bright samples, as of glossy surfaces under small lights, would be
-    dropped too and bias the fit. Raise spp and light_samples first.
+    The noise of the render must be well below `scale`: rare bright samples, as of glossy surfaces under small lights, would be
+    dropped too and bias the fit. Raise spp and Sampling.lights first.
+
+    Parameters
+    ----------
+    image, target, weight : as of l1()
+    scale : float, default 0.1
+        Residuals far beyond hardly count with alpha ≤ 0, whatever hides the object there.
+    alpha : float, default −2
+        With x = r/scale, 2 is l2, 1 a smooth l1, 0 Cauchy's log(½ x² + 1), −2 Geman and McClure's 2x² / (x² + 4), and −∞
+        Welsch's 1 − exp(−½ x²).
     """
     square = ((image - target) / scale).square()
     if alpha == 2.0:
@@ -69,15 +100,24 @@ def robust(
 
 
 def iou(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return 1 − Σ min(a, b) / Σ max(a, b) of soft masks: one minus intersection over union, over each whole image."""
+    """Return 1 − Σ min(a, b) / Σ max(a, b) of soft masks: one minus intersection over union, over each whole image.
+
+    Parameters
+    ----------
+    image, target, weight : as of l1()
+    """
     w = torch.ones_like(image[..., :1]) if weight is None else weight
     both, either = ((w * f(image, target)).sum((-3, -2, -1)) for f in (torch.minimum, torch.maximum))
     return (1.0 - both / either.clamp(min=1e-30)).mean()
 
 
 def ssim(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return 1 − the structural similarity (Wang et al. 2004) of images in 0 … 1, by torchmetrics (`pip install
-    'edgegrad[fit]'`)."""
+    """Return 1 − the structural similarity (Wang et al. 2004), by torchmetrics (`pip install 'edgegrad[fit]'`).
+
+    Parameters
+    ----------
+    image, target, weight : as of l1(), with values in 0 … 1
+    """
     metrics = require("torchmetrics.functional.image", "edgegrad[fit]", "ssim")
 
     def batch(x: Tensor) -> Tensor:
@@ -90,7 +130,13 @@ def ssim(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
 
 
 def multiscale(loss: Loss = l2, levels: int = 4) -> Loss:
-    """Return a loss that is the mean of `loss` over an image pyramid of halved levels; it sees farther than a pixel."""
+    """Return a loss that is the mean of `loss` over an image pyramid of halved levels; it sees farther than a pixel.
+
+    Parameters
+    ----------
+    loss : function of image, target and weight, default l2
+    levels : int, default 4
+    """
 
     def over_levels(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
         total = torch.zeros((), dtype=image.dtype)

@@ -27,16 +27,18 @@ MAD = 1.4826  # standard deviation of Gaussian noise over the median of its size
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Measured depths, normals or positions, and how far to trust them.
+    """Measured depths, normals or positions, and how far to trust them. TypeError and ValueError name a wrong argument.
 
-    values   for each camera (H, W), (H, W, 1) or (H, W, 3), or None where it has none; a pixel that is not finite, or 0 (for
-             normals and positions in all three), is not measured
-    weights  for each camera (H, W) or (H, W, 1), ≥ 0: how much a pixel counts, as a sensor's confidence says; None: 1
-    factor   weight of all of them relative to masks and colours
-    scale    residuals up to about this are noise, in the units of `values`; much larger ones count as outliers once most are
-             below. None: the width of a pixel at the object, and 0.1 for normals
-
-    Raises TypeError or ValueError that names the argument.
+    Parameters
+    ----------
+    values : for each camera (H, W), (H, W, 1) or (H, W, 3), or None where it has none
+        A pixel that is not finite, or 0 (for normals and positions in all three), is not measured.
+    weights : for each camera (H, W) or (H, W, 1), ≥ 0, default 1
+        How much a pixel counts, as a sensor's confidence says.
+    factor : float, default 1
+        Weight of all of them relative to masks and colours.
+    scale : float, default the width of a pixel at the object, and 0.1 for normals
+        Residuals up to about this are noise, in the units of `values`; much larger ones count as outliers once most are below.
     """
 
     values: Any

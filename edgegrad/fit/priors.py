@@ -34,7 +34,12 @@ def checked_priors(priors: Sequence[Prior], values: Mapping[str, Tensor]) -> lis
 
 
 def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
-    """Return the prior weight · Σ (x − rest)² over all values but PLACE; rotations are in radians."""
+    """Return the prior weight · Σ (x − rest)² over all values but translation, orientation and scale.
+
+    Parameters
+    ----------
+    rest, weight : mapping of names to Tensor, rotations in radians, and float, default 1e-6
+    """
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:
         total = torch.zeros((), dtype=torch.float64)
@@ -49,8 +54,15 @@ def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
 def mirrored(
     name: str, pairs: Sequence[tuple[int, int]], signs: Sequence[float] = (1.0, -1.0, -1.0), weight: float = 1e-6
 ) -> Prior:
-    """Return the prior weight · Σ |x_left − s x_right|² over pairs of rows of a control. The signs s mirror rotation vectors at
-    x = 0 if the joints' own axes are the world's."""
+    """Return the prior weight · Σ |x_left − s x_right|² over pairs of rows of a control.
+
+    Parameters
+    ----------
+    name, pairs : name of the control, and sequence of (left, right) places of rows
+    signs : sequence of float, default (1, −1, −1)
+        The signs s mirror rotation vectors at x = 0 if the joints' own axes are the world's.
+    weight : float, default 1e-6
+    """
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:
         value = values[name]
@@ -61,8 +73,19 @@ def mirrored(
 
 
 def near(before: Mapping[str, Tensor], weight: float = 1e-5) -> Prior:
-    """Return the prior weight · Σ (x − before)² over all values. It makes a sequence smooth if `before` is the pose of the last
-    frame, or its extrapolation."""
+    """Return the prior weight · Σ (x − before)² over all values, which makes a sequence smooth.
+
+    Parameters
+    ----------
+    before, weight : pose of the last frame, or its extrapolation, by names, and float, default 1e-5
+
+    Examples
+    --------
+    >>> import torch, edgegrad as eg
+    >>> prior = eg.fit.priors.near({"angles": torch.zeros(2)}, weight=0.5)
+    >>> prior({"angles": torch.tensor([1.0, 2.0])})
+    tensor(2.5000)
+    """
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:
         parts = [(value - before[name].to(value)).square().sum() for name, value in values.items() if name in before]

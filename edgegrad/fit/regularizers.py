@@ -33,7 +33,19 @@ def _sides(faces: Tensor) -> Tensor:
 
 
 def laplacian(verts: Tensor, faces: Tensor) -> Tensor:
-    """Return the mean |v − mean of its neighbours|², in squared mean edge lengths: zero where the surface is flat and even."""
+    """Return the mean |v − mean of its neighbours|², in squared mean edge lengths: zero where the surface is flat and even.
+
+    Parameters
+    ----------
+    verts, faces : (V, 3) float, (F, 3) int
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> ball, box = eg.shapes.sphere(), eg.shapes.box()
+    >>> bool(eg.fit.regularizers.laplacian(ball.verts, ball.faces) < eg.fit.regularizers.laplacian(box.verts, box.faces))
+    True
+    """
     pairs = edges(faces)
     both = torch.cat([pairs, pairs.flip(1)])
     count = torch.zeros(len(verts), dtype=verts.dtype).index_add(0, both[:, 0], verts.new_ones(len(both)))
@@ -44,14 +56,24 @@ def laplacian(verts: Tensor, faces: Tensor) -> Tensor:
 
 
 def edge_length(verts: Tensor, faces: Tensor) -> Tensor:
-    """Return the variance of the edges' lengths over their mean square: zero when all are equal."""
+    """Return the variance of the edges' lengths over their mean square: zero when all are equal.
+
+    Parameters
+    ----------
+    verts, faces : (V, 3) float, (F, 3) int
+    """
     pairs = edges(faces)
     length = (verts[pairs[:, 0]] - verts[pairs[:, 1]]).norm(dim=1)
     return length.var(correction=0) / length.square().mean().detach()
 
 
 def normal_consistency(verts: Tensor, faces: Tensor) -> Tensor:
-    """Return the mean 1 − n₁·n₂ of faces that share an edge: zero where the surface is flat."""
+    """Return the mean 1 − n₁·n₂ of faces that share an edge: zero where the surface is flat.
+
+    Parameters
+    ----------
+    verts, faces : (V, 3) float, (F, 3) int
+    """
     normals = unit(areas(verts[faces.long()])).to(verts.dtype)
     first, second = normals[edge_pairs(faces)].unbind(1)
     return (1.0 - (first * second).sum(1)).mean()
@@ -62,6 +84,10 @@ def area(verts: Tensor, faces: Tensor) -> Tensor:
 
     It prefers the smallest surface that the pictures allow. In a fit to silhouettes nothing else removes what no view shows to
     be empty or full.
+
+    Parameters
+    ----------
+    verts, faces : (V, 3) float, (F, 3) int
     """
     a, b, c = verts[faces.long()].unbind(1)
     low, high = verts.detach().aminmax(dim=0)
@@ -69,7 +95,12 @@ def area(verts: Tensor, faces: Tensor) -> Tensor:
 
 
 def total_variation(texture: Tensor) -> Tensor:
-    """Return the mean |difference of neighbouring texels| of (h, w, C): it keeps edges and removes speckles."""
+    """Return the mean |difference of neighbouring texels| of (h, w, C): it keeps edges and removes speckles.
+
+    Parameters
+    ----------
+    texture : (h, w, C) float
+    """
     return (texture[1:] - texture[:-1]).abs().mean() + (texture[:, 1:] - texture[:, :-1]).abs().mean()
 
 

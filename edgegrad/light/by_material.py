@@ -12,10 +12,15 @@ from . import in_kernel
 
 @torch.no_grad()
 def points_by_material(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
-    """Return points of a light for each of the hits, as many as `samples`.
+    """Return points of a light for each of the hits, one of each in every LightPoints; hits.light_points(by=…) calls it.
 
-    Those of a light whose shadow boundary is sampled are given. For hits of trace(), each of which has another viewer, they are
-    drawn by what the light emits.
+    They are drawn by what the material scatters. Points of a light whose shadow boundary is sampled are given. For hits of
+    trace(), each of which has another viewer, they are drawn by what the light emits.
+
+    Parameters
+    ----------
+    hits, light, samples : Hits, Light, int
+        The list has as many LightPoints as `samples`.
     """
     if light.punctual or hits._knows_light(light) or not isinstance(hits._view, CameraView):
         return [hits.light_points(light, k, samples) for k in range(samples)]

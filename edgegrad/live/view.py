@@ -36,21 +36,30 @@ POLL = 0.1  # seconds until a pause notices Ctrl-C
 
 
 def viewer(port: int = 8080, host: str = "127.0.0.1", *, server: bool | None = None, share: float = 0.03) -> Viewer:
-    """Open a live view: moving meshes, cameras with their pictures, target | render | difference, the loss, and buttons that
-    pause and stop. It shows the skeleton, too, in fit_rig().
+    """Open a live view of a fit: meshes, cameras with their pictures, target | render | difference, the loss, and buttons.
+
+    The buttons pause and stop. The view shows the skeleton, too, in fit_rig().
 
         with eg.viewer() as view:
             print(view.url)
             fit = eg.fit.fit_pose(mesh, image, camera, callback=view)
 
-    port     of the page, or the next free one; 0: any
-    host     address of the page. "127.0.0.1" is visible on this computer alone; "0.0.0.0" to all who reach it, without a
-             password
-    server   False: a figure that is updated in place in a notebook, without meshes and buttons. None: that figure in a notebook
-             without viser, a page everywhere else
-    share    of the time that drawing may take, 0.001 … 1
+    Parameters
+    ----------
+    port : int, default 8080
+        Port of the page, or the next free one; 0: any.
+    host : str, default "127.0.0.1"
+        Address of the page. "127.0.0.1" is visible on this computer alone; "0.0.0.0" to all who reach it, without a password.
+    server : bool, default None
+        False: a figure that is updated in place in a notebook, without meshes and buttons. None: that figure in a notebook
+        without viser, a page everywhere else.
+    share : float, default 0.03
+        Share of the time that drawing may take, 0.001 … 1.
 
-    Raises TypeError or ValueError that names the argument, ImportError without viser (`pip install 'edgegrad[view]'`).
+    Raises
+    ------
+    TypeError, ValueError, ImportError
+        An argument is wrong; the message names it. viser is missing (`pip install 'edgegrad[view]'`).
     """
     port = check_int("port", port, 0, 65535)
     if not isinstance(host, str):

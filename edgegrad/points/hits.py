@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -12,12 +12,11 @@ from torch.nn.functional import normalize
 
 from ..check import as_tensor, check_finite, check_float, check_int, check_positive_int, check_shape, values_visible
 from ..scene.lights import Light, LightPoints
-from ..scene.material import WRAPS
-from ..scene.mesh import FILTERS
 from ..scene.rows import interpolated, rows_of
 from ..scene.textures import bilinear, in_texels, nearest
 from .discontinuities import Discontinuities, DiscontinuitiesOfSubset
 from .footprints import Footprints, level, pyramid_of
+from .hit_arguments import as_attribute, as_function, as_rows, as_sides, as_texture
 from .records import RayRecords, visible
 from .seeds import uniform
 from .shadow_rays import Forced, seen_from
@@ -35,6 +34,16 @@ class Hits:
 
     render() makes hits for its shader, trace() for any rays, primary_hits() for those of an image. A property is computed when
     it is first asked for, and kept. If you use torch.utils.checkpoint in a shader, ask for the properties before it.
+
+    Examples
+    --------
+    >>> import torch, edgegrad as eg
+    >>> def checkers(hits):
+    ...     odd = hits.floor(4 * hits.position[:, :2]).sum(1) % 2 > 0.5
+    ...     return torch.where(odd[:, None], 0.8, 0.2) * hits.normal.abs()
+    >>> camera = eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(8, 8))
+    >>> eg.render(eg.shapes.box(), camera, shader=checkers).shape
+    torch.Size([8, 8, 3])
     """
 
     # What has an underscore is between the renderer and its own shader of lit scenes (edgegrad/light).
@@ -74,21 +83,16 @@ class Hits:
         return f"Hits({len(self)} points)"
 
     def select(self, index: Tensor) -> Hits:
-        """Return some of the points, or all in another order: `index` (M,) of integers, each once, or a mask (N,).
-        Discontinuities that where() and floor() declare of them are those of the whole. Raises TypeError or ValueError that
-        names the argument."""
-        index = as_tensor("index", index).to(self._face.device)
+        """Return some of the points, or all in another order.
+
+        Discontinuities that where() and floor() declare of them are those of the whole.
+
+        Parameters
+        ----------
+        index : (M,) int, each once, or a mask (N,); others raise TypeError or ValueError
+        """
         count = len(self)
-        if index.dtype == torch.bool:
-            check_shape("index", index, (count,), fix="a mask has a value for each point")
-            index = index.nonzero()[:, 0]
-        if index.is_floating_point() or index.is_complex():
-            raise TypeError(f"index: expected integers or a mask, got {index.dtype}")
-        check_shape("index", index, (len(index) if index.dim() == 1 else "M",))
-        index = index.long()
-        wrong = (index < -count) | (index >= count)
-        if values_visible(index) and bool(wrong.any()):
-            raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
+        index = as_rows(index, count, self._face.device)
         return self._subset(index, DiscontinuitiesOfSubset(self._discontinuities, index % max(count, 1), count))
 
     def _subset(self, index: Tensor | slice, discontinuities: Discontinuities | None = None) -> Hits:
@@ -109,14 +113,14 @@ class Hits:
 
     @property
     def pixel(self) -> Tensor:
-        """(N, 2) where in the image, px: x right, y down."""
+        """Return the places in the image (N, 2) in pixels: x right, y down."""
         if self._pixel is None:
             raise ValueError("hits.pixel: expected hits of a camera, these are of rays; see hits.ray")
         return self._pixel.to(self._surfaces.verts.dtype)
 
     @property
     def ray(self) -> Tensor:
-        """(N,) int64: of hits that trace() found, the row of the ray."""
+        """Return the rows (N,) int64 of the rays, for hits that trace() found."""
         if not isinstance(self._view, Rays):
             raise ValueError("hits.ray: expected hits of trace(), these are of a camera; see hits.pixel")
         return self._view.ray
@@ -132,37 +136,37 @@ class Hits:
 
     @property
     def face(self) -> Tensor:
-        """(N,) int64: the face, as the scene counts them, mesh after mesh."""
+        """Return the faces (N,) int64, as the scene counts them, mesh after mesh."""
         self._note_faces()
         return self._face
 
     @property
     def mesh(self) -> Tensor:
-        """(N,) int64: the mesh of the scene."""
+        """Return the meshes (N,) int64 of the scene."""
         s = self._surfaces
         self._note_jump("mesh", lambda: s.mesh_of_face[:, None, None].expand(-1, 3, 1))
         return s.mesh_of_face[self._face]
 
     @property
     def barycentrics(self) -> Tensor:
-        """(N, 3): the weights of the corners of the face."""
+        """Return the weights (N, 3) of the corners of the face."""
         self._note_faces()
         return self._barycentrics
 
     @cached_property
     def position(self) -> Tensor:
-        """(N, 3) in world coordinates."""
+        """Return the positions (N, 3) in world coordinates."""
         s = self._surfaces
         return interpolated(self._barycentrics, s.corners(self._face))
 
     @cached_property
     def depth(self) -> Tensor:
-        """(N,) along the camera's axis, world units; of trace(), along the ray, in lengths of its direction."""
+        """Return the depth (N,) along the camera's axis, world units; of trace(), along the ray, in lengths of its direction."""
         return self._view.depth(self.position).to(self.position.dtype)
 
     @cached_property
     def normal(self) -> Tensor:
-        """(N, 3) unit normal of the face, on the side from which its vertices run counter-clockwise."""
+        """Return the unit normals (N, 3) of the faces, on the side from which their vertices run counter-clockwise."""
         s = self._surfaces
         every = torch.arange(len(s.faces), device=s.verts.device)
         self._note_jump("normal", lambda: s.face_normals(every)[:, None].expand(-1, 3, -1))
@@ -170,7 +174,7 @@ class Hits:
 
     @cached_property
     def shading_normal(self) -> Tensor:
-        """(N, 3) unit normal, interpolated between the vertices' normals: means of the faces' normals, weighted by area."""
+        """Return unit normals (N, 3) interpolated between the vertices': means of the faces' normals, weighted by area."""
         s = self._surfaces
         self._note_jump("shading_normal", lambda: s.vertex_normals[s.faces])
         normals = rows_of(s.vertex_normals, rows_of(s.faces, self._face))
@@ -178,37 +182,28 @@ class Hits:
 
     @cached_property
     def uv(self) -> Tensor:
-        """(N, 2) texture coordinates, v running up."""
+        """Return the texture coordinates (N, 2), v running up."""
         s = self._surfaces
         self._note_jump("uv", lambda: s.corner_uvs)
         return interpolated(self._barycentrics, rows_of(s.corner_uvs, self._face))
 
     @cached_property
     def view(self) -> Tensor:
-        """(N, 3) unit direction to the eye, or back along the ray."""
+        """Return unit directions (N, 3) to the eye, or back along the ray."""
         return self._view.to_viewer(self.position).to(self.position.dtype)
 
     def interpolate(self, attribute: Tensor, per: str | None = None) -> Tensor:
-        """Return an attribute (N, K) of the scene's vertices (V, K), faces (F, K) or corners of faces (F, 3, K).
+        """Return an attribute of the scene at the points, (N, K).
 
-        per   "vertex", "face" or "corner", where the shape does not say
-
-        Raises TypeError or ValueError that names the argument.
+        Parameters
+        ----------
+        attribute : (V, K), (F, K) or (F, 3, K) float
+            Of vertices, faces or corners of faces. Others raise TypeError or ValueError.
+        per : "vertex", "face" or "corner"
+            Where the shape does not say.
         """
         s = self._surfaces
-        V, F = len(s.verts), len(s.faces)
-        attribute = as_tensor("attribute", attribute, floating=True)
-        check_float("attribute", attribute)
-        check_shape("attribute", attribute, (V, "K"), (F, "K"), (F, 3, "K"))
-        if per is None:
-            per = "corner" if attribute.dim() == 3 else "vertex" if attribute.shape[0] == V else "face"
-            if V == F and attribute.dim() == 2:
-                raise ValueError(f'per: expected "vertex" or "face", for the scene has {V} of each; say which')
-        rows = {"vertex": (V, 2), "face": (F, 2), "corner": (F, 3)}
-        if per not in rows:
-            raise ValueError(f'per: expected "vertex", "face" or "corner", got {per!r}')
-        if (attribute.shape[0], attribute.dim()) != rows[per]:
-            raise ValueError(f"attribute: expected one row a {per}, got shape {tuple(attribute.shape)}")
+        attribute, per = as_attribute(attribute, per, len(s.verts), len(s.faces))
 
         def corners() -> Tensor:
             return (
@@ -233,26 +228,23 @@ class Hits:
         mipmap: bool = False,
         filter: str = "linear",
     ) -> Tensor:
-        """Return values (N, K) of a texture (h, w, K), row 0 on top, at texture coordinates uv (N, 2), v running up; those of the
-        surface when None.
+        """Return the values (N, K) of a texture at the points. Raises TypeError or ValueError that names the argument.
 
-        wrap     beyond the border: "repeat", "clamp" or "mirror", or two of these, for u and for v
-        filter   "linear" between the centres of texels; "nearest", the texel itself, whose edges are discontinuities: see where()
-        mipmap   True: texels are averaged over squares of 2, 4, 8 … so that neighbouring pixels are about a texel apart, linear
-                 between two such levels (Williams 1983). Only for hits of a camera
-
-        Raises TypeError or ValueError that names the argument.
+        Parameters
+        ----------
+        texture : (h, w, K) float
+            Row 0 on top.
+        uv : (N, 2) float, default those of the surface
+            Texture coordinates, v running up.
+        wrap : "repeat", "clamp" or "mirror", or two of these, for u and for v
+            Continuation beyond the border.
+        mipmap : bool, default False
+            True: texels are averaged over squares of 2, 4, 8 … so that neighbouring pixels are about a texel apart, linear
+            between two such levels (Williams 1983). Only for hits of a camera.
+        filter : "linear" or "nearest", default "linear"
+            "linear" between the centres of texels; "nearest", the texel itself, whose edges are discontinuities: see where().
         """
-        texture = as_tensor("texture", texture, floating=True)
-        check_float("texture", texture)
-        check_shape("texture", texture, ("h", "w", "K"))
-        wraps = (wrap, wrap) if isinstance(wrap, str) or not isinstance(wrap, Sequence) else tuple(wrap)
-        if len(wraps) != 2 or any(w not in WRAPS for w in wraps):
-            raise ValueError(f'wrap: expected "repeat", "clamp" or "mirror", or two of these, got {wrap!r}')
-        if filter not in FILTERS:
-            raise ValueError(f'filter: expected "linear" or "nearest", got {filter!r}')
-        if mipmap and filter == "nearest":
-            raise ValueError('mipmap: expected filter="linear" with it, got "nearest"')
+        texture, wraps = as_texture(texture, wrap, filter, mipmap)
         kind = "mipmap" if mipmap else filter
         if uv is None:
             corners = self._surfaces.corner_uvs[self._face] if mipmap else None
@@ -290,37 +282,32 @@ class Hits:
     def where(self, s: Tensor, a: Tensor | float, b: Tensor | float) -> Tensor:
         """Return `a` where s > 0 and `b` elsewhere (N, C). The discontinuity is declared: where it lies has a gradient.
 
-        s      (N,) or (N, 1), any differentiable function of the point: s = 0 is the border
-        a, b   rows (N, C), a colour (C,), or a number
-
-        torch.where() gives the same image, but no gradient for the border. Borders are found along lines through the image,
-        a pixel apart by default (Sampling.discontinuity_spacing); two that lie closer may be missed. A shader must call where(),
+        torch.where() gives the same image, but no gradient for the border. Borders are found along lines through the image, a
+        pixel apart by default (Sampling.discontinuity_spacing); two that lie closer may be missed. A shader must call where(),
         floor() and nearest lookups equally often, in the same order, whatever its points. For hits that are not of render()'s
-        shader, where() is torch.where(). Raises TypeError or ValueError that names the argument.
+        shader, where() is torch.where().
+
+        Parameters
+        ----------
+        s : (N,) or (N, 1)
+            Any differentiable function of the point: s = 0 is the border.
+        a, b : rows (N, C), a colour (C,), or a number
+            Others raise TypeError or ValueError that names the argument.
         """
-        s = _function("s", s)
+        s = as_function("s", s)
         check_shape("s", s, (len(self),), (len(self), 1))
         up = self._discontinuities.above_zero(s.reshape(-1))[:, None]
-        sides = []
-        for name, side in (("a", a), ("b", b)):
-            value = as_tensor(name, side, like=s, floating=True)
-            if value.dim() > 2 or (value.dim() == 2 and value.shape[0] not in (1, len(self))):
-                raise ValueError(f"{name}: expected rows (N, C), a colour (C,) or a number, got {tuple(value.shape)}")
-            if value.dim() == 1 and (value.shape[0] > 1024 or 64 < value.shape[0] == len(self)):
-                raise ValueError(
-                    f"{name}: expected rows (N, C), a colour (C,) or a number, got shape {tuple(value.shape)}; a number a point "
-                    "is value[:, None]"
-                )
-            sides.append(value)
-        channels = [value.shape[-1] if value.dim() else 1 for value in sides]
-        if channels[0] != channels[1] and 1 not in channels:
-            raise ValueError(f"b: expected as many channels as a has, {channels[0]}, got {channels[1]}")
-        return torch.where(up, *sides)
+        return torch.where(up, *as_sides(a, b, s))
 
     def floor(self, t: Tensor) -> Tensor:
-        """Return the largest integers not above t (N,) or (N, K), whose jumps are declared discontinuities: see where(). For
-        checkerboards, stripes, tables. Raises TypeError or ValueError that names the argument."""
-        t = _function("t", t)
+        """Return the largest integers not above t, whose jumps are declared discontinuities: for checkerboards and stripes.
+
+        Parameters
+        ----------
+        t : (N,) or (N, K)
+            See where(). Others raise TypeError or ValueError that names the argument.
+        """
+        t = as_function("t", t)
         check_shape("t", t, (len(self),), (len(self), "K"))
         if t.dim() == 1:
             return self._discontinuities.floor(t)
@@ -329,11 +316,15 @@ class Hits:
     # -- shadows -------------------------------------------------------------------------------------------------------
 
     def visible(self, points: Tensor) -> Tensor:
-        """Return (N,) bool, whether nothing lies between each point and another, `points` (N, 3) or (3,) in world coordinates.
+        """Return (N,) bool, whether nothing lies between each point and another.
 
         A shadow ray ignores the face of its point, and what touches either end up to the rounding of the coordinates. There is
-        no derivative, and what moves the border of such a shadow has no gradient: see visible_from(). Raises TypeError or
-        ValueError that names the argument.
+        no derivative, and what moves the border of such a shadow has no gradient: see visible_from().
+
+        Parameters
+        ----------
+        points : (N, 3) or (3,)
+            World coordinates. Others raise TypeError or ValueError that names the argument.
         """
         s = self._surfaces
         points = as_tensor("points", points, like=s.verts, floating=True)
@@ -349,28 +340,45 @@ class Hits:
 
     @property
     def lights(self) -> tuple[Light, ...]:
-        """The scene's lights that cast shadows: those of scene.lights, then the meshes that emit."""
+        """Return the scene's lights that cast shadows: those of scene.lights, then the meshes that emit."""
         return self._surfaces.scene.casting
 
     def random(self, n: int, stream: int = 0, part: int = 0, parts: int = 1) -> Tensor:
-        """Return random numbers (N, n) float64, uniform in [0, 1), without derivatives. All points of one sample, such as both
-        sides of an edge, get the same numbers. Those of successive points, and of the `parts` of one point, fill the unit cube
-        evenly (a Kronecker sequence with the powers of the generalised golden ratio of three dimensions). Each `stream` gives
-        other numbers."""
+        """Return random numbers (N, n) float64, uniform in [0, 1), without derivatives.
+
+        All points of one sample, such as both sides of an edge, get the same numbers. Those of successive points, and of the
+        parts of one point, fill the unit cube evenly: a Kronecker sequence with powers of the generalised golden ratio.
+
+        Parameters
+        ----------
+        n : int
+            Numbers a point.
+        stream : int, default 0
+            Each gives other numbers.
+        part, parts : int, default 0 of 1
+            Which of the parts of each point it is.
+        """
         return uniform(self._seed * parts + part, n, stream)
 
     def light_points(
         self, light: Light, sample: int = 0, samples: int = 1, by: LightSampler | None = None
     ) -> LightPoints:
-        """Return a point of a light of `lights` for each of the N points. With several `samples` of a light, `sample` is the
-        number of this one. light.place() and light.arriving() take the result.
+        """Return a point of a light for each of the N points, which light.place() and light.arriving() take.
 
-        by   None: drawn in proportion to what the light emits. eg.lights.points_by_material: as render() draws them, by what the
-             material of the point's mesh makes of them where nothing lies between; on glossy ones the density is then that of
-             the choice among some candidates, infinite where none gives anything. For hits of trace() it is as None
+        A mean of any function of the point over the density is right with either sampler, but points_by_material draws nothing
+        of what the material scatters not at all. There are no derivatives by where points are drawn. Raises TypeError or
+        ValueError that names the argument.
 
-        A mean of any function of the point over the density is right with either, but points_by_material draws nothing of what
-        the material scatters not at all. There are no derivatives by where points are drawn. Raises TypeError or ValueError.
+        Parameters
+        ----------
+        light : Light
+            One of `lights`.
+        sample, samples : int, default 0 of 1
+            The number of this one among several samples of a light.
+        by : eg.lights.points_by_material, default None
+            None draws in proportion to what the light emits. points_by_material draws as render() does, by what the material
+            of the point's mesh makes of it where nothing lies between; on glossy ones the density is then that of the choice
+            among some candidates, infinite where none gives anything. For hits of trace() it is as None.
         """
         index = self._index(light)
         if by is not None and not callable(by):
@@ -391,8 +399,10 @@ class Hits:
         return points if forced is None or forced.light != index else forced.among(points)
 
     def visible_from(self, light: Light, points: LightPoints) -> Tensor:
-        """Return 1 (N,) where nothing lies between the points and those of a light, else 0: see visible(). It has no
-        derivative, but the renderer samples the borders of the light's shadow, so what moves them has a gradient."""
+        """Return 1 (N,) where nothing lies between the points and those of a light by light_points(), else 0; see visible().
+
+        It has no derivative, but the renderer samples the borders of the light's shadow, so what moves them has a gradient.
+        """
         index, s, forced = self._index(light), self._surfaces, self._forced
         s.shadowing.add(index)
         if forced is not None and forced.light == index and values_visible(forced.some) and bool(forced.some.all()):
@@ -431,17 +441,3 @@ class Hits:
             if known is light:
                 return i
         raise ValueError(f"light: expected one of hits.lights, got {light!r}; lights are told apart by what they are")
-
-
-def _function(name: str, value: Tensor) -> Tensor:
-    """Return the function of a discontinuity, finite, and not in the half precision that autocast gives. Raises TypeError or
-    ValueError."""
-    value = as_tensor(name, value, floating=True)
-    if value.dtype in (torch.float16, torch.bfloat16):
-        value = value.float()
-    check_float(name, value)
-    if values_visible(value) and not bool(torch.isfinite(value.detach()).all()):
-        raise ValueError(
-            f"{name}: expected finite numbers, got {value.detach()[~torch.isfinite(value.detach())][0].item()}"
-        )
-    return value

@@ -16,13 +16,31 @@ from .surfaces import Rays, Surfaces
 
 
 def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
-    """Return the nearest hits of any rays: Hits of those that hit something, with the row of each in `hits.ray`.
-
-    origins, directions  (N, 3) or (3,) world coordinates, directions of any length
+    """Return the nearest hits of any rays.
 
     Positions, normals, texture coordinates and the rest are differentiable functions of the vertices, the origins and the
-    directions, while each ray meets the same face: what moves at silhouettes has no gradient. `hits.depth` is in lengths of
-    the direction; there is no `hits.pixel`. Raises TypeError or ValueError that names the argument.
+    directions, while each ray meets the same face: what moves at silhouettes has no gradient. TypeError and ValueError name a
+    wrong argument.
+
+    Parameters
+    ----------
+    scene : Scene or Mesh
+    origins, directions : (N, 3) or (3,)
+        World coordinates, directions of any length.
+
+    Returns
+    -------
+    Hits
+        Those of the rays that hit something, with the row of each in `hits.ray`. `hits.depth` is in lengths of the direction;
+        there is no `hits.pixel`.
+
+    Examples
+    --------
+    >>> import torch, edgegrad as eg
+    >>> rays = torch.tensor([[0.0, 0.0, 4.0], [9.0, 0.0, 4.0]])
+    >>> hits = eg.points.trace(eg.shapes.box(), rays, torch.tensor([0.0, 0.0, -1.0]))
+    >>> hits.ray, hits.depth
+    (tensor([0]), tensor([3.]))
     """
     scene = as_scene(scene)
     like = scene.meshes[0].verts

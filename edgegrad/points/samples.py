@@ -43,10 +43,14 @@ ALL_AT_ONCE = 1 << 40
 class PrimaryHits:
     """Hits of the rays of an image. All samples of a pixel on one face are one hit, at one of them drawn at random.
 
-    hits      Hits, N points, differentiable functions of vertices and camera at fixed places in the image
-    index     (N,) int64, the pixel of each, row by row
-    weight    (N,) the share of the pixel's samples on that face
-    coverage  (H, W) the share of each pixel that is covered
+    Attributes
+    ----------
+    hits : Hits
+        N points, differentiable functions of vertices and camera at fixed places in the image.
+    index, weight : (N,) int64, (N,)
+        The pixel of each, row by row, and the share of its samples on that face.
+    coverage : (H, W)
+        The share of each pixel that is covered.
     """
 
     def __init__(self, scene: Scene, request: Request) -> None:
@@ -61,10 +65,15 @@ class PrimaryHits:
         return f"PrimaryHits({len(self.hits)} points in {self.context.height} x {self.context.width} pixels)"
 
     def image(self, radiance: Tensor, background: Tensor | None = None) -> Tensor:
-        """Return the image (H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
+        """Return the image (H, W, C) of a radiance of the hits.
 
-        Its gradient by the radiance, and so inside faces, is right; that of what moves at edges is not in it. Raises TypeError
-        or ValueError that names the argument.
+        Its gradient by the radiance, and so inside faces, is right; that of what moves at edges is not in it.
+
+        Parameters
+        ----------
+        radiance : (N, C)
+            Of the hits. Others raise TypeError or ValueError.
+        background : (C,) or (H, W, C), default black
         """
         radiance = _rows("radiance", radiance, len(self.hits))
         background = _background(background, radiance, self.context)
@@ -75,8 +84,10 @@ class PrimaryHits:
 class SurfaceSamples:
     """Samples inside faces, where the image sees them.
 
-    hits    Hits, S points, differentiable functions of vertices and camera at fixed places in the image
-    weight  (S,) px² that each stands for
+    Attributes
+    ----------
+    hits, weight : Hits, (S,)
+        S points, differentiable functions of vertices and camera at fixed places in the image; and px² that each stands for.
     """
 
     def __init__(self, context: ImageContext, records: SurfaceRecords, first: int = 0) -> None:
@@ -102,8 +113,10 @@ class SurfaceSamples:
         return self._hits
 
     def image(self, radiance: Tensor) -> Tensor:
-        """Return an estimate of the image (H, W, C) before black from the radiance (S, C) of the samples. Its weights are
-        areas, so its gradient is the interior term. Raises TypeError or ValueError that names the argument."""
+        """Return an estimate of the image (H, W, C) before black from the radiance (S, C) of the samples.
+
+        Its weights are areas, so its gradient is the interior term. Raises TypeError or ValueError that names the argument.
+        """
         radiance = _rows("radiance", radiance, len(self))
         weighted = self.weight.to(radiance.dtype)[:, None] * radiance
         return self.context.composed(splat(self._records.x, weighted, self.context.request), None)
@@ -114,14 +127,17 @@ class SurfaceSamples:
 
 
 class EdgeSamples:
-    """Samples on the curves where the image jumps: silhouettes, borders, intersections and creases, and
-    the boundary where a lens folds or ends.
+    """Samples on silhouettes, borders, intersections and creases, and on the boundary where a lens folds or ends.
 
-    hits      Hits, the N points on their surfaces, at most three a sample; without derivatives
-    sample    (N,) int64, the sample of each point
-    x         (S, 2) places in the image, px
-    velocity  (S,) along the curve's normal, times the length that a sample stands for: its value is zero, its derivative is
-              that of the place by vertices and camera
+    Attributes
+    ----------
+    hits, sample : Hits, (N,) int64
+        The N points on their surfaces, at most three a sample, without derivatives; and the sample of each.
+    x : (S, 2)
+        Places in the image, px.
+    velocity : (S,)
+        Along the curve's normal, times the length that a sample stands for: its value is zero, its derivative is that of the
+        place by vertices and camera.
     """
 
     def __init__(
@@ -174,8 +190,10 @@ class EdgeSamples:
         return f"EdgeSamples({len(self)} samples, {len(self.hits)} points)"
 
     def jump(self, radiance: Tensor) -> Tensor:
-        """Return the jump (S, C) of the image at each sample, from the radiance (N, C) of the hits; a background comes in by
-        attach_boundary(). Raises TypeError or ValueError that names the argument."""
+        """Return the jump (S, C) of the image at each sample, from the radiance (N, C) of the hits.
+
+        A background comes in by attach_boundary(). Raises TypeError or ValueError that names the argument.
+        """
         return self.sum(_rows("radiance", radiance, len(self.hits)))
 
     def sum(self, radiance: Tensor) -> Tensor:
@@ -199,8 +217,25 @@ def primary_hits(
     sampling: Sampling | None = None,
     generator: torch.Generator | None = None,
 ) -> PrimaryHits:
-    """Return the hits of the rays of an image: render()'s samples, for a pipeline of your own. The arguments are render()'s,
-    with one camera. Raises what render() raises."""
+    """Return the hits of the rays of an image: render()'s samples, for a pipeline of your own.
+
+    Parameters
+    ----------
+    scene, camera, spp, seed, filter, sampling, generator
+        As of render(), with one camera, and so are the errors.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> camera = eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(8, 8))
+    >>> primary = eg.points.primary_hits(eg.shapes.box(), camera, seed=0)
+    >>> image = primary.image(primary.hits.normal.abs())
+    >>> surface = eg.points.surface_samples(primary, 50)
+    >>> edges = eg.points.edge_samples(primary, 50)
+    >>> jump = edges.jump(edges.hits.normal.abs()).detach()
+    >>> eg.points.attach_boundary(image, edges, jump).shape
+    torch.Size([8, 8, 3])
+    """
     request = make_request(scene, camera, spp, seed, filter=filter, sampling=sampling, generator=generator)
     if camera.batch is not None:
         raise ValueError(f"camera: expected one camera, got a batch of {camera.batch}; take camera[i] one by one")
@@ -208,12 +243,13 @@ def primary_hits(
 
 
 def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSamples:
-    """Return samples for the gradient inside faces, fewer than those of the image: by default half a sample a pixel of surface.
+    """Return samples for the gradient inside faces, fewer than those of the image.
 
-    primary   of primary_hits()
-    count     of samples; see Sampling.surface
-
-    Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
+    Parameters
+    ----------
+    primary : PrimaryHits
+    count : int, default half a sample a pixel of surface
+        See Sampling.surface. TypeError or ValueError names a wrong argument; MemoryError if so many do not fit.
     """
     request = _request_of(primary, "surface_samples", count)
     with shaded_memory(request._replace(gradient=request.gradient._replace(edge_samples=0)), gradient=True):
@@ -223,14 +259,16 @@ def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSa
 
 
 def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool | Tensor = True) -> EdgeSamples:
-    """Samples for the gradient of what moves at edges.
+    """Return samples for the gradient of what moves at edges.
 
-    primary   of primary_hits()
-    count     of samples; see Sampling.edges
-    creases   at which edges between two visible faces radiance may jump: True, at all; False, at none; or numbers at the corners
-              of faces (F, 3, K), at those where these differ on both sides
-
-    Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
+    Parameters
+    ----------
+    primary : PrimaryHits
+    count : int, default by the length of the curves
+        See Sampling.edges. Errors are those of surface_samples().
+    creases : bool or (F, 3, K), default True
+        At which edges between two visible faces radiance may jump: True, at all; False, at none; or numbers at the corners of
+        faces, at those where these differ on both sides.
     """
     request = _request_of(primary, "edge_samples", count)
     F = len(primary.context.surfaces.faces)
@@ -260,12 +298,16 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
 def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, background: Tensor | None = None) -> Tensor:
     """Return the image, with the gradient of what moves at edges: its value is the same.
 
-    image       (H, W, C)
-    samples     of edge_samples()
-    jump        (S, C) samples.jump(…), without derivatives
-    background  (C,) or (H, W, C) behind all surfaces; black when None
+    The gradient is there in reverse and in forward mode, once. Raises TypeError or ValueError that names the argument.
 
-    In reverse and in forward mode, once. Raises TypeError or ValueError that names the argument.
+    Parameters
+    ----------
+    image : (H, W, C)
+    samples : EdgeSamples
+    jump : (S, C)
+        samples.jump(…), without derivatives.
+    background : (C,) or (H, W, C), default black
+        Behind all surfaces.
     """
     if not isinstance(samples, EdgeSamples):
         raise TypeError(f"samples: expected what edge_samples() returned, got {type(samples).__name__}")

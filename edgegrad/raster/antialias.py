@@ -18,7 +18,7 @@ from .tensors import check_image, check_positions, contiguous, ranges_of, to_ker
 
 
 class TopologyHash:
-    """The edges that triangles share, from `antialias_construct_topology_hash`."""
+    """Edges that triangles share, from `antialias_construct_topology_hash`."""
 
     def __init__(self, tri: Tensor) -> None:
         self.tri = tri
@@ -39,12 +39,12 @@ class TopologyHash:
 
 
 def antialias_construct_topology_hash(tri: Tensor) -> TopologyHash:
-    """Return which triangles share edges, for `antialias`, which otherwise finds it at each call. Raises TypeError or
-    ValueError that names the argument.
+    """Return which triangles share edges, for `antialias`, which otherwise finds it at each call.
 
     Parameters
     ----------
     tri : (F, 3) int
+        Others raise TypeError or ValueError that names the argument.
     """
     return TopologyHash(triangles(tri, 2**31 - 1, "pos").clone())
 
@@ -62,8 +62,7 @@ def antialias(
     spp: int = 16,
     seed: int | None = None,
 ) -> Tensor:
-    """Return an image whose pixels are blended across silhouettes, so that it changes continuously with the vertices, (B, H, W,
-    C).
+    """Return an image (B, H, W, C) whose pixels are blended across silhouettes: it changes continuously with the vertices.
 
     Where two pixels side by side, or above each other, show different triangles and the nearer of these ends between their
     centres with a silhouette (an edge of one triangle, or of several on the same side in the image), the pixel that the edge

@@ -24,9 +24,7 @@ def interpolate(
 ) -> tuple[Tensor, Tensor]:
     """Return attributes of vertices, interpolated in each pixel's triangle, and their derivatives in the image.
 
-    The first are (B, H, W, A), zero where there is no triangle. The second are (B, H, W, 2 len(diff_attrs)), ∂a/∂X and ∂a/∂Y of
-    each, for a pixel to the right and up, or (B, H, W, 0). Gradients go to `attr`, to u and v of `rast`, and to `rast_db`.
-    Raises TypeError or ValueError that names the argument.
+    Gradients go to `attr`, to u and v of `rast`, and to `rast_db`. TypeError and ValueError name a wrong argument.
 
     Parameters
     ----------
@@ -35,8 +33,15 @@ def interpolate(
         The results of `rasterize`.
     tri : (F, 3) int
         Vertices of the triangles.
-    diff_attrs : sequence of int, or "all"
+    diff_attrs : sequence of int, or "all", default none
         Numbers of the attributes whose derivatives in the image are wanted; with `rast_db`.
+
+    Returns
+    -------
+    attributes : Tensor
+        (B, H, W, A), zero where there is no triangle.
+    derivatives : Tensor
+        (B, H, W, 2 len(diff_attrs)): ∂a/∂X and ∂a/∂Y of each, for a pixel to the right and up; or (B, H, W, 0).
     """
     if rast_db is not None and diff_attrs is None and tuple(rast_db.shape[3:]) == (0,):
         rast_db = None  # of a context without derivatives

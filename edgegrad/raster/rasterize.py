@@ -76,10 +76,6 @@ def rasterize(
 ) -> tuple[Tensor, Tensor]:
     """Return the nearest surface at the centre of each pixel, in two tensors of the dtype and on the device of `pos`.
 
-    The first is (B, H, W, 4): u, v, z/w and the triangle + 1; all 0 where there is none. u and v are the barycentrics of the
-    first two vertices, in space, not in the image. The second is (B, H, W, 4): ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y for a pixel to the
-    right and up; (B, H, W, 0) if the context says so.
-
     A centre on an edge that two triangles share belongs to exactly one of them, by exact arithmetic. Of surfaces at the same
     depth the first in `tri` is seen. Gradients of u, v and their derivatives go to x, y and w of `pos`. z/w has none, and what
     moves at silhouettes gets its gradient in `antialias`. A float32 can name 2²⁴ triangles; give float64 positions for more.
@@ -98,17 +94,39 @@ def rasterize(
         For each image the first of its triangles and how many; with pos (V, 4), else ignored.
     grad_db : bool, default True
         Whether gradients of the second result go to `pos`.
+
+    Returns
+    -------
+    rast : Tensor
+        (B, H, W, 4): u, v, z/w and the triangle + 1; all 0 where there is none. u and v are the barycentrics of the first two
+        vertices, in space, not in the image.
+    rast_db : Tensor
+        (B, H, W, 4): ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y for a pixel to the right and up; (B, H, W, 0) if the context says so.
+
+    Examples
+    --------
+    >>> import torch, edgegrad.raster as dr
+    >>> pos = torch.tensor([[[-1.0, -1, 0, 1], [3, -1, 0, 1], [-1, 3, 0, 1]]])
+    >>> tri = torch.tensor([[0, 1, 2]])
+    >>> rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (2, 2))
+    >>> dr.interpolate(torch.eye(3), rast, tri)[0][0, 0, 0]
+    tensor([0.7500, 0.1250, 0.1250])
     """
     return _Arguments.checked(ctx, pos, tri, resolution, ranges, grad_db).layer(None)
 
 
 class DepthPeeler:
-    """Surfaces behind one another, layer by layer; arguments as of `rasterize`.
+    """Surfaces behind one another, layer by layer.
 
         with DepthPeeler(ctx, pos, tri, resolution) as peeler:
             rast, rast_db = peeler.rasterize_next_layer()
 
     A layer is the nearest surface whose z/w is larger than that of the layer before, in the dtype of `pos`.
+
+    Parameters
+    ----------
+    ctx, pos, tri, resolution, ranges, grad_db
+        As of `rasterize`.
     """
 
     def __init__(

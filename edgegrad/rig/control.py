@@ -69,8 +69,10 @@ class Control:
         return self.names.index(str(which))
 
     def value(self, name: str, given: object) -> Tensor:
-        """Return a value in float64, with or without a batch in front; of rotations matrices (…, J, 3, 3). Raises TypeError or
-        ValueError."""
+        """Return a value in float64, with or without a batch in front; of rotations matrices (…, J, 3, 3).
+
+        Raises TypeError or ValueError.
+        """
         if given is None:
             value = self.rest
         elif isinstance(given, Mapping):

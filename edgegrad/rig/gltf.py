@@ -31,8 +31,11 @@ def load_gltf(path: PathLike, materials: bool = True, lit: bool = False, dtype: 
     joint, primitives without JOINTS_0 are rigid with their node, rotations of another length than 1 are divided by it, and
     channels of animations, morph targets and lights that cannot be read are left out.
 
-    The arguments are those of load_scene(), and so are the errors. ValueError is also raised for a skin whose joints are not in
-    the scene, other errors of a skin, and nodes in a cycle.
+    Parameters
+    ----------
+    path, materials, lit, dtype
+        As of load_scene(), and so are the errors. ValueError is also raised for a skin whose joints are not in the scene,
+        other errors of a skin, and nodes in a cycle.
     """
     roma()
     options = LoadOptions(materials, lit, rigged=True, dtype=dtype)

@@ -71,6 +71,16 @@ class Rig:
     animations : mapping of names to Animation
     joints : Joints
         Of a skinned rig, at rest.
+
+    Examples
+    --------
+    >>> import torch, edgegrad as eg
+    >>> box = eg.shapes.box()
+    >>> def stretched(height):
+    ...     return box.verts * torch.stack([torch.ones(()), height, torch.ones(())])
+    >>> rig = eg.rig.Rig.from_function(stretched, box, {"height": torch.tensor(1.0)})
+    >>> rig.posed(height=torch.tensor(3.0)).verts.amax(0)
+    tensor([1., 3., 1.])
     """
 
     scene: Scene | Mesh
@@ -115,17 +125,17 @@ class Rig:
         skinning: str | None = None,
         **values: Any,
     ) -> Any:
-        """Return the meshes in a pose: a Mesh or a Scene, as the rig's; of a batch a list of these. Arguments that are not
-        given are at rest.
+        """Return the meshes in a pose: a Mesh or a Scene, as the rig's; of a batch a list of these.
 
-        It is differentiable by all of them. Each may have one more dimension in front, the poses of a batch. Limits are not
-        applied: see clamped(). Raises TypeError or ValueError that names the argument, ImportError without roma.
+        It is differentiable by all arguments; those that are not given are at rest. Each may have one more dimension in front,
+        the poses of a batch. Limits are not applied: see clamped(). TypeError and ValueError name a wrong argument;
+        ImportError says that roma is missing.
 
         Parameters
         ----------
-        rotations : (J, 3) rotation vectors in radians, (J, 4) unit quaternions x, y, z, w or (J, 3, 3) matrices, or a mapping
-        of some by the joint's name
-            Rotations of each joint about its own axes, from rest, where all are the identity.
+        rotations : (J, 3), (J, 4) or (J, 3, 3), or a mapping of some by the joint's name
+            Rotations of each joint about its own axes, from rest, where all are the identity: rotation vectors in radians,
+            unit quaternions x, y, z, w or matrices.
         morphs : (M,), or a mapping by name
             Weights of morph targets.
         joint_translations, joint_scales : (J, 3)
@@ -208,10 +218,9 @@ class Rig:
         return self.controls[name]
 
     def bones(self, values: Mapping[str, Any]) -> Tensor | None:
-        """Return the bones (K, 2, 3) float64, from the parent of each joint that has one to the joint, of all values that
-        posed() takes.
+        """Return the bones (K, 2, 3) float64, from the parent of each joint that has one to the joint.
 
-        None is returned where the rig has no such joints.
+        Its values are all that posed() takes. None is returned where the rig has no such joints.
         """
         own = {name: value for name, value in values.items() if name in self.controls}
         joints = self.shape(own, **{name: value for name, value in values.items() if name not in own}).joints
@@ -221,11 +230,14 @@ class Rig:
     # -- limits -------------------------------------------------------------------------------------------------------------
 
     def with_limits(self, **limits: Any) -> Rig:
-        """Return the rig with limits for controls: a pair of low and high that broadcast, or such pairs by the names of rows.
+        """Return the rig with limits for controls, which fits keep and clamped() applies.
 
             rig.with_limits(rotations={"elbow": ([0, 0, 0], [0, 0, 2.4])}, morphs=(0.0, 1.0))
 
-        Fits keep them, clamped() applies them. Raises TypeError or ValueError.
+        Parameters
+        ----------
+        **limits
+            A pair of low and high that broadcast, or such pairs by the names of rows. Others raise TypeError or ValueError.
         """
         controls = dict(self.controls)
         for name, given in limits.items():
@@ -316,8 +328,9 @@ class Rig:
         batched: bool = False,
         joints: Sequence[tuple[str, int]] = (),
     ) -> Rig:
-        """Return a rig of any function from numbers to vertices, such as a body model. Raises TypeError or ValueError that
-        names the argument.
+        """Return a rig of any function from numbers to vertices, such as a body model.
+
+        TypeError and ValueError name a wrong argument.
 
             model = anny.Anny(skinning_method="lbs")
             rig = eg.rig.Rig.from_function(body, model.get_triangular_faces(), {"age": torch.tensor(0.5), …})

@@ -68,8 +68,10 @@ class Skin:
     def bent(
         self, world: Tensor, morphs: Tensor, verts: Tensor, normals: Tensor | None, skinning: str
     ) -> tuple[Tensor, Tensor | None]:
-        """Return vertices (…, V, 3) and normals (…, N, 3) by the joints' world transformations (…, J, 4, 4) and morph weights
-        (…, M)."""
+        """Return vertices (…, V, 3) and normals (…, N, 3) by the joints' world transformations and morph weights.
+
+        These are (…, J, 4, 4) and (…, M).
+        """
         # Double is needed: a joint may be far from the origin, and its inverse bind takes it back.
         A = (world.index_select(-3, self.joints) @ self.inverse_binds)[..., :3, :]
         bases, turns = (_linear if skinning == "linear" else _dual_quaternion)(A, self.weights, normals is not None)

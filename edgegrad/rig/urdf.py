@@ -26,18 +26,17 @@ MOVING = ("revolute", "continuous", "prismatic")
 
 
 def load_urdf(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ()) -> Rig:
-    """Return a Rig from a URDF file. Its control `angles` (m,) has the positions of its joints in the file's order: radians, or
-    metres of prismatic ones.
+    """Return a Rig from a URDF file; its control `angles` (m,) has the positions of its joints in the file's order.
 
         robot = eg.rig.load("arm.urdf")
         scene = robot.posed(angles=[0.0, 0.4, -1.2, 0.0, 0.7, 0.0, 0.0])
 
-    Joints that mimic others follow them and have no angle. There is one Mesh for each visual, or for each part of it where
-    parts differ in appearance: OBJ, glTF, GLB, PLY, STL, OFF, 3MF or DAE files (in the unit that a DAE says, along its own
-    axes), boxes, cylinders and spheres. A mesh file's own appearance goes before the visual's material, whose colour or texture
-    is shown else. One warning names what is not shown. At rest all angles are 0, or at the limit nearest to 0. Limits are those
-    of the file, 0 where a <limit> lacks lower or upper; fits keep them, robot.clamped(angles=…) applies them. Links are the
-    rig's joints, by their names.
+    These are radians, or metres of prismatic joints. Joints that mimic others follow them and have no angle. There is one Mesh
+    for each visual, or for each part of it where parts differ in appearance: OBJ, glTF, GLB, PLY, STL, OFF, 3MF or DAE files
+    (in the unit that a DAE says, along its own axes), boxes, cylinders and spheres. A mesh file's own appearance goes before
+    the visual's material, whose colour or texture is shown else. One warning names what is not shown. At rest all angles are
+    0, or at the limit nearest to 0. Limits are those of the file, 0 where a <limit> lacks lower or upper; fits keep them,
+    robot.clamped(angles=…) applies them. Links are the rig's joints, by their names.
 
     Files are read by yourdfpy, kinematics are by pytorch-kinematics (`pip install 'edgegrad[robots]'`). Raises
     FileNotFoundError (the file, or a mesh that it names), ValueError that names the file (no URDF, no visuals, no tree of
@@ -47,8 +46,8 @@ def load_urdf(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ()) 
     ----------
     path : str or Path
     package_dirs : str, Path or a sequence of these
-        Folders in which package://NAME/… is looked for as FOLDER/NAME/…, or as FOLDER/… where the folder itself is called NAME.
-        By default, and then, the folder of the file and those above it are searched.
+        Folders in which package://NAME/… is looked for as FOLDER/NAME/…, or as FOLDER/… where the folder itself is called
+        NAME. By default, and then, the folder of the file and those above it are searched.
     """
     file = check_readable(path, (".urdf", ".xml"))
     packages = _folders(package_dirs)

@@ -24,19 +24,29 @@ class Environment(Light):
     """Light from infinitely far away, from all around.
 
     Directions are drawn by what texels emit times their solid angle, a tenth of them evenly; for glossy surfaces also by how
-    they scatter. Radiance below zero is not refused, because an optimisation may pass there: like a negative intensity of other
-    lights, it takes light away. Raises TypeError or ValueError that names the argument.
+    they scatter. Radiance below zero takes light away, as an optimisation may need. TypeError and ValueError name a wrong
+    argument.
 
     Parameters
     ----------
     radiance : float, (C,) or (h, w, C)
-        Constant, or a linear image of directions in the equirectangular projection: row 0 is around +Y, the last one around −Y,
-        the middle is the direction −Z, and +X is to the right of it. Between the centres of texels it is bilinear, around the
-        whole turn.
+        Constant, or a linear image of directions in the equirectangular projection: row 0 is around +Y, the last one around
+        −Y, the middle is the direction −Z, and +X is to the right of it. Between the centres of texels it is bilinear, around
+        the whole turn.
     rotation : (3, 3), default the identity
         Rotation from that frame to the world.
     visible : bool, default True
         Whether it is shown behind all surfaces where the scene has no background of its own.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> sky = eg.lights.Environment(1.0)
+    >>> ball = eg.shapes.sphere(material=eg.Material(base_color=0.5))
+    >>> camera = eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(9, 9))
+    >>> image = eg.render(eg.Scene([ball], lights=[sky]), camera, spp=512)
+    >>> round(float(image[0, 0, 0]), 1), round(float(image[4, 4, 0]), 1)
+    (1.0, 0.5)
     """
 
     radiance: Tensor

@@ -41,8 +41,11 @@ class LightPoints(NamedTuple):
 
 
 class Light:
-    """Base class of all lights. Negative radiances, intensities and colours are not refused, because an optimisation may pass
-    there: they take light away, and images stay linear in them."""
+    """Base class of all lights.
+
+    Negative radiances, intensities and colours are not refused, because an optimisation may pass there: they take light away,
+    and images stay linear in them.
+    """
 
     casts = True  # whether it casts shadows
     infinite = False  # whether it is a direction
@@ -81,8 +84,10 @@ class Light:
         raise NotImplementedError
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
-        """Return the irradiance (N, C) or (N, 1) at normal incidence at positions (N, 3), over the pdf, with nothing in
-        between. Differentiable."""
+        """Return the irradiance (N, C) or (N, 1) at normal incidence at positions (N, 3), over the pdf.
+
+        Nothing lies in between. It is differentiable.
+        """
         raise NotImplementedError
 
     def incident(self, points: LightPoints, position: Tensor) -> Tensor:
@@ -119,7 +124,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class DirectionalLight(Light):
-    """Light from infinitely far away, such as the sun's. Raises TypeError or ValueError that names the argument.
+    """Light from infinitely far away, such as the sun's. TypeError and ValueError name a wrong argument.
 
     Parameters
     ----------
@@ -129,6 +134,16 @@ class DirectionalLight(Light):
         Irradiance of a surface that it meets head-on, W/m² (glTF: lux).
     color : (C,), default ones
         Factor of the intensity.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> ball = eg.shapes.sphere(material=eg.Material(base_color=0.5))
+    >>> sun = eg.lights.DirectionalLight(direction=(0.0, 0.0, -1.0), intensity=3.1416)
+    >>> camera = eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(9, 9))
+    >>> image = eg.render(eg.Scene([ball], lights=[sun]), camera)
+    >>> round(float(image[4, 4, 0]), 1)
+    0.5
     """
 
     direction: Tensor
@@ -153,7 +168,7 @@ class DirectionalLight(Light):
 
 @dataclass(frozen=True, eq=False)
 class PointLight(Light):
-    """Light from one point in all directions. Raises TypeError or ValueError that names the argument.
+    """Light from one point in all directions. TypeError and ValueError name a wrong argument.
 
     Parameters
     ----------
@@ -188,8 +203,8 @@ class PointLight(Light):
 class SpotLight(Light):
     """Light from one point in a cone, as in glTF (KHR_lights_punctual).
 
-    Between the angles the intensity falls by the square of (cos θ − cos outer) / (cos inner − cos outer). Raises TypeError or
-    ValueError that names the argument.
+    Between the angles the intensity falls by the square of (cos θ − cos outer) / (cos inner − cos outer). TypeError and
+    ValueError name a wrong argument.
 
     Parameters
     ----------
@@ -265,7 +280,7 @@ def inverse_square(v: Tensor) -> Tensor:
 class SphericalHarmonics(Light):
     """Irradiance by the direction of the normal, without shadows: cheap and smooth.
 
-    It is scattered by the Lambertian part of a material alone. Raises TypeError or ValueError that names the argument.
+    It is scattered by the Lambertian part of a material alone. TypeError and ValueError name a wrong argument.
 
     Parameters
     ----------

@@ -20,8 +20,9 @@ LARGEST_UV = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """An image on the faces of a mesh, whose tensors may all require gradients. Raises TypeError or ValueError that names the
-    argument.
+    """An image on the faces of a mesh, whose tensors may all require gradients.
+
+    TypeError and ValueError name a wrong argument.
 
     Parameters
     ----------
@@ -34,11 +35,11 @@ class Texture:
     wrap : "repeat", "clamp" or "mirror", or a pair of these for u and v
         Continuation beyond the border of the image.
     filter : "linear", "nearest" or "mipmap", default "linear"
-        "linear" interpolates between texel centres; "nearest" takes the texel that the point lies in. "mipmap" takes means over
-        squares of 2, 4, 8 … texels, so that neighbouring pixels are about a texel apart, linear between two such levels
+        "linear" interpolates between texel centres; "nearest" takes the texel that the point lies in. "mipmap" takes means
+        over squares of 2, 4, 8 … texels, so that neighbouring pixels are about a texel apart, linear between two such levels
         (Williams 1983). "clamp" then continues with the border of such means, as GPUs do: where many texels fall on a pixel,
         with a mean of the border and of what lies within, at last of the whole image.
-    factor : float or (K,)
+    factor : float or (K,), default 1
         Factor of the image, as glTF has it.
     """
 
@@ -100,38 +101,42 @@ class Material:
     """How the surface of a mesh scatters light, and what it emits. All tensors may require gradients.
 
     Each of the first four is a number, a constant (C,) or 0-d tensor, a tensor (V, C) or (V, 1) of the mesh's vertices, or a
-    Texture; metallic and roughness have one channel.
-
-    With metallic and roughness both None the surface is Lambertian, f = base / π. Else it follows the metallic-roughness model
-    of glTF 2.0 (appendix B): a Lambertian base under microfacets with the GGX distribution, α = roughness² (Walter et al.
-    2007), Smith's masking with correlated heights (Heitz 2014; glTF's own text has it uncorrelated), and Schlick's Fresnel term
-    from F0 = 0.04 + (base − 0.04) · metallic. If one of the two is left out, metallic is 0, or roughness is 1. α is at least
-    1e-4, because a mirror has no pdf. As in glTF, what the layer reflects and what it takes from the base follow different half
-    vectors, so a white dielectric returns more than came at grazing angles (1.14 at 75°, roughness 0.3). Numbers outside of 0 …
-    1 are not refused, because an optimisation may pass there. Raises TypeError or ValueError that names the argument.
+    Texture. Numbers outside of 0 … 1 are not refused, because an optimisation may pass there; other types and shapes raise
+    TypeError or ValueError.
 
     Parameters
     ----------
     base_color : default 1
-        Share of light that is scattered: a factor of the colours or the texture of the mesh, and alone where the mesh has none.
-    metallic, roughness : 0 … 1
-        Parameters of the microfacet model; see above.
-    emission
+        Share of light that is scattered: a factor of the mesh's colours or texture, and alone where the mesh has none.
+    metallic, roughness : 0 … 1, of one channel
+        With both None the surface is Lambertian, f = base / π. If one is left out, metallic is 0, or roughness is 1.
+    emission : default none
         Radiance of its own, W/(sr m²) or whatever unit the lights have. A mesh with emission is a light.
     normal_map : Texture (h, w, 3)
         Linear numbers in [0, 1]; 2 n − 1 is the normal in the tangent frame of the texture's uvs, as in glTF: red along u,
-        green along v (upwards), blue along the normal. Of a mesh with normals, the frames at the corners of faces are
-        MikkTSpace's. Where 2 n − 1 is shorter than 1/128, which 8 bits do not distinguish from zero, the normal is not bent and
-        has no derivative by the map: start an optimisation at (½, ½, 1).
+        green along v (upwards), blue along the normal. Of a mesh with normals, the frames are MikkTSpace's. Where 2 n − 1 is
+        shorter than 1/128 the normal has no derivative by the map: start at (½, ½, 1).
     normal_scale : float, default 1
         Factor of the first two of these.
     two_sided : bool, default True
         False: seen from behind (vertices clockwise), faces are black and emit nothing.
     alpha_mode : "MASK", "OPAQUE" or "BLEND", default "MASK"
-        "MASK" lets rays pass where the mesh's alpha, if it has one, is below its cutoff. "OPAQUE" forbids alpha. "BLEND" shows
-        what lies behind by 1 − alpha, for up to 8 such surfaces in a row, in the order of their depth; they cast shadows where
-        alpha is at least ½. There are gradients inside faces, by alpha, too, and of what moves before and behind such surfaces;
-        there are none of borders of nearest texels of its alpha, nor of those behind it.
+        "MASK" lets rays pass where the mesh's alpha is below its cutoff. "OPAQUE" forbids alpha. "BLEND" shows what lies
+        behind by 1 − alpha, for up to 8 such surfaces in a row; they cast shadows where alpha is at least ½. There are no
+        gradients of borders of nearest texels of its alpha, nor of those behind it.
+
+    Notes
+    -----
+    The metallic-roughness model is that of glTF 2.0 (appendix B): a Lambertian base under GGX microfacets, α = roughness² ≥
+    1e-4 (Walter et al. 2007), Smith's masking with correlated heights (Heitz 2014; glTF's text: uncorrelated), and Schlick's
+    Fresnel term from F0 = 0.04 + (base − 0.04) · metallic. As in glTF, a white dielectric returns more than came at grazing
+    angles.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> eg.shapes.sphere(material=eg.Material(base_color=0.5, roughness=0.3))
+    Mesh(2562 vertices, 5120 faces, plain, lit, torch.float32)
     """
 
     base_color: Tensor | Texture | float | None = None

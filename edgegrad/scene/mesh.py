@@ -38,50 +38,43 @@ SMALLEST_MESH = 1e-38
 class Mesh:
     """A triangle mesh whose tensors may all require gradients.
 
-    At most one of colors, face_colors, corner_colors and texture gives the radiance (linear, any number of channels C); without
-    any, the mesh is plain grey. Faces of zero area render nothing. Numbers reach up to 3.4e38, the range of float32, also in
-    float64; uvs reach up to 1e9, because beyond that a double does not distinguish the texels of a large texture. The largest
-    of the verts lies above 1e-38, unless all are zero. Raises TypeError for a wrong type, ValueError for a wrong shape, a wrong
-    index or a value that is not finite or out of this range.
+    At most one of colors, face_colors, corner_colors and texture gives the radiance (linear, any number of channels C);
+    without any, the mesh is plain grey. Faces of zero area render nothing. TypeError and ValueError name a wrong argument:
+    numbers reach up to 3.4e38, uvs up to 1e9, and the largest of the verts lies above 1e-38, unless all are zero.
 
     Parameters
     ----------
-    verts : (V, 3) float
-        Positions, in the user's world units and axes.
-    faces : (F, 3) int
-        Vertex indices, from zero; both sides of a face are seen.
-    colors : (V, C) float
-        Colours of vertices, interpolated over the faces.
-    face_colors : (F, C) float
-        Colours of faces, constant over each.
-    corner_colors : (F, 3, C) float
-        Colours of corners of faces; they jump across edges where they differ.
+    verts, faces : (V, 3) float, (F, 3) int
+        Positions, in the user's world units and axes. Vertex indices, from zero; both sides of a face are seen.
+    colors, face_colors, corner_colors : (V, C), (F, C), (F, 3, C) float
+        Colours of vertices, interpolated; of faces, constant over each; or of corners, which jump across edges where they
+        differ.
     texture : (h, w, C) float
         Image on the faces: row 0 is on top, texel centres are at +0.5. It needs uvs.
-    uvs : (T, 2) float
-        Texture coordinates, v running up (as in OBJ), given with uv_faces.
-    uv_faces : (F, 3) int
-        Indices into uvs, apart from `faces`, so that vertices stay welded at seams.
-    alpha : (h, w) float
-        Another image on the faces, of any size, whatever gives the radiance. Rays pass through faces where it is below
-        alpha_cutoff. It needs uvs.
-    alpha_cutoff : float, default 0.5
+    uvs, uv_faces : (T, 2) float, (F, 3) int
+        Texture coordinates, v running up (as in OBJ), and indices into them, apart from `faces`: vertices stay welded at
+        seams.
+    alpha, alpha_cutoff : (h, w) float, default none, and float, default 0.5
+        Another image on the faces, of any size. Rays pass through faces where it is below the cutoff. It needs uvs.
     wrap : "repeat", "clamp" or "mirror", or a pair of these for u and v
         Continuation of both images beyond their borders; "clamp" repeats the texels at the border.
     filter : "linear", "nearest" or "mipmap", default "linear"
-        "linear" interpolates between the centres of texels; "nearest" takes the texel that the point lies in. "mipmap", for a
-        texture finer than the pixels, takes its means over squares of 2, 4, 8 … texels, as of eg.Texture. It takes 1.2 to 1.5
-        times as long, and is not for screen_gradient(); alpha is then looked up as "linear".
-    material : Material
-        How it scatters light, and what it emits; the colours above are then base colours. None: it is not lit, and colours are
-        radiance.
-    normals : (N, 3) float
-        Normals of any length, interpolated over the faces where a material is lit, and turned to the side of the face that is
-        seen. Faces are flat without them.
-    normal_faces : (F, 3) int, default `faces`
-        Indices into normals.
+        As of eg.Texture. "mipmap" is for a texture finer than the pixels, and not for screen_gradient(); alpha is then
+        "linear".
+    material : Material, default none: colours are radiance
+        How it scatters light, and what it emits; the colours above are then base colours.
+    normals, normal_faces : (N, 3) float, (F, 3) int, default `faces`
+        Normals of any length and indices into them, interpolated where a material is lit, and turned to the side of the face
+        that is seen. Faces are flat without them.
     name : str
         Name in a file.
+
+    Examples
+    --------
+    >>> import torch, edgegrad as eg
+    >>> corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], requires_grad=True)
+    >>> eg.Mesh(corners, torch.tensor([[0, 1, 2]]), colors=torch.eye(3))
+    Mesh(3 vertices, 1 faces, colors (3, 3), torch.float32)
     """
 
     verts: Tensor
@@ -259,9 +252,17 @@ class Mesh:
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Mesh:
         """Return the mesh with vertices `scale · R v + t`, differentiable in all four.
 
-        R (3, 3) is any matrix, by default the identity; t (3,) is in world units, by default zero; scale is a number or 0-d
-        tensor. Normals are transformed, too. A mirror, R of negative determinant, keeps the faces' corners in their order, so
-        it turns a mesh inside out. Raises TypeError or ValueError.
+        Normals are transformed, too. A mirror, R of negative determinant, keeps the faces' corners in their order, so it turns
+        a mesh inside out.
+
+        Parameters
+        ----------
+        R : (3, 3), default the identity
+            Any matrix.
+        t : (3,), default zero
+            World units.
+        scale : float or 0-d tensor, default 1
+            Another type or value of an argument raises TypeError or ValueError.
         """
         affine = Affine.from_arguments(R, t, scale, self.verts)
         fields = {} if self.normals is None else {"normals": affine.normals(self.normals)}

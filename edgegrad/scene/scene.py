@@ -26,7 +26,7 @@ class Scene:
     """Meshes that hide one another, before a background.
 
     With a light, or a mesh with a material, the scene is lit: meshes with a material are shaded, those without keep their
-    colours for radiance. Raises TypeError or ValueError.
+    colours for radiance. TypeError and ValueError name a wrong field.
 
     Parameters
     ----------
@@ -35,8 +35,16 @@ class Scene:
     background : (C,) or (H, W, C) float, default black
         Linear radiance where nothing is hit. An image is laid behind the pixels: I = Σ samples that hit + (1 − coverage) ·
         background.
-    lights : sequence of lights
+    lights : sequence of lights, default none
         Meshes whose materials have emission are lights, too; those among `lights` join the meshes. All have one channel or C.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> ball = eg.shapes.sphere(subdivisions=1, material=eg.Material(base_color=0.8))
+    >>> scene = eg.Scene([ball], lights=[eg.lights.DirectionalLight((0.0, -1.0, -1.0))])
+    >>> scene.is_lit, scene.channels
+    (True, 3)
     """
 
     meshes: Sequence[Mesh]
@@ -174,10 +182,10 @@ class Scene:
         return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:
-        """Return the scene with all meshes and lights moved together; see Mesh.transformed.
+        """Return the scene with all meshes and lights moved together; the arguments are those of Mesh.transformed().
 
-        Surfaces stay as bright: the intensities of points and spots, which fall off with distance, grow as areas do. For lights
-        from all around R must be a rotation.
+        Surfaces stay as bright: the intensities of points and spots, which fall off with distance, grow as areas do. For
+        lights from all around R must be a rotation.
         """
         return self.replace(
             meshes=[mesh.transformed(R, t, scale) for mesh in self.meshes],
@@ -193,7 +201,7 @@ class Scene:
         return map_tensors(self, Tensor.detach)
 
     def state_dict(self) -> dict[str, Any]:
-        """All of the scene in nested dictionaries and lists of tensors, strings and numbers, for torch.save().
+        """Return the scene as nested dictionaries and lists of tensors, strings and numbers, for torch.save().
 
         torch.load(…, weights_only=True) reads them. Tensors are detached, and share their memory with the scene's. Raises
         TypeError for a light of a class of one's own.
@@ -202,8 +210,10 @@ class Scene:
 
     @staticmethod
     def from_state_dict(state: dict[str, Any]) -> Scene:
-        """The scene of a state_dict(), with the same tensors; none requires gradients. Raises TypeError or ValueError, which
-        name missing and unexpected keys."""
+        """Return the scene of a state_dict(), with the same tensors; none requires gradients.
+
+        TypeError and ValueError name missing and unexpected keys.
+        """
         return from_state(state, Scene, CLASSES)
 
     def __repr__(self) -> str:

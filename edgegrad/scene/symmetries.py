@@ -37,14 +37,20 @@ class PoseError(NamedTuple):
 class Symmetries:
     """The symmetries of a mesh: each of the discrete ones, followed by a rotation about each axis.
 
-    Symmetries.find(mesh) finds them. Raises TypeError or ValueError that names the argument.
+    Symmetries.find(mesh) finds them. TypeError and ValueError name a wrong argument.
 
     Parameters
     ----------
     discrete : (N, 4, 4), default the identity alone
         Rigid motions in the mesh's coordinates, for column vectors. The identity is put first where it is missing.
-    continuous : sequence of Symmetries.Axis
+    continuous : sequence of Symmetries.Axis, default none
         Two axes that are not parallel make a sphere: it may be turned in any way about their common point.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> eg.Symmetries(continuous=[eg.Symmetries.Axis((0.0, 0.0, 1.0))])
+    Symmetries(1 discrete with the identity, 1 continuous)
     """
 
     discrete: Tensor | None = None
@@ -91,20 +97,20 @@ class Symmetries:
 
         The distance is that of 600 points of the surface and as many vertices: a detail smaller than their spacing that is
         nearer than the tolerance breaks no symmetry. A mesh like a sphere has continuous symmetries about three axes. Mirror
-        images are no symmetries, because no motion makes them. Raises TypeError, ValueError that names the argument, or
-        ImportError without SciPy.
+        images are no symmetries, because no motion makes them. TypeError and ValueError name a wrong argument; ImportError
+        says that SciPy is missing.
 
         Parameters
         ----------
         mesh : Mesh or Scene
         tolerance : float, default 0.01
-            Largest distance of points of the rotated mesh from the mesh, as a share of its size: twice the largest distance from
-            its centroid. A prism with so many sides that it is a cylinder within it counts as one.
+            Largest distance of points of the rotated mesh from the mesh, as a share of its size: twice the largest distance
+            from its centroid. A prism with so many sides that it is a cylinder within it counts as one.
         textured : bool, default True
             Whether colours must agree, too; False finds the symmetries of the shape alone. A plain mesh has none.
         color_tolerance : float, default 0.1
-            Largest difference of the colours of corresponding points, all but one in a hundred of the points, from 0 to 1 of the
-            brightest. Square roots of radiance (or of base colours) are compared, which is about how the eye sees them.
+            Largest difference of the colours of corresponding points, all but one in a hundred of the points, from 0 to 1 of
+            the brightest. Square roots of radiance (or of base colours) are compared, which is about how the eye sees them.
         max_order : int, default 24
             Highest order n of a rotation by 360° / n that is looked for.
         """
@@ -119,8 +125,11 @@ class Symmetries:
     def from_bop(cls, info: Mapping[str, Any]) -> Symmetries:
         """Return the symmetries of an entry of BOP's models_info.json.
 
-        Its keys are symmetries_discrete (lists of 16 numbers by rows) and symmetries_continuous (objects with axis and offset);
-        without them there is the identity alone. Raises ValueError.
+        Parameters
+        ----------
+        info : mapping
+            Its keys are symmetries_discrete (lists of 16 numbers by rows) and symmetries_continuous (objects with axis and
+            offset); without them there is the identity alone. Other values raise ValueError.
         """
         motions = info.get("symmetries_discrete", [])
         if any(not isinstance(one, Sequence) or len(one) != 16 for one in motions):
@@ -163,11 +172,16 @@ class Symmetries:
         )
 
     def transforms(self, step: float = 0.01) -> Tensor:
-        """Return all symmetries (T, 4, 4), continuous ones in ⌈π / step⌉ equal angles each.
+        """Return all symmetries (T, 4, 4) float64, continuous ones in ⌈π / step⌉ equal angles each.
 
-        Between two angles no point moves by more than `step` of the object's diameter. The order and the angles are those of
-        BOP's own toolkit: where there are axes, each discrete one is followed by the rotations about each axis. Of a sphere
-        there are therefore only the rotations about its axes; closest() knows all of them. Raises ValueError.
+        The order and the angles are those of BOP's own toolkit: where there are axes, each discrete one is followed by the
+        rotations about each axis. Of a sphere there are therefore only the rotations about its axes; closest() knows all of
+        them.
+
+        Parameters
+        ----------
+        step : float, default 0.01
+            Between two angles no point moves by more than this share of the object's diameter; 1e-4 … 1, else ValueError.
         """
         check_positive("step", step, least=1e-4, most=1.0)
         if not self.continuous:
@@ -178,17 +192,16 @@ class Symmetries:
         return (turns[None] @ self.motions[:, None]).reshape(-1, 4, 4)
 
     def closest(self, pose: object, reference: object) -> Tensor:
-        """Return the pose (4, 4) float64 whose rotation is nearest to the reference's, of all poses that show the same as
-        `pose`.
+        """Return the pose (4, 4) float64, of all that show the same as `pose`, whose rotation is nearest to the reference's.
 
         It is exact for continuous symmetries, too: with A and B the rotations of both, the trace of Bᵀ A S is a sine of the
         angle about the axis. All symmetries keep one point of the mesh where it is, so no pose is nearer by its translation
-        alone. Of poses that are equally near the first is returned. Raises TypeError or ValueError.
+        alone. Of poses that are equally near the first is returned.
 
         Parameters
         ----------
         pose, reference : (4, 4), or an object with such a `matrix`, as PoseFit
-            Mesh to world for column vectors; a scale may be included.
+            Mesh to world for column vectors; a scale may be included. Others raise TypeError or ValueError.
         """
         P, Q = _pose("pose", pose), _pose("reference", reference)
         if self.spherical:
@@ -220,8 +233,7 @@ class Symmetries:
         return PoseError(math.degrees(angle), float((P[:3, 3] - Q[:3, 3]).norm()))
 
     def scaled(self, factor: float) -> Symmetries:
-        """Return the symmetries of the mesh in other units: of a mesh in mm, `scaled(0.001)` are those in m. Raises
-        ValueError."""
+        """Return the symmetries of the mesh in other units: of one in mm, `scaled(0.001)` are those in m. Raises ValueError."""
         check_positive("factor", factor, least=1e-12, most=1e12)
         motions = self.motions.clone()
         motions[:, :3, 3] *= factor

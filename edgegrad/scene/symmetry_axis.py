@@ -14,7 +14,7 @@ from ..check import as_double
 class SymmetryAxis:
     """The axis of a continuous symmetry: the mesh may be turned about it by any angle.
 
-    Both tensors become float64. Raises TypeError or ValueError.
+    Both tensors become float64. Other types and values raise TypeError or ValueError.
 
     Parameters
     ----------

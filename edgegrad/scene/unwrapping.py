@@ -13,11 +13,10 @@ from .mesh import Mesh
 
 
 def unwrap(mesh: Mesh, size: int = 512, gap: int = 4) -> Mesh:
-    """Return the mesh with texture coordinates for fit_texture(): charts of little stretch, side by side in a square, by
-    xatlas.
+    """Return the mesh with texture coordinates: charts of little stretch, side by side in a square, by xatlas.
 
-    Vertices and faces stay as they are; colours and textures are left away. Needs xatlas (`pip install 'edgegrad[fit]'`).
-    Raises TypeError or ValueError that names the argument, ImportError.
+    Vertices and faces stay as they are; colours and textures are left away. fit_texture() and bake() need such coordinates.
+    TypeError and ValueError name a wrong argument; ImportError says that xatlas is missing (`pip install 'edgegrad[fit]'`).
 
     Parameters
     ----------
@@ -26,6 +25,14 @@ def unwrap(mesh: Mesh, size: int = 512, gap: int = 4) -> Mesh:
         Texels on a side of the texture that it is for.
     gap : int, default 4
         Texels between charts, so that a texel belongs to one of them.
+
+    Examples
+    --------
+    >>> import edgegrad as eg
+    >>> mesh = eg.textures.unwrap(eg.shapes.sphere(subdivisions=1), size=32)
+    >>> texture = eg.textures.bake(mesh, lambda points: points.position.abs(), 32, progress=False)
+    >>> mesh.replace(texture=texture)
+    Mesh(42 vertices, 80 faces, texture (32, 32, 3), torch.float32)
     """
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}")
