@@ -15,7 +15,7 @@ from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..scene.symmetries import Symmetries
 from .history import Record
-from .options import Parameter
+from .parameter import Parameter
 
 
 class Pose(NamedTuple):

@@ -17,6 +17,7 @@ from ..check import as_tensor, check_finite, check_float, check_shape
 from ..files.image import linear_to_srgb
 from ..scene.tree import map_tensors
 from ..warnings import warn
+from .by_camera import numbered, one_for_each
 from .measured import Measurement, area_mean, measurements
 
 Images = Tensor | Sequence[Tensor]
@@ -103,8 +104,13 @@ def views_of(
     In a sequence of any of them None stands where a camera has none.
     """
     split = cameras_of(cameras)
+    n = len(split)
     pictures, shapes, counts = (
-        _images(name, value, split) for name, value in (("images", images), ("masks", masks), ("weights", weights))
+        [
+            None if one is None else check_image(numbered(name, k, n), one, split[k].size)
+            for k, one in enumerate(one_for_each(name, value, n, dims))
+        ]
+        for name, value, dims in (("images", images, 3), ("masks", masks, 2), ("weights", weights, 2))
     )
     by_camera = measurements(measured or {}, split)
     views = []
@@ -181,22 +187,6 @@ def part_of(camera: Camera, k: int) -> Camera:
     return camera.replace(
         **{name: v[k] if v is not None and v.dim() == fields[name] else v for name, v in values.items()}
     )
-
-
-def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | None]:
-    """Return (H, W, c) float32 on the CPU, one for each camera. Raises TypeError or ValueError."""
-    if value is None:
-        return [None] * len(cameras)
-    if len(cameras) == 1 and isinstance(value, (list, tuple)) and len(value) > 1 and hasattr(value[0], "ndim"):
-        raise ValueError(f"{name}: expected one for each camera, got {len(value)} and one camera; give as many cameras")
-    single = len(cameras) == 1 and not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) < 4
-    given: Any = [value] if single else value
-    if len(given) != len(cameras):
-        raise ValueError(f"{name}: expected {len(cameras)}, one for each camera, got {len(given)}")
-    return [
-        None if image is None else check_image(name if single else f"{name}[{i}]", image, camera.size)
-        for i, (image, camera) in enumerate(zip(given, cameras, strict=True))
-    ]
 
 
 def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
