@@ -12,7 +12,7 @@ import trimesh
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_scene
+from edgegrad.fit import FitOptions, Parameter, fit_scene
 
 TRUTH, START = 0.3, 0.6
 CASES = [("l2", 8, 1), ("l1", 8, 1), ("huber", 8, 1), ("robust", 8, 1), ("l2", 64, 16), ("robust", 64, 16)]
@@ -36,9 +36,9 @@ def main() -> None:
     print("loss    spp  light_samples  roughness")
     for loss, spp, light_samples in CASES:
         fit = fit_scene(
-            lambda values: scene(values["roughness"]), camera, target,
-            {"roughness": Parameter(0.02, torch.tensor(START), low=0.05, high=1.0)},
-            loss=loss, spp=spp, steps=150, progress=False, render={"light_samples": light_samples},
+            lambda values: scene(values["roughness"]), target, camera, {"roughness": Parameter(0.02, torch.tensor(START),
+            low=0.05, high=1.0)}, options=FitOptions(seed=0, loss=loss, spp=spp, steps=150, progress=False,
+            sampling=eg.Sampling(lights=light_samples)),
         )  # fmt: skip
         print(f"{loss:7} {spp:3} {light_samples:9} {float(fit.values['roughness']):15.2f}   {fit.reason}", flush=True)
 

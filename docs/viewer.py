@@ -18,7 +18,7 @@ from selenium import webdriver
 
 import edgegrad as eg
 from edgegrad.demo import airliner
-from edgegrad.fit import PoseFit, fit_pose
+from edgegrad.fit import FitOptions, PoseFit, fit_pose
 
 FLAGS = ("headless=new", "no-sandbox", "use-gl=angle", "use-angle=swiftshader", "enable-unsafe-swiftshader",
          "window-size=1240,780")  # fmt: skip
@@ -62,7 +62,13 @@ def main() -> None:
                 shot.quantize(COLORS).save(folder / "viewer.png", optimize=True)
                 raise KeyboardInterrupt
 
-        fit_pose(mesh, pictures, cameras, init=turn, background=BACKGROUND, callback=callback, progress=False)
+        fit_pose(
+            eg.Scene([mesh], BACKGROUND),
+            pictures,
+            cameras,
+            init=turn,
+            options=FitOptions(seed=0, callback=callback, progress=False),
+        )
     browser.quit()
 
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import RigFit, fit_rig
+from edgegrad.fit import FitOptions, RigFit, fit_rig
 
 SIZE = 192
 LIMIT = 0.75  # radians, of each component of a rotation
@@ -53,7 +53,7 @@ def trial(
     rig = figure.figure(colored=True).with_limits(rotations=(-LIMIT, LIMIT))
     cameras, truth = figure.cameras(size), figure.pose(seed, degrees)
     masks = [eg.render_aovs(rig.posed(truth), camera, ["alpha"], spp=64, seed=5)["alpha"] for camera in cameras]
-    return rig, truth, masks, fit_rig(rig, cameras, masks=masks, seed=seed, **options)
+    return rig, truth, masks, fit_rig(rig, None, cameras, masks=masks, options=FitOptions(seed=seed, **options))
 
 
 def pictures(rig: eg.Rig, truth: Tensor, fit: RigFit, size: int) -> list[dict[str, Tensor]]:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Fit, Parameter, fit_scene
+from edgegrad.fit import Fit, FitOptions, Parameter, fit_scene
 
 SIZE, SHOWN = 64, 160  # pixels on a side, of the pictures and of what is drawn
 WALLS = {
@@ -55,7 +55,13 @@ def fit(seen: list[Tensor], bounces: int, steps: int = 30) -> Fit:
     size = len(seen[0])
     sought = {name: Parameter(0.03, torch.full((3,), 0.5), low=0.0, high=1.0) for name in WALLS}
     render = {"bounces": bounces}
-    return fit_scene(scene, cameras(size), seen, sought, method="gauss-newton", steps=steps, spp=16, render=render)
+    return fit_scene(
+        scene,
+        seen,
+        cameras(size),
+        sought,
+        options=FitOptions(seed=0, method="gauss-newton", steps=steps, spp=16, render=render),
+    )
 
 
 def errors(found: Fit) -> dict[str, float]:

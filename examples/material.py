@@ -23,7 +23,7 @@ import trimesh
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Fit, Parameter, fit_scene
+from edgegrad.fit import Fit, FitOptions, Parameter, fit_scene
 
 ROUGHNESS, METALLIC = 0.3, 0.7
 GOLD = torch.tensor([0.9, 0.65, 0.25])
@@ -84,7 +84,9 @@ def fit(
         for name, value in zip(Made._fields, start or half(truth), strict=True)
     }
     seen = pictures(truth.scene(shape), cameras)
-    found = fit_scene(lambda values: Made(**values).scene(shape), cameras, seen, sought, **options)
+    found = fit_scene(
+        lambda values: Made(**values).scene(shape), seen, cameras, sought, options=FitOptions(seed=0, **options)
+    )
     return found, Made(**found.values)
 
 

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, fit_pose
+from edgegrad.fit import FitOptions, PoseFit, fit_pose
 
 SIZE = 256
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])
@@ -81,7 +81,7 @@ def trial(mesh: eg.Mesh, case: str, seed: int, size: int = SIZE) -> tuple[float,
     R = random_rotation(generator, math.radians(TURN))
     off = torch.rand(3, generator=generator, dtype=torch.float64) * 2.0 - 1.0
     start[:3, :3], start[:3, 3] = R, center - R @ center + SHIFT * diagonal * off / math.sqrt(3.0)
-    fit = fit_pose(turned, init=start, seed=seed, progress=False, **given)
+    fit = fit_pose(turned, init=start, options=FitOptions(seed=seed, progress=False, **given))
     return degrees(R), degrees(fit.R), fit
 
 

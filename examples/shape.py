@@ -22,7 +22,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 import edgegrad as eg
-from edgegrad.fit import Fit, fit_shape
+from edgegrad.fit import Fit, FitOptions, fit_shape
 
 # Radiance by the normal: constant, and a colour for each axis. Vertex colours, so no light has to be sampled.
 EVEN = 0.5
@@ -62,14 +62,21 @@ def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures"
     options = {"levels": 3, "steps": 150, "spp": 4} | options
     images, masks = ([found[name] for found in seen] for name in ("image", "alpha"))
     if given == "pictures":
-        return fit_shape(start, cameras, images, masks=masks, look=lit, **options)
+        return fit_shape(start, images, cameras, masks=masks, appearance=lit, options=FitOptions(seed=0, **options))
     if given == "masks":
-        return fit_shape(start, cameras, masks=masks, **options)
+        return fit_shape(start, None, cameras, masks=masks, options=FitOptions(seed=0, **options))
     if given == "depths":
         depths = [torch.where(found["alpha"] > 0.999, found["depth"], 0.0) for found in seen]
-        return fit_shape(start, cameras, masks=masks, depths=depths, **options)
+        return fit_shape(start, None, cameras, masks=masks, depths=depths, options=FitOptions(seed=0, **options))
     depths = sensed(seen, diagonal)
-    return fit_shape(start, cameras, masks=[(mask > 0.5).float() for mask in masks], depths=depths, **options)
+    return fit_shape(
+        start,
+        None,
+        cameras,
+        masks=[(mask > 0.5).float() for mask in masks],
+        depths=depths,
+        options=FitOptions(seed=0, **options),
+    )
 
 
 def sensed(seen: list[dict[str, torch.Tensor]], diagonal: float) -> list[torch.Tensor]:

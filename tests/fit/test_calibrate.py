@@ -8,11 +8,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from brackets import BACKGROUND, about_center, bracket, camera, picture, rotation, silhouette, task_of
+from brackets import BACKGROUND, about_center, before_sky, bracket, camera, picture, rotation, silhouette, task_of
+from quiet_fits import arranged, quiet
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Calibration, calibrate, fit_camera
+from edgegrad.fit import Calibration, FitOptions, calibrate, fit_camera
 from edgegrad.fit.ending import Ending
 from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
 from edgegrad.fit.pose.loss_model import ColorLoss, score_covariance
@@ -110,7 +111,7 @@ def test_a_lens_that_a_picture_does_not_show() -> None:
     (true,) = taken(1, 96, distance=11.0)
     (start,) = guessed([true], 1.0)
     start = start.replace(K=true.K)
-    fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, distortion=2, progress=False)
+    fit = fit_camera(before_sky(), picture(true), start, distortion=2, options=quiet())
     known = fit.uncertainty
     assert known is not None and fit.explained > 0.9
     assert not fit.converged and fit.reason.startswith("not known: ") and "k2 known to ±" in fit.reason
@@ -124,9 +125,7 @@ def test_a_lens_that_a_picture_does_not_show() -> None:
 def test_a_near_object_shows_the_lens() -> None:
     (true,) = taken(1, 64, distance=2.2, distortion=SIMPLE)
     (start,) = guessed([true])
-    fit = fit_camera(
-        bracket(), picture(true), start, background=BACKGROUND, principal=True, distortion=1, progress=False
-    )
+    fit = fit_camera(before_sky(), picture(true), start, principal=True, distortion=1, options=quiet())
     known = fit.uncertainty
     assert known is not None and fit.converged and fit.search.converged
     assert fit.history[-1].loss == fit.loss and fit.steps == len(fit.history)
@@ -166,7 +165,7 @@ def chi_square(found: eg.Camera, true: eg.Camera, known: CameraUncertainty | Non
 def test_a_lens_from_several_pictures(tmp_path) -> None:
     true = taken(2, 48, distortion=SIMPLE)
     seen: list[Calibration] = []
-    fit = calibrate(scene(), pictures(true), guessed(true), distortion=1, progress=False, callback=seen.append)
+    fit = calibrate(scene(), pictures(true), guessed(true), distortion=1, options=quiet(callback=seen.append))
     assert fit.converged and fit.reason == "converged" and fit.explained > 0.9 and fit.uncertainty is not None
     checked(fit, true, 0.005, 0.25)
     for one in fit.cameras:  # one lens
@@ -204,7 +203,7 @@ def test_a_resumed_calibration_ends_as_if_it_had_never_stopped(tmp_path) -> None
             raise KeyboardInterrupt
 
     def fit(**options) -> Calibration:
-        return calibrate(scene(), pictures(true), guessed(true), distortion=1, progress=False, **options)
+        return calibrate(scene(), pictures(true), guessed(true), distortion=1, **arranged(**options))
 
     whole, kept = fit(), {"checkpoint": tmp_path / "lens"}
     assert fit(**kept, callback=stop).interrupted
@@ -217,7 +216,7 @@ def test_a_calibration_that_is_interrupted() -> None:
         raise KeyboardInterrupt
 
     true = taken(2, 48)
-    fit = calibrate(scene(), pictures(true), guessed(true), progress=False, callback=stop)
+    fit = calibrate(scene(), pictures(true), guessed(true), options=quiet(callback=stop))
     assert fit.interrupted and not fit.converged and fit.reason == "interrupted" and fit.uncertainty is None
     assert len(fit.cameras) == 1 and fit.steps == 0
 
@@ -256,7 +255,7 @@ def test_errors_of_calibrate(change: dict, message: str) -> None:
         "cameras": [ONE, ONE], "progress": False, **change,
     }  # fmt: skip
     with pytest.raises((TypeError, ValueError)) as caught:
-        calibrate(**given)
+        calibrate(**arranged(**given))
     assert message in str(caught.value)
 
 
@@ -264,7 +263,7 @@ def test_errors_of_calibrate(change: dict, message: str) -> None:
 def test_a_lens_from_masks_alone() -> None:
     true = taken(4, 96, distortion=SIMPLE)
     masks = [silhouette(one) for one in true]
-    fit = calibrate(bracket(plain=True), None, guessed(true), masks=masks, distortion=1, progress=False)
+    fit = calibrate(bracket(plain=True), None, guessed(true), masks=masks, distortion=1, options=quiet())
     assert fit.explained > 0.9
     # Contours alone have other places of rest nearby, of which deviations do not know: the focal length is 0.4 % off.
     assert abs(float(fit.camera.K[0, 0] / true[0].K[0, 0]) - 1.0) < 0.01
@@ -278,7 +277,7 @@ def test_a_lens_from_photographs() -> None:
     coarse = 0.05 + 0.5 * torch.rand(4, 3, 11, 11, generator=torch.Generator().manual_seed(3))
     clutter = torch.nn.functional.interpolate(coarse, (128, 128), mode="bilinear").movedim(1, -1)
     shot = [picture(one, background=behind) for one, behind in zip(true, clutter, strict=True)]
-    fit = calibrate(bracket(), shot, guessed(true, 1.02), distortion=1, progress=False)
+    fit = calibrate(bracket(), shot, guessed(true, 1.02), distortion=1, options=quiet())
     assert fit.explained > 0.8
     assert abs(float(fit.camera.K[0, 0] / true[0].K[0, 0]) - 1.0) < 0.02
 
@@ -292,7 +291,7 @@ def test_deviations_of_cameras_are_calibrated() -> None:
         true = taken(4, 96, distance)[k]
         (start,) = guessed([true], 1.03)
         fit = fit_camera(
-            bracket(), picture(true), start, background=BACKGROUND, principal=True, distortion=2, seed=k, progress=False
+            before_sky(), picture(true), start, principal=True, distortion=2, options=FitOptions(seed=k, progress=False)
         )
         known = fit.uncertainty
         assert known is not None and fit.camera.distortion is not None

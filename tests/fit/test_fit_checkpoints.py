@@ -3,6 +3,7 @@
 import pytest
 import torch
 from brackets import BACKGROUND, START, bracket, camera, picture, silhouette
+from quiet_fits import arranged
 
 from edgegrad.fit import fit_pose
 from edgegrad.fit.checkpoints import FORMAT
@@ -14,7 +15,7 @@ PICTURE = picture(camera(96))
 def small_fit(**options):
     target = options.get("target", PICTURE)
     given = {"mesh": bracket(), "target": target, "camera": camera(len(target)), "init": START, "steps": 6} | options
-    return fit_pose(**given, progress=False)
+    return fit_pose(**arranged(**given))
 
 
 @pytest.fixture(scope="module")

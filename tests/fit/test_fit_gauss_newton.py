@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from brackets import BACKGROUND, bracket, camera, rotation
+from quiet_fits import arranged
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses
@@ -200,7 +201,7 @@ def test_is_far_quicker_than_adam_by_steps():
     start = Pose(rotation(0.1, -0.1, 0.05), torch.tensor([0.05, 0.0, 0.1], dtype=F64))
     seen = []
     wanted = {"meshes.0.pose": PoseParameter(start, rotation=0.02, shift=0.01)}
-    fit = fit_scene(scene, view, target, wanted, method="gauss-newton", callback=seen.append, **QUIET)
+    fit = fit_scene(scene, target, view, wanted, **arranged(method="gauss-newton", callback=seen.append, **QUIET))
     assert fit.converged and fit.steps < 40 and [record.step for record in seen] == list(range(fit.steps))
     assert float((fit.poses["meshes.0.pose"].R - torch.eye(3)).norm()) < 0.02
     assert set(seen[0].gradient) == {"meshes.0.pose.rotation", "meshes.0.pose.shift"}
@@ -240,7 +241,7 @@ def test_errors_name_the_argument(change, error, message):
         arguments["parameters"] = {"v": Parameter(0.01, quad().verts)}
     view = eg.Camera.look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), size=(16, 16))
     with pytest.raises(error, match=message):
-        fit_scene(cameras=view, images=torch.zeros(16, 16, 3), **arguments)
+        fit_scene(**arranged(**arguments))
 
 
 def quad():

@@ -10,9 +10,10 @@ import pytest
 import torch
 from brackets import BACKGROUND, START, about_center, bracket, camera, picture, silhouette
 from photographs import coverage, depth_of, photograph
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
+from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
 from edgegrad.fit.pose.photo.depth import warn_of_units
@@ -46,11 +47,11 @@ def one_pixel(value=1.0):
 def test_what_shows_nothing_is_named(taken, given, message):
     view, image = taken
     with pytest.raises(ValueError, match=message):
-        fit_pose(bracket(), image, view, **{**QUICK, **given})
+        fit_pose(bracket(), image, view, **arranged(**{**QUICK, **given}))
     if "mask" in given:
         given = {**given, "mask": given["mask"].int()}
     with pytest.raises(ValueError, match=message.replace("mask:", r"mask\[0\]:")):
-        fit_poses([bracket()], image, view, **{**QUICK, **given, "init": [START]})
+        fit_poses([bracket()], image, view, **arranged(**{**QUICK, **given, "init": [START]}))
 
 
 @pytest.mark.parametrize("side", [1, 3, 7])
@@ -59,9 +60,9 @@ def test_a_tiny_picture_is_named(side, plain):
     picture = torch.rand(side, side, 3, generator=torch.Generator().manual_seed(0))
     message = rf"{{}}: expected a picture of 8 × 8 pixels or more, got {side} × {side}"
     with pytest.raises(ValueError, match=message.format("target")):
-        fit_pose(bracket(plain), picture, camera(side), **QUICK)
+        fit_pose(bracket(plain), picture, camera(side), **arranged(**QUICK))
     with pytest.raises(ValueError, match=message.format("image")):
-        fit_camera(bracket(plain), picture, camera(side), progress=False)
+        fit_camera(bracket(plain), picture, camera(side), options=quiet())
 
 
 def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
@@ -87,7 +88,7 @@ def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
 def test_poses_to_start_from_may_be_an_array(taken):
     view, image = taken
     labels = (coverage(view)[..., 0] > 0.5).numpy().astype(np.int32)
-    (fit,) = fit_poses([bracket()], image, view, labels, **{**QUICK, "init": START[None].numpy()})
+    (fit,) = fit_poses([bracket()], image, view, labels, **arranged(**{**QUICK, "init": START[None].numpy()}))
     assert fit.steps > 0
 
 
@@ -103,17 +104,17 @@ def test_poses_to_start_from_may_be_an_array(taken):
 def test_errors_of_labels(taken, given, message):
     view, image = taken
     with pytest.raises((TypeError, ValueError), match=message):
-        fit_poses([bracket()], image, view, **{**QUICK, "init": [START], **given})
+        fit_poses([bracket()], image, view, **arranged(**{**QUICK, "init": [START], **given}))
 
 
 def test_one_picture_for_two_cameras(taken):
     view, image = taken
     with pytest.raises(ValueError, match=r"target: expected 2, one for each camera, got one of shape \(48, 48, 3\)"):
-        fit_pose(bracket(), image, [view, view], **QUICK)
+        fit_pose(bracket(), image, [view, view], **arranged(**QUICK))
     mask = coverage(view)[..., 0]
     for given in (mask, [mask]):
         with pytest.raises(ValueError, match=r"mask.*: expected 2, one for each camera, got one of shape \(48, 48\)"):
-            fit_poses([bracket()], [image] * 2, [view] * 2, given, **{**QUICK, "init": [START]})
+            fit_poses([bracket()], [image] * 2, [view] * 2, given, **arranged(**{**QUICK, "init": [START]}))
 
 
 def test_units_of_depth(taken):
@@ -135,11 +136,11 @@ def test_depth_in_other_units_is_warned_of(taken, fit):
     depth = 1000.0 * depth_of(view)[..., 0]
     with pytest.warns(UserWarning, match=r"depth: expected .* multiply it by 0\.001"):
         if fit is track:
-            next(track(bracket(), [image], view, START, depth=[depth]))
+            next(track(bracket(), [image], view, START, depths=[depth], options=FitOptions(seed=0)))
         elif fit is fit_poses:
-            fit_poses([bracket()], image, view, depth=depth, **{**QUICK, "init": [START]})
+            fit_poses([bracket()], image, view, depths=depth, **arranged(**{**QUICK, "init": [START]}))
         else:
-            fit_pose(bracket(), image, view, depth=depth, **QUICK)
+            fit_pose(bracket(), image, view, depths=depth, **arranged(**QUICK))
 
 
 @pytest.mark.parametrize(
@@ -151,7 +152,7 @@ def test_a_film_begins_where_the_object_is_seen(taken, along, message):
     init = START.clone()
     init[:3, 3] -= 50.0 * view.world_to_camera[along, :3].double()
     with pytest.raises(ValueError, match=message):
-        track(bracket(), [image], view, init)  # at once
+        track(bracket(), [image], view, init, options=FitOptions(seed=0))  # at once
 
 
 def test_more_steps_are_taken_where_they_are_asked_for():
@@ -164,7 +165,7 @@ def test_more_steps_are_taken_where_they_are_asked_for():
 def test_what_is_not_explained_is_not_blamed_on_steps(taken):
     """A plain mesh has to show more of its edges than one with colours."""
     view, image = taken
-    fit = fit_pose(bracket(True), image, view, init=START, search=False, progress=False, steps=2)
+    fit = fit_pose(bracket(True), image, view, init=START, search=False, options=quiet(steps=2))
     assert 0.6 < fit.explained < CONTOUR_SUPPORT and not fit.converged, fit.explained
     assert fit.reason.startswith("edges not explained"), fit.reason
 
@@ -175,7 +176,7 @@ def test_a_picture_from_the_bottom_up_is_named(masked):
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
     options = {"mask": mask} if masked else {"background": BACKGROUND}
     with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=3, **options)
+        fit = fit_pose(bracket(), target, view, init=START, **arranged(steps=3, **options))
     assert not fit.converged
 
 
@@ -185,10 +186,12 @@ def test_masks_from_the_bottom_up_are_named():
     parameters = {"verts": 1e-4}
     options = {"masks": masks, "steps": 2, "spp": 2, "progress": False}
     with pytest.warns(UserWarning, match=r"^masks: expected the upper row first.*IoU of \d+%, as given at \d+%"):
-        fit_scene(bracket(), views, None, parameters, **options)
+        fit_scene(bracket(), None, views, parameters, **arranged(**options))
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        fit_scene(bracket(), views, None, parameters, **options | {"masks": [mask.flip(0) for mask in masks]})
+        fit_scene(
+            bracket(), None, views, parameters, **arranged(**options | {"masks": [mask.flip(0) for mask in masks]})
+        )
 
 
 BLANK = torch.zeros(64, 64, 3)
@@ -226,7 +229,9 @@ BLANK = torch.zeros(64, 64, 3)
 def test_errors_name_the_argument(change, error, message):
     something = torch.eye(64)[..., None].expand(-1, -1, 3)
     with pytest.raises(error) as caught:
-        fit_pose(**{"mesh": bracket(), "target": something, "camera": camera(), "progress": False, **change})
+        fit_pose(
+            **arranged(**{"mesh": bracket(), "target": something, "camera": camera(), "progress": False, **change})
+        )
     assert message in str(caught.value)
 
 
@@ -235,19 +240,19 @@ def test_pictures_and_masks_of_bytes_are_named():
     image = picture(view)
     bytes_ = (255 * image / image.max()).round()
     with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
-        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, steps=1, search=False, progress=False)
+        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, search=False, options=quiet(steps=1))
     resized = 40.0 + 0.7 * bytes_  # no whole numbers any more
     with pytest.warns(
         UserWarning, match=r"target: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
     ):
-        fit_pose(bracket(), resized, view, silhouette(view), init=START, steps=1, search=False, progress=False)
+        fit_pose(bracket(), resized, view, silhouette(view), init=START, search=False, options=quiet(steps=1))
     with pytest.raises(
         ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
     ):
-        fit_pose(bracket(), image, view, 255.0 * torch.eye(16), progress=False)
+        fit_pose(bracket(), image, view, 255.0 * torch.eye(16), options=quiet())
     with pytest.raises(ValueError, match=r"masks\[0\]: expected numbers from 0 to 1"):
         masks = [255.0 * torch.eye(16)]
-        fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
+        fit_scene(bracket(), None, [view], {"meshes[0].verts": 0.01}, masks=masks, options=quiet())
 
 
 def test_alpha_is_no_colour_of_a_picture():
@@ -258,9 +263,9 @@ def test_alpha_is_no_colour_of_a_picture():
         r"expected grey or colours, got 4 channels.*read_image\(path, channels=3\), or, .* x\[\.\.\., -1:\] as its mask"
     )
     with pytest.raises(ValueError, match="target: " + words):
-        fit_pose(bracket(plain=True), image, view, progress=False)
+        fit_pose(bracket(plain=True), image, view, options=quiet())
     with pytest.raises(ValueError, match="images: " + words):
-        fit_scene(bracket(plain=True), view, image, {"verts": 0.01}, loss="region", progress=False)
+        fit_scene(bracket(plain=True), image, view, {"verts": 0.01}, options=quiet(loss="region"))
 
 
 def test_faint_masks_are_named():
@@ -272,14 +277,14 @@ def test_faint_masks_are_named():
     with pytest.warns(
         UserWarning, match=r"mask: expected 1 where the object covers .* got at most 0\.216; .* read_mask"
     ):
-        fit_pose(bracket(), picture(view), view, 0.216 * mask, init=START, **options)
+        fit_pose(bracket(), picture(view), view, 0.216 * mask, init=START, **arranged(**options))
     what = {"verts": 0.01}
     with pytest.warns(UserWarning, match=r"masks: expected 1 where the object covers .* got at most 0\.00392"):
-        fit_scene(bracket(), view, None, what, masks=mask / 255, **options)
+        fit_scene(bracket(), None, view, what, masks=mask / 255, **arranged(**options))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # In one of two views the object is hardly seen.
-        fit_scene(bracket(), [view, other], None, what, masks=[mask, 0.1 * silhouette(other)], **options)
+        fit_scene(bracket(), None, [view, other], what, masks=[mask, 0.1 * silhouette(other)], **arranged(**options))
 
 
 @pytest.mark.parametrize("channels", [1, 2, 4])
@@ -287,7 +292,7 @@ def test_faint_masks_are_named():
 def test_pictures_of_scenes_have_the_channels_of_the_scene(channels, method):
     image = torch.rand(16, 16, channels)
     with pytest.raises(ValueError, match=f"images: expected 3 channels like the scene's colours, got {channels}"):
-        fit_scene(bracket(), camera(16), image, parameters={"verts": 0.1}, method=method, steps=1, progress=False)
+        fit_scene(bracket(), image, camera(16), parameters={"verts": 0.1}, options=quiet(method=method, steps=1))
 
 
 def test_pictures_of_a_texture_have_its_channels():
@@ -296,4 +301,4 @@ def test_pictures_of_a_texture_have_its_channels():
     verts = torch.cat([corners, torch.zeros(3, 1)], 1)
     mesh = eg.Mesh(verts, faces, texture=torch.rand(4, 4, 3), uvs=corners, uv_faces=faces)
     with pytest.raises(ValueError, match="images: expected 3 channels like the mesh's texture, got 4"):
-        fit_texture(mesh, camera(16), torch.rand(16, 16, 4), steps=1, progress=False)
+        fit_texture(mesh, torch.rand(16, 16, 4), camera(16), options=quiet(steps=1))

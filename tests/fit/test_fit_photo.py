@@ -9,11 +9,12 @@ import torch
 import trimesh
 from brackets import CENTER, START, about_center, bracket, camera, errors, rotation, task_of
 from photographs import clutter, coverage, depth_of, photograph
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import srgb_to_linear
-from edgegrad.fit import fit_camera, fit_pose
+from edgegrad.fit import Checkpoint, fit_camera, fit_pose
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.photo import photo_descent, photo_search
 from edgegrad.fit.pose.photo.level import photo_levels
@@ -77,7 +78,7 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     view, image = taken
     given = {"mask": {"mask": coverage(view)}, "depth": {"depth": depth_of(view)}}.get(kind, {})
     given["search"] = kind in ("colours", "plain")
-    fit = fit_pose(bracket(kind == "plain"), image, view, init=START, progress=False, **given)
+    fit = fit_pose(bracket(kind == "plain"), image, view, init=START, **arranged(**given))
     off = errors(fit)
     assert off[0] < degrees and off[1] < percent, (off, fit.explained)  # 12.3° and 8.4 % off at the start
     assert fit.explained >= photo_descent.PHOTO_SUPPORT and fit.converged == (kind != "plain")
@@ -92,7 +93,7 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
 def test_radiance_and_weights_of_any_unit(taken, unit, weight):
     view, image = taken
     given = {"init": START, "weight": torch.full(view.size, weight), "search": False, "progress": False}
-    fit = fit_pose(bracket(), unit * image, view, **given)
+    fit = fit_pose(bracket(), unit * image, view, **arranged(**given))
     off = errors(fit)
     assert off[0] < 2.5 and off[1] < 0.6 and fit.converged, (off, fit.explained)
     assert float(fit.uncertainty.degrees) == pytest.approx(2.3, abs=0.1)
@@ -109,7 +110,7 @@ def test_two_photographs_of_one_pose(taken):
         [view, other],
         init=START,
         search=False,
-        progress=False,
+        options=quiet(),
     )
     off = errors(fit)
     assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, off
@@ -119,7 +120,7 @@ def test_a_camera_in_a_photograph(taken):
     """fit_camera takes the same terms; the camera starts as far from the bracket as the bracket did from its pose."""
     view, image = taken
     moved = view.replace(world_to_camera=view.world_to_camera.double() @ START)
-    fit = fit_camera(bracket(), image, moved, focal=False, search=False, progress=False)
+    fit = fit_camera(bracket(), image, moved, focal=False, search=False, options=quiet())
     found = fit.camera.world_to_camera.double() @ torch.linalg.inv(view.world_to_camera.double())
     degrees = math.degrees(math.acos(min(1.0, (float(found[:3, :3].trace()) - 1.0) / 2.0)))
     seen, before, right = (one.project(bracket().verts) for one in (fit.camera, moved, view))
@@ -129,7 +130,7 @@ def test_a_camera_in_a_photograph(taken):
 
 def test_a_photograph_of_something_else_is_not_converged():
     view = camera(64)
-    fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, progress=False)
+    fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, options=quiet())
     assert not fit.converged and fit.explained < photo_descent.PHOTO_SUPPORT
     assert fit.reason.startswith("edges not explained")
 
@@ -151,7 +152,7 @@ def test_a_faint_contour_proves_little(step, least, most):
 @pytest.mark.slow
 def test_noise_is_refused_without_following_other_starts():
     noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
-    fit = fit_pose(bracket(), noise, camera(96), init=START, progress=False)
+    fit = fit_pose(bracket(), noise, camera(96), init=START, options=quiet())
     assert not fit.converged and fit.explained < 0.1
     assert fit.reason.startswith("edges not explained")
     finest = [step for step in fit.history if step.size == fit.history[-1].size]
@@ -161,20 +162,27 @@ def test_noise_is_refused_without_following_other_starts():
 def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
     view, image = taken
     start, whole = about_center(rotation(0.05, -0.04, 0.03)), {"progress": False, "search": False, "spp": 8, "steps": 4}
-    expected = fit_pose(bracket(), image, view, init=start, **whole)
+    expected = fit_pose(bracket(), image, view, init=start, **arranged(**whole))
 
     def stop(fit):
         if fit.steps == 5:
             raise KeyboardInterrupt
 
     file = tmp_path / "fit.pt"
-    first = fit_pose(bracket(), image, view, init=start, checkpoint=file, callback=stop, **whole)
+    first = fit_pose(bracket(), image, view, init=start, **arranged(callback=stop, checkpoint=file, **whole))
     assert first.interrupted and first.steps == 5 and not first.converged
-    found = fit_pose(bracket(), image, view, init=start, checkpoint=file, resume=True, **whole)
+    found = fit_pose(bracket(), image, view, init=start, **arranged(checkpoint=Checkpoint(file, resume=True), **whole))
     assert torch.equal(found.matrix, expected.matrix) and found.explained == expected.explained
     assert found.steps == expected.steps and found.converged == expected.converged
     with pytest.raises(ValueError, match="depth"):
-        fit_pose(bracket(), image, view, init=start, checkpoint=file, resume=True, depth=depth_of(view), **whole)
+        fit_pose(
+            bracket(),
+            image,
+            view,
+            init=start,
+            depths=depth_of(view),
+            **arranged(checkpoint=Checkpoint(file, resume=True), **whole),
+        )
 
 
 @pytest.mark.parametrize(
@@ -190,7 +198,7 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
 def test_errors_of_depth(taken, depth, error, message):
     view, image = taken
     with pytest.raises(error, match=message):
-        fit_pose(bracket(), image, view, init=START, depth=depth, progress=False)
+        fit_pose(bracket(), image, view, init=START, depths=depth, options=quiet())
 
 
 @pytest.mark.slow
@@ -204,7 +212,7 @@ def test_an_ambiguous_pose_in_unknown_light_is_not_converged():
     R = turned(torch.tensor([0.0, 0.25, 0.0], dtype=torch.float64))
     start = torch.eye(4, dtype=torch.float64)
     start[:3, :3] = turned(torch.tensor([0.05, -0.2, 0.0], dtype=torch.float64))
-    fit = fit_pose(box, photograph(view, box.transformed(R), seed=4), view, init=start, spp=8, progress=False)
+    fit = fit_pose(box, photograph(view, box.transformed(R), seed=4), view, init=start, options=quiet(spp=8))
     assert fit.explained >= photo_descent.PHOTO_SUPPORT and not fit.uncertainty.unknown and not fit.converged
     assert fit.reason.startswith("ambiguous: the pictures hardly separate it from a pose that is turned by "), (
         fit.reason
@@ -230,7 +238,7 @@ def test_an_ambiguous_pose_is_not_converged(monkeypatch):
     ):  # the colours of this clutter make the right one likelier, by a factor of some exp(2.6)
         monkeypatch.setattr(photo_search, "AMBIGUITY_NATS", least)
         monkeypatch.setattr(photo_search, "CONTOUR_AMBIGUITY_NATS", least)
-        found.append(fit_pose(box, image, view, init=start, progress=False))
+        found.append(fit_pose(box, image, view, init=start, options=quiet()))
     for fit in found:
         assert math.degrees(math.acos(min(1.0, (float((fit.R.T @ R).trace()) - 1.0) / 2.0))) < 3.0
         assert fit.explained >= photo_descent.CONTOUR_SUPPORT

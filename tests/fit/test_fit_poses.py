@@ -11,6 +11,7 @@ from brackets import CENTER, bracket, rotation, task_of
 from motions import about
 from photographs import clutter, depth_of, photograph
 from PIL import Image
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
@@ -183,7 +184,7 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
     if kind == "depth":
         given["depth"] = depth_of(view, *scene_of(2))
     meshes = [mesh.replace(face_colors=None) for mesh in MESHES[:2]] if kind == "plain" else MESHES[:2]
-    fits = fit_poses(meshes, image, view, init=STARTS[:2], progress=False, **given)
+    fits = fit_poses(meshes, image, view, init=STARTS[:2], **arranged(**given))
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=False):
         off = errors(fit, mesh, truth)
         assert off[0] < degrees and off[1] < percent, (kind, off, fit.explained)
@@ -201,7 +202,7 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
 def test_three_objects():
     view = view_of(96)
     image = photograph(view, *scene_of(3), seed=1)
-    fits = fit_poses(MESHES, image, view, init=STARTS, depth=depth_of(view, *scene_of(3)), progress=False)
+    fits = fit_poses(MESHES, image, view, init=STARTS, depths=depth_of(view, *scene_of(3)), options=quiet())
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=True):
         off = errors(fit, mesh, truth)
         assert off[0] < 0.3 and off[1] < 0.1 and fit.converged, (off, fit.explained)
@@ -211,7 +212,7 @@ def test_three_objects():
 def test_a_mesh_that_is_not_there_makes_no_other_wrong(two):
     view, image = two
     absent = at(rotation(0.2, 0.3, 0.1), CENTER + torch.tensor([-1.2, -1.0, 0.2]).double())
-    fits = fit_poses(MESHES, image, view, init=[*STARTS[:2], absent], search=False, progress=False)
+    fits = fit_poses(MESHES, image, view, init=[*STARTS[:2], absent], search=False, options=quiet())
     assert fits[0].converged and fits[1].converged and not fits[2].converged, [fit.explained for fit in fits]
     assert fits[2].explained < 0.65 and fits[2].reason.startswith(("edges not explained", "steps ran out"))
     assert errors(fits[1], MESHES[1], TRUTHS[1])[0] < 1.5
@@ -225,7 +226,7 @@ def test_a_hidden_mesh_is_said_to_be_hidden(two):
     away = torch.nn.functional.normalize(CENTER + ASIDE - eye, dim=0)
     small = box((0.3, 0.3, 0.3), seed=5)
     hidden = at(torch.eye(3).double(), CENTER + ASIDE + 1.3 * away)
-    fits = fit_poses([*MESHES[:2], small], image, view, init=[*STARTS[:2], hidden], search=False, progress=False)
+    fits = fit_poses([*MESHES[:2], small], image, view, init=[*STARTS[:2], hidden], search=False, options=quiet())
     assert fits[0].converged and fits[1].converged and not fits[2].converged
     assert fits[2].visible < 0.1 and fits[2].reason.startswith("hidden: the other objects leave"), fits[2].reason
     torch.testing.assert_close(fits[2].matrix, hidden, atol=0.05, rtol=0.0)
@@ -240,7 +241,7 @@ def test_a_stopped_fit_keeps_the_poses_so_far(two):
         if len(seen) == 3:
             raise KeyboardInterrupt
 
-    fits = fit_poses(MESHES[:2], image, view, init=STARTS[:2], callback=stop, progress=False)
+    fits = fit_poses(MESHES[:2], image, view, init=STARTS[:2], options=quiet(callback=stop))
     assert len(seen) == 3 and all(fit.interrupted and not fit.converged and fit.steps == 3 for fit in fits)
     assert all(fit.reason == "interrupted" for fit in fits)
     assert not torch.equal(fits[0].matrix, STARTS[0])
@@ -276,7 +277,7 @@ WITHIN = at(torch.eye(3).double(), CENTER + ASIDE)
 def test_errors_name_the_argument(two, meshes, given, error, message):
     view, image = two
     with pytest.raises(error, match=message):
-        fit_poses(meshes, image, view, progress=False, **given)
+        fit_poses(meshes, image, view, **arranged(**given))
 
 
 @pytest.mark.slow
@@ -354,7 +355,7 @@ def test_what_covers_an_object_is_found_by_its_light(covered, strength):
 @pytest.mark.slow
 def test_a_quarter_covered(covered):
     view, image, _, _ = covered
-    fit = fit_pose(bracket(), image, view, init=STARTS[0], progress=False)
+    fit = fit_pose(bracket(), image, view, init=STARTS[0], options=quiet())
     off = errors(fit, MESHES[0], TRUTHS[0])
     assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, (off, fit.explained)
 
@@ -379,11 +380,11 @@ def test_two_meshes_that_end_in_one_place_have_not_converged():
     neighbour = moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
     image = photograph(view, *scene_of(1), seed=4)
     starts = [TRUTHS[0], neighbour]
-    fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, spp=8, steps=2, search=False, progress=False)
+    fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, search=False, options=quiet(spp=8, steps=2))
     for k, fit in enumerate(fits):
         assert not fit.converged and fit.reason.startswith(f"in one place: meshes[{k}] ends where")
     apart = [TRUTHS[0], moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (2.5, 0.02, 0.02))]
-    fits = fit_poses([MESHES[0]] * 2, image, view, init=apart, spp=8, steps=2, search=False, progress=False)
+    fits = fit_poses([MESHES[0]] * 2, image, view, init=apart, search=False, options=quiet(spp=8, steps=2))
     assert not any(fit.reason.startswith("in one place") for fit in fits)
 
 
@@ -391,6 +392,6 @@ def test_two_meshes_that_end_in_one_place_have_not_converged():
 def test_a_direction_that_contours_do_not_show_is_unknown():
     view = view_of(96)
     plain = [mesh.replace(face_colors=None) for mesh in MESHES[:2]]
-    first, _ = fit_poses(plain, photograph(view, *scene_of(2), seed=2), view, init=STARTS[:2], spp=8, progress=False)
+    first, _ = fit_poses(plain, photograph(view, *scene_of(2), seed=2), view, init=STARTS[:2], options=quiet(spp=8))
     assert not first.converged and first.uncertainty is not None and first.uncertainty.unknown
     assert first.reason.startswith("directions unknown")

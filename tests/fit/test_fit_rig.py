@@ -11,15 +11,16 @@ from typing import Any
 import pytest
 import torch
 from arms import TRUTH, arm, degrees, shown, views
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import fit_rig, priors, track_rig
+from edgegrad.fit import Checkpoint, FitOptions, fit_rig, priors, track_rig
 
 
 def test_a_pose_from_masks() -> None:
     rig, cameras = arm(), views(32)
     masks = shown(rig.posed(TRUTH, translation=[0.05, 0.0, -0.1]), cameras)
-    found = fit_rig(rig, cameras, masks=masks, tries=0, coarsest=32, progress=False)
+    found = fit_rig(rig, None, cameras, masks=masks, search=0, options=quiet(coarsest=32))
     assert found.converged and degrees(found.values["rotations"], TRUTH) < 2.0
     assert torch.allclose(found.values["translation"], torch.tensor([0.05, 0.0, -0.1]).double(), atol=0.02)
     assert torch.allclose(found.posed().verts, found.fit.mesh.verts, atol=1e-6)
@@ -36,7 +37,7 @@ def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
     rig, cameras = arm(colored=True).with_limits(rotations={"bone 1": ([-0.2] * 3, [0.2] * 3)}), views()
     pictures = shown(rig.posed(TRUTH), cameras, "image")
     options = {"seek": ["rotations"], "joints": ["bone 1"], "start": {"rotations": {"bone 0": TRUTH[0]}}, "tries": 0}
-    found = fit_rig(rig, cameras, pictures, progress=False, steps=5, **options)
+    found = fit_rig(rig, pictures, cameras, **arranged(steps=5, **options))
     assert (
         torch.allclose(found.values["rotations"][0], TRUTH[0])
         and found.values["rotations"][1].abs().max() <= 0.2 + 1e-12
@@ -61,12 +62,12 @@ def test_a_pose_from_photographs_without_masks() -> None:
     rig, cameras = arm(), views(48)
     _, photos = photographs(rig, cameras, 5)
     start = {"rotations": 0.5 * TRUTH}
-    found = fit_rig(rig, cameras, photos, loss="region", start=start, coarsest=24, progress=False)
+    found = fit_rig(rig, photos, cameras, init=start, options=quiet(loss="region", coarsest=24))
     assert degrees(0.5 * TRUTH, TRUTH) > 15.0 and degrees(found.values["rotations"], TRUTH) < 5.0
     assert found.converged and all(view.by_region for view in found.fit.views)
     far = {"translation": [50.0, 0.0, 0.0]}
     with pytest.raises(ValueError, match="expected an object that the pictures show at the start"):
-        fit_rig(rig, cameras, photos, loss="region", start=far, progress=False)
+        fit_rig(rig, photos, cameras, init=far, options=quiet(loss="region"))
 
 
 @pytest.mark.slow
@@ -76,7 +77,7 @@ def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
     posed, photos = photographs(rig, cameras, 1)
     start = {"rotations": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.6]]).double()}
     options = {"loss": "region", "start": start, "progress": False}
-    alone, helped = (fit_rig(rig, cameras, photos, tries=n, **options) for n in (0, 40))
+    alone, helped = (fit_rig(rig, photos, cameras, search=n, **arranged(**options)) for n in (0, 40))
     off = [float((fit.posed().verts - posed.verts).norm(dim=1).max()) for fit in (alone, helped)]
     assert off[0] > 0.5 and not alone.converged and "bone 1" in alone.reason
     assert off[1] < 0.1 and helped.converged
@@ -93,9 +94,7 @@ def test_keypoints_find_what_masks_do_not() -> None:
     seen[1, 1] = math.nan
     masks = shown(rig.posed(truth), cameras)
     given = {f"bone {k}": seen[k] for k in range(3)}
-    found = fit_rig(
-        rig, cameras, masks=masks, keypoints=given, keypoint_weight=0.1, tries=0, coarsest=48, steps=30, progress=False
-    )
+    found = fit_rig(rig, None, cameras, masks=masks, keypoints=given, search=0, options=quiet(coarsest=48, steps=30))
     assert (found.rig.shape({"rotations": found.values["rotations"]}).joints - joints).norm(dim=1).max() < 0.1
 
 
@@ -113,7 +112,7 @@ def test_a_limb_is_found_from_new_starts() -> None:
         "seek": ["rotations"],
         "steps": 8,
     }
-    alone, helped = (fit_rig(rig, cameras, tries=tries, **options) for tries in (0, 6))
+    alone, helped = (fit_rig(rig, None, cameras, search=tries, **arranged(**options)) for tries in (0, 6))
     assert helped.loss < 0.3 * alone.loss and not alone.converged
 
 
@@ -123,7 +122,7 @@ def test_ctrl_c_in_the_search_of_limbs_keeps_the_descent(monkeypatch) -> None:
 
     monkeypatch.setattr("edgegrad.fit.rig.limbs.LimbSearch.run", stop)
     rig, cameras = arm(), views(32, 2)
-    found = fit_rig(rig, cameras, masks=shown(rig.posed(TRUTH), cameras), steps=2, progress=False)
+    found = fit_rig(rig, None, cameras, masks=shown(rig.posed(TRUTH), cameras), options=quiet(steps=2))
     assert found.fit.interrupted and not found.converged
     assert float(found.values["rotations"].abs().max()) > 0.05  # of the descent before
 
@@ -133,7 +132,7 @@ def test_a_sequence() -> None:
     rig, cameras = arm(), views()
     truths = [TRUTH * 0.25 * k for k in range(4)]
     frames = [{"masks": shown(rig.posed(truth), cameras)} for truth in truths]
-    found = list(track_rig(rig, cameras, frames, start={}, tries=0, steps=8, progress=False))
+    found = list(track_rig(rig, frames, cameras, init={}, search=0, options=quiet(steps=8)))
     errors = [degrees(one.values["rotations"], truth) for one, truth in zip(found, truths, strict=True)]
     assert max(errors) < 3.0
 
@@ -159,7 +158,16 @@ def test_what_a_frame_misses_is_searched_once(monkeypatch, loss: float, angles: 
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.fit_rig", fit)
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.MOTION_SHARE", 0.0)
     start = {"rotations": torch.zeros(2, 3, dtype=torch.float64)}
-    found = list(track_rig(arm(), views(16, 1), [{}, {}, {}], start=start, again=5, checkpoint="a.ckpt", resume=True))
+    found = list(
+        track_rig(
+            arm(),
+            [{}, {}, {}],
+            views(16, 1),
+            init=start,
+            again=5,
+            options=FitOptions(seed=0, checkpoint=Checkpoint("a.ckpt", resume=True)),
+        )
+    )
     assert [float(one.values["rotations"][0, 0]) for one in found] == angles
     assert [tries for tries, _ in calls] == [None, 0, 5, 0]
 
@@ -168,7 +176,7 @@ def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
     rig, cameras = arm(), views(16, 2)
     frames = [{"masks": shown(rig.posed(TRUTH * k), cameras)} for k in (0.1, 0.2)]
     options = {"tries": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
-    first, again = (list(track_rig(rig, cameras, frames, start={}, resume=True, **options)) for _ in range(2))
+    first, again = (list(track_rig(rig, frames, cameras, init={}, **arranged(**options))) for _ in range(2))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["walk-0001.ckpt", "walk-0002.ckpt"]
     for a, b in zip(first, again, strict=True):
         assert torch.equal(a.values["rotations"], b.values["rotations"])
@@ -177,19 +185,19 @@ def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
         (TypeError, r"frames\[0\]: expected arguments by name", {"frames": [frames[0]["masks"]]}),
     ):
         with pytest.raises(error, match=message):
-            next(track_rig(rig, cameras, **given))
+            next(track_rig(rig, cameras, **arranged(**given)))
 
 
 def test_a_start_within_limits_that_leave_out_rest() -> None:
     rig, cameras = arm().with_limits(rotations={"bone 1": ([0.1] * 3, [0.6] * 3)}), views(16, 2)
-    found = fit_rig(rig, cameras, masks=shown(rig.posed(TRUTH.abs()), cameras), tries=0, steps=1, progress=False)
+    found = fit_rig(rig, None, cameras, masks=shown(rig.posed(TRUTH.abs()), cameras), search=0, options=quiet(steps=1))
     assert float(found.values["rotations"][1].min()) >= 0.1
 
 
 def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
     rig, cameras = arm(), views(32, 2)
     options = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
-    whole = fit_rig(rig, cameras, **options)
+    whole = fit_rig(rig, None, cameras, **arranged(**options))
     count = 0
 
     def stop(record: object) -> None:
@@ -199,9 +207,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
             raise KeyboardInterrupt
 
     path = tmp_path / "checkpoint.pt"
-    half = fit_rig(rig, cameras, checkpoint=path, callback=stop, **options)
+    half = fit_rig(rig, None, cameras, **arranged(callback=stop, checkpoint=path, **options))
     assert half.fit.interrupted and half.reason == "interrupted"
-    rest = fit_rig(rig, cameras, checkpoint=path, resume=True, **options)
+    rest = fit_rig(rig, None, cameras, **arranged(checkpoint=Checkpoint(path, resume=True), **options))
     assert torch.equal(rest.values["rotations"], whole.values["rotations"]) and len(rest.history) == len(whole.history)
     assert "pose.json" in rest.save(tmp_path / "out", figures=False)
 
@@ -277,4 +285,4 @@ def test_errors_name_the_argument() -> None:
     ):
         given = {"rig": rig, "cameras": cameras, "masks": masks, "progress": False, **change}
         with pytest.raises(error, match=message):
-            fit_rig(**given)
+            fit_rig(**arranged(**given))

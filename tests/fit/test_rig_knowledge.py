@@ -7,9 +7,10 @@ import math
 import pytest
 import torch
 from arms import arm, shown, views
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import Options, Parameter, fit_rig
+from edgegrad.fit import Options, fit_rig
 from edgegrad.fit.descent.curvature import curvature, derivatives
 from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.rig.joint_support import edge_support_by_joint, left_out
@@ -93,13 +94,12 @@ def test_what_no_picture_shows_is_unknown() -> None:
     camera.world_to_camera[1, 3] += 2.2  # of the upper limb hardly anything is seen
     fit = fit_rig(
         rig,
+        None,
         camera,
         masks=shown(rig.posed(), [camera]),
         seek=["rotations"],
-        tries=0,
-        coarsest=32,
-        steps=3,
-        progress=False,
+        search=0,
+        options=quiet(coarsest=32, steps=3),
     )
     assert fit.uncertainty is not None and fit.uncertainty.degrees["bone 1"] > 5.0
     assert "bone 1 known to ±" in fit.uncertainty.unknown
@@ -120,10 +120,10 @@ def test_light_is_found_with_the_pose() -> None:
     start = torch.zeros_like(light)
     start[0] = 2.0
     options = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
-    found = fit_rig(rig, cameras, pictures, parameters={"light": Parameter(0.2, start)}, **options)
+    found = fit_rig(rig, pictures, cameras, **arranged(**options))
     assert math.degrees(float((found.values["rotations"] - truth).norm(dim=1).max())) < 5.0
     assert torch.allclose(found.fit.values["light"][:4], light[:4], atol=0.3) and "light" not in found.values
     with pytest.raises(ValueError, match="parameters: expected names that the rig does not have, got 'rotations'"):
-        fit_rig(rig, cameras, pictures, parameters={"rotations": Parameter(0.2, start)}, **options)
+        fit_rig(rig, pictures, cameras, **arranged(**options))
     with pytest.raises(TypeError, match=r"parameters\['light'\]: expected a Parameter, got float"):
-        fit_rig(rig, cameras, pictures, parameters={"light": 0.2}, **options)
+        fit_rig(rig, pictures, cameras, **arranged(**options))
