@@ -17,7 +17,8 @@ def one_for_each(name: str, given: Any, count: int, dims: int) -> list[Any]:
     if shape is None:
         several = isinstance(given, Sequence) and not isinstance(given, str)
     else:  # (H, W, 1) is one mask.
-        several = len(shape) > dims and not (len(shape) == 3 and shape[-1] == 1 and len(given) != count)
+        one = len(shape) == 3 and len(given) != count and (count == 1 or shape[-1] == 1)
+        several = len(shape) > dims and not one
     each = list(given) if several else [given]
     if len(each) != count:
         got = str(len(each)) if shape is None else f"{len(each)} in shape {shape_text(shape)}"

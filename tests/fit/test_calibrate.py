@@ -228,8 +228,8 @@ ONE = taken(1, 16)[0]
     "change, message",
     [
         ({"mesh": 3}, "mesh: expected a Mesh or a Scene, got int"),
-        ({"cameras": 3}, "cameras: expected a list of cameras, got int"),
-        ({"cameras": []}, "cameras: expected one for each picture, got none"),
+        ({"cameras": 3}, "cameras: expected a Camera or a sequence of them, got int"),
+        ({"cameras": []}, "cameras: expected one for each picture, got an empty list"),
         ({"cameras": [ONE, 3]}, "cameras[1]: expected a Camera, got int"),
         ({"cameras": [ONE]}, "images: expected "),
         ({"cameras": [ONE, ONE.resized((16, 20))]}, "cameras[1]: expected perspective, 16 × 16 pixels, like cameras[0]"),
@@ -239,14 +239,14 @@ ONE = taken(1, 16)[0]
         ({"distortion": 9}, "distortion: expected at most 8 for a camera that is perspective, got 9"),
         ({"distortion": -1}, "distortion: expected"),
         ({"principal": 1}, "principal: expected True or False"),
-        ({"images": None}, "images: expected a picture, or a masks"),
+        ({"images": None}, "images: expected pictures or masks to compare with"),
         ({"images": torch.rand(3, 16, 16, 3)}, "images: expected 2, one for each camera, got 3"),
         ({"images": [torch.rand(16, 16, 3), torch.rand(8, 8, 3)]}, "images[1]: expected "),
         ({"masks": [torch.ones(16, 16)]}, "masks: expected 2, one for each camera, got 1"),
         ({"masks": 2 * [torch.zeros(9, 9)]}, "masks[0]: expected "),
         ({"max_size": 2}, "max_size: expected"),
-        ({"resume": True}, "resume: expected a checkpoint"),
-        ({"callback": 3}, "callback: expected a function of a Calibration"),
+        ({"loss": "l1"}, "options.loss: calibrate has a loss of its own; leave it out"),
+        ({"callback": 3}, "callback: expected a function of the result so far"),
     ],
 )  # fmt: skip
 def test_errors_of_calibrate(change: dict, message: str) -> None:

@@ -17,7 +17,7 @@ from brackets import (
     rotation,
     silhouette,
 )
-from quiet_fits import arranged, quiet
+from quiet_fits import quiet
 
 import edgegrad as eg
 from edgegrad.fit import FitOptions, PoseFit, fit_pose
@@ -143,13 +143,15 @@ def test_a_picture_larger_than_max_size_is_reduced():
     fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(max_size=32, steps=12))
     assert max(max(step.size) for step in fit.history) == 32
     assert max(errors(fit)) < 1.5
-    assert fit.camera is view
+    assert torch.equal(fit.camera.K, view.K) and fit.camera.size == view.size
 
 
 def test_the_same_seed_gives_the_same_fit():
     view = camera(24)
-    given = {"init": START, "background": BACKGROUND, "steps": 2, "search": False, "progress": False}
-    fits = [fit_pose(bracket(), picture(view), view, **arranged(seed=seed, **given)) for seed in (3, 3, 4)]
+    fits = [
+        fit_pose(before_sky(), picture(view), view, init=START, search=False, options=quiet(steps=2, seed=seed))
+        for seed in (3, 3, 4)
+    ]
     assert torch.equal(fits[0].matrix, fits[1].matrix)
     assert not torch.equal(fits[0].matrix, fits[2].matrix)
 

@@ -10,6 +10,7 @@ from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.fit import fit_camera
+from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.robust_loss import Comparison
 from edgegrad.fit.pose.task import STEP_PARTS
 
@@ -45,8 +46,7 @@ def test_the_history_of_a_camera(tmp_path):
     start = started_aside(true, 1.05)
 
     def fit(**options):
-        given = {"background": BACKGROUND, "steps": 4, "progress": False, **options}
-        return fit_camera(bracket(), picture(true), start, **arranged(**given))
+        return fit_camera(before_sky(), picture(true), start, **arranged(**{"steps": 4, **options}))
 
     whole = fit()
     history = whole.history
@@ -80,7 +80,7 @@ def test_the_gradient_in_the_history():
     )  # fmt: skip
     task, first, h = fit.search.task, fit.search.history[0], 2e-3
     assert task is not None
-    level = task.pyramid(first.pose, 512, 64)[0]
+    level = task.pyramid(first.pose, Settings(max_size=512, spp=64))[0]
     assert level.size == first.size
 
     def loss(entry, step, c=None):
@@ -134,20 +134,20 @@ def test_a_rig_of_cameras(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"camera": 3}, "camera: expected a Camera"),
-        ({"camera": []}, "camera: expected at least one"),
-        ({"camera": [camera(8), camera(8)]}, "image: expected 2, one for each camera"),
+        ({"cameras": 3}, "cameras: expected a Camera"),
+        ({"cameras": []}, "cameras: expected one for each picture"),
+        ({"cameras": [camera(8), camera(8)]}, "images: expected 2, one for each camera"),
         ({"distortion": 9}, "distortion: expected at most 8 for a camera that is perspective"),
         ({"focal": 1}, "focal: expected True or False"),
-        ({"image": None}, "image: expected a picture, or a mask"),
-        ({"image": torch.zeros(8, 9, 3)}, "image: expected "),
-        ({"image": torch.ones(8, 8, 3)}, "image: expected "),
-        ({"image": None, "mask": torch.zeros(9, 8)}, "mask: expected "),
+        ({"images": None}, "images: expected pictures or masks"),
+        ({"images": torch.zeros(8, 9, 3)}, "images: expected "),
+        ({"images": torch.ones(8, 8, 3)}, "images: expected "),
+        ({"images": None, "masks": torch.zeros(9, 8)}, "masks: expected "),
         ({"scene": 3}, "scene: expected a Mesh or a Scene"),
     ],
 )
 def test_errors_of_fit_camera(change, message):
-    arguments = {"scene": bracket(), "image": torch.zeros(8, 8, 3), "camera": camera(8), "progress": False, **change}
+    arguments = {"scene": bracket(), "images": torch.zeros(8, 8, 3), "cameras": camera(8), "progress": False, **change}
     with pytest.raises((TypeError, ValueError)) as caught:
         fit_camera(**arranged(**arguments))
     assert message in str(caught.value)

@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from brackets import BACKGROUND, START, about_center, bracket, camera, picture, silhouette
+from brackets import START, about_center, before_sky, bracket, camera, picture, silhouette
 from photographs import coverage, depth_of, photograph
 from quiet_fits import arranged, quiet
 
@@ -38,9 +38,9 @@ def one_pixel(value=1.0):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"weight": torch.zeros(SIZE, SIZE)}, r"weight: expected numbers above 0 somewhere, got zero"),
-        ({"mask": one_pixel()}, r"mask: expected the object in 10 pixels or more, got it in 1;"),
-        ({"mask": one_pixel(), "init": None}, r"mask: expected the object in 10 pixels"),
+        ({"weights": torch.zeros(SIZE, SIZE)}, r"weights: expected numbers above 0 somewhere, got zero"),
+        ({"masks": one_pixel()}, r"masks: expected the object in 10 pixels or more, got it in 1;"),
+        ({"masks": one_pixel(), "init": None}, r"masks: expected the object in 10 pixels"),
         ({"max_size": 1}, r"max_size: expected an int from 8 "),
     ],
 )
@@ -48,9 +48,9 @@ def test_what_shows_nothing_is_named(taken, given, message):
     view, image = taken
     with pytest.raises(ValueError, match=message):
         fit_pose(bracket(), image, view, **arranged(**{**QUICK, **given}))
-    if "mask" in given:
-        given = {**given, "mask": given["mask"].int()}
-    with pytest.raises(ValueError, match=message.replace("mask:", r"mask\[0\]:")):
+    if "masks" in given:
+        given = {**given, "masks": given["masks"].int()}
+    with pytest.raises(ValueError, match=message.replace("masks:", r"masks\[0\]:")):
         fit_poses([bracket()], image, view, **arranged(**{**QUICK, **given, "init": [START]}))
 
 
@@ -59,9 +59,9 @@ def test_what_shows_nothing_is_named(taken, given, message):
 def test_a_tiny_picture_is_named(side, plain):
     picture = torch.rand(side, side, 3, generator=torch.Generator().manual_seed(0))
     message = rf"{{}}: expected a picture of 8 × 8 pixels or more, got {side} × {side}"
-    with pytest.raises(ValueError, match=message.format("target")):
+    with pytest.raises(ValueError, match=message.format("images")):
         fit_pose(bracket(plain), picture, camera(side), **arranged(**QUICK))
-    with pytest.raises(ValueError, match=message.format("image")):
+    with pytest.raises(ValueError, match=message.format("images")):
         fit_camera(bracket(plain), picture, camera(side), options=quiet())
 
 
@@ -76,12 +76,12 @@ def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
         (labels, several), (one, several), (one[..., None], several), ([one.astype(np.uint8)], several), (one[None], several),
         (masks, several), ([[m] for m in masks], several), ([m[None].numpy() for m in masks], several),
     ):  # fmt: skip
-        for own, expected in zip(_masks(mask, 2, cameras), masks, strict=True):
+        for own, expected in zip(_masks(mask, 2, [view]), masks, strict=True):
             picture = torch.zeros(SIZE, SIZE, 3)
-            ((_, _, _, found, _),) = shots_of(cameras, picture, own, None, ArgumentNames())
+            ((_, _, _, found, _),) = shots_of(picture, cameras, own, None, ArgumentNames())
             assert torch.equal(torch.as_tensor(found).reshape(SIZE, SIZE), expected), (type(mask), cameras)
     for target in (torch.zeros(SIZE, SIZE, 3), np.zeros((1, SIZE, SIZE, 3)), [np.zeros((SIZE, SIZE, 3))]):
-        ((_, _, found, _, _),) = shots_of([view], target, None, None, ArgumentNames())
+        ((_, _, found, _, _),) = shots_of(target, [view], None, None, ArgumentNames())
         assert found.shape == (SIZE, SIZE, 3)
 
 
@@ -95,9 +95,9 @@ def test_poses_to_start_from_may_be_an_array(taken):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"mask": torch.ones(9, 9).int()}, r"mask: expected shape \(48, 48\) .*, got \(9, 9\); an image of labels"),
-        ({"mask": np.ones((9, 9), int)}, r"mask: expected shape \(48, 48\) .*, got \(9, 9\)"),
-        ({"mask": np.ones((SIZE, SIZE))}, r"mask: expected an image of labels, of integers.*float64"),
+        ({"masks": torch.ones(9, 9).int()}, r"masks: expected shape \(48, 48\) .*, got \(9, 9\); an image of labels"),
+        ({"masks": np.ones((9, 9), int)}, r"masks: expected shape \(48, 48\) .*, got \(9, 9\)"),
+        ({"masks": np.ones((SIZE, SIZE))}, r"masks: expected an image of labels, of integers.*float64"),
         ({"init": START}, r"init: expected a list with one for each mesh, got Tensor; give \[init\]"),
     ],
 )
@@ -109,11 +109,11 @@ def test_errors_of_labels(taken, given, message):
 
 def test_one_picture_for_two_cameras(taken):
     view, image = taken
-    with pytest.raises(ValueError, match=r"target: expected 2, one for each camera, got one of shape \(48, 48, 3\)"):
+    with pytest.raises(ValueError, match=r"images: expected 2, one for each camera, got 1 in shape \(48, 48, 3\)"):
         fit_pose(bracket(), image, [view, view], **arranged(**QUICK))
     mask = coverage(view)[..., 0]
     for given in (mask, [mask]):
-        with pytest.raises(ValueError, match=r"mask.*: expected 2, one for each camera, got one of shape \(48, 48\)"):
+        with pytest.raises(ValueError, match=r"masks.*: expected 2, one for each camera, got 1"):
             fit_poses([bracket()], [image] * 2, [view] * 2, given, **arranged(**{**QUICK, "init": [START]}))
 
 
@@ -122,7 +122,7 @@ def test_units_of_depth(taken):
     depth, scene = depth_of(view)[..., 0], eg.Scene([bracket()])
     depth[depth == 0.0] = torch.nan
     for factor, scale in ((1e-3, r"1e\+03"), (10.0, r"0\.1"), (6.56, r"0\.15")):
-        with pytest.warns(UserWarning, match=rf"depth: expected distances in world units.* multiply it by {scale}"):
+        with pytest.warns(UserWarning, match=rf"depths: expected distances in world units.* multiply it by {scale}"):
             warn_of_units(scene, [view], [factor * depth], "at the start")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -134,7 +134,7 @@ def test_units_of_depth(taken):
 def test_depth_in_other_units_is_warned_of(taken, fit):
     view, image = taken
     depth = 1000.0 * depth_of(view)[..., 0]
-    with pytest.warns(UserWarning, match=r"depth: expected .* multiply it by 0\.001"):
+    with pytest.warns(UserWarning, match=r"depths: expected .* multiply it by 0\.001"):
         if fit is track:
             next(track(bracket(), [image], view, START, depths=[depth], options=FitOptions(seed=0)))
         elif fit is fit_poses:
@@ -174,9 +174,9 @@ def test_what_is_not_explained_is_not_blamed_on_steps(taken):
 def test_a_picture_from_the_bottom_up_is_named(masked):
     view = camera(24)
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
-    options = {"mask": mask} if masked else {"background": BACKGROUND}
-    with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(bracket(), target, view, init=START, **arranged(steps=3, **options))
+    options = {"masks": mask} if masked else {}
+    with pytest.warns(UserWarning, match=r"^images: expected the upper row first.*image\.flip\(0\)"):
+        fit = fit_pose(before_sky(), target, view, init=START, **arranged(steps=3, **options))
     assert not fit.converged
 
 
@@ -201,36 +201,35 @@ BLANK = torch.zeros(64, 64, 3)
     "change, error, message",
     [
         ({"mesh": "bracket.obj"}, TypeError, "mesh: expected a Mesh or a Scene, got str"),
-        ({"target": torch.zeros(32, 64, 3)}, ValueError, "target: expected shape (64, 64, C), got (32, 64, 3)"),
-        ({"target": torch.zeros(64, 64, 4)}, ValueError, "target: expected 3 channels"),
-        ({"target": [BLANK] * 2}, ValueError, "target: expected one, for the one camera, got a list of 2"),
-        ({"target": BLANK}, ValueError, "target: expected a picture of the object, got the same in every"),
-        ({"target": BLANK, "mask": torch.ones(64, 64)}, ValueError, "mask: expected a picture of the object"),
-        ({"target": torch.full((64, 64, 3), math.nan)}, ValueError, "target: expected finite"),
-        ({"target": "photo.png"}, TypeError, "target: expected an image (H, W, C) of numbers, got the path 'photo.png'; read"),
-        ({"target": None}, TypeError, "target: expected an image (H, W, C) of numbers, got None; read one with read_image"),
-        ({"camera": np.eye(4)}, TypeError, "camera: expected a Camera, got ndarray"),
-        ({"camera": eg.Camera.stack([camera(), camera()])}, ValueError, "camera: expected one camera, got 2"),
-        ({"camera": []}, ValueError, "camera: expected at least one"),
-        ({"mask": torch.ones(8, 8)}, ValueError, "mask: expected shape (64, 64) or (64, 64, 1), got (8, 8)"),
-        ({"camera": [camera()], "target": [BLANK], "mask": [torch.ones(4, 4)]}, ValueError, "mask[0]: expected"),
-        ({"mask": torch.ones(64, 64), "background": 0.0}, ValueError, "background: expected None with a mask"),
-        ({"background": torch.ones(2)}, ValueError, "background: expected shape (3,) or (64, 64, 3), got (2,)"),
-        ({"weight": -torch.ones(64, 64)}, ValueError, "weight: expected numbers from 0 up"),
-        ({"weight": torch.ones(64, 64, 3)}, ValueError, "weight: expected shape (64, 64) or (64, 64, 1)"),
+        ({"images": torch.zeros(32, 64, 3)}, ValueError, "images: expected shape (64, 64, C), got (32, 64, 3)"),
+        ({"images": torch.zeros(64, 64, 4)}, ValueError, "images: expected 3 channels"),
+        ({"images": [BLANK] * 2}, ValueError, "images: expected 1, one for each camera, got 2; give as many cameras"),
+        ({"images": BLANK}, ValueError, "images: expected a picture of the object, got the same in every"),
+        ({"images": BLANK, "masks": torch.ones(64, 64)}, ValueError, "masks: expected a picture of the object"),
+        ({"images": torch.full((64, 64, 3), math.nan)}, ValueError, "images: expected finite"),
+        ({"images": "photo.png"}, TypeError, "images: expected an image (H, W, C) of numbers, got the path 'photo.png'; read"),
+        ({"images": None}, ValueError, "images: expected pictures or masks to compare with, got neither"),
+        ({"cameras": np.eye(4)}, TypeError, "cameras: expected a Camera or a sequence of them, got ndarray"),
+        ({"cameras": eg.Camera.stack([camera(), camera()])}, ValueError, "images: expected 2, one for each camera"),
+        ({"cameras": []}, ValueError, "cameras: expected one for each picture, got an empty list"),
+        ({"masks": torch.ones(8, 8)}, ValueError, "masks: expected shape (64, 64) or (64, 64, 1), got (8, 8)"),
+        ({"cameras": [camera()], "images": [BLANK], "masks": [torch.ones(4, 4)]}, ValueError, "masks: expected"),
+        ({"mesh": eg.Scene([bracket()], torch.ones(9, 9, 3))}, ValueError, "background: expected shape"),
+        ({"weights": -torch.ones(64, 64)}, ValueError, "weights: expected numbers from 0 up"),
+        ({"weights": torch.ones(64, 64, 3)}, ValueError, "weights: expected shape (64, 64) or (64, 64, 1)"),
         ({"init": torch.eye(3)}, ValueError, "init: expected shape (4, 4), got (3, 3)"),
         ({"init": about_center(torch.eye(3).double(), (20.0, 0.0, -8.0))}, ValueError, "init: expected a pose at which"),
         ({"init": about_center(torch.eye(3).double(), (3.0, 3.0, 9.0))}, ValueError, "init: expected the object in front"),
         ({"steps": 0}, ValueError, "steps: expected an int from 1"),
         ({"spp": 1.5}, TypeError, "spp: expected an int"),
-        ({"tolerance": 0.0}, ValueError, "tolerance: expected a number above 0 and below 1, got 0"),
+        ({"step_tolerance": 0.0}, ValueError, "step_tolerance: expected a number from 1e-30 to 1, got 0"),
     ],
 )  # fmt: skip
 def test_errors_name_the_argument(change, error, message):
     something = torch.eye(64)[..., None].expand(-1, -1, 3)
     with pytest.raises(error) as caught:
         fit_pose(
-            **arranged(**{"mesh": bracket(), "target": something, "camera": camera(), "progress": False, **change})
+            **arranged(**{"mesh": bracket(), "images": something, "cameras": camera(), "progress": False, **change})
         )
     assert message in str(caught.value)
 
@@ -239,18 +238,18 @@ def test_pictures_and_masks_of_bytes_are_named():
     view = camera(16)
     image = picture(view)
     bytes_ = (255 * image / image.max()).round()
-    with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
+    with pytest.warns(UserWarning, match=r"images: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
         fit_pose(bracket(), bytes_, view, silhouette(view), init=START, search=False, options=quiet(steps=1))
     resized = 40.0 + 0.7 * bytes_  # no whole numbers any more
     with pytest.warns(
-        UserWarning, match=r"target: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
+        UserWarning, match=r"images: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
     ):
         fit_pose(bracket(), resized, view, silhouette(view), init=START, search=False, options=quiet(steps=1))
     with pytest.raises(
-        ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
+        ValueError, match=r"masks: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
     ):
         fit_pose(bracket(), image, view, 255.0 * torch.eye(16), options=quiet())
-    with pytest.raises(ValueError, match=r"masks\[0\]: expected numbers from 0 to 1"):
+    with pytest.raises(ValueError, match=r"masks: expected numbers from 0 to 1"):
         masks = [255.0 * torch.eye(16)]
         fit_scene(bracket(), None, [view], {"meshes[0].verts": 0.01}, masks=masks, options=quiet())
 
@@ -262,7 +261,7 @@ def test_alpha_is_no_colour_of_a_picture():
     words = (
         r"expected grey or colours, got 4 channels.*read_image\(path, channels=3\), or, .* x\[\.\.\., -1:\] as its mask"
     )
-    with pytest.raises(ValueError, match="target: " + words):
+    with pytest.raises(ValueError, match="images: " + words):
         fit_pose(bracket(plain=True), image, view, options=quiet())
     with pytest.raises(ValueError, match="images: " + words):
         fit_scene(bracket(plain=True), image, view, {"verts": 0.01}, options=quiet(loss="region"))
@@ -275,7 +274,7 @@ def test_faint_masks_are_named():
     view, other = camera(16), camera(16, distance=2.6)
     mask, options = silhouette(view), {"callback": stop, "progress": False}
     with pytest.warns(
-        UserWarning, match=r"mask: expected 1 where the object covers .* got at most 0\.216; .* read_mask"
+        UserWarning, match=r"masks: expected 1 where the object covers .* got at most 0\.216; .* read_mask"
     ):
         fit_pose(bracket(), picture(view), view, 0.216 * mask, init=START, **arranged(**options))
     what = {"verts": 0.01}

@@ -15,6 +15,7 @@ import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import Checkpoint, fit_camera, fit_pose
+from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.photo import photo_descent, photo_search
 from edgegrad.fit.pose.photo.level import photo_levels
@@ -39,7 +40,8 @@ def test_a_result_is_judged_by_the_limit_of_the_terms_that_it_is_from(photograph
     """Colours that show 62 % of the edges converged, though the terms of photographs would need more."""
     view = camera(48)
     image = eg.render(eg.Scene([bracket()], torch.tensor([0.1, 0.2, 0.3])), view, spp=16)
-    search = photo_search.PhotoSearch(task_of(image, view), pose_from_matrix("pose", START), [None], 48, 8, 10, 1e-3, 0)
+    few = Settings(steps=10, step_tolerance=1e-3, spp=8, max_size=48)
+    search = photo_search.PhotoSearch(task_of(image, view), pose_from_matrix("pose", START), [None], few)
     assert search.colors_first
     colors = SimpleNamespace(
         best=search.start, loss=1.0, edge_support=0.62, converged=True, information=None, enough=0.6, history=[]
@@ -76,7 +78,7 @@ def taken():
 )
 def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     view, image = taken
-    given = {"mask": {"mask": coverage(view)}, "depth": {"depth": depth_of(view)}}.get(kind, {})
+    given = {"mask": {"masks": coverage(view)}, "depth": {"depths": depth_of(view)}}.get(kind, {})
     given["search"] = kind in ("colours", "plain")
     fit = fit_pose(bracket(kind == "plain"), image, view, init=START, **arranged(**given))
     off = errors(fit)
@@ -92,7 +94,7 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
 @pytest.mark.parametrize(("unit", "weight"), [(40.0, 1.0), (1e-3, 1.0), (1.0, 0.01), (1.0, 255.0)])
 def test_radiance_and_weights_of_any_unit(taken, unit, weight):
     view, image = taken
-    given = {"init": START, "weight": torch.full(view.size, weight), "search": False, "progress": False}
+    given = {"init": START, "weights": torch.full(view.size, weight), "search": False, "progress": False}
     fit = fit_pose(bracket(), unit * image, view, **arranged(**given))
     off = errors(fit)
     assert off[0] < 2.5 and off[1] < 0.6 and fit.converged, (off, fit.explained)
@@ -145,7 +147,7 @@ def test_a_faint_contour_proves_little(step, least, most):
     image = srgb_to_linear((255.0 * display).round() / 255.0)  # of 8 bits, in which 1 is white
     task = task_of(image, view, bracket(True))
     pose = pose_from_matrix("init", torch.eye(4))
-    level = photo_levels(task, pose, [None], 96, 16, 0)[-1]
+    level = photo_levels(task, pose, [None], Settings(max_size=96))[-1]
     assert least <= level.edge_support(pose, 0) <= most
 
 
@@ -188,11 +190,11 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
 @pytest.mark.parametrize(
     ("depth", "error", "message"),
     [
-        (torch.ones(10, 10), ValueError, r"depth: expected shape .*96.*, got .*10.*"),
-        (torch.full((96, 96), -1.0), ValueError, r"depth: expected distances along the camera's axis.*got -1"),
-        (torch.ones(96, 96, dtype=torch.int32), TypeError, r"depth: expected .*float.*take depth / 1000"),
-        (torch.zeros(96, 96), ValueError, r"depth: expected distances somewhere, got none"),
-        ([torch.ones(96, 96)] * 2, ValueError, r"depth: expected 1, one for each camera, got 2"),
+        (torch.ones(10, 10), ValueError, r"depths: expected shape .*96.*, got .*10.*"),
+        (torch.full((96, 96), -1.0), ValueError, r"depths: expected distances along the camera's axis.*got -1"),
+        (torch.ones(96, 96, dtype=torch.int32), TypeError, r"depths: expected .*float.*take depth / 1000"),
+        (torch.zeros(96, 96), ValueError, r"depths: expected distances somewhere, got none"),
+        ([torch.ones(96, 96)] * 2, ValueError, r"depths: expected 1, one for each camera, got 2"),
     ],
 )
 def test_errors_of_depth(taken, depth, error, message):

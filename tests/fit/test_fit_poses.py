@@ -18,6 +18,7 @@ from edgegrad.camera.poses import rotation as turned
 from edgegrad.cli import main
 from edgegrad.files.image import linear_to_srgb
 from edgegrad.fit import PoseFit, fit_pose, fit_poses
+from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.jacobian import Motions, Rendered
 from edgegrad.fit.pose.photo.level import photo_levels
 from edgegrad.fit.pose.photo.light import FittedLight
@@ -178,11 +179,11 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
     view, image = two
     given = {"search": kind not in ("colours", "depth")}
     if kind == "labels":
-        given = {"mask": labels_of(view, scene_of(2))}
+        given = {"masks": labels_of(view, scene_of(2))}
     if kind == "shares":
-        given = {"mask": list(shares_of(view, scene_of(2), 256).unbind(-1))}
-    if kind == "depth":
-        given["depth"] = depth_of(view, *scene_of(2))
+        given = {"masks": list(shares_of(view, scene_of(2), 256).unbind(-1))}
+    if kind == "depths":
+        given["depths"] = depth_of(view, *scene_of(2))
     meshes = [mesh.replace(face_colors=None) for mesh in MESHES[:2]] if kind == "plain" else MESHES[:2]
     fits = fit_poses(meshes, image, view, init=STARTS[:2], **arranged(**given))
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=False):
@@ -265,11 +266,11 @@ WITHIN = at(torch.eye(3).double(), CENTER + ASIDE)
         ([*MESHES[:2], box((0.3, 0.3, 0.3))], {"init": [*STARTS[:2], WITHIN]}, ValueError,
          r"init\[2\]: expected the objects next to one another, got meshes\[2\] inside meshes\[1\]"),
         ([MESHES[0]] * 2, {"init": [STARTS[0]] * 2}, ValueError, r"init\[0\]: expected the objects apart"),
-        (MESHES[:2], {"init": STARTS[:2], "mask": BLANK[..., 0]}, TypeError, r"mask: expected an image of labels, of integers"),
-        (MESHES[:2], {"init": STARTS[:2], "mask": [BLANK[..., 0]]}, ValueError, r"mask: expected 2, one for each mesh, got 1"),
-        (MESHES[:2], {"init": STARTS[:2], "mask": BLANK[..., 0].int() + 1}, ValueError, r"mask: expected the label 2 where"),
-        (MESHES[:2], {"init": STARTS[:2], "mask": [BLANK[:9, :9, 0]] * 2}, ValueError, r"mask\[0\]: expected .*160.*, got .*9"),
-        (MESHES[:2], {"init": STARTS[:2], "depth": BLANK[:9, :9, 0]}, ValueError, r"depth: expected shape .*160.*, got .*9"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": BLANK[..., 0]}, TypeError, r"masks: expected an image of labels, of integers"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": [BLANK[..., 0]]}, ValueError, r"masks: expected 2, one for each mesh, got 1"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": BLANK[..., 0].int() + 1}, ValueError, r"masks: expected the label 2 where"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": [BLANK[:9, :9, 0]] * 2}, ValueError, r"masks: expected .*160.*, got .*9"),
+        (MESHES[:2], {"init": STARTS[:2], "depths": BLANK[:9, :9, 0]}, ValueError, r"depths: expected shape .*160.*, got .*9"),
         (MESHES[:2], {"init": STARTS[:2], "symmetries": ["find"]}, ValueError, r"symmetries: expected 2, .* got 1"),
         (MESHES[:2], {"init": STARTS[:2], "callback": 3}, TypeError, r"callback: expected a function of a list of PoseFits"),
     ],
@@ -338,7 +339,7 @@ def test_what_covers_an_object_is_found_by_its_light(covered, strength):
     image = torch.lerp(bare, image, strength)
     task = task_of(image, view)
     pose = pose_from_matrix("pose", torch.eye(4))
-    level = photo_levels(task, pose, [None], 256, 16, 0)[-1]
+    level = photo_levels(task, pose, [None], Settings())[-1]
     (weight,) = occluder_weights(level.comparisons(pose, 0))
     # The level is a part of the picture.
     top, left = (

@@ -254,7 +254,7 @@ FIRST = {"pose": PoseParameter()}
 def test_errors_name_the_argument(taken, scene, given, error, message):
     whole = {"images": taken, "parameters": FIRST, "loss": "region", "progress": False, **given}
     with pytest.raises(error, match=message):
-        fit_scene(scene, None, VIEW, **arranged(**whole))
+        fit_scene(scene, cameras=VIEW, **arranged(**whole))
 
 
 def test_other_fits_refuse_the_region_loss(taken):

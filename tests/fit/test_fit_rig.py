@@ -14,7 +14,7 @@ from arms import TRUTH, arm, degrees, shown, views
 from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import Checkpoint, FitOptions, fit_rig, priors, track_rig
+from edgegrad.fit import Checkpoint, FitOptions, Measured, fit_rig, priors, track_rig
 
 
 def test_a_pose_from_masks() -> None:
@@ -29,14 +29,14 @@ def test_a_pose_from_masks() -> None:
     assert not unsure.converged and "rotations unknown: bone 1 known to ±7° only" in unsure.reason
     # A limb in another's place still shows some edges, but fewer than the others.
     for share, enough in ((0.8, False), (0.9, True)):
-        aside = replace(found, explained={"bone 0": 0.99, "bone 1": share, "bone 2": 0.98, "bone 3": 0.99})
+        aside = replace(found, explained_joints={"bone 0": 0.99, "bone 1": share, "bone 2": 0.98, "bone 3": 0.99})
         assert aside.converged == enough and ("80% at bone 1" in aside.reason) != enough
 
 
 def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
     rig, cameras = arm(colored=True).with_limits(rotations={"bone 1": ([-0.2] * 3, [0.2] * 3)}), views()
     pictures = shown(rig.posed(TRUTH), cameras, "image")
-    options = {"seek": ["rotations"], "joints": ["bone 1"], "start": {"rotations": {"bone 0": TRUTH[0]}}, "tries": 0}
+    options = {"seek": ["bone 1"], "init": {"rotations": {"bone 0": TRUTH[0]}}, "search": 0}
     found = fit_rig(rig, pictures, cameras, **arranged(steps=5, **options))
     assert (
         torch.allclose(found.values["rotations"][0], TRUTH[0])
@@ -76,7 +76,7 @@ def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
     rig, cameras = arm(), views(48)
     posed, photos = photographs(rig, cameras, 1)
     start = {"rotations": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.6]]).double()}
-    options = {"loss": "region", "start": start, "progress": False}
+    options = {"loss": "region", "init": start, "progress": False}
     alone, helped = (fit_rig(rig, photos, cameras, search=n, **arranged(**options)) for n in (0, 40))
     off = [float((fit.posed().verts - posed.verts).norm(dim=1).max()) for fit in (alone, helped)]
     assert off[0] > 0.5 and not alone.converged and "bone 1" in alone.reason
@@ -94,7 +94,15 @@ def test_keypoints_find_what_masks_do_not() -> None:
     seen[1, 1] = math.nan
     masks = shown(rig.posed(truth), cameras)
     given = {f"bone {k}": seen[k] for k in range(3)}
-    found = fit_rig(rig, None, cameras, masks=masks, keypoints=given, search=0, options=quiet(coarsest=48, steps=30))
+    found = fit_rig(
+        rig,
+        None,
+        cameras,
+        masks=masks,
+        keypoints=Measured(given, factor=100.0),
+        search=0,
+        options=quiet(coarsest=48, steps=30),
+    )
     assert (found.rig.shape({"rotations": found.values["rotations"]}).joints - joints).norm(dim=1).max() < 0.1
 
 
@@ -106,7 +114,7 @@ def test_a_limb_is_found_from_new_starts() -> None:
     masks = shown(rig.posed(truth), cameras)
     options = {
         "masks": masks,
-        "start": {"rotations": -truth},
+        "init": {"rotations": -truth},
         "coarsest": 24,
         "progress": False,
         "seek": ["rotations"],
@@ -123,7 +131,7 @@ def test_ctrl_c_in_the_search_of_limbs_keeps_the_descent(monkeypatch) -> None:
     monkeypatch.setattr("edgegrad.fit.rig.limbs.LimbSearch.run", stop)
     rig, cameras = arm(), views(32, 2)
     found = fit_rig(rig, None, cameras, masks=shown(rig.posed(TRUTH), cameras), options=quiet(steps=2))
-    assert found.fit.interrupted and not found.converged
+    assert found.interrupted and not found.converged
     assert float(found.values["rotations"].abs().max()) > 0.05  # of the descent before
 
 
@@ -142,41 +150,33 @@ def test_what_a_frame_misses_is_searched_once(monkeypatch, loss: float, angles: 
     """A result is kept where it is better. A limb that is still missed is not searched again in the next frame."""
     calls: list[tuple[int | None, float]] = []
 
-    def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **options: Any) -> Any:
-        angle = float(start["rotations"][0, 0]) + (1.0 if calls else 0.0)
-        calls.append((options.get("tries"), angle))
-        assert options["resume"] == (options["checkpoint"] is not None)
+    def fit(rig: eg.Rig, *, init: dict[str, torch.Tensor], search: bool | int, options: FitOptions, **_: Any) -> Any:
+        angle = float(init["rotations"][0, 0]) + (1.0 if calls else 0.0)
+        calls.append((search, angle))
+        assert (options.checkpoint is None) == (search == 5)
         values = {"rotations": torch.full((2, 3), angle, dtype=torch.float64)}
         missed = ["bone 1"] if len(calls) > 1 else []
         return SimpleNamespace(
             values=values,
             missed=missed,
-            loss=loss if options.get("tries") else 1.0,
-            fit=SimpleNamespace(interrupted=False),
+            loss=loss if search else 1.0,
+            interrupted=False,
         )
 
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.fit_rig", fit)
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.MOTION_SHARE", 0.0)
     start = {"rotations": torch.zeros(2, 3, dtype=torch.float64)}
-    found = list(
-        track_rig(
-            arm(),
-            [{}, {}, {}],
-            views(16, 1),
-            init=start,
-            again=5,
-            options=FitOptions(seed=0, checkpoint=Checkpoint("a.ckpt", resume=True)),
-        )
-    )
+    found = list(track_rig(arm(), [{}, {}, {}], views(16, 1), init=start, again=5, options=quiet(checkpoint="a.ckpt")))
     assert [float(one.values["rotations"][0, 0]) for one in found] == angles
-    assert [tries for tries, _ in calls] == [None, 0, 5, 0]
+    assert [search for search, _ in calls] == [True, 0, 5, 0]
 
 
 def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
     rig, cameras = arm(), views(16, 2)
     frames = [{"masks": shown(rig.posed(TRUTH * k), cameras)} for k in (0.1, 0.2)]
-    options = {"tries": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
-    first, again = (list(track_rig(rig, frames, cameras, init={}, **arranged(**options))) for _ in range(2))
+    options = {"search": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
+    first = list(track_rig(rig, frames, cameras, init={}, **arranged(**options)))
+    again = list(track_rig(rig, frames, cameras, init={}, **arranged(resume=True, **options)))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["walk-0001.ckpt", "walk-0002.ckpt"]
     for a, b in zip(first, again, strict=True):
         assert torch.equal(a.values["rotations"], b.values["rotations"])
@@ -185,7 +185,7 @@ def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
         (TypeError, r"frames\[0\]: expected arguments by name", {"frames": [frames[0]["masks"]]}),
     ):
         with pytest.raises(error, match=message):
-            next(track_rig(rig, cameras, **arranged(**given)))
+            next(track_rig(rig, cameras=cameras, **given))
 
 
 def test_a_start_within_limits_that_leave_out_rest() -> None:
@@ -196,7 +196,13 @@ def test_a_start_within_limits_that_leave_out_rest() -> None:
 
 def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
     rig, cameras = arm(), views(32, 2)
-    options = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
+    options = {
+        "masks": shown(rig.posed(TRUTH), cameras),
+        "search": 0,
+        "steps": 4,
+        "progress": False,
+        "loss_tolerance": 0.0,
+    }
     whole = fit_rig(rig, None, cameras, **arranged(**options))
     count = 0
 
@@ -208,7 +214,7 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
 
     path = tmp_path / "checkpoint.pt"
     half = fit_rig(rig, None, cameras, **arranged(callback=stop, checkpoint=path, **options))
-    assert half.fit.interrupted and half.reason == "interrupted"
+    assert half.interrupted and half.reason == "interrupted"
     rest = fit_rig(rig, None, cameras, **arranged(checkpoint=Checkpoint(path, resume=True), **options))
     assert torch.equal(rest.values["rotations"], whole.values["rotations"]) and len(rest.history) == len(whole.history)
     assert "pose.json" in rest.save(tmp_path / "out", figures=False)
@@ -230,10 +236,11 @@ def test_the_command_line(tmp_path, capsys) -> None:
         tmp_path / "mask.png",
         "--camera",
         tmp_path / "camera.json",
-        "--joints",
+        "--seek",
         "upper",
+        "translation",
     ]
-    command += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
+    command += ["--search", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
     assert cli.main([str(word) for word in command]) == 0
     assert "wrote pose.json, joints.json, posed.glb" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "pose.json").read_text())["rotations"]
@@ -257,19 +264,17 @@ def test_errors_name_the_argument() -> None:
         (TypeError, "rig: expected a Rig", {"rig": rig.posed()}),
         (ValueError, "seek: expected names among .*got 'pose'", {"seek": ["pose"]}),
         (ValueError, "seek: expected a name or more", {"seek": []}),
-        (ValueError, "start: expected names among", {"start": {"turns": 1.0}}),
-        (ValueError, "rotations: expected names among bone 0, bone 1", {"joints": ["elbow"]}),
+        (ValueError, "init: expected names among", {"init": {"turns": 1.0}}),
+        (ValueError, "seek: expected names among .*bone 0, bone 1, got 'elbow'", {"seek": ["elbow"]}),
         (ValueError, "keypoints: expected joints among", {"keypoints": {"elbow": torch.zeros(2, 2)}}),
         (ValueError, "a pixel for each camera", {"keypoints": {"bone 0": torch.zeros(3, 2)}}),
         (ValueError, "expected numbers for one at least", {"keypoints": {"bone 0": torch.full((2, 2), math.nan)}}),
         (TypeError, "keypoints: expected pixels .*got none", {"keypoints": {}}),
         (TypeError, "keypoints: expected pixels .*got Tensor", {"keypoints": torch.zeros(2, 2)}),
-        (ValueError, "joints: expected names of joints .*got none", {"joints": []}),
-        (ValueError, "joints: expected None where turns", {"joints": ["bone 0"], "seek": ["translation"]}),
         (
             ValueError,
-            r"start\['rotations'\]: expected shape .*one pose",
-            {"start": {"rotations": torch.zeros(2, 2, 3)}},
+            r"init\['rotations'\]: expected shape .*one pose",
+            {"init": {"rotations": torch.zeros(2, 2, 3)}},
         ),
         (TypeError, "priors: expected a list of functions", {"priors": lambda values: 0.0}),
         (TypeError, r"priors\[0\]: expected a function", {"priors": [0.5]}),
@@ -278,11 +283,10 @@ def test_errors_name_the_argument() -> None:
             r"priors\[0\]: expected it to return a number, got \(2, 3\)",
             {"priors": [lambda v: v["rotations"]]},
         ),
-        (TypeError, "look: expected it to return a Mesh or a Scene, got NoneType", {"look": lambda posed: None}),
-        (ValueError, "parameters: expected a look that takes light", {"parameters": {"light": None}}),
-        (TypeError, "expected options among", {"step": 3}),
+        (TypeError, "appearance: expected it to return a Mesh or a Scene, got NoneType", {"appearance": lambda posed: None}),
+        (ValueError, "options.max_size: fit_rig compares pictures at their own size", {"max_size": 64}),
         (ValueError, "images: expected pictures or masks", {"masks": None}),
     ):
-        given = {"rig": rig, "cameras": cameras, "masks": masks, "progress": False, **change}
+        given = {"rig": rig, "images": None, "cameras": cameras, "masks": masks, **change}
         with pytest.raises(error, match=message):
             fit_rig(**arranged(**given))

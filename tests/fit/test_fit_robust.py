@@ -20,7 +20,7 @@ from brackets import (
     task_of,
 )
 from photographs import compressed
-from quiet_fits import arranged, quiet
+from quiet_fits import quiet
 
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb
@@ -45,10 +45,8 @@ def covered(view, image):
 def test_a_quarter_covered(how, steps):
     view = camera(64)
     image, free = covered(view, picture(view))
-    options = {"background": BACKGROUND}
-    if how == "weight":
-        options["weight"] = free
-    fit = fit_pose(bracket(), image, view, init=START, **arranged(steps=steps, **options))
+    weights = free if how == "weight" else None
+    fit = fit_pose(before_sky(), image, view, init=START, weights=weights, options=quiet(steps=steps))
     degrees, percent = errors(fit)
     assert degrees < 1.0 and percent < 1.0, (degrees, percent)
     assert fit.converged and fit.explained > 0.5

@@ -160,8 +160,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path):
 
     whole = colour_fit(cameras, target, steps=30, patience=5, views_per_step=2)
     file = tmp_path / "fit.ckpt"
-    options = {"steps": 30, "patience": 5, "checkpoint": file, "resume": True, "views_per_step": 2}
+    options = {"steps": 30, "patience": 5, "checkpoint": file, "views_per_step": 2}
     half = colour_fit(cameras, target, callback=stop, **options)
+    options["resume"] = True
     assert half.interrupted and not half.converged and half.steps == 14 and file.exists()
     again = colour_fit(cameras, target, **options)
     assert again.steps == whole.steps and not again.interrupted
@@ -177,7 +178,7 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
     target = pictures(bracket(), cameras)
     file = tmp_path / "fit.ckpt"
     colour_fit(cameras, target, steps=1, checkpoint=file)
-    with pytest.raises(ValueError, match=r"resume: expected .* made with another scene, parameters;"):
+    with pytest.raises(ValueError, match=r"checkpoint: expected .* made with another scene, parameters;"):
         fit_scene(
             bracket(),
             target,
@@ -190,9 +191,9 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
         "cameras": ([eg.Camera.look_at((0, 0, 7), (0, 0, 0), size=view.size) for view in cameras], target, {}),
         "masks": (cameras, target, {"masks": [torch.ones(picture.shape[:2]) for picture in target]}),
         "seed": (cameras, target, {"seed": 1}),
-        "render": (cameras, target, {"render": {"filter": "gaussian"}}),
+        "bounces": (cameras, target, {"bounces": 2}),
     }.items():
-        with pytest.raises(ValueError, match=rf"fit\.ckpt to be a checkpoint of this fit.* another {name};"):
+        with pytest.raises(ValueError, match=rf"fit\.ckpt to be of this fit.* another {name};"):
             colour_fit(*given[:2], steps=2, checkpoint=file, resume=True, **given[2])
     assert colour_fit(cameras, target, steps=2, checkpoint=file, resume=True).steps == 2  # of the same fit
     file.write_bytes(file.read_bytes()[:200])
@@ -283,19 +284,18 @@ def test_saves_the_materials_it_found(tmp_path):
             ValueError,
             "background: expected low ≤ high",
         ),
-        ({"images": torch.zeros(8, 8, 3)}, ValueError, "images: expected 2, one for each camera, got 8"),
+        ({"images": torch.zeros(8, 8, 3)}, ValueError, "images: expected 2, one for each camera, got 1 in shape"),
         ({"images": None}, ValueError, "images: expected pictures or masks"),
         ({"weights": -torch.ones(2, 32, 32)}, ValueError, "weights: expected numbers from 0 up"),
         ({"masks": torch.ones(2, 32, 32, 3)}, ValueError, "masks[0]: expected shape (32, 32) or (32, 32, 1)"),
         ({"cameras": "here"}, TypeError, "cameras[0]: expected a Camera"),
         ({"scene": 3}, TypeError, "scene: expected a Scene, a Mesh, or a function"),
         ({"loss": "l3"}, ValueError, "loss: expected one of l1, l2"),
-        ({"step": 3}, TypeError, "did you mean 'steps'"),
+        ({"max_size": 64}, ValueError, "options.max_size: fit_scene compares pictures at their own size"),
+        ({"options": {"steps": 3}}, TypeError, "options: expected FitOptions, got dict; give FitOptions(steps=…)"),
         ({"steps": 0}, ValueError, "steps: expected an int from 1"),
-        ({"resume": True}, ValueError, "resume: expected a checkpoint"),
         ({"checkpoint": "/nowhere/at/all"}, FileNotFoundError, "checkpoint: expected the folder"),
-        ({"render": {"spps": 3}}, ValueError, "render: expected arguments of render() among surface_samples"),
-        ({"render": {"spp": 3}}, ValueError, "got 'spp'; it is an option of its own"),
+        ({"sampling": {"lights": 3}}, TypeError, "options.sampling: expected a Sampling, got dict"),
         (
             {"loss": lambda image, target: image.mean()},
             TypeError,
@@ -314,7 +314,9 @@ def test_errors_name_the_argument(change, error, message):
         "parameters": {"background": 0.1},
     }  # fmt: skip
     with pytest.raises(error) as caught:
-        fit_scene(**arranged(**{**arguments, "progress": False, **change}))
+        fit_scene(
+            **{**arranged(**arguments), **(change if "options" in change else arranged(**{**arguments, **change}))}
+        )
     assert message in str(caught.value)
 
 

@@ -71,10 +71,10 @@ def test_a_shape_resumes_on_a_later_level(tmp_path):
             raise KeyboardInterrupt
 
     stop.count = 0
-    options = {"masks": masks, "levels": 2, "steps": 6, "checkpoint": file, "resume": True, **QUIET}
+    options = {"masks": masks, "refinement": Refinement(2), "steps": 6, "checkpoint": file, **QUIET}
     half = fit_shape(ball(1), None, cameras, **arranged(callback=stop, **options))
     assert half.interrupted and half.steps == 9
-    again = fit_shape(ball(1), None, cameras, **arranged(**options))
+    again = fit_shape(ball(1), None, cameras, **arranged(resume=True, **options))
     file.unlink()
     whole = fit_shape(ball(1), None, cameras, **arranged(**options))
     assert again.steps == whole.steps == 12

@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
-from quiet_fits import arranged
+from quiet_fits import arranged, quiet
 from small_scenes import QUIET, ball, egg_views
 
 import edgegrad as eg
-from edgegrad.fit import FitOptions, Measured, Refinement, fit_shape
+from edgegrad.fit import Measured, Refinement, fit_shape
 from edgegrad.fit.measured import measured_loss, measurements
 from edgegrad.fit.views import views_of
 
@@ -136,14 +136,7 @@ def test_errors_of_weights_and_of_views_without_pictures():
     with pytest.raises(ValueError, match="factor: expected a number from"):
         Measured(GOOD, factor=-1.0)
     with pytest.raises(ValueError, match=r"images: expected pictures or masks .* got neither for cameras\[1\]"):
-        fit_shape(
-            ball(1),
-            None,
-            [CAMERA, CAMERA],
-            depths=[GOOD, None],
-            refinement=Refinement(levels=1),
-            options=FitOptions(seed=0),
-        )
+        fit_shape(ball(1), None, [CAMERA, CAMERA], depths=[GOOD, None], refinement=Refinement(1), options=quiet())
 
 
 # -- what they find ---------------------------------------------------------------------------------------------------
@@ -184,7 +177,7 @@ def dent():
     return seen()
 
 
-OPTIONS = {"levels": 2, "faces": 1600, "steps": 60, **QUIET}
+OPTIONS = {"refinement": Refinement(2, 1600), "steps": 60, **QUIET}
 
 
 @pytest.mark.slow
@@ -234,7 +227,7 @@ def test_views_that_have_only_some_of_it(dent, tmp_path):
     depths = [None, *covered(views, "depth")[1:3], None, None]
     normals = [covered(views, "shading_normal")[0], None, None, None, None]
     given = {"masks": masks, "depths": depths, "normals": Measured(normals, factor=0.5)}
-    options = {"levels": 1, "steps": 4, "checkpoint": tmp_path / "fit.pt", "resume": True, **QUIET}
+    options = {"refinement": Refinement(1), "steps": 4, "checkpoint": tmp_path / "fit.pt", **QUIET}
     fit = fit_shape(ball(2), None, cameras, **arranged(**given, **options))
     assert [view.aovs for view in fit.views] == [
         ["alpha", "shading_normal"], ["depth", "alpha"], ["alpha", "depth"], ["alpha"], ["alpha"],
@@ -243,6 +236,7 @@ def test_views_that_have_only_some_of_it(dent, tmp_path):
     assert fit.render(1).shape == (40, 40, 1) and float(fit.render(1).max()) > 2.0
     pytest.importorskip("matplotlib")
     assert "fit.png" in fit.save(tmp_path)
+    options["resume"] = True
     again = fit_shape(ball(2), None, cameras, **arranged(**given, **options))
     assert again.steps == 4 and torch.equal(again.mesh.verts, fit.mesh.verts)
     with pytest.raises(ValueError, match=r"made with another measured;"):

@@ -167,8 +167,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path, method):
             raise KeyboardInterrupt
 
     whole = fitted(steps=12, method=method)
-    options = {"steps": 12, "checkpoint": tmp_path / "fit.ckpt", "resume": True, "method": method}
+    options = {"steps": 12, "checkpoint": tmp_path / "fit.ckpt", "method": method}
     half = fitted(callback=stop, **options)
+    options["resume"] = True
     assert half.reason == "interrupted" and half.steps == 6
     again = fitted(**options)
     assert again.steps == whole.steps and again.reason == whole.reason

@@ -10,9 +10,10 @@ from arms import arm, shown, views
 from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import Options, fit_rig
+from edgegrad.fit import Parameter, fit_rig
 from edgegrad.fit.descent.curvature import curvature, derivatives
 from edgegrad.fit.descent.objective import Objective
+from edgegrad.fit.options import Settings
 from edgegrad.fit.rig.joint_support import edge_support_by_joint, left_out
 from edgegrad.fit.rig.uncertainty import uncertainty_of
 from edgegrad.fit.views import views_of
@@ -25,7 +26,7 @@ def objective(rig: eg.Rig, cameras: list[eg.Camera], **pictures: list[torch.Tens
     def build(values: dict[str, torch.Tensor]) -> tuple[eg.Scene, list[eg.Camera]]:
         return eg.Scene([rig.posed(values["rotations"])]), cameras
 
-    return Objective(build, views_of(cameras, pictures.get("images"), pictures.get("masks"), None), Options(spp=64))
+    return Objective(build, views_of(cameras, pictures.get("images"), pictures.get("masks"), None), Settings(spp=64))
 
 
 def test_a_misplaced_hand_has_low_edge_support() -> None:
@@ -119,11 +120,13 @@ def test_light_is_found_with_the_pose() -> None:
     pictures = [eg.render(lit(rig.posed(truth), light), camera, 64, 9) for camera in cameras]
     start = torch.zeros_like(light)
     start[0] = 2.0
-    options = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
-    found = fit_rig(rig, pictures, cameras, **arranged(**options))
+    options = {"seek": ["rotations"], "search": 0, "coarsest": 32, "steps": 12}
+    sought = {"light": Parameter(0.2, start)}
+    found = fit_rig(rig, pictures, cameras, appearance=(lit, sought), **arranged(**options))
     assert math.degrees(float((found.values["rotations"] - truth).norm(dim=1).max())) < 5.0
     assert torch.allclose(found.fit.values["light"][:4], light[:4], atol=0.3) and "light" not in found.values
     with pytest.raises(ValueError, match="parameters: expected names that the rig does not have, got 'rotations'"):
-        fit_rig(rig, pictures, cameras, **arranged(**options))
+        sought = {"rotations": Parameter(0.2, start)}
+        fit_rig(rig, pictures, cameras, appearance=(lit, sought), **arranged(**options))
     with pytest.raises(TypeError, match=r"parameters\['light'\]: expected a Parameter, got float"):
-        fit_rig(rig, pictures, cameras, **arranged(**options))
+        fit_rig(rig, pictures, cameras, appearance=(lit, {"light": 0.2}), **arranged(**options))

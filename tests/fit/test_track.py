@@ -100,8 +100,8 @@ def test_a_broken_frame_is_named(film, frames, spoil, words):
         ({"mesh": 3}, "mesh: expected"),
         ({"init": torch.eye(3)}, "init: expected"),
         ({"spp": 0}, "spp: expected"),
-        ({"depth": 1.0}, "depth: expected"),
-        ({"depth": torch.ones(SIZE, SIZE)}, r"depth: expected \(T, H, W\), got"),
+        ({"depths": 1.0}, "depths: expected"),
+        ({"depths": torch.ones(SIZE, SIZE)}, r"depths: expected \(T, H, W\), got"),
     ],
 )
 def test_bad_arguments_are_named_at_once(film, frames, change, words):
@@ -111,7 +111,7 @@ def test_bad_arguments_are_named_at_once(film, frames, change, words):
 
 
 def test_depth_for_each_frame(film, frames):
-    with pytest.raises(ValueError, match="depth: expected one for each frame, got 1"):
+    with pytest.raises(ValueError, match="depths: expected one for each frame, got 1"):
         list(track(film.mesh, frames[:2], film.camera, film.poses[0], depths=[None], options=FitOptions(seed=0)))
     plain = eg.Mesh(film.mesh.verts, film.mesh.faces)
     depths = []

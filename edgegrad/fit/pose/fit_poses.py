@@ -182,7 +182,7 @@ def _starts(init: object, count: int) -> list[Pose]:
 def _masks(masks: Any, count: int, cameras: Sequence[Camera]) -> list[Any]:
     """Return, for each mesh, what fit_pose calls the masks. Raises TypeError or ValueError."""
     n = len(cameras)
-    labelled = n > 1 and isinstance(masks, Sequence) and masks and all(map(_is_labels, masks))
+    labelled = isinstance(masks, Sequence) and len(masks) == n and all(map(_is_labels, masks))
     if not hasattr(masks, "ndim") and not labelled:
         found = _each("masks", masks, count)
         if 0 < (missing := sum(one is None for one in found)) < count:
