@@ -18,9 +18,7 @@ def add(commands: Any) -> None:
     )
     add_views(parser, "masks, white on the object, or pictures whose alpha is one")
     add_label(parser)
-    parser.add_argument(
-        "--seek", nargs="+", metavar="NAME", help="joints and controls (all joints, and translation)"
-    )
+    parser.add_argument("--seek", nargs="+", metavar="NAME", help="joints and controls (all joints, and translation)")
     parser.add_argument(
         "--search", type=number, default=40, help="limbs drawn anew; 0 for a start nearby (%(default)s)"
     )

@@ -182,10 +182,6 @@ class Settings:
     @property
     def render(self) -> dict[str, Any]:
         """Further arguments of render_aovs()."""
-        found = {name: value for name in ("shadows", "bounces") if (value := getattr(self, name)) is not None}
-        s = self.sampling
-        of_sampling = {} if s is None else {
-            "surface_samples": s.surface, "edge_samples": s.edges, "light_samples": s.lights,
-            "step_spacing": s.discontinuity_spacing, "grad_seed": s.seed,
-        }  # fmt: skip
-        return found | of_sampling
+        return {
+            name: value for name in ("sampling", "shadows", "bounces") if (value := getattr(self, name)) is not None
+        }

@@ -283,7 +283,11 @@ def test_errors_name_the_argument() -> None:
             r"priors\[0\]: expected it to return a number, got \(2, 3\)",
             {"priors": [lambda v: v["rotations"]]},
         ),
-        (TypeError, "appearance: expected it to return a Mesh or a Scene, got NoneType", {"appearance": lambda posed: None}),
+        (
+            TypeError,
+            "appearance: expected it to return a Mesh or a Scene, got NoneType",
+            {"appearance": lambda posed: None},
+        ),
         (ValueError, "options.max_size: fit_rig compares pictures at their own size", {"max_size": 64}),
         (ValueError, "images: expected pictures or masks", {"masks": None}),
     ):
