@@ -97,11 +97,7 @@ def main() -> None:
     for seed, (true, start, shot) in enumerate(cases):
         began = time.process_time()
         found = fit_camera(
-            eg.Scene([mesh], BACKGROUND),
-            shot[0],
-            start[0],
-            principal=True,
-            distortion=4,
+            eg.Scene([mesh], BACKGROUND), shot[0], start[0], principal=True, distortion=4,
             options=FitOptions(seed=seed, progress=False),
         )
         ratios += row(found, true[0], time.process_time() - began, found.reason)

@@ -39,9 +39,9 @@ def main() -> None:
     print("loss    spp  lights  roughness")
     for loss, spp, lights in CASES:
         fit = fit_scene(
-            lambda values: scene(values["roughness"]), target, camera, {"roughness": Parameter(0.02, torch.tensor(START),
-            low=0.05, high=1.0)}, options=FitOptions(seed=0, loss=loss, spp=spp, steps=150, progress=False,
-            sampling=eg.Sampling(lights=lights)),
+            lambda values: scene(values["roughness"]), target, camera,
+            {"roughness": Parameter(0.02, torch.tensor(START), low=0.05, high=1.0)},
+            options=FitOptions(loss=loss, spp=spp, steps=150, seed=0, progress=False, sampling=eg.Sampling(lights=lights)),
         )  # fmt: skip
         print(f"{loss:7} {spp:3} {lights:6} {float(fit.values['roughness']):15.2f}   {fit.reason}", flush=True)
 

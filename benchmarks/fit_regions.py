@@ -27,13 +27,8 @@ def of_bracket(method: str, seed: int) -> tuple[Fit, str]:
     view = camera(128)
     image = photograph(view, seed=seed, sampling=eg.Sampling(lights=16))
     sought = {"pose": PoseParameter(Pose(START[:3, :3], START[:3, 3]))}
-    fit = fit_scene(
-        bracket(plain=True),
-        image,
-        view,
-        sought,
-        options=FitOptions(seed=0, loss="region", method=method, spp=8, progress=False),
-    )
+    options = FitOptions(seed=0, loss="region", method=method, spp=8, progress=False)
+    fit = fit_scene(bracket(plain=True), image, view, sought, options=options)
     degrees, percent = errors(fit.poses["pose"])
     return fit, f"{degrees:5.2f}° {percent:5.2f} %"
 

@@ -180,7 +180,7 @@ class Run:
         began = Work.now()
         fit = fit_pose(
             case.mesh, case.picture, case.camera, mask, None if start is None else start.matrix, depths=case.depth,
-            search="global" if start is None else 1, options=FitOptions(seed=0, progress=False),
+            search="global" if start is None else search, options=FitOptions(seed=0, progress=False),
         )  # fmt: skip
         found = Placed(fit.R, fit.t)
         trial = self.noted(part, case, start, found, truth, fit, Work.since(began))
@@ -192,13 +192,8 @@ class Run:
         first = cases[0]
         init = [start.matrix for start in starts]
         began = Work.now()
-        fits = fit_poses(
-            [case.mesh for case in cases],
-            first.picture,
-            first.camera,
-            init=init,
-            options=FitOptions(seed=0, progress=False),
-        )
+        options = FitOptions(seed=0, progress=False)
+        fits = fit_poses([case.mesh for case in cases], first.picture, first.camera, init=init, options=options)
         work = Work.since(began)
         image = first.picture
         for case, start, fit in zip(cases, starts, fits, strict=True):

@@ -126,20 +126,16 @@ def picture(count: int, first: int, size: int) -> None:
         truth, began = figure.pose(seed, 40.0), time.process_time()
         target = eg.render(in_light(rig.posed(truth), sun_and_sky(seed)), camera, 64, 5)
         seen = visible(rig, rig.posed(truth), camera)
-        told = {"loss": "huber", "seed": seed, "progress": False}
+        told: dict[str, Any] = {"loss": "huber", "seed": seed, "progress": False}
         smooth = fit_rig(
-            rig,
-            target,
-            camera,
-            appearance=(harmonic, {"light": Parameter(0.2, light)}),
-            search=TRIES,
-            options=FitOptions(seed=0, **told),
+            rig, target, camera, appearance=(harmonic, {"light": Parameter(0.2, light)}), search=TRIES,
+            options=FitOptions(**told),
         )
         before = body.Errors.of(rig, smooth.values["rotations"], truth).rotation[seen]
         # With a light that is known better, from there: shadows that no smooth light has turn limbs aside.
         fit = fit_rig(
             rig, target, camera, appearance=(sunny, sun_of(smooth.fit.values["light"])), init=smooth.values, search=0,
-            options=FitOptions(seed=0, coarsest=size // 2, **told),
+            options=FitOptions(coarsest=size // 2, **told),
         )  # fmt: skip
         seconds.append(time.process_time() - began)
         errors = body.Errors.of(rig, fit.values["rotations"], truth)
@@ -265,9 +261,8 @@ def walk(count: int, first: int, size: int) -> None:
     ]
     start = {"rotations": truths[0], "translation": shifts[0]}
     began, rotation, direction = time.process_time(), [], []
-    for k, fit in enumerate(
-        track_rig(rig, frames, cameras, init=start, search=0, options=FitOptions(seed=0, progress=False))
-    ):
+    options = FitOptions(seed=0, progress=False)
+    for k, fit in enumerate(track_rig(rig, frames, cameras, init=start, search=0, options=options)):
         errors = body.Errors.of(rig, fit.values["rotations"], truths[k])
         rotation.append(errors.rotation)
         direction.append(errors.direction)

@@ -62,13 +62,8 @@ def main() -> None:
                 shot.quantize(COLORS).save(folder / "viewer.png", optimize=True)
                 raise KeyboardInterrupt
 
-        fit_pose(
-            eg.Scene([mesh], BACKGROUND),
-            pictures,
-            cameras,
-            init=turn,
-            options=FitOptions(seed=0, callback=callback, progress=False),
-        )
+        options = FitOptions(seed=0, callback=callback, progress=False)
+        fit_pose(eg.Scene([mesh], BACKGROUND), pictures, cameras, init=turn, options=options)
     browser.quit()
 
 

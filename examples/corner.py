@@ -54,14 +54,8 @@ def fit(seen: list[Tensor], bounces: int, steps: int = 30) -> Fit:
     """Start from grey walls."""
     size = len(seen[0])
     sought = {name: Parameter(0.03, torch.full((3,), 0.5), low=0.0, high=1.0) for name in WALLS}
-    render = {"bounces": bounces}
-    return fit_scene(
-        scene,
-        seen,
-        cameras(size),
-        sought,
-        options=FitOptions(seed=0, method="gauss-newton", steps=steps, spp=16, render=render),
-    )
+    options = FitOptions(seed=0, method="gauss-newton", steps=steps, spp=16, bounces=bounces)
+    return fit_scene(scene, seen, cameras(size), sought, options=options)
 
 
 def errors(found: Fit) -> dict[str, float]:

@@ -87,9 +87,8 @@ def fit(
         for name, value in zip(Made._fields, start or half(truth), strict=True)
     }
     seen = pictures(truth.scene(shape), cameras)
-    found = fit_scene(
-        lambda values: Made(**values).scene(shape), seen, cameras, sought, options=FitOptions(seed=0, **options)
-    )
+    given = FitOptions(seed=0, **options)
+    found = fit_scene(lambda values: Made(**values).scene(shape), seen, cameras, sought, options=given)
     return found, Made(**found.values)
 
 
@@ -100,7 +99,7 @@ def resized(image: Tensor, rows: int, columns: int) -> Tensor:
 
 def fit_textured(shape: eg.Mesh, truth: Made, size: int = 128, steps: tuple[int, int] = (300, 150)) -> tuple[Fit, Made]:
     """Fit coarse textures, then fine ones."""
-    options: dict[str, Any] = {"spp": 4, "views_per_step": 2, "tolerance": 0.0}
+    options: dict[str, Any] = {"spp": 4, "views_per_step": 2, "loss_tolerance": 0.0}
     rows, columns, _ = truth.base.shape
     start = half(truth)
     start = start._replace(base=start.base[: max(rows // 8, 1), : max(columns // 8, 1)].clone())
@@ -123,7 +122,7 @@ def main() -> None:
     numbers = torch.tensor(ROUGHNESS), torch.tensor(METALLIC)
     scan = scan.replace(normals=eg.vertex_normals(scan.verts, scan.faces))
     things = (
-        ("ball", ball(), Made(GOLD, *numbers), partial(fit, method="gauss-newton", steps=50, spp=4, tolerance=0.0)),
+        ("ball", ball(), Made(GOLD, *numbers), partial(fit, method="gauss-newton", steps=50, spp=4, loss_tolerance=0.0)),
         ("scan", scan, Made(scan.texture, *numbers), fit_textured),
     )
     rows = []

@@ -60,12 +60,7 @@ def simplify(mesh: eg.Mesh, faces: int = 300, steps: int = 100) -> tuple[eg.Mesh
 
     simple = simplified(mesh, faces)
     fit = fit_shape(
-        simple,
-        images,
-        cameras,
-        masks=masks,
-        appearance=lit,
-        refinement=Refinement(levels=1, lr=0.002, smoothness=1.0),
+        simple, images, cameras, masks=masks, appearance=lit, refinement=Refinement(levels=1, lr=0.002, smoothness=1.0),
         options=FitOptions(seed=0, steps=steps, spp=4),
     )
     assert fit.mesh is not None

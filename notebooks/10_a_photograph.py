@@ -108,10 +108,7 @@ def fitted(camera, R, t, shape, **options):
     free = {name: Parameter(0.01, value, low=0.02, high=1.2) for name, value in shape.items()}
     given = {"pose": pose, **free}
     return fit_scene(
-        scene,
-        photo,
-        camera,
-        given,
+        scene, photo, camera, given,
         options=FitOptions(seed=0, loss="region", spp=4, steps=150, loss_tolerance=1e-3, progress=False, **options),
     )
 

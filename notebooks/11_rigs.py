@@ -114,9 +114,8 @@ small = figure.cameras(96)
 for pose in poses:
     frames.append({"masks": [eg.render_aovs(rig.posed(pose), one, ["alpha"], spp=32)["alpha"] for one in small]})
 start = {"rotations": fit.values["rotations"]}
-for pose, found in zip(
-    poses, track_rig(rig, frames, small, init=start, search=0, options=FitOptions(seed=0, progress=False))
-):
+options = FitOptions(seed=0, progress=False)
+for pose, found in zip(poses, track_rig(rig, frames, small, init=start, search=0, options=options)):
     print(body.Errors.of(rig, found.values["rotations"], pose))
 
 # %% [markdown]

@@ -122,12 +122,7 @@ show([*pictures, images[2]], ["sphere", "a step by the gradient", "a smoothed st
 
 # %%
 found = fit_shape(
-    sphere,
-    images,
-    cameras,
-    masks=masks,
-    appearance=lit,
-    refinement=Refinement(levels=2, faces=6000, lr=0.02),
+    sphere, images, cameras, masks=masks, appearance=lit, refinement=Refinement(levels=2, faces=6000, lr=0.02),
     options=FitOptions(seed=0, steps=60, spp=4, progress=False),
 )
 print(f"{found.reason}; {len(found.mesh.faces)} faces, {found.seconds:.0f} s")

@@ -226,7 +226,7 @@ pictures = [
     eg.render(made(gold), camera, 64, 1000 + k, sampling=eg.Sampling(lights=2)) for k, camera in enumerate(cameras)
 ]
 sought = {name: Parameter(0.02, torch.full_like(value, 0.5), low=0.0, high=1.0) for name, value in gold.items()}
-options = {"steps": 300, "spp": 4, "views_per_step": 1, "tolerance": 0.0, "progress": False}
+options = {"steps": 300, "spp": 4, "views_per_step": 1, "loss_tolerance": 0.0, "progress": False}
 fit = fit_scene(made, pictures, cameras, sought, options=FitOptions(seed=0, **options))
 made_of = {name: (fit.values[name] - value).abs().max().item() for name, value in gold.items()}
 print("off by " + ", ".join(f"{value:.4f} in {name.replace('_', ' ')}" for name, value in made_of.items()))

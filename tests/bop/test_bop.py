@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 from bop_scenes import SIZE, TRUTHS, K, camera, estimates, meshes, pose
-from quiet_fits import quiet
 from PIL import Image
+from quiet_fits import quiet
 
 import edgegrad as eg
 from edgegrad import bop, cli
