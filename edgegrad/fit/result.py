@@ -1,4 +1,4 @@
-"""What the results of all fits have in common."""
+"""The base of the results of all fits."""
 
 from __future__ import annotations
 
@@ -13,24 +13,18 @@ if TYPE_CHECKING:
 
 
 class FitResult:
-    """What a fit found, under its own names, and how it went.
+    """The base of all results. Each has these attributes, and under its own names what was found.
 
     Attributes
     ----------
-    converged : bool
-        Whether further steps lead no further, and the pictures show what the fit found.
-    reason : str
-        "converged", or what kept the fit from it and how to mend that.
-    loss : float
-        The loss at the end.
-    explained : float
-        Share of the render's edges that the pictures show too, 0 … 1.
+    converged, reason : bool, str
+        Whether further steps lead no further, and the pictures show what was found; and "converged", or in words what is missing.
+    loss, explained : float
+        The loss at the end, and the share, 0 … 1, of the render's edges that the pictures show too.
     history : list
         A record of each step, with its `loss` and the norms of its `gradient`.
-    steps, seconds : int, float
-        Number of steps, and time.
-    interrupted : bool
-        Whether KeyboardInterrupt ended the fit; the result is the best until then.
+    steps, seconds, interrupted : int, float, bool
+        Number of steps, time, and whether KeyboardInterrupt ended the fit; the result is the best until then.
     """
 
     def plot(self, most: int = 4) -> Figure:

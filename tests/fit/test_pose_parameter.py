@@ -197,9 +197,9 @@ def test_coordinates_without_poses_are_the_values():
         ({"background": PoseParameter()}, ValueError, "expected a pose's name among meshes.0.pose, cameras.0.pose"),
         ({"cameras.0.pose": PoseParameter(scale=0.1)}, ValueError, "cameras.0.pose: scale: expected None for a camera"),
         (
-            {"meshes.0.pose": PoseParameter(torch.eye(4))},
-            TypeError,
-            "meshes.0.pose: start: expected a Pose, got Tensor",
+            {"meshes.0.pose": PoseParameter(torch.eye(3))},
+            ValueError,
+            r"meshes.0.pose: init: expected shape \(4, 4\)",
         ),
         (
             {"meshes.0.pose": PoseParameter(Pose(2.0 * torch.eye(3), torch.zeros(3)))},
