@@ -15,6 +15,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.fit import Calibration, FitOptions, calibrate, fit_camera
 from edgegrad.fit.ending import Ending
+from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
 from edgegrad.fit.pose.loss_model import ColorLoss, score_covariance
 from edgegrad.fit.pose.pose import Pose
@@ -99,7 +100,7 @@ def test_deviations_are_those_of_pictures_with_noise(blocks: int) -> None:
     for seed in range(10):
         lens = Unknowns(False, True, True, 2)
         task = task_of(noisy(clean, blocks, seed), true, background=BACKGROUND, unknowns=lens)
-        loss = ColorLoss(task, pose, 512, 16, seed).at(pose)
+        loss = ColorLoss(task, pose, Settings(max_size=512, seed=seed)).at(pose)
         step = torch.linalg.solve(loss.curvature, loss.gradient)
         found.append(float(loss.gradient @ torch.linalg.solve(loss.scores, loss.gradient)) / len(step))
     # The mean over ten has a deviation of 0.13. Bartlett's weights leave out a part of the correlation: of blocks of 3, a ninth.
