@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import CameraFit, FitOptions, calibrate, fit_camera
+from edgegrad.fit import FitOptions, calibrate, fit_camera
+from edgegrad.fit.pose.fit_camera import CameraFit
 
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])
 LENS = torch.tensor([-0.15, 0.05, 0.001, -0.001], dtype=torch.float64)
@@ -97,7 +98,11 @@ def main() -> None:
     for seed, (true, start, shot) in enumerate(cases):
         began = time.process_time()
         found = fit_camera(
-            eg.Scene([mesh], BACKGROUND), shot[0], start[0], principal=True, distortion=4,
+            eg.Scene([mesh], BACKGROUND),
+            shot[0],
+            start[0],
+            principal=True,
+            distortion=4,
             options=FitOptions(seed=seed, progress=False),
         )
         ratios += row(found, true[0], time.process_time() - began, found.reason)

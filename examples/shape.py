@@ -22,7 +22,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 import edgegrad as eg
-from edgegrad.fit import Fit, FitOptions, Refinement, fit_shape
+from edgegrad.fit import FitOptions, Refinement, fit_shape
+from edgegrad.fit.descent.result import Fit
 
 # Radiance by the normal: constant, and a colour for each axis. Vertex colours, so no light has to be sampled.
 EVEN = 0.5
@@ -30,7 +31,7 @@ LIGHT = torch.tensor([[0.30, 0.10, 0.02], [0.05, 0.25, 0.10], [0.12, 0.02, 0.30]
 
 
 def lit(mesh: eg.Mesh) -> eg.Mesh:
-    normals = F.normalize(eg.vertex_normals(mesh.verts, mesh.faces), dim=1)
+    normals = F.normalize(mesh.vertex_normals(), dim=1)
     return mesh.replace(colors=EVEN + normals @ LIGHT.to(normals))
 
 
@@ -48,7 +49,9 @@ def stone(subdivisions: int = 6) -> eg.Mesh:
 NOISE, MISSING, WALL = 0.002, 0.1, 2.2  # of the sensor; noise and the wall's depth in diagonals
 
 
-def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures", levels: int = 3, **options: Any) -> Fit:
+def fit(
+    mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures", levels: int = 3, **options: Any
+) -> Fit:
     """Start from a sphere around the middle of the mesh's box, 0.35 of its diagonal in radius."""
     cameras = objects.around(mesh, views, size, distance=1.35)
     seen = [
@@ -57,8 +60,7 @@ def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures"
     ]
     low, high = mesh.verts.aminmax(dim=0)
     diagonal = float((high - low).norm())
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.35 * diagonal)
-    start = eg.Mesh(torch.tensor(ball.vertices).float() + (low + high) / 2, torch.tensor(ball.faces))
+    start = eg.shapes.sphere((low + high) / 2, 0.35 * diagonal, subdivisions=3)
     own = FitOptions(**{"seed": 0, "steps": 150, "spp": 4} | options)
     shared: dict[str, Any] = {"cameras": cameras, "refinement": Refinement(levels), "options": own}
     images, masks = ([found[name] for found in seen] for name in ("image", "alpha"))

@@ -38,8 +38,8 @@ def simplified(mesh: eg.Mesh, faces: int) -> eg.Mesh:
 
 
 def textured(mesh: eg.Mesh, source: eg.Mesh, texels: int = 256) -> eg.Mesh:
-    mesh = eg.unwrap(mesh, size=texels)
-    return mesh.replace(texture=eg.bake(mesh, source, texels))
+    mesh = eg.textures.unwrap(mesh, size=texels)
+    return mesh.replace(texture=eg.textures.bake(mesh, source, texels))
 
 
 def simplify(mesh: eg.Mesh, faces: int = 300, steps: int = 100) -> tuple[eg.Mesh, Differences]:
@@ -60,7 +60,12 @@ def simplify(mesh: eg.Mesh, faces: int = 300, steps: int = 100) -> tuple[eg.Mesh
 
     simple = simplified(mesh, faces)
     fit = fit_shape(
-        simple, images, cameras, masks=masks, appearance=lit, refinement=Refinement(levels=1, lr=0.002, smoothness=1.0),
+        simple,
+        images,
+        cameras,
+        masks=masks,
+        appearance=lit,
+        refinement=Refinement(levels=1, lr=0.002, smoothness=1.0),
         options=FitOptions(seed=0, steps=steps, spp=4),
     )
     assert fit.mesh is not None

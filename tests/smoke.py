@@ -12,7 +12,7 @@ import trimesh
 import edgegrad as eg
 from edgegrad.cli import main
 from edgegrad.cli.doctor import gradient_error
-from edgegrad.fit import FitOptions, Refinement, fit_pose, fit_shape
+from edgegrad.fit import FitOptions, fit_pose, fit_shape
 from edgegrad.fit.losses import ssim
 
 
@@ -34,7 +34,7 @@ def light() -> None:
     camera = eg.Camera.look_at((0, 3, 5), (0, 0, 0), size=(48, 48))
 
     def total(x: torch.Tensor, seed: int) -> torch.Tensor:
-        sun = eg.DirectionalLight(torch.stack([x, -torch.ones_like(x), -0.3 * torch.ones_like(x)]), 3.0)
+        sun = eg.lights.DirectionalLight(torch.stack([x, -torch.ones_like(x), -0.3 * torch.ones_like(x)]), 3.0)
         return eg.render(
             eg.Scene([mesh, floor], lights=[sun]), camera, spp=64, seed=seed, sampling=eg.Sampling(edges=20_000)
         ).sum()
@@ -72,15 +72,9 @@ def extras() -> None:
         "torchmetrics": ("fit", lambda: ssim(image, image)),
         "gpytoolbox": (
             "fit",
-            lambda: fit_shape(
-                mesh,
-                [image],
-                [camera],
-                refinement=Refinement(levels=2),
-                options=FitOptions(seed=0, steps=1, progress=False),
-            ),
+            lambda: fit_shape(mesh, [image], [camera], options=FitOptions(seed=0, steps=1, progress=False)),
         ),
-        "xatlas": ("fit", lambda: eg.unwrap(mesh)),
+        "xatlas": ("fit", lambda: eg.textures.unwrap(mesh)),
     }
     for library, (extra, call) in needs.items():
         if importlib.util.find_spec(library) is None:

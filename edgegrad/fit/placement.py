@@ -86,8 +86,8 @@ class PoseParameter:
 
     Parameters
     ----------
-    init : PoseFit or Tensor, optional
-        An earlier fit, or mesh to world (4, 4). By default the vertices stay where they are.
+    init : PoseFit, Tensor or tuple, optional
+        An earlier fit, mesh to world (4, 4), (R, t) or (R, t, scale). By default the vertices stay where they are.
     of : Mesh or Scene, optional
         The object: centre and size are those of its bounding box. By default the part of the scene that the parameter's name
         names.
@@ -128,9 +128,9 @@ def _checked(name: str, init: Any) -> Pose:
     f64 = torch.float64
     if init is None:
         return Pose(torch.eye(3, dtype=f64), torch.zeros(3, dtype=f64))
-    if not isinstance(init, Pose):
+    if not isinstance(init, tuple) or not 2 <= len(init) <= 6:
         return pose_from_matrix(f"{name}: init", getattr(init, "matrix", init))
-    R, t, scale = (torch.as_tensor(x).detach().cpu().to(f64, copy=True) for x in init[:3])
+    R, t, scale = (torch.as_tensor(x).detach().cpu().to(f64, copy=True) for x in Pose(*init)[:3])
     for part, value, shape in (("R", R, (3, 3)), ("t", t, (3,)), ("scale", scale, ())):
         check_shape(f"{name}: {part}", value, shape)
         check_finite(f"{name}: {part}", value)

@@ -13,9 +13,10 @@ from quiet_fits import arranged, quiet
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Calibration, FitOptions, calibrate, fit_camera
+from edgegrad.fit import FitOptions, calibrate, fit_camera
 from edgegrad.fit.ending import Ending
 from edgegrad.fit.options import Settings
+from edgegrad.fit.pose.calibrate import Calibration
 from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
 from edgegrad.fit.pose.loss_model import ColorLoss, score_covariance
 from edgegrad.fit.pose.pose import Pose

@@ -20,8 +20,8 @@ from brackets import (
 from quiet_fits import quiet
 
 import edgegrad as eg
-from edgegrad.fit import FitOptions, PoseFit, fit_pose
-from edgegrad.fit.pose.result import pose_from_json
+from edgegrad.fit import FitOptions, fit_pose
+from edgegrad.fit.pose.result import PoseFit, pose_from_json
 
 pytestmark = pytest.mark.unsanitized
 

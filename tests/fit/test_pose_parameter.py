@@ -12,8 +12,8 @@ from brackets import START as START_MATRIX
 from quiet_fits import arranged
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene
-from edgegrad.fit.placement import Coordinates
+from edgegrad.fit import Parameter, PoseParameter, fit_scene
+from edgegrad.fit.placement import Coordinates, Pose
 
 F64 = torch.float64
 QUIET = {"progress": False, "spp": 4}

@@ -20,7 +20,6 @@ from tqdm import tqdm
 
 from ...camera.camera import Camera
 from ...check import as_tensor, check_flag, check_float, check_int, check_shape
-from ...scene.find_symmetries import find_symmetries
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
@@ -279,11 +278,11 @@ def _check_search(search: object, init: object, cameras: Sequence[Camera], name:
 
 
 def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -> Symmetries | None:
-    """Return the given or found symmetries. Raises TypeError or ValueError, or what find_symmetries() raises."""
+    """Return the given or found symmetries. Raises TypeError or ValueError, or what Symmetries.find() raises."""
     if given is None or isinstance(given, Symmetries):
         return given
     if given == "find":
-        return find_symmetries(mesh)
+        return Symmetries.find(mesh)
     if isinstance(given, str):
         raise ValueError(f'{name}: expected Symmetries, "find" or None, got {given!r}')
     raise TypeError(f'{name}: expected Symmetries, "find" or None, got {type(given).__name__}')

@@ -82,7 +82,7 @@ def fit_rig(
         An argument is wrong; the message names it.
     """
     if not isinstance(rig, Rig):
-        raise TypeError(f"rig: expected a Rig, got {type(rig).__name__}; load one with load_rig(path)")
+        raise TypeError(f"rig: expected a Rig, got {type(rig).__name__}; load one with eg.rig.load(path)")
     tries = 40 * search if isinstance(search, bool) else check_int("search", search, 0, 10**6)
     scene_of, parameters = appearance if isinstance(appearance, tuple) else (appearance or (lambda scene: scene), {})
     free = FreeParameters.from_arguments(rig, seek, init or {}, parameters)
