@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from ..check import check_flag, check_int, check_positive, check_positive_int
+from ..check import check_flag, check_int, check_positive
 from ..files.paths import PathLike
 from ..sampling import Sampling, drawn_seed
 from .checkpoints import Checkpoint, saved_seed
@@ -14,6 +14,10 @@ from .losses import REGION, Loss, loss_of
 
 METHODS = ("adam", "gauss-newton")
 MIN_PICTURE_SIDE = 8  # Pixels on the shorter side of a picture: fewer show no contour.
+RANGES = {
+    **dict.fromkeys(("steps", "spp", "patience", "views_per_step"), (1, 2**31 - 1)), "seed": (0, 2**32 - 1),
+    "max_size": (MIN_PICTURE_SIDE, 2**31 - 1), "coarsest": (4, 65536),
+}  # fmt: skip
 # Options that only some fits use, and why others leave them out.
 POSE_OPTIONS = ("steps", "step_tolerance", "spp", "max_size", "callback")
 DESCENT_OPTIONS = (
@@ -23,19 +27,14 @@ DESCENT_OPTIONS = (
 UNUSED = {
     "steps": "takes as many steps as each picture needs",
     "step_tolerance": "ends by its loss, as options.loss_tolerance says",
-    "loss_tolerance": "ends by the length of its steps, as options.step_tolerance says",
-    "patience": "ends by the length of its steps, as options.step_tolerance says",
+    **dict.fromkeys(("loss_tolerance", "patience"), "ends by the length of its steps, as options.step_tolerance says"),
     "max_size": "compares pictures at their own size, which camera.resized() changes",
     "views_per_step": "compares all views in each step",
-    "loss": "has a loss of its own",
-    "mask_loss": "has a loss of its own",
-    "method": "has steps of its own",
+    **dict.fromkeys(("loss", "mask_loss", "method"), "has a loss and steps of its own"),
     "coarsest": "chooses its levels of resolution",
     "callback": "gives its results one by one to your loop",
     "checkpoint": "keeps no state in files",
-    "sampling": "compares colours without light",
-    "shadows": "compares colours without light",
-    "bounces": "compares colours without light",
+    **dict.fromkeys(("sampling", "shadows", "bounces"), "compares colours without light"),
 }
 
 
@@ -102,35 +101,30 @@ class FitOptions:
     coarsest: int | None = None
 
     def __post_init__(self) -> None:
-        value: Any
-        for name, value in vars(self).items():
-            if value is None:
-                continue
-            shown = f"options.{name}"
-            if name in ("steps", "spp", "patience", "views_per_step"):
-                check_positive_int(shown, value)
-            elif name == "seed":
-                check_int(shown, value, 0, 2**32 - 1)
-            elif name == "coarsest":
-                check_int(shown, value, 4, 65536)
-            elif name == "max_size":
-                check_int(shown, value, MIN_PICTURE_SIDE, 2**31 - 1)
-            elif name == "method" and value not in METHODS:
-                raise ValueError(f"{shown}: expected one of {', '.join(METHODS)}, got {value!r}")
-            elif name == "loss_tolerance":
-                check_positive(shown, value, least=0.0, most=1.0)
-            elif name == "step_tolerance":
-                check_positive(shown, value, least=1e-30, most=1.0)
-            elif name == "progress":
-                check_flag(shown, value)
-            elif name == "callback" and not callable(value):
-                raise TypeError(f"{shown}: expected a function of the result so far, got {type(value).__name__}")
-            elif name == "sampling" and not isinstance(value, Sampling):
-                raise TypeError(f"{shown}: expected a Sampling, got {type(value).__name__}; give Sampling(…)")
-            elif name in ("loss", "mask_loss") and (name, value) != ("loss", REGION):
-                loss_of(shown, value)
-            elif name == "checkpoint" and not isinstance(value, Checkpoint):
-                Checkpoint(value)
+        for name, (least, most) in RANGES.items():
+            if (number := getattr(self, name)) is not None:
+                check_int(f"options.{name}", number, least, most)
+        for name, smallest in (("loss_tolerance", 0.0), ("step_tolerance", 1e-30)):
+            if (number := getattr(self, name)) is not None:
+                check_positive(f"options.{name}", number, least=smallest, most=1.0)
+        if self.method not in (None, *METHODS):
+            raise ValueError(f"options.method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+        if self.loss not in (None, REGION):
+            loss_of("options.loss", self.loss)
+        if self.mask_loss is not None:
+            loss_of("options.mask_loss", self.mask_loss)
+        check_flag("options.progress", self.progress)
+        if self.callback is not None and not callable(self.callback):
+            raise TypeError(
+                f"options.callback: expected a function of the result so far, got {type(self.callback).__name__}"
+            )
+        if not isinstance(self.sampling, Sampling | None):
+            raise TypeError(f"options.sampling: expected a Sampling, got {type(self.sampling).__name__}")
+        _checkpoint(self.checkpoint)
+
+
+def _checkpoint(given: Checkpoint | PathLike | None) -> Checkpoint | None:
+    return given if given is None or isinstance(given, Checkpoint) else Checkpoint(given)
 
 
 @dataclass(frozen=True)
@@ -167,10 +161,9 @@ class Settings:
         for name in set_ones:
             if name in UNUSED and name not in used:
                 raise ValueError(f"options.{name}: {fit} {UNUSED[name]}; leave it out")
-        checkpoint = given.checkpoint
-        checkpoint = checkpoint if checkpoint is None or isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
+        checkpoint = _checkpoint(given.checkpoint)
         seed = saved_seed(checkpoint) if given.seed is None else given.seed
-        seed = drawn_seed(below=2**32) if seed is None else seed
+        seed = int(drawn_seed()) % 2**32 if seed is None else seed
         return Settings(**{**defaults, **set_ones, "seed": seed, "checkpoint": checkpoint})
 
     @property

@@ -247,7 +247,7 @@ ONE = taken(1, 16)[0]
         ({"masks": [torch.ones(16, 16)]}, "masks: expected 2, one for each camera, got 1"),
         ({"masks": 2 * [torch.zeros(9, 9)]}, "masks[0]: expected "),
         ({"max_size": 2}, "max_size: expected"),
-        ({"loss": "l1"}, "options.loss: calibrate has a loss of its own; leave it out"),
+        ({"loss": "l1"}, "options.loss: calibrate has a loss and steps of its own; leave it out"),
         ({"callback": 3}, "callback: expected a function of the result so far"),
     ],
 )  # fmt: skip
