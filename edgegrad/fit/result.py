@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from ..files.paths import PathLike
@@ -51,6 +52,11 @@ class FitResult:
         file = io.BytesIO()
         self.plot().savefig(file, format="png", dpi=100)
         return file.getvalue()
+
+
+def delegated(part: str, names: str) -> list[Any]:
+    """Return properties that are those of the attribute `part`, by names apart by spaces."""
+    return [property(attrgetter(f"{part}.{name}")) for name in names.split()]
 
 
 def chosen(count: int, most: int) -> list[int]:

@@ -21,7 +21,7 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..history import Record, history_rows
 from ..options import POSE_OPTIONS, FitOptions, Settings
-from ..result import FitResult
+from ..result import FitResult, delegated
 from ..views import Images, cameras_of
 from .bundle_adjustment import MAX_ADJUST_STEPS, adjust_bundle
 from .camera_uncertainty import CameraUncertainty
@@ -33,7 +33,7 @@ from .result import PoseFit, Step
 from .task import STEP_PARTS, Unknowns
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 # Each part of a step moves one tensor of a camera.
 TENSOR_OF = {
@@ -60,6 +60,9 @@ class CameraFit(FitResult):
     cameras: list[Camera]
     search: PoseFit
     uncertainty: CameraUncertainty | None = None
+    loss, explained, steps, seconds, converged, interrupted, plot, plot_history, _repr_png_ = delegated(
+        "search", "loss explained steps seconds converged interrupted plot plot_history _repr_png_"
+    )
 
     @property
     def camera(self) -> Camera:
@@ -67,32 +70,8 @@ class CameraFit(FitResult):
         return self.cameras[0]
 
     @property
-    def loss(self) -> float:
-        return self.search.loss
-
-    @property
     def history(self) -> list[Record]:
         return [self._record(number, step) for number, step in enumerate(self.search.history)]
-
-    @property
-    def steps(self) -> int:
-        return self.search.steps
-
-    @property
-    def seconds(self) -> float:
-        return self.search.seconds
-
-    @property
-    def explained(self) -> float:
-        return self.search.explained
-
-    @property
-    def converged(self) -> bool:
-        return self.search.converged
-
-    @property
-    def interrupted(self) -> bool:
-        return self.search.interrupted
 
     @property
     def reason(self) -> str:
@@ -101,12 +80,6 @@ class CameraFit(FitResult):
         if known is None or not known.unknown:
             return self.search.reason
         return reason_with(replace(self.search, uncertainty=None, converged=True).reason, known)
-
-    def plot(self, most: int = 4) -> Figure:
-        return self.search.plot(most)
-
-    def plot_history(self) -> Figure:
-        return self.search.plot_history()
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write history.json, camera.json for load_camera (of several cameras camera-0.json and so on) and what PoseFit.save
@@ -138,10 +111,6 @@ class CameraFit(FitResult):
         for part, norm in step.gradient.items():
             squares[TENSOR_OF[part]] = squares.get(TENSOR_OF[part], 0.0) + norm**2
         return Record(number, step.loss, {name: math.sqrt(square) for name, square in squares.items()}, values)
-
-    @property
-    def _can_draw(self) -> bool:
-        return self.search._can_draw
 
 
 def fit_camera(

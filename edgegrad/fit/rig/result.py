@@ -16,12 +16,11 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..descent.result import Fit
 from ..edge_support import MIN_EDGE_SUPPORT
-from ..history import Record
-from ..result import FitResult
+from ..result import FitResult, delegated
 from .uncertainty import JointUncertainty
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 MISSED_REGION = 0.01  # A region of a larger share of a mask is a missed limb.
 SHARE_OF_MEDIAN = 0.85  # A joint in a wrong place shows a smaller share of edges, relative to the median joint.
@@ -46,6 +45,10 @@ class RigFit(FitResult):
     explained_joints: dict[str, float] = field(default_factory=dict, repr=False)
     uncertainty: JointUncertainty | None = field(default=None, repr=False)
     left_out: float = field(default=0.0, repr=False)
+
+    loss, explained, history, steps, seconds, interrupted, plot = delegated(
+        "fit", "loss explained history steps seconds interrupted plot"
+    )
 
     def posed(self) -> Scene | Mesh:
         return self.rig.posed(**self.values)
@@ -92,33 +95,6 @@ class RigFit(FitResult):
             return []
         least = max(MIN_EDGE_SUPPORT, SHARE_OF_MEDIAN * statistics.median(self.explained_joints.values()))
         return [name for name, share in self.explained_joints.items() if share < least]
-
-    @property
-    def loss(self) -> float:
-        return self.fit.loss
-
-    @property
-    def history(self) -> list[Record]:
-        return self.fit.history
-
-    @property
-    def steps(self) -> int:
-        return self.fit.steps
-
-    @property
-    def seconds(self) -> float:
-        return self.fit.seconds
-
-    @property
-    def explained(self) -> float:
-        return self.fit.explained
-
-    @property
-    def interrupted(self) -> bool:
-        return self.fit.interrupted
-
-    def plot(self, most: int = 4) -> Figure:
-        return self.fit.plot(most)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write what Fit.save() writes, and pose.json, posed.glb and joints.json; return the names.
