@@ -183,7 +183,7 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
         given = {"masks": labels_of(view, scene_of(2))}
     if kind == "shares":
         given = {"masks": list(shares_of(view, scene_of(2), 256).unbind(-1))}
-    if kind == "depths":
+    if kind == "depth":
         given["depths"] = depth_of(view, *scene_of(2))
     meshes = [mesh.replace(face_colors=None) for mesh in MESHES[:2]] if kind == "plain" else MESHES[:2]
     fits = fit_poses(meshes, image, view, init=STARTS[:2], **arranged(**given))
@@ -270,10 +270,10 @@ WITHIN = at(torch.eye(3).double(), CENTER + ASIDE)
         (MESHES[:2], {"init": STARTS[:2], "masks": BLANK[..., 0]}, TypeError, r"masks: expected an image of labels, of integers"),
         (MESHES[:2], {"init": STARTS[:2], "masks": [BLANK[..., 0]]}, ValueError, r"masks: expected 2, one for each mesh, got 1"),
         (MESHES[:2], {"init": STARTS[:2], "masks": BLANK[..., 0].int() + 1}, ValueError, r"masks: expected the label 2 where"),
-        (MESHES[:2], {"init": STARTS[:2], "masks": [BLANK[:9, :9, 0]] * 2}, ValueError, r"masks: expected .*160.*, got .*9"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": [BLANK[:9, :9, 0]] * 2}, ValueError, r"masks\[0\]: expected .*160.*, got .*9"),
         (MESHES[:2], {"init": STARTS[:2], "depths": BLANK[:9, :9, 0]}, ValueError, r"depths: expected shape .*160.*, got .*9"),
         (MESHES[:2], {"init": STARTS[:2], "symmetries": ["find"]}, ValueError, r"symmetries: expected 2, .* got 1"),
-        (MESHES[:2], {"init": STARTS[:2], "callback": 3}, TypeError, r"callback: expected a function of a list of PoseFits"),
+        (MESHES[:2], {"init": STARTS[:2], "callback": 3}, TypeError, r"callback: expected a function of the result so far"),
     ],
 )  # fmt: skip
 def test_errors_name_the_argument(two, meshes, given, error, message):

@@ -201,10 +201,10 @@ def test_nine_of_ten_are_found_without_a_start(masked: bool) -> None:
 
 def test_errors_name_the_argument() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    for starts, says in ((0, "starts"), ("all", 'or "global"'), (10**6, "starts")):
+    for search, says in ((0, "search"), ("all", 'or "global"'), (10**6, "search")):
         with pytest.raises(ValueError, match=says):
-            fit_pose(mesh, picture, camera(), mask, search=starts, options=quiet())  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="starts"):
+            fit_pose(mesh, picture, camera(), mask, search=search, options=quiet())  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="search"):
         fit_pose(mesh, picture, camera(), mask, search=2.5, options=quiet())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="leave init out"):
         fit_pose(mesh, picture, camera(), mask, torch.eye(4), search="global", options=quiet())
