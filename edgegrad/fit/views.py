@@ -166,7 +166,7 @@ def _counted(measured: dict[str, Measurement], mask: Tensor | None, weight: Tens
 def cameras_of(cameras: object) -> list[Camera]:
     """Return cameras one by one, as copies on the CPU. Raises TypeError."""
     given = [cameras] if isinstance(cameras, Camera) else cameras
-    if not isinstance(given, Sequence):
+    if not isinstance(given, Sequence) or isinstance(given, str):
         raise TypeError(f"cameras: expected a Camera or a sequence of them, got {type(cameras).__name__}")
     if not given:
         raise ValueError("cameras: expected one for each picture, got an empty list; give at least one")

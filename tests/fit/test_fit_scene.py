@@ -288,7 +288,7 @@ def test_saves_the_materials_it_found(tmp_path):
         ({"images": None}, ValueError, "images: expected pictures or masks"),
         ({"weights": -torch.ones(2, 32, 32)}, ValueError, "weights: expected numbers from 0 up"),
         ({"masks": torch.ones(2, 32, 32, 3)}, ValueError, "masks[0]: expected shape (32, 32) or (32, 32, 1)"),
-        ({"cameras": "here"}, TypeError, "cameras[0]: expected a Camera"),
+        ({"cameras": "here"}, TypeError, "cameras: expected a Camera"),
         ({"scene": 3}, TypeError, "scene: expected a Scene, a Mesh, or a function"),
         ({"loss": "l3"}, ValueError, "loss: expected one of l1, l2"),
         ({"max_size": 64}, ValueError, "options.max_size: fit_scene compares pictures at their own size"),

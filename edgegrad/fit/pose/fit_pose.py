@@ -119,7 +119,8 @@ def search_pose(
     if images is None:
         if masks is None:
             raise ValueError(f"{names.images}: expected pictures or masks to compare with, got neither")
-        mesh, images, names = without_colors(mesh), masks, names._replace(images=names.masks)
+        mesh = without_colors(mesh) if isinstance(mesh, Mesh | Scene) else mesh
+        images, names = masks, names._replace(images=names.masks)
     given_cameras = cameras_of(cameras)
     _check_search(search, init, given_cameras, names.init)
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
