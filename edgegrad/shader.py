@@ -25,7 +25,7 @@ from .camera.camera import Camera
 from .check import all_finite, values_visible
 from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
-from .kernel.request import LEAST_SPACING, Request, derived_seed
+from .kernel.request import Request
 from .points.background import environments
 from .points.blend import Blended, let_through, transparent
 from .points.discontinuities import UNEQUAL
@@ -39,6 +39,7 @@ from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
 from .points.splat import SplatTerm, boundary
 from .points.surfaces import every_face
+from .sampling import LEAST_SPACING, derived_seed
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene
 from .warnings import warn
@@ -50,7 +51,6 @@ POINTS_AT_ONCE = 1 << 17
 # So many samples of a pixel on one face are shaded at one of them: a face once at the usual number, and more often the more
 # there are, so that what shading leaves of noise falls with them too.
 SAMPLES_A_POINT = 16
-CREASES = ("auto", True, False)
 
 
 def points_of_face(spp: int) -> int:
@@ -120,7 +120,6 @@ def render_shaded(
     shader: Shader,
     request: Request,
     creases: bool | str,
-    check: bool,
     traits: ShadingTraits | None = None,
     watch: Watch = Watch(),  # noqa: B008  it keeps nothing
 ) -> Tensor:
@@ -128,13 +127,16 @@ def render_shaded(
     takes."""
     if not callable(shader):
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
-    if creases not in CREASES or not isinstance(creases, (bool, str)):
-        raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
+    if not values_visible(request.image.seed):
+        raise RuntimeError(
+            "seed: expected one of all elements of a torch.vmap batch where a shader is given, got one of each; give seed=, "
+            'or torch.vmap(…, randomness="same")'
+        )
     radiance = shader if isinstance(shader, Radiance) else UserShader(shader)
     traits = traits or ShadingTraits(points_of_face(request.image.spp), blended=scene.blends)
     with shaded_memory(request, textured=traits.lit and scene.textured_faces is not None):
         images = [
-            _Image(ImageContext(scene, request, k), radiance, creases, check, traits, watch).render()
+            _Image(ImageContext(scene, request, k), radiance, creases, traits, watch).render()
             for k in range(request.cameras)
         ]
     return images[0] if camera.batch is None else torch.stack(images)
@@ -161,11 +163,10 @@ class _Image:
         context: ImageContext,
         radiance: Radiance,
         creases: bool | str,
-        check: bool,
         traits: ShadingTraits,
         watch: Watch = Watch(),  # noqa: B008  it keeps nothing
     ) -> None:
-        self._context, self._creases, self._check, self._traits, self._watch = context, creases, check, traits, watch
+        self._context, self._creases, self._traits, self._watch = context, creases, traits, watch
         self._radiance = radiance
         # (C,) or (H, W, C): the scene's background, or the environments that it shows. Found here, where derivatives are
         # enabled if they are asked for; the values of an image are found without.
@@ -216,7 +217,7 @@ class _Image:
                 declare = self._radiance.declare if self._radiance.declares_discontinuities else self._shade
                 margin = self._traits.discontinuity_margin
                 found = DiscontinuityTerms(
-                    context, self._kinds, self._shade, declare, POINTS_AT_ONCE, self._step_spacing, margin
+                    context, self._kinds, self._shade, declare, POINTS_AT_ONCE, self._spacing, margin
                 )
                 terms += found.found(watch)
         if visibility:
@@ -342,8 +343,8 @@ class _Image:
         return boundary(samples.x, samples.velocity, jump, to_background, self._background)
 
     @property
-    def _step_spacing(self) -> float:
-        return max(self._context.request.gradient.step_spacing / self._traits.closer, LEAST_SPACING)
+    def _spacing(self) -> float:
+        return max(self._context.request.gradient.discontinuity_spacing / self._traits.closer, LEAST_SPACING)
 
     def _with_creases(self) -> Request:
         """Return the request for samples on curves, with colours that jump where the shader may."""
@@ -353,7 +354,7 @@ class _Image:
                 attributes = every_face(len(context.fixed.faces))
             else:
                 attributes = context.fixed.crease_attributes().cpu() if self._creases else None
-        gradient = context.request.gradient._replace(step_spacing=self._step_spacing)
+        gradient = context.request.gradient._replace(discontinuity_spacing=self._spacing)
         return context.request._replace(scene=with_attributes(context.request.scene, attributes), gradient=gradient)
 
     # -- the shader ----------------------------------------------------------------------------------------------------
@@ -367,18 +368,6 @@ class _Image:
                 raise ValueError(UNEQUAL)
             self._kinds = kinds
             self.discontinuities_move = self.discontinuities_move or moves(*hits._discontinuities.values)
-        if self._check and len(hits) > 1 and not hits._discontinuities.forced:
-            order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
-            order = order[: (len(hits) + 1) // 2]
-            with torch.no_grad():
-                again = self._shader(hits._subset(order)).to(radiance.dtype)
-            if not torch.allclose(
-                again, radiance.detach()[order], rtol=1e-4, atol=1e-5 * float(radiance.detach().abs().max())
-            ):
-                raise ValueError(
-                    "shader: expected a function of each point by itself, got other values for half of the points in "
-                    "another order; leave out what mixes points (batch norm, means, sorting) and what is drawn at random"
-                )
         return radiance
 
     def _checked(self, radiance: object, hits: Hits) -> Tensor:
