@@ -318,12 +318,8 @@ def fitted() -> Arrays:
     view = camera().detach()
     target = eg.render(mesh.replace(verts=mesh.verts @ matrix[:3, :3].T), view, spp=16, seed=0)
     found = fit.fit_scene(
-        mesh,
-        [target],
-        view,
-        {"verts": 0.01, "face_colors": 0.02},
-        options=fit.FitOptions(seed=0, steps=8, progress=False),
-    )
+        mesh, [target], view, {"verts": 0.01, "face_colors": 0.02}, options=fit.FitOptions(seed=0, steps=8, progress=False),
+    )  # fmt: skip
     return {"verts": found.scene.meshes[0].verts, "colors": found.scene.meshes[0].face_colors}
 
 

@@ -109,13 +109,9 @@ def test_finds_the_focal_length():
     K[:2, :2] *= 1.1
     start = about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05))
     fit = fit_pose(
-        before_sky(),
-        picture(near.replace(K=K)),
-        near,
-        init=start,
-        focal=True,
+        before_sky(), picture(near.replace(K=K)), near, init=start, focal=True,
         options=FitOptions(steps=12, seed=1, progress=False),
-    )
+    )  # fmt: skip
     degrees, percent = errors(fit)
     assert float(fit.camera.K[0, 0] / K[0, 0]) == pytest.approx(1.0, abs=0.02)
     assert float(fit.camera.K[0, 2]) == float(near.K[0, 2])

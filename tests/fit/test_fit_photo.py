@@ -107,13 +107,9 @@ def test_two_photographs_of_one_pose(taken):
         CENTER + 4.5 * torch.tensor([-0.6, 0.35, 0.72]).double(), CENTER, fov_y=45.0, size=(96, 96)
     )
     fit = fit_pose(
-        bracket(),
-        [image, photograph(other, seed=1, gain=(0.7, 0.8, 0.9))],
-        [view, other],
-        init=START,
-        search=False,
+        bracket(), [image, photograph(other, seed=1, gain=(0.7, 0.8, 0.9))], [view, other], init=START, search=False,
         options=quiet(),
-    )
+    )  # fmt: skip
     off = errors(fit)
     assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, off
 
@@ -178,13 +174,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
     assert found.steps == expected.steps and found.converged == expected.converged
     with pytest.raises(ValueError, match="depth"):
         fit_pose(
-            bracket(),
-            image,
-            view,
-            init=start,
-            depths=depth_of(view),
+            bracket(), image, view, init=start, depths=depth_of(view),
             **arranged(checkpoint=Checkpoint(file, resume=True), **whole),
-        )
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -93,12 +93,8 @@ def test_finds_a_shape_from_several_views():
     views = [eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=40.0, size=(96, 96)) for eye in eyes]
     images = [photograph(view, true, seed=k) for k, view in enumerate(views)]
     fit = fit_shape(
-        eg.Mesh(*sphere(2)),
-        images,
-        views,
-        refinement=Refinement(levels=2),
-        options=quiet(loss="region", steps=80, spp=4),
-    )
+        eg.Mesh(*sphere(2)), images, views, refinement=Refinement(levels=2), options=quiet(loss="region", steps=80, spp=4),
+    )  # fmt: skip
 
     def off(mesh):
         shown = [[eg.render_aovs(m, view, ["alpha"], spp=32, seed=0)["alpha"] for m in (mesh, true)] for view in views]
@@ -251,12 +247,9 @@ def test_errors_name_the_argument(taken, scene, given, error, message):
 def test_other_fits_refuse_the_region_loss(taken):
     with pytest.raises(ValueError, match=r"loss: expected .* got 'region'"):
         fit_texture(
-            MESH.replace(uvs=torch.rand(6 * AROUND, 2), uv_faces=MESH.faces, colors=None),
-            taken,
-            VIEW,
-            8,
+            MESH.replace(uvs=torch.rand(6 * AROUND, 2), uv_faces=MESH.faces, colors=None), taken, VIEW, 8,
             options=quiet(loss="region"),
-        )
+        )  # fmt: skip
     with pytest.raises(ValueError, match=r"depths: expected none with loss=\"region\""):
         fit_shape(
             MESH, taken, VIEW, depths=torch.ones(96, 96), refinement=Refinement(levels=1), options=quiet(loss="region")

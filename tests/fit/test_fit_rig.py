@@ -95,14 +95,9 @@ def test_keypoints_find_what_masks_do_not() -> None:
     masks = shown(rig.posed(truth), cameras)
     given = {f"bone {k}": seen[k] for k in range(3)}
     found = fit_rig(
-        rig,
-        None,
-        cameras,
-        masks=masks,
-        keypoints=Measured(given, factor=100.0),
-        search=0,
+        rig, None, cameras, masks=masks, keypoints=Measured(given, factor=100.0), search=0,
         options=quiet(coarsest=48, steps=30),
-    )
+    )  # fmt: skip
     assert (found.rig.shape({"rotations": found.values["rotations"]}).joints - joints).norm(dim=1).max() < 0.1
 
 

@@ -109,12 +109,8 @@ def test_a_flat_loss_alone_is_no_convergence():
     )
     target = pictures(eg.Scene([other], BACKGROUND), cameras)
     fit = fit_scene(
-        eg.Scene([bracket()], BACKGROUND),
-        target,
-        cameras,
-        {"background": 0.02},
-        **arranged(steps=200, patience=8, **QUIET),
-    )
+        eg.Scene([bracket()], BACKGROUND), target, cameras, {"background": 0.02}, **arranged(steps=200, patience=8, **QUIET),
+    )  # fmt: skip
     assert fit.ending is Ending.FLAT and not fit.converged and fit.explained < 0.6
     assert fit.reason.startswith("edges not explained: the pictures show")
 
@@ -180,12 +176,9 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
     colour_fit(cameras, target, steps=1, checkpoint=file)
     with pytest.raises(ValueError, match=r"checkpoint: expected .* made with another scene, parameters;"):
         fit_scene(
-            bracket(),
-            target,
-            cameras,
-            {"verts": 1e-3},
+            bracket(), target, cameras, {"verts": 1e-3},
             **arranged(steps=1, checkpoint=Checkpoint(file, resume=True), **QUIET),
-        )
+        )  # fmt: skip
     for name, given in {
         "images": (cameras, [picture + 0.1 for picture in target], {}),
         "cameras": ([eg.Camera.look_at((0, 0, 7), (0, 0, 0), size=view.size) for view in cameras], target, {}),
@@ -221,12 +214,9 @@ def test_a_step_too_far_is_taken_back():
         return loss * (math.nan if float(image.detach().max()) > 1.5 else 1.0)
 
     fit = fit_scene(
-        eg.Scene([bracket()], torch.zeros(3)),
-        target,
-        cameras,
-        {"background": 0.9},
+        eg.Scene([bracket()], torch.zeros(3)), target, cameras, {"background": 0.9},
         **arranged(loss=broken, steps=40, **QUIET),
-    )
+    )  # fmt: skip
     assert all(bool(value.isfinite().all()) for value in fit.values.values())
     assert fit.loss < fit.history[0].loss
 
@@ -328,11 +318,7 @@ def test_the_best_values_are_not_those_of_the_easiest_views():
     easy, hard = (torch.full((8, 8, 1), value) for value in (0.45, 1.0))
     for images in ([easy, hard], [hard, easy]):
         fit = fit_scene(
-            mesh,
-            images,
-            cameras,
-            {"face_colors": 0.02},
-            weights=torch.ones(2, 8, 8),
+            mesh, images, cameras, {"face_colors": 0.02}, weights=torch.ones(2, 8, 8),
             **arranged(views_per_step=1, steps=60, **QUIET),
-        )
+        )  # fmt: skip
         assert float(fit.values["face_colors"].mean()) > 0.6  # the mean of both is the best

@@ -30,13 +30,9 @@ def test_finds_a_shape_from_masks():
     pytest.importorskip("gpytoolbox")
     cameras, masks = egg_views()
     fit = fit_shape(
-        ball(1),
-        None,
-        cameras,
-        masks=masks,
-        refinement=Refinement(levels=2, faces=600),
+        ball(1), None, cameras, masks=masks, refinement=Refinement(levels=2, faces=600),
         **arranged(steps=40, mask_loss="l2", **QUIET),
-    )
+    )  # fmt: skip
     v = fit.mesh.verts - 0.05
     off = ((v / torch.tensor([0.7, 1.1, 0.8])).norm(dim=1) - 1.0).abs()
     assert float(off.mean()) < 0.04, float(off.mean())

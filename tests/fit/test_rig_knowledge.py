@@ -94,14 +94,9 @@ def test_what_no_picture_shows_is_unknown() -> None:
     camera = cameras[0].replace(world_to_camera=cameras[0].world_to_camera.clone())
     camera.world_to_camera[1, 3] += 2.2  # of the upper limb hardly anything is seen
     fit = fit_rig(
-        rig,
-        None,
-        camera,
-        masks=shown(rig.posed(), [camera]),
-        seek=["rotations"],
-        search=0,
+        rig, None, camera, masks=shown(rig.posed(), [camera]), seek=["rotations"], search=0,
         options=quiet(coarsest=32, steps=3),
-    )
+    )  # fmt: skip
     assert fit.uncertainty is not None and fit.uncertainty.degrees["bone 1"] > 5.0
     assert "bone 1 known to ±" in fit.uncertainty.unknown
 

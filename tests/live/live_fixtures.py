@@ -23,9 +23,6 @@ def page(viewer) -> Browser:
 def colour_fit(**options):
     cameras = views(1)
     return fit_scene(
-        bracket(),
-        pictures(bracket(), cameras),
-        cameras,
-        {"face_colors": Parameter(0.01)},
+        bracket(), pictures(bracket(), cameras), cameras, {"face_colors": Parameter(0.01)},
         **arranged(**{**QUIET, **options}),
-    )
+    )  # fmt: skip

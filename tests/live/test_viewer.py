@@ -118,13 +118,9 @@ def test_shapes_are_shown_as_they_move_also_after_remeshing(viewer, monkeypatch)
         seen.append((progress.step, len(progress.scene.meshes[0].faces), progress.views[0].camera.size))
 
     fit = fit_shape(
-        start,
-        None,
-        cameras,
-        masks=masks,
-        refinement=Refinement(levels=2, faces=600),
+        start, None, cameras, masks=masks, refinement=Refinement(levels=2, faces=600),
         **arranged(steps=4, callback=look, **QUIET),
-    )
+    )  # fmt: skip
     viewer.show(fit)
     handle = page(viewer)._meshes[0].handle
     np.testing.assert_allclose(handle.vertices, fit.mesh.verts, atol=1e-6)
