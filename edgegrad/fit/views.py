@@ -20,7 +20,7 @@ from ..warnings import warn
 from .by_camera import numbered, one_for_each
 from .measured import Measurement, area_mean, measurements
 
-Images = Tensor | Sequence[Tensor]
+Images = Tensor | Sequence[Tensor | None]
 FULL = 0.98  # a pixel with a higher mask is covered
 FILL_REACH = 8  # pixels by which colours grow into partly covered ones
 WITH_ALPHA = 2, 4  # channels of pictures with alpha
