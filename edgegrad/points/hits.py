@@ -358,7 +358,9 @@ class Hits:
         part, parts : int, default 0 of 1
             Which of the parts of each point it is.
         """
-        return uniform(self._seed * parts + part, n, stream)
+        n, parts = check_int("n", n, 0, 1 << 16), check_int("parts", parts, 1, 1 << 31)
+        part = check_int("part", part, 0, parts - 1)
+        return uniform(self._seed * parts + part, n, check_int("stream", stream, 0, 1 << 31))
 
     def light_points(
         self, light: Light, sample: int = 0, samples: int = 1, by: LightSampler | None = None
