@@ -1,14 +1,8 @@
 """Docstrings as reStructuredText, for Sphinx.
 
-Docstrings here are plain text: paragraphs, lists with dashes, code in single backticks, formulas indented by four, and tables of
-arguments, of which all rows begin in one column and all texts in another:
-
-    verts   (V, 3) float   positions, which go
-                           on below
-    colors  (V, C) float   one a vertex
-
-Such a table becomes a definition list, whose terms are all columns but the last. So do the sections of numpydoc, such as
-Parameters, whose entries are a line `name : type` and indented lines of text.
+Docstrings here are plain text: paragraphs, lists with dashes, code in single backticks, formulas and code indented by four, and
+the sections of numpydoc. An entry of a section, a line `name : type` and indented lines of text, becomes one of a definition
+list. Napoleon would read all of that as reStructuredText, in which `|x|` and `x_i` are markup.
 """
 
 from __future__ import annotations
@@ -16,19 +10,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator
 from textwrap import dedent
-from typing import NamedTuple
 
 SPECIAL = re.compile(r"([\\*_|<>])")
-ROW = re.compile(r"(\S[^.]*?)\s{2,}(?=\S)")  # what begins a row: an argument, or several
-WORD = re.compile(r"[A-Za-z_]\w*$")
 UNDERLINE = re.compile(r"-{3,}")  # of a section's name
+TEXT = "Notes", "Examples"  # sections without entries
 References = dict[str, str]
-
-
-class Row(NamedTuple):
-    terms: list[str]  # the argument and what comes between it and the text
-    text: list[str]
-    nested: list[str]  # the lines of a table within it
 
 
 def to_rst(lines: Iterable[str], references: References | None = None) -> list[str]:
@@ -45,30 +31,28 @@ def _blocks(lines: list[str], references: References) -> Iterator[str]:
         yield ""
         if i + 1 < len(lines) and UNDERLINE.fullmatch(lines[i + 1]):
             end = next((k for k in range(i + 2, len(lines) - 1) if UNDERLINE.fullmatch(lines[k + 1])), len(lines))
-            yield from (f".. rubric:: {lines[i]}", "", *_section(lines[i + 2 : end], references))
+            section = _blocks if lines[i] in TEXT else _entries
+            yield from (f".. rubric:: {lines[i]}", "", *section(lines[i + 2 : end], references))
         elif lines[i].startswith("    "):
             end = _end(lines, i, lambda line: not line.startswith(" "))
             yield from ("::", "", *("   " + line[1:] for line in lines[i:end]))
-        elif ROW.match(lines[i]) and not lines[i].startswith("- "):
-            end = _end(
-                lines, i, lambda line: not line.startswith("  ") and not ROW.match(line) and not WORD.match(line)
-            )
-            yield from _definitions(_rows(lines[i:end]), references)
+        elif lines[i].startswith(">>> "):
+            end = _end(lines, i, lambda line: False)
+            yield from lines[i:end]
         else:
-            end = _end(lines, i, lambda line: bool(ROW.match(line)) and not line.startswith(("-", " ")))
-            if lines[i].startswith("- "):
-                end = min(end, _end(lines, i, lambda line: line.startswith("- ")))
+            marker = "- " if lines[i].startswith("- ") else ">>> "
+            end = _end(lines, i, lambda line, marker=marker: line.startswith(marker))
             yield from (_inline(line, references) for line in lines[i:end])
         yield ""
         i = end
 
 
-def _section(lines: list[str], references: References) -> Iterator[str]:
+def _entries(lines: list[str], references: References) -> Iterator[str]:
     """The entries of a section of numpydoc, as a definition list."""
     starts = [k for k, line in enumerate(lines) if line and not line.startswith(" ")]
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         name, _, kind = lines[start].partition(" : ")
-        yield f"``{name}``" + f" : *{_inline(kind, {})}*" * bool(kind)
+        yield f"``{name}``" + f" : *{_plain(kind.replace('`', ''), {})}*" * bool(kind)
         text = dedent("\n".join(lines[start + 1 : end])).split("\n")
         found = list(_blocks(text, references)) if any(text) else ["\\ "]
         first = next(k for k, line in enumerate(found) if line)
@@ -78,30 +62,6 @@ def _section(lines: list[str], references: References) -> Iterator[str]:
 def _end(lines: list[str], start: int, ends: Callable[[str], bool]) -> int:
     """Of the block that begins at `start`."""
     return next((k for k in range(start + 1, len(lines)) if not lines[k] or ends(lines[k])), len(lines))
-
-
-def _rows(lines: list[str]) -> list[Row]:
-    """The rows of a table. Lines between the columns of names and texts are a table within the row."""
-    rows: list[Row] = []
-    column = 0  # where texts begin
-    for line in lines:
-        if not line.startswith("  "):
-            *terms, text = re.split(r"\s{2,}", line)
-            rows.append(Row(terms, [text], []) if terms else Row([text], [], []))
-            column = len(line) - len(text)
-        elif len(line) - len(line.lstrip()) < column or rows[-1].nested:
-            rows[-1].nested.append(line)
-        else:
-            rows[-1].text.append(line.strip())
-    return rows
-
-
-def _definitions(rows: list[Row], references: References) -> Iterator[str]:
-    for (name, *kinds), text, nested in rows:
-        yield f"``{name}``" + "".join(f" : *{_inline(kind, {})}*" for kind in kinds)
-        yield from ("   " + _inline(line, references) for line in text or ["\\ "])
-        if nested:
-            yield from ("", *("   " + line for line in _blocks(dedent("\n".join(nested)).split("\n"), references)))
 
 
 def _inline(text: str, references: References) -> str:

@@ -34,7 +34,8 @@ class Camera(Viewpoints, Conventions):
     A fisheye shows up to all around, 180° from its axis, a perspective lens what lies less than 88° from it. Where the
     distortion folds the image over, it ends: beyond there is background, and a render warns with the radius. The motion of
     that lens boundary with the distortion and with K has its gradient. All tensors are differentiable. Numbers reach up to
-    3.4e38, the range of float32, also in float64, and so do those of the inverse of K.
+    3.4e38, the range of float32, also in float64, and so do those of the inverse of K. Raises TypeError for a wrong type,
+    ValueError for a wrong shape or value.
 
     Parameters
     ----------
@@ -48,11 +49,6 @@ class Camera(Viewpoints, Conventions):
     distortion : (4,), (5,), (8,) or (B, ·), default none
         Of a perspective lens, Brown–Conrady: k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV has them (12 or 14 if zeros follow). Of
         a fisheye (4,): k1, k2, k3, k4. None is a pinhole, or a fisheye without.
-
-    Raises
-    ------
-    TypeError, ValueError
-        A field has another type, or another shape or value.
     """
 
     @classmethod
@@ -183,7 +179,7 @@ class Camera(Viewpoints, Conventions):
         return dataclasses.replace(self, **fields)
 
     def project(self, points: Tensor) -> Tensor:
-        """Return the pixel positions of world points, differentiable.
+        """Return pixel positions (…, 2) of world points, differentiable; of a batch (B, …, 2), all points in each camera.
 
         Positions are not finite in the plane of a perspective camera, nor right behind a fisheye. Points that a lens does not
         show, beyond a fold or behind it, may have a position, too. In a panorama the position within ±180° is returned.
@@ -192,12 +188,6 @@ class Camera(Viewpoints, Conventions):
         ----------
         points : (…, 3) float
             World units. Other types and values raise TypeError or ValueError.
-
-        Returns
-        -------
-        Tensor
-            (…, 2): x to the right and y down, the corner of the image at (0, 0). Of a batch (B, …, 2), all points in each
-            camera.
         """
         points = as_tensor("points", points, like=self.K)
         check_float("points", points)

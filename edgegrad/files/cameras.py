@@ -30,10 +30,8 @@ def save_camera(path: PathLike, camera: Camera) -> None:
 
     Parameters
     ----------
-    path : str or Path
-        It ends in .json, else ValueError; OSError where it cannot be written.
-    camera : Camera
-        Others raise TypeError.
+    path, camera : str or Path that ends in .json, Camera
+        Others raise TypeError or ValueError; OSError where it cannot be written.
     """
     file = check_suffix(path, (".json",))
     if not isinstance(camera, Camera):

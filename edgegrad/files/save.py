@@ -41,8 +41,7 @@ def from_trimesh(given: Any) -> Mesh:
 
     Parameters
     ----------
-    given : trimesh.Trimesh
-        Others raise TypeError, those without faces ValueError.
+    given : trimesh.Trimesh; others raise TypeError, those without faces ValueError
     """
     trimesh = require("trimesh", "trimesh", "from_trimesh")
     if isinstance(given, trimesh.Scene):

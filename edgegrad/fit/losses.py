@@ -134,8 +134,7 @@ def multiscale(loss: Loss = l2, levels: int = 4) -> Loss:
 
     Parameters
     ----------
-    loss : function of image, target and weight, default l2
-    levels : int, default 4
+    loss, levels : function of image, target and weight, default l2, and int, default 4
     """
 
     def over_levels(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:

@@ -351,12 +351,10 @@ class Hits:
 
         Parameters
         ----------
-        n : int
-            Numbers a point.
-        stream : int, default 0
-            Each gives other numbers.
+        n, stream : int, int, default 0
+            Numbers a point, and a stream of which each gives other numbers.
         part, parts : int, default 0 of 1
-            Which of the parts of each point it is.
+            Which of the parts of each point it is. Others raise TypeError or ValueError.
         """
         n, parts = check_int("n", n, 0, 1 << 16), check_int("parts", parts, 1, 1 << 31)
         part = check_int("part", part, 0, parts - 1)

@@ -65,15 +65,10 @@ class PrimaryHits:
         return f"PrimaryHits({len(self.hits)} points in {self.context.height} x {self.context.width} pixels)"
 
     def image(self, radiance: Tensor, background: Tensor | None = None) -> Tensor:
-        """Return the image (H, W, C) of a radiance of the hits.
+        """Return the image (H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
 
-        Its gradient by the radiance, and so inside faces, is right; that of what moves at edges is not in it.
-
-        Parameters
-        ----------
-        radiance : (N, C)
-            Of the hits. Others raise TypeError or ValueError.
-        background : (C,) or (H, W, C), default black
+        Its gradient by the radiance, and so inside faces, is right; that of what moves at edges is not in it. Raises TypeError
+        or ValueError that names the argument.
         """
         radiance = _rows("radiance", radiance, len(self.hits))
         background = _background(background, radiance, self.context)

@@ -42,12 +42,14 @@ RESULT_SPP = 64  # samples per pixel at least, of the renders by which the resul
 class Fit(FitResult):
     """The result of fit_scene(), fit_shape() and fit_texture(), a FitResult.
 
-    values     parameters by name; a PoseParameter as its matrix (4, 4) float64, mesh to world
-    poses      PoseParameters by name
-    scene      the scene with these values, and cameras
-    loss       mean over all views, without the regularizer, at 64 samples per pixel or more
-    explained  share of the render's edges that the pictures show too, 0 … 1
-    ending     why the fit took no more steps
+    Attributes
+    ----------
+    values : parameters by name; a PoseParameter as its matrix (4, 4) float64, mesh to world
+    poses : PoseParameters by name
+    scene, cameras : the scene with these values, and cameras
+    loss : mean over all views, without the regularizer, at 64 samples per pixel or more
+    explained : share of the render's edges that the pictures show too, 0 … 1
+    ending : why the fit took no more steps
     """
 
     values: dict[str, Tensor]

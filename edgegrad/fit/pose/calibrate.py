@@ -49,12 +49,16 @@ PROJECTIONS = "perspective", "fisheye"
 class Calibration(FitResult):
     """The result of calibrate(), a FitResult: cameras with one lens, and how exactly each number is known.
 
-    fits     a CameraFit of each picture: its camera, the search by itself at a lower resolution, and the uncertainty of all
-             numbers, None before the lens was found
-    ending   why the fit took no more steps
-    history  a Record of each step of all numbers at once: the loss, the norms of its gradient by "world_to_camera" (in
-             radians and sizes of the mesh), "K" (logarithm of the focal length, widths of the image) and "distortion", and
-             the cameras by the names "cameras.0.world_to_camera", "cameras.0.K" and "cameras.0.distortion"
+    Attributes
+    ----------
+    fits : a CameraFit of each picture
+        Its camera, the search by itself at a lower resolution, and the uncertainty of all numbers, None before the lens was
+        found.
+    ending : why the fit took no more steps
+    history : a Record of each step of all numbers at once
+        The loss, the norms of its gradient by "world_to_camera" (in radians and sizes of the mesh), "K" (logarithm of the
+        focal length, widths of the image) and "distortion", and the cameras by the names "cameras.0.world_to_camera",
+        "cameras.0.K" and "cameras.0.distortion".
     """
 
     fits: list[CameraFit]

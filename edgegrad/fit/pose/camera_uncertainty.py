@@ -23,12 +23,14 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 class CameraUncertainty(Uncertainty):
     """Standard deviations of a camera's pose and lens, each with all other numbers unknown, too.
 
-    covariance  (6, 6) float64, of a rotation vector in radians and a shift in world units along the world's axes: of the scene
-                before the camera, about the middle of the scene's bounding box, where the scene was given
-    size        the diagonal of this box, world units
-    focal       relative to the focal length; 0 where it was not sought
-    principal   (2,) of the principal point, pixels; zeros where it was not sought
-    distortion  (n,) of the coefficients of distortion that were sought, in the order of Camera.distortion
+    Attributes
+    ----------
+    covariance : (6, 6) float64, of a rotation vector in radians and a shift in world units along the world's axes
+        Of the scene before the camera, about the middle of the scene's bounding box, where the scene was given.
+    size : the diagonal of this box, world units
+    focal : relative to the focal length; 0 where it was not sought
+    principal : (2,) of the principal point, pixels; zeros where it was not sought
+    distortion : (n,) of the coefficients of distortion that were sought, in the order of Camera.distortion
     """
 
     principal: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))

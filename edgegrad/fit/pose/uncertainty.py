@@ -31,14 +31,16 @@ MAX_CONTOUR_DEGREES = 2.0  # The limit for a contour alone: rotations known to Â
 class Uncertainty:
     """Standard deviations of a pose about the object's centre, the middle of its bounding box.
 
-    covariance  (6, 6) float64, of a rotation vector in radians and a shift of the centre in world units, along the world's
-                axes. Entries that were not sought, such as the distance with fit_scale, are zero. Where the focal length is
-                sought, places are those at the one found, since distance goes with it
-    size        the diagonal of the object's bounding box, world units
-    focal       relative to the focal length; 0 where it was not sought
-    most        degrees up to which a rotation counts as known: 5, or 2 where only a contour is compared
-    free        directions (n, 3) in the world about which a continuous symmetry makes all rotations the same; none of them is
-                unknown
+    Attributes
+    ----------
+    covariance : (6, 6) float64, of a rotation vector in radians and a shift of the centre, world units and axes
+        Entries that were not sought, such as the distance with scale=True, are zero. Where the focal length is sought, places
+        are those at the one found, since distance goes with it.
+    size : the diagonal of the object's bounding box, world units
+    focal : relative to the focal length; 0 where it was not sought
+    most : degrees up to which a rotation counts as known: 5, or 2 where only a contour is compared
+    free : directions (n, 3) in the world
+        About these a continuous symmetry makes all rotations the same; none of them is unknown.
     """
 
     covariance: Tensor

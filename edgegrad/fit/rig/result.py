@@ -30,13 +30,16 @@ SHARE_OF_MEDIAN = 0.85  # A joint in a wrong place shows a smaller share of edge
 class RigFit(FitResult):
     """The result of fit_rig(), a FitResult.
 
-    values       all that posed() takes, by name: rig.posed(**values); rotations as rotation vectors
-    fit          the numbers that were sought, loss, views and history
-    explained_joints  by the name of each joint that was sought and that pictures can show, the share of its edges that they
-                 do, 0 … 1
-    left_out     the largest share of a mask's area in regions that the fit does not cover, or covers wrongly
-    uncertainty  how exactly the pictures show each joint; None where that is unknown: of a rig whose controls have no names,
-                 or one that PyTorch does not differentiate in forward mode
+    Attributes
+    ----------
+    values : all that posed() takes, by name: rig.posed(**values); rotations as rotation vectors
+    fit : the numbers that were sought, loss, views and history
+    explained_joints : by the name of each joint that was sought and that pictures can show
+        The share of its edges that they do, 0 … 1.
+    left_out : the largest share of a mask's area in regions that the fit does not cover, or covers wrongly
+    uncertainty : how exactly the pictures show each joint
+        None where that is unknown: of a rig whose controls have no names, or one that PyTorch does not differentiate in
+        forward mode.
     """
 
     rig: Rig

@@ -28,9 +28,11 @@ MAX_JOINT_DEGREES = 5.0  # A joint known less exactly counts as unknown.
 class JointUncertainty:
     """Standard deviations of what was sought, where the pictures' pixels are off by chance and the rig is right.
 
-    covariance  (n, n) float64, of all numbers that were sought, in the order of the fit's values
-    degrees     by the joint's name, of its rotation about the axis about which it is known least; of a robot of its angle
-    axes        by the joint's name, this axis (3,), among its own, of length 1; none of a robot
+    Attributes
+    ----------
+    covariance : (n, n) float64, of all numbers that were sought, in the order of the fit's values
+    degrees : by the joint's name, of its rotation about the axis about which it is known least; of a robot of its angle
+    axes : by the joint's name, this axis (3,), among its own, of length 1; none of a robot
     """
 
     covariance: Tensor
