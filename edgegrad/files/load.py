@@ -63,8 +63,9 @@ def load_mesh(
     Vertices that the file repeats (at texture seams, for normals, in triangle soups) are welded where their positions are
     equal; unused ones are left out. Convex polygons become fans of triangles, concave ones triangles that cover them. Texture
     coordinates run up, and are kept without a texture, too. Where welded vertices had different colours, they become
-    `corner_colors`. Parts of one appearance become one Mesh. Files that the file names are read from its folder and below, and
-    from nowhere else.
+    `corner_colors`. Parts of one appearance (all plain, all with vertex colours, all with face colours, all on one texture;
+    lit, all with one material) become one Mesh. Files that the file names are read from its folder and below, and from nowhere
+    else.
 
     Parameters
     ----------

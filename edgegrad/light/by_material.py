@@ -12,10 +12,14 @@ from . import in_kernel
 
 @torch.no_grad()
 def points_by_material(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
-    """Return points of a light for each of the hits, as many as `samples`; hits.light_points(by=…) calls it.
+    """Return points of a light for each of the hits, one of each in every LightPoints; hits.light_points(by=…) calls it.
 
     They are drawn by what the material scatters. Points of a light whose shadow boundary is sampled are given. For hits of
     trace(), each of which has another viewer, they are drawn by what the light emits.
+
+    Parameters
+    ----------
+    hits, light, samples : Hits, Light, int; the list has as many LightPoints as `samples`
     """
     if not isinstance(hits, Hits):
         raise TypeError(f"hits: expected Hits, got {type(hits).__name__}")

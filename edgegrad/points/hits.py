@@ -347,7 +347,8 @@ class Hits:
         """Return random numbers (N, n) float64, uniform in [0, 1), without derivatives.
 
         All points of one sample, such as both sides of an edge, get the same numbers. Those of successive points, and of the
-        parts of one point, fill the unit cube evenly: a Kronecker sequence with powers of the generalised golden ratio.
+        parts of one point, fill the unit cube evenly: a Kronecker sequence with powers of the generalised golden ratio of
+        three dimensions.
 
         Parameters
         ----------

@@ -122,21 +122,21 @@ class Material:
         False: seen from behind (vertices clockwise), faces are black and emit nothing.
     alpha_mode : "MASK", "OPAQUE" or "BLEND", default "MASK"
         "MASK" lets rays pass where the mesh's alpha is below its cutoff. "OPAQUE" forbids alpha. "BLEND" shows what lies
-        behind by 1 − alpha, for up to 8 such surfaces in a row; they cast shadows where alpha is at least ½. There are no
-        gradients of borders of nearest texels of its alpha, nor of those behind it.
+        behind by 1 − alpha, for up to 8 such surfaces in a row, by depth; they cast shadows where alpha is at least ½. There
+        are no gradients of borders of nearest texels of its alpha, nor of those behind it.
 
     Notes
     -----
     The metallic-roughness model is that of glTF 2.0 (appendix B): a Lambertian base under GGX microfacets, α = roughness² ≥
     1e-4 (Walter et al. 2007), Smith's masking with correlated heights (Heitz 2014; glTF's text: uncorrelated), and Schlick's
-    Fresnel term from F0 = 0.04 + (base − 0.04) · metallic. As in glTF, a white dielectric returns more than came at grazing
-    angles.
+    Fresnel term from F0 = 0.04 + (base − 0.04) · metallic. As in glTF, what the layer reflects and what it takes from the base
+    follow different half vectors: a white dielectric returns more than came at grazing angles (1.14 at 75°, roughness 0.3).
 
     Examples
     --------
     >>> import edgegrad as eg
-    >>> eg.shapes.sphere(material=eg.Material(base_color=0.5, roughness=0.3))
-    Mesh(2562 vertices, 5120 faces, plain, lit, torch.float32)
+    >>> eg.shapes.box(material=eg.Material(base_color=0.5, roughness=0.3))
+    Mesh(8 vertices, 12 faces, plain, lit, torch.float32)
     """
 
     base_color: Tensor | Texture | float | None = None
