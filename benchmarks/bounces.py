@@ -68,7 +68,7 @@ def secondary_edges(bench: Bench) -> list[Row]:
     def gradient(samples: int, seed: int) -> tuple[Tensor, float]:
         shift, begin = torch.zeros(3, dtype=torch.float64, requires_grad=True), time.process_time()
         moved = found.meshes | {"ball": ball.replace(verts=verts + shift)}
-        counts: dict[str, Any] = {"surface_samples": 1, "edge_samples": samples}
+        counts: dict[str, Any] = {"sampling": eg.Sampling(surface=1, edges=samples)}
         image = eg.render(eg.Scene(list(moved.values())), _larger(found), 1, seed, bounces=2, shadows=False, **counts)
         (slope,) = torch.autograd.grad(image.mean(), shift)
         return slope, time.process_time() - begin

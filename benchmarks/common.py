@@ -149,7 +149,7 @@ class Converged:
             kept = torch.load(path, weights_only=True)
         except (OSError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError):
             # Of an image of 16 samples a pixel: which faces it sees steers where the gradient's samples go.
-            options = {"spp": 16, "surface_samples": surface, "edge_samples": edge}
+            options = {"spp": 16, "sampling": eg.Sampling(surface=surface, edges=edge)}
             runs = [differentiate(scene, seed=(1 << 40) + run, **options)[0] for run in range(self.RUNS)]
             kept = {"gradient": torch.stack(runs).mean(0), "error": standard_error(runs), "made_by": kernel}
             folder.mkdir(parents=True, exist_ok=True)

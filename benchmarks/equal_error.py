@@ -137,7 +137,7 @@ def step(bench: Bench) -> list[Row]:
 
     def ours(factor: float, seed: int) -> tuple[Tensor, float]:
         # So few samples inside faces are enough at 3 %: less time at that error, as Mitsuba's SPLIT is for it.
-        return one(surface_samples=round(factor / 4 * surface), edge_samples=round(factor * edge), grad_seed=seed)
+        return one(sampling=eg.Sampling(surface=round(factor / 4 * surface), edges=round(factor * edge), seed=seed))
 
     def theirs(spp: float, seed: int) -> tuple[Tensor, float]:
         (gradient,), seconds = peer.gradient(spp, seed)

@@ -31,16 +31,19 @@ def scene(roughness: Tensor) -> eg.Scene:
 def main() -> None:
     camera = eg.Camera.look_at((0.0, 0.5, 3.2), (0.0, 0.0, 0.0), fov_y=40, size=(32, 32))
     with torch.no_grad():
-        renders = [eg.render(scene(torch.tensor(TRUTH)), camera, 64, 10**6 + k, light_samples=16) for k in range(64)]
+        renders = [
+            eg.render(scene(torch.tensor(TRUTH)), camera, 64, 10**6 + k, sampling=eg.Sampling(lights=16))
+            for k in range(64)
+        ]
     target = torch.stack(renders).mean(0)
-    print("loss    spp  light_samples  roughness")
-    for loss, spp, light_samples in CASES:
+    print("loss    spp  lights  roughness")
+    for loss, spp, lights in CASES:
         fit = fit_scene(
             lambda values: scene(values["roughness"]), camera, target,
             {"roughness": Parameter(0.02, torch.tensor(START), low=0.05, high=1.0)},
-            loss=loss, spp=spp, steps=150, progress=False, render={"light_samples": light_samples},
+            loss=loss, spp=spp, steps=150, progress=False, render={"sampling": eg.Sampling(lights=lights)},
         )  # fmt: skip
-        print(f"{loss:7} {spp:3} {light_samples:9} {float(fit.values['roughness']):15.2f}   {fit.reason}", flush=True)
+        print(f"{loss:7} {spp:3} {lights:6} {float(fit.values['roughness']):15.2f}   {fit.reason}", flush=True)
 
 
 if __name__ == "__main__":

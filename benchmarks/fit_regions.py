@@ -25,7 +25,7 @@ OFF = torch.tensor([1.2, 0.8, 1.2, 0.8])
 
 def of_bracket(method: str, seed: int) -> tuple[Fit, str]:
     view = camera(128)
-    image = photograph(view, seed=seed, light_samples=16)
+    image = photograph(view, seed=seed, sampling=eg.Sampling(lights=16))
     sought = {"pose": PoseParameter(Pose(START[:3, :3], START[:3, 3]))}
     fit = fit_scene(bracket(plain=True), view, image, sought, loss="region", method=method, spp=8, progress=False)
     degrees, percent = errors(fit.poses["pose"])
@@ -34,7 +34,7 @@ def of_bracket(method: str, seed: int) -> tuple[Fit, str]:
 
 def of_vase(method: str, seed: int) -> tuple[Fit, str]:
     colors = 0.45 + 0.25 * torch.sin(3.0 * vase(RADII).verts)
-    image = photograph(VIEW, vase(RADII).replace(colors=colors), seed=seed, light_samples=16)
+    image = photograph(VIEW, vase(RADII).replace(colors=colors), seed=seed, sampling=eg.Sampling(lights=16))
     start = Pose(torch.eye(3), torch.tensor([0.06, -0.04, 0.0]))
     sought = {
         "radii": Parameter(0.01, RADII * OFF, low=0.05),

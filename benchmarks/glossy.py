@@ -43,7 +43,7 @@ class Images:
         self.light_samples = light_samples
 
     def __call__(self, seed: int) -> Tensor:
-        return eg.render(self.scene, self.camera, spp=16, light_samples=self.light_samples, seed=seed)
+        return eg.render(self.scene, self.camera, spp=16, sampling=eg.Sampling(lights=self.light_samples), seed=seed)
 
 
 class MitsubaImages:
@@ -93,7 +93,7 @@ class LightImages:
         self.camera = eg.Camera.look_at((0.0, 1.6, 3.6), (0.0, 0.35, 0.0), (0.0, 1.0, 0.0), 36.0, (SIZE, SIZE))
 
     def __call__(self, seed: int) -> Tensor:
-        return eg.render(self.scene, self.camera, spp=16, light_samples=4, seed=seed)
+        return eg.render(self.scene, self.camera, spp=16, sampling=eg.Sampling(lights=4), seed=seed)
 
 
 class MitsubaLightImages:

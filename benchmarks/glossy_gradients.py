@@ -86,7 +86,7 @@ def residuals(
 
     def clean(p: Parameters) -> Tensor:
         with torch.no_grad():
-            return eg.render(scene(p), camera, spp=64, light_samples=4, seed=900)
+            return eg.render(scene(p), camera, spp=64, sampling=eg.Sampling(lights=4), seed=900)
 
     return {name: 2 * (clean(given) - clean({**given, name: given[name] + by})) for name, by in changes.items()}
 

@@ -114,11 +114,12 @@ def shadow_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, 
     """Return the shadow term (V, 3), float64, from `count` samples (−1: default), and its seconds without the image."""
     verts = scene.verts.float().requires_grad_()
     moved = scene.moved(verts)
-    request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
+    request = make_request(
+        moved, scene.camera, 16, 0, sampling=eg.Sampling(edges=None if count < 0 else count, seed=seed)
+    )
     image = ShadowBoundaries(
         ImageContext(moved, request, 0),
         UserShader(Lighting(True, 1)),
-        False,
         False,
         ShadingTraits(keeps_little=True, additive=True),
     )

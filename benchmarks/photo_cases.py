@@ -220,7 +220,9 @@ def _lit(
         channels = meshes[0].channels or 3
         meshes.append(bar.replace(face_colors=torch.zeros(2, channels), material=eg.Material()))
     with torch.no_grad():
-        return eg.render(eg.Scene(meshes, background=behind, lights=lights), camera, spp=64, light_samples=2)
+        return eg.render(
+            eg.Scene(meshes, background=behind, lights=lights), camera, spp=64, sampling=eg.Sampling(lights=2)
+        )
 
 
 def _covered(image: Tensor, alpha: Tensor, cover: Tensor, rng: np.random.Generator) -> Tensor:

@@ -162,7 +162,9 @@ def mipmaps(seeds: int = 16, converged: int = 32) -> None:
             image = eg.render(mesh, scene.camera, seed=seed, **samples)
             return torch.autograd.grad(image, [verts, texture], scene.adjoint.to(image))
 
-        many = zip(*(gradient(1000 + seed, surface_samples=200_000) for seed in range(converged)), strict=True)
+        many = zip(
+            *(gradient(1000 + seed, sampling=eg.Sampling(surface=200_000)) for seed in range(converged)), strict=True
+        )
         some = zip(*(gradient(seed) for seed in range(seeds)), strict=True)
         errors = []
         for correct, found in zip(many, some, strict=True):

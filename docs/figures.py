@@ -24,7 +24,7 @@ import body as body_example
 import sun  # the fit of examples/sun.py, in a larger picture
 
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb2", "#d9730d", "#8a8f98"
-SAMPLES = {"surface_samples": 2_000_000, "edge_samples": 1_000_000}
+SAMPLES = {"sampling": eg.Sampling(surface=2_000_000, edges=1_000_000)}
 
 
 def picture(axis: Axes, image: Tensor, title: str) -> None:
@@ -122,7 +122,7 @@ def bounces(folder: Path) -> None:
         picture(axis, eg.render(room, camera, 64, bounces=count), f"bounces={count}")
     *others, block = room.meshes
     right = torch.tensor([1.0, 0.0, 0.0]).expand(1, len(block.verts), 3)
-    samples = {"surface_samples": 600_000, "edge_samples": 300_000}
+    samples = {"sampling": eg.Sampling(surface=600_000, edges=300_000)}
 
     def derivative(count: int, visibility: bool = True) -> Tensor:
         scene = eg.Scene([*others, block])

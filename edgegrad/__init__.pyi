@@ -38,6 +38,7 @@ from .rig.load import load_rig
 from .rig.rig import Rig
 from .rig.robot import load_robot
 from .rig.skin import Skin
+from .sampling import Sampling
 from .scene.environment import Environment
 from .scene.find_symmetries import find_symmetries
 from .scene.lights import AreaLight, DirectionalLight, LightPoints, PointLight, SphericalHarmonics, SpotLight
@@ -67,6 +68,7 @@ __all__ = [
     "PointLight",
     "PrimaryHits",
     "Rig",
+    "Sampling",
     "Scene",
     "Skin",
     "SphericalHarmonics",

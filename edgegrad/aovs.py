@@ -19,6 +19,7 @@ from .kernel.request import Channels, Request, check_camera, make_request
 from .light.lit_operator import lit_image
 from .light.radiance import Lighting
 from .light.unused_options import warn_of_unused
+from .sampling import Sampling, check_sampling, drawn_seed
 from .scene.mesh import Mesh
 from .scene.rows import areas, rows_of, unit
 from .scene.scene import Scene, as_scene
@@ -35,19 +36,16 @@ def render_aovs(
     camera: Camera,
     aovs: Sequence[str],
     spp: int = 16,
-    seed: int = 0,
+    seed: int | None = None,
     *,
-    surface_samples: int | None = None,
-    edge_samples: int | None = None,
-    visibility: bool = True,
     filter: str = "box",
-    grad_seed: int | None = None,
-    step_spacing: float = 1.0,
+    visibility: bool = True,
     shadows: bool = True,
-    light_samples: int = 1,
     bounces: int = 1,
+    sampling: Sampling | None = None,
+    generator: torch.Generator | None = None,
 ) -> dict[str, Tensor]:
-    """Return channels of a scene by name, (H, W, c) each, or (B, H, W, c) for a batch of cameras, all from the same samples.
+    """Render channels of a scene (arbitrary output variables), all from the same samples.
 
     A pixel holds the filtered sum over its samples, with zero where a sample hits nothing (the image: its background): values
     are premultiplied with alpha. Where a surface ends within a pixel, or two meet, `depth / alpha` is the mean depth of what is
@@ -60,7 +58,8 @@ def render_aovs(
 
     Parameters
     ----------
-    scene, camera, spp, seed, … : as of render()
+    scene, camera, spp, seed, filter, visibility, shadows, bounces, sampling, generator
+        As of render().
     aovs : sequence of str
         Names, each once, in any order, of channels with c numbers:
 
@@ -75,31 +74,34 @@ def render_aovs(
         - barycentrics (3): weights of the face's three corners.
         - mesh_id (1): int64, place in scene.meshes of what is seen through the pixel's centre; −1: nothing.
         - face_id (1): int64, row of that mesh's faces; −1: nothing.
+
+    Returns
+    -------
+    dict of str to Tensor
+        (H, W, c) each, or (B, H, W, c) for a batch of cameras.
     """
     names = check_aovs(aovs)
     scene = as_scene(scene)
     check_camera(camera)
-    lighting = Lighting.from_options(shadows, light_samples, bounces)
+    sampling, drawn = check_sampling(sampling), drawn_seed(seed, generator)
+    lighting = Lighting.from_options(shadows, bounces, sampling)
     if "image" in names:
-        warn_of_unused(scene, False, lighting.options)
+        warn_of_unused(scene, False, lighting, sampling)
     if "uv" in names:
         _check_uvs(scene)
-    options: dict[str, Any] = {
-        "surface_samples": surface_samples, "edge_samples": edge_samples, "visibility": visibility, "filter": filter,
-        "grad_seed": grad_seed, "step_spacing": step_spacing,
-    }  # fmt: skip
+    options: dict[str, Any] = {"filter": filter, "visibility": visibility, "sampling": sampling}
     batched, device = camera.batch is not None, scene.meshes[0].verts.device
     found: dict[str, Tensor] = {}
     shaded = scene.is_shaded and "image" in names
     if shaded:
         scene, camera = savable(scene), savable(camera)
-        request = make_request(scene, camera, spp, seed, **options)
+        request = make_request(scene, camera, spp, drawn, **options)
         found["image"] = lit_image(lighting, scene, camera, request)
         if names == ["image"]:
             return found
     radiance = "image" in names and not shaded
     request = make_request(
-        scene if radiance else _without_radiance(scene), camera, spp, seed, **options, all_uvs="uv" in names
+        scene if radiance else _without_radiance(scene), camera, spp, drawn, **options, all_uvs="uv" in names
     )
     if any(name in IDS for name in names):
         found |= {name: ids.to(device) for name, ids in _ids(scene, faces_at_centers(request, batched)).items()}

@@ -16,6 +16,7 @@ from .camera.camera import Camera
 from .check import as_tensor, check_choice, check_finite, check_float, check_int, check_positive, check_shape
 from .optional import require
 from .points.rays import trace
+from .sampling import drawn_seed
 from .scene.appearance import OnMesh, coordinates
 from .scene.mesh import Mesh
 from .scene.mikktspace import Fans
@@ -61,7 +62,7 @@ def bake(
     reach: float | None = None,
     rays: int = 64,
     margin: int | None = 4,
-    seed: int = 0,
+    seed: int | None = None,
     progress: bool = True,
 ) -> Tensor:
     """Return a texture (h, w, C) for a mesh, of what another surface has where the two lie on each other.
@@ -91,8 +92,8 @@ def bake(
     margin : int or None, default 4
         Texels around charts that take the colour of the nearest texel within, because bilinear look-ups reach beyond seams;
         None: all others. The rest is zero, of a normal map the flat (½, ½, 1).
-    seed : int, default 0
-        Of the directions.
+    seed : int, optional
+        Of the directions; by default torch's generator draws one.
     progress : bool, default True
         Whether a bar is shown.
     """
@@ -111,7 +112,7 @@ def bake(
         diagonal = float((high - low).norm())
         reach = REACH * diagonal if reach is None else check_positive("reach", reach, least=1e-30, most=1e30)
         if what == "visibility":
-            values = _visibility(texels.points, scene, CONTACT * diagonal, rays, seed, progress)
+            values = _visibility(texels.points, scene, CONTACT * diagonal, rays, int(drawn_seed(seed)), progress)
         else:
             values = _of_surface(scene, _matched(texels.points, scene, by, reach), what)
             if what == "normal_map":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -19,18 +19,21 @@ from .kernel.operators import HitBuffers, backward_kernel, image_memory, pass_si
 from .kernel.request import DISCONTINUITY_SLOTS, MOVING, SLOTS, Request, WantedTerms, label, make_request, required
 from .library import core
 from .light.bounces import check_bounces
-from .light.radiance import LIGHTING, Lighting
+from .light.radiance import Lighting
 from .light.sampling import how_drawn
 from .light.unused_options import warn_of_unused
 from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, with_attributes
 from .points.shadows import ShadowLight
 from .points.surfaces import every_face
-from .render import SHADING, check_options
+from .sampling import RenderOptions, check_options, check_sampling, without_shading
 from .scene.lights import Light
 from .scene.mesh import Mesh
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene, as_scene
 from .shader import POINTS_AT_ONCE
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 @dataclass(frozen=True)
@@ -90,26 +93,46 @@ class Plan(Mapping[str, Term]):
     __repr__ = __str__
 
 
-def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **options: Any) -> Plan:
-    """Return the terms of `render(scene, camera, spp, seed, …)` and its backward pass: each with whether it is on, why, samples
-    and memory.
+def plan(
+    scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int | None = 0, **options: Unpack[RenderOptions]
+) -> Plan:
+    """Describe what a render and its backward pass will do: which terms are on, why, their samples and memory.
 
-    Takes the arguments of render() and raises what it raises. Samples of the gradient are counted for a loss that is nowhere
-    zero and an image that sees every face: where the adjoint is zero none are taken, and fewer on faces that no sample of the
-    image hits. Nothing is drawn; the ray structure and the edges are built, and render() then finds them.
+    Samples of the gradient are counted for a loss that is nowhere zero and an image that sees every face: where the adjoint is
+    zero none are taken, and fewer on faces that no sample of the image hits. Nothing is rendered; the ray structure and the
+    edges are built, and render() then finds them.
+
+    Parameters
+    ----------
+    scene, camera, spp
+        As of render().
+    seed : int, default 0
+        As of render(), but fixed by default, so that a plan does not change what torch's generator draws next.
+    **options
+        Other arguments of render().
+
+    Returns
+    -------
+    Plan
+        Mapping from the name of a term to a Term; prints as a table.
+
+    Raises
+    ------
+    TypeError, ValueError, MemoryError
+        What render() raises.
     """
     check_options("plan", options)
     scene = as_scene(scene)
-    shading = {name: options.pop(name) for name in SHADING if name in options}
-    request = make_request(scene, camera, spp, seed, **options)
-    warn_of_unused(scene, shading.get("shader") is not None, shading)
-    if shading.get("shader") is not None:
-        return Plan(_shaded_terms(scene, request, shading.get("creases", "auto")))
-    lighting = Lighting.from_options(**{name: shading[name] for name in LIGHTING if name in shading})
+    shader, sampling = options.get("shader"), check_sampling(options.get("sampling"))
+    lighting = Lighting.from_options(options.get("shadows", True), options.get("bounces", 1), sampling)
+    request = make_request(scene, camera, spp, seed, **without_shading(options))
+    warn_of_unused(scene, shader is not None, lighting, sampling)
+    if shader is not None:
+        return Plan(_shaded_terms(scene, request, sampling.creases))
     if scene.is_shaded:
         if lighting.bounces > 1:
             check_bounces(scene, camera, request)
-        return Plan(_lit_terms(scene, request, shading.get("creases", "auto"), lighting))
+        return Plan(_lit_terms(scene, request, sampling.creases, lighting))
     wanted = required(request)
     return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})
 

@@ -68,7 +68,7 @@ def thumbnail(scene: Scene | Mesh) -> bytes:
         background = None if scene.background is None or scene.background.dim() == 3 else scene.background
         background = torch.full((scene.channels,), BACKGROUND) if background is None else background
         shown = under_headlight(scene.replace(background=background), camera)
-        image = render(shown, camera, spp=8, shadows=not shown.is_lit)
+        image = render(shown, camera, spp=8, seed=0, shadows=not shown.is_lit)
         image = image if image.shape[-1] in (1, 3) else image[..., :1]
         write_image(file := Path(folder) / "thumbnail.png", image.clamp(0.0, 1.0))
         return file.read_bytes()

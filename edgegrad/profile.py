@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,12 +17,15 @@ from .kernel import memory as memory
 from .kernel.counts import CURVES, Watch, table
 from .kernel.operators import backward_kernel, forward_kernel
 from .kernel.request import Request, make_request, required
-from .light.radiance import LIGHTING, Lighting
+from .light.radiance import Lighting
 from .light.unused_options import warn_of_unused
-from .render import SHADING, check_options
+from .sampling import RenderOptions, check_options, check_sampling, drawn_seed, without_shading
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
 from .scene.tree import map_tensors, tensors_in
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 # The kernel measures these parts, in the order of a step.
 _PARTS = (
@@ -99,36 +102,51 @@ def profile(
     camera: Camera,
     adjoint: Tensor | None = None,
     spp: int = 16,
-    seed: int = 0,
+    seed: int | None = 0,
     *,
     repeats: int = 5,
-    **options: Any,
+    **options: Unpack[RenderOptions],
 ) -> Profile:
-    """Return where the time of a step goes: vertices that moved, an image, and the gradient of what requires one.
+    """Measure where the time of a step goes: vertices that moved, an image, and the gradient of what requires one.
 
-    The other arguments are those of render(). If nothing requires a gradient, that of the vertices is taken. A batch of cameras
-    counts as one step. Of scenes that are not lit, autograd itself is not run, so its cost is not included. Raises what
-    render() raises.
+    If nothing requires a gradient, that of the vertices is taken. A batch of cameras
+    counts as one step. Of scenes that are not lit, autograd itself is not run, so its cost is not included.
 
     Parameters
     ----------
+    scene, camera, spp
+        As of render().
     adjoint : (H, W, C) or (B, H, W, C), default ones
         ∂loss/∂image.
+    seed : int, default 0
+        As of render(), but fixed by default.
     repeats : int, default 5
         Steps of which the medians are taken.
+    **options
+        Other arguments of render(), but for `shader`.
+
+    Returns
+    -------
+    Profile
+        Mapping from the name of a part to its seconds; prints as a table.
+
+    Raises
+    ------
+    TypeError, ValueError, MemoryError
+        What render() raises.
     """
     check_options("profile", options)
     if options.get("shader") is not None:
         raise ValueError("shader: expected None, for profile() measures the kernel alone; torch.profiler sees a shader")
-    warn_of_unused(as_scene(scene), False, options)
-    if as_scene(scene).is_shaded:
-        return _of_shaded(
-            as_scene(scene), camera, adjoint, (spp, seed), check_positive_int("repeats", repeats), options
-        )
-    options = {name: value for name, value in options.items() if name not in SHADING}
     scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
+    seed, sampling = int(drawn_seed(seed, options.pop("generator", None))), check_sampling(options.get("sampling"))
+    lighting = Lighting.from_options(options.get("shadows", True), options.get("bounces", 1), sampling)
+    own = without_shading(options)
+    warn_of_unused(scene, False, lighting, sampling)
+    if scene.is_shaded:
+        return _of_shaded(scene, camera, adjoint, (spp, seed), repeats, lighting, sampling.creases, own)
     # Caches between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
-    request = make_request(scene, camera, spp, seed, **options)
+    request = make_request(scene, camera, spp, seed, **own)
     wanted = required(request) or ("verts",)
     adjoint = _adjoint(adjoint, camera, request)
 
@@ -138,7 +156,7 @@ def profile(
         elsewhere = request._replace(scene=request.scene._replace(verts=verts), image=request.image._replace(spp=1))
         forward_kernel(elsewhere)
         begin = time.perf_counter()
-        step = make_request(scene, camera, spp, seed, **options)
+        step = make_request(scene, camera, spp, seed, **own)
         _, hits, forward = forward_kernel(step)
         _, backward = backward_kernel(adjoint, hits, step, wanted)
         wall = time.perf_counter() - begin
@@ -158,11 +176,11 @@ def _of_shaded(
     adjoint: Tensor | None,
     spp_and_seed: tuple[int, int],
     repeats: int,
-    options: Mapping[str, Any],
+    lighting: Lighting,
+    creases: bool | str,
+    own: Mapping[str, Any],
 ) -> Profile:
     """Return the profile of a scene of which points are shaded."""
-    lighting = Lighting.from_options(**{name: options[name] for name in LIGHTING if name in options})
-    creases, own = options.get("creases", "auto"), {n: v for n, v in options.items() if n not in SHADING}
     scene, camera, leaves = _leaves(scene, camera)
     request = make_request(scene, camera, *spp_and_seed, **own)
     adjoint = _adjoint(adjoint, camera, request)
@@ -170,7 +188,7 @@ def _of_shaded(
     for repeat in range(repeats):
         elsewhere = scene.replace(meshes=[m.replace(verts=m.verts * (1.001 + 1e-6 * repeat)) for m in scene.meshes])
         with torch.no_grad():
-            lighting.image(elsewhere, camera, make_request(elsewhere, camera, 1, **own), creases)
+            lighting.image(elsewhere, camera, make_request(elsewhere, camera, 1, 0, **own), creases)
         watch = _Recorder()
         begin = time.perf_counter()
         with torch.enable_grad():

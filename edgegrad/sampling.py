@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
 
-from .check import as_int, check_positive, check_positive_int
+from .check import as_int, check_positive, check_positive_int, values_visible
 
 LEAST_SPACING = 1 / 64  # px, of Sampling.discontinuity_spacing
 MOST_SPACING = 64  # px
@@ -63,6 +65,33 @@ class Sampling:
             check_seed("sampling.seed", self.seed)
 
 
+class RenderOptions(TypedDict, total=False):
+    """Arguments of render() by keyword, which functions around it hand on."""
+
+    shader: Any
+    filter: str
+    visibility: bool
+    shadows: bool
+    bounces: int
+    sampling: Sampling | None
+    generator: torch.Generator | None
+
+
+SHADING = ("shader", "shadows", "bounces")  # those that say how points are shaded
+
+
+def without_shading(options: RenderOptions) -> dict[str, Any]:
+    """Return the options that all images have."""
+    return {name: value for name, value in options.items() if name not in SHADING}
+
+
+def check_options(function: str, options: Mapping[str, Any], without: Sequence[str] = ()) -> None:
+    """Raise TypeError if a `function` that takes the options of render(), but for those `without`, was given others."""
+    known = [name for name in RenderOptions.__annotations__ if name not in without]
+    if unknown := [name for name in options if name not in known]:
+        raise TypeError(f"{function}: expected only the options {', '.join(known)}, got {unknown[0]!r}")
+
+
 def check_seed(name: str, seed: object) -> int:
     """Return the seed as an int. Raises TypeError or ValueError."""
     number = as_int(name, seed)
@@ -71,17 +100,39 @@ def check_seed(name: str, seed: object) -> int:
     return number
 
 
-def drawn_seed(
-    seed: int | Tensor | None = None, generator: torch.Generator | None = None, below: int = 2**63 - 1
-) -> int:
-    """Return `seed`, or one that torch's generator draws where it is None, as torch.randint would.
+def check_sampling(sampling: object) -> Sampling:
+    """Return the Sampling that was given, or the default for None. Raises TypeError."""
+    if sampling is not None and not isinstance(sampling, Sampling):
+        raise TypeError(f"sampling: expected an edgegrad.Sampling, got {type(sampling).__name__}")
+    return sampling or Sampling()
 
-    Raises TypeError or ValueError for a seed that is none, or for one together with a generator.
+
+def drawn_seed(seed: object = None, generator: torch.Generator | None = None) -> Tensor:
+    """Return a seed () int64: the one given, or one that torch's generator draws, as torch.randint would, for None.
+
+    Under torch.compile it is part of the graph. Under torch.vmap it is drawn as its `randomness` says. Raises TypeError or
+    ValueError for what is no seed, and for a seed together with a generator.
     """
     if generator is not None and not isinstance(generator, torch.Generator):
         raise TypeError(f"generator: expected a torch.Generator, got {type(generator).__name__}")
     if seed is None:
-        return int(torch.randint(below, (), generator=generator))
+        device = "cpu" if generator is None else generator.device
+        return torch.randint(2**63 - 1, (), generator=generator, device=device).cpu()
     if generator is not None:
-        raise ValueError("seed: expected None together with a generator, which draws the seed; give one of both")
-    return check_seed("seed", seed)
+        raise ValueError("seed: expected None together with a generator, which draws the seed; give one of them")
+    if isinstance(seed, Tensor) and not values_visible(seed):
+        return seed  # one that was drawn in torch.compile or torch.vmap
+    return torch.tensor(check_seed("seed", seed), device="cpu")
+
+
+_Seed = TypeVar("_Seed", int, Tensor)
+
+
+def derived_seed(seed: _Seed, stream: int = 1) -> _Seed:
+    """Return a seed of its own for each stream: multiplication by an odd number is a bijection, so no two seeds meet."""
+    return (seed * 0x5851F42D4C957F2D + stream * 0x14057B7EF767814F) & (2**63 - 1)
+
+
+def camera_seed(seed: int, camera: int) -> int:
+    """Return the seed of a camera of a batch: each has samples of its own."""
+    return seed if camera == 0 else derived_seed(seed, camera + 1)

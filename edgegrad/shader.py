@@ -26,7 +26,7 @@ from .camera.camera import Camera
 from .check import all_finite, values_visible
 from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
-from .kernel.request import LEAST_SPACING, Request, derived_seed
+from .kernel.request import Request
 from .library import core
 from .points.background import environments
 from .points.blend import Blended, let_through, transparent
@@ -41,6 +41,7 @@ from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
 from .points.splat import SplatTerm, boundary
 from .points.surfaces import every_face
+from .sampling import LEAST_SPACING, derived_seed
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene
 from .warnings import warn
@@ -52,7 +53,6 @@ POINTS_AT_ONCE = 1 << 17
 # So many samples of a pixel on one face are shaded at one of them: a face once at the usual number, and more often the more
 # there are, so that what shading leaves of noise falls with them too.
 SAMPLES_A_POINT = 16
-CREASES = ("auto", True, False)
 
 
 def points_of_face(spp: int) -> int:
@@ -124,7 +124,6 @@ def render_shaded(
     shader: Shader,
     request: Request,
     creases: bool | str,
-    check: bool,
     traits: ShadingTraits | None = None,
     watch: Watch = Watch(),  # noqa: B008  it keeps nothing
 ) -> Tensor:
@@ -132,14 +131,17 @@ def render_shaded(
     takes."""
     if not callable(shader):
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
-    if creases not in CREASES or not isinstance(creases, (bool, str)):
-        raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
+    if not values_visible(request.image.seed):
+        raise RuntimeError(
+            "seed: expected one of all elements of a torch.vmap batch where a shader is given, got one of each; give seed=, "
+            'or torch.vmap(…, randomness="same")'
+        )
     radiance = shader if isinstance(shader, Radiance) else UserShader(shader)
     traits = traits or ShadingTraits(points_of_face(request.image.spp), blended=scene.blends)
     textured = traits.lit and scene.textured_faces is not None
     with shaded_memory(request, textured=textured, indirect=traits.indirect):
         images = [
-            _Image(ImageContext(scene, request, k), radiance, creases, check, traits, watch).render()
+            _Image(ImageContext(scene, request, k), radiance, creases, traits, watch).render()
             for k in range(request.cameras)
         ]
     return images[0] if camera.batch is None else torch.stack(images)
@@ -166,11 +168,10 @@ class _Image:
         context: ImageContext,
         radiance: Radiance,
         creases: bool | str,
-        check: bool,
         traits: ShadingTraits,
         watch: Watch = Watch(),  # noqa: B008  it keeps nothing
     ) -> None:
-        self._context, self._creases, self._check, self._traits, self._watch = context, creases, check, traits, watch
+        self._context, self._creases, self._traits, self._watch = context, creases, traits, watch
         self._radiance = radiance
         # (C,) or (H, W, C): the scene's background, or the environments that it shows. Found here, where derivatives are
         # enabled if they are asked for; the values of an image are found without.
@@ -349,8 +350,8 @@ class _Image:
         return boundary(samples.x, samples.velocity, jump, to_background, self._background)
 
     @property
-    def _step_spacing(self) -> float:
-        return max(self._context.request.gradient.step_spacing / self._traits.closer, LEAST_SPACING)
+    def _spacing(self) -> float:
+        return max(self._context.request.gradient.discontinuity_spacing / self._traits.closer, LEAST_SPACING)
 
     @property
     def _grid(self) -> tuple[float, int]:
@@ -361,7 +362,7 @@ class _Image:
         """
         growth, closer = core.sample_growth(self._context.request.image.spp), self._traits.closer
         lines = max(closer, growth**0.5)
-        spacing = max(self._context.request.gradient.step_spacing / lines, LEAST_SPACING)
+        spacing = max(self._context.request.gradient.discontinuity_spacing / lines, LEAST_SPACING)
         return spacing, math.ceil(growth * closer / lines) if self._traits.noisy else 1
 
     def _with_creases(self) -> Request:
@@ -372,7 +373,7 @@ class _Image:
                 attributes = every_face(len(context.fixed.faces))
             else:
                 attributes = context.fixed.crease_attributes().cpu() if self._creases else None
-        gradient = context.request.gradient._replace(step_spacing=self._step_spacing)
+        gradient = context.request.gradient._replace(discontinuity_spacing=self._spacing)
         return context.request._replace(scene=with_attributes(context.request.scene, attributes), gradient=gradient)
 
     # -- the shader ----------------------------------------------------------------------------------------------------
@@ -386,18 +387,6 @@ class _Image:
                 raise ValueError(UNEQUAL)
             self._kinds = kinds
             self.discontinuities_move = self.discontinuities_move or moves(*hits._discontinuities.values)
-        if self._check and len(hits) > 1 and not hits._discontinuities.forced:
-            order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
-            order = order[: (len(hits) + 1) // 2]
-            with torch.no_grad():
-                again = self._shader(hits._subset(order)).to(radiance.dtype)
-            if not torch.allclose(
-                again, radiance.detach()[order], rtol=1e-4, atol=1e-5 * float(radiance.detach().abs().max())
-            ):
-                raise ValueError(
-                    "shader: expected a function of each point by itself, got other values for half of the points in "
-                    "another order; leave out what mixes points (batch norm, means, sorting) and what is drawn at random"
-                )
         return radiance
 
     def _checked(self, radiance: object, hits: Hits) -> Tensor:

@@ -66,7 +66,10 @@ class Made(NamedTuple):
 
 def pictures(scene: eg.Scene, cameras: list[eg.Camera]) -> list[Tensor]:
     with torch.no_grad():
-        return [eg.render(scene, camera, 64, seed=10_000 + k, light_samples=2) for k, camera in enumerate(cameras)]
+        return [
+            eg.render(scene, camera, 64, seed=10_000 + k, sampling=eg.Sampling(lights=2))
+            for k, camera in enumerate(cameras)
+        ]
 
 
 def half(truth: Made) -> Made:

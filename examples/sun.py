@@ -116,7 +116,7 @@ def fit(target: Tensor, camera: eg.Camera, steps: int = 150) -> Guess:
     optimizer = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(found, rates, strict=True)])
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=1e-4)
     for step in tqdm(range(steps), desc="sun"):
-        loss = (eg.render(found.scene(), camera, 8, seed=step) - target).square().mean()
+        loss = (eg.render(found.scene(), camera, 8) - target).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -106,7 +106,7 @@ def loss(verts, spp=16, **options):
 
 def gradient(**options):
     leaf = verts.clone().requires_grad_()
-    loss(leaf, surface_samples=20_000, edge_samples=20_000, **options).backward()
+    loss(leaf, sampling=eg.Sampling(surface=20_000, edges=20_000), **options).backward()
     return leaf.grad
 
 

@@ -83,7 +83,7 @@ def loss(x, spp=64, **options):
 
 def slope(x, **options):
     x = x.clone().requires_grad_()
-    return torch.autograd.grad(loss(x, edge_samples=20_000, **options), x)[0]
+    return torch.autograd.grad(loss(x, sampling=eg.Sampling(edges=20_000), **options), x)[0]
 
 
 xs = torch.linspace(-0.1, 0.45, 23)
@@ -118,7 +118,7 @@ print(
 #
 # ## By hand
 #
-# Adam finds a rotation vector and a translation. Each step has a seed of its own, so that the error of few samples averages
+# Adam finds a rotation vector and a translation. Each step draws new samples, so that the error of few samples averages
 # out.
 
 # %%
@@ -128,7 +128,7 @@ schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.98)
 losses, turned = [], []
 for step in range(140):
     optimizer.zero_grad()
-    value = (eg.render(posed(w, t), camera, spp=4, seed=step) - target).square().mean()
+    value = (eg.render(posed(w, t), camera, spp=4) - target).square().mean()
     value.backward()
     optimizer.step()
     schedule.step()

@@ -113,8 +113,8 @@ def picture(material, light, **options):
 show(
     point=picture(matt, light),
     point_on_plastic=picture(plastic, light),
-    panel=picture(matt, panel, light_samples=8),
-    sky=picture(matt, sky, light_samples=64),
+    panel=picture(matt, panel, sampling=eg.Sampling(lights=8)),
+    sky=picture(matt, sky, sampling=eg.Sampling(lights=64)),
 )
 
 # %% [markdown]
@@ -222,7 +222,9 @@ def made(values):
 
 
 gold = {"base_color": vector([0.9, 0.65, 0.25]), "metallic": vector(0.7), "roughness": vector(0.3)}
-pictures = [eg.render(made(gold), camera, 64, 1000 + k, light_samples=2) for k, camera in enumerate(cameras)]
+pictures = [
+    eg.render(made(gold), camera, 64, 1000 + k, sampling=eg.Sampling(lights=2)) for k, camera in enumerate(cameras)
+]
 sought = {name: Parameter(0.02, torch.full_like(value, 0.5), low=0.0, high=1.0) for name, value in gold.items()}
 options = {"steps": 300, "spp": 4, "views_per_step": 1, "tolerance": 0.0, "progress": False}
 fit = fit_scene(made, cameras, pictures, sought, **options)

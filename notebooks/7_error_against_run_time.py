@@ -51,7 +51,7 @@ leaf = verts.clone().requires_grad_()
 
 def estimate(surface, edge, seed, **options):
     leaf = verts.clone().requires_grad_()
-    image = eg.render(scene(leaf), camera, seed=seed, surface_samples=surface, edge_samples=edge, **options)
+    image = eg.render(scene(leaf), camera, seed=seed, sampling=eg.Sampling(surface=surface, edges=edge), **options)
     return torch.autograd.grad((image * weights).sum(), leaf)[0]
 
 
@@ -144,7 +144,7 @@ plt.tight_layout()
 # runs few; `python -m benchmarks.error_time` does it at 256² for eight scenes, with error bars and a check of its
 # references, and `docs/error-time.md` has a run.
 #
-# In practice: leave the numbers of samples alone, and give each step of an optimiser a seed of its own. Errors of
+# In practice: leave the numbers of samples and the seeds alone: each step of an optimiser draws new samples. Errors of
 # unbiased gradients average out over the steps.
 #
 # ## Check

@@ -35,7 +35,7 @@ def drawn(seeds, **options):
 
 
 def mean_gradient(verts, scene, camera, seeds=8, samples=40_000):
-    ways = drawn(seeds, surface_samples=samples, edge_samples=samples)
+    ways = drawn(seeds, sampling=eg.Sampling(surface=samples, edges=samples))
     return torch.stack([gradient(verts, scene, camera, way) for way in ways]).mean(0)
 
 

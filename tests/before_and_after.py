@@ -305,7 +305,7 @@ def posed() -> Arrays:
     mesh, matrix = bracket()
     view = camera().detach()
     moved = mesh.replace(verts=mesh.verts @ matrix[:3, :3].T)
-    target = eg.render(moved, view, spp=32)
+    target = eg.render(moved, view, spp=32, seed=0)
     found = fit.fit_pose(mesh, target, view, init=torch.eye(4), steps=6, progress=False)
     return {"matrix": found.matrix}
 
@@ -314,7 +314,7 @@ def fitted() -> Arrays:
     """The colour and the place of a scene after a few steps of a fit."""
     mesh, matrix = bracket()
     view = camera().detach()
-    target = eg.render(mesh.replace(verts=mesh.verts @ matrix[:3, :3].T), view, spp=16)
+    target = eg.render(mesh.replace(verts=mesh.verts @ matrix[:3, :3].T), view, spp=16, seed=0)
     found = fit.fit_scene(mesh, view, [target], {"verts": 0.01, "face_colors": 0.02}, steps=8, progress=False)
     return {"verts": found.scene.meshes[0].verts, "colors": found.scene.meshes[0].face_colors}
 
@@ -328,7 +328,7 @@ SCENES: dict[str, Callable[[], Arrays]] = {
     "tent filter": through(make=lambda: camera().detach(), filter="tent"),
     "cone and sun": under(cone_and_sun, {}),
     "point light, three bounces": under(point, {"bounces": 3}),
-    "mesh that shines": under(shining_mesh, {"light_samples": 2}),
+    "mesh that shines": under(shining_mesh, {"sampling": eg.Sampling(lights=2)}),
     "mesh that shines, two bounces": under(shining_mesh, {"bounces": 2}),
     "sky": under(sky, {}),
     "alpha-tested, shadows": under(point, {}, alpha_mode="MASK"),

@@ -35,7 +35,9 @@ def light() -> None:
 
     def total(x: torch.Tensor, seed: int) -> torch.Tensor:
         sun = eg.DirectionalLight(torch.stack([x, -torch.ones_like(x), -0.3 * torch.ones_like(x)]), 3.0)
-        return eg.render(eg.Scene([mesh, floor], lights=[sun]), camera, spp=64, seed=seed, edge_samples=20_000).sum()
+        return eg.render(
+            eg.Scene([mesh, floor], lights=[sun]), camera, spp=64, seed=seed, sampling=eg.Sampling(edges=20_000)
+        ).sum()
 
     x = torch.tensor(0.4, requires_grad=True)
     total(x, 1).backward()
@@ -63,7 +65,7 @@ def files_and_fits() -> None:
 def extras() -> None:
     """What needs a library that is not installed names the extra that brings it."""
     mesh, camera = painted(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, size=(16, 16))
-    image = eg.render(mesh, camera)
+    image = eg.render(mesh, camera, seed=0)
     fit = fit_pose(mesh, image, camera, background=0.0, progress=False, steps=1)
     needs = {
         "matplotlib": ("figures", fit.plot),

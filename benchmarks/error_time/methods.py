@@ -18,6 +18,7 @@ from edgegrad.camera.camera import Camera
 from edgegrad.kernel.operators import backward_kernel, forward_kernel
 from edgegrad.kernel.request import make_request
 from edgegrad.render import render
+from edgegrad.sampling import Sampling
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
@@ -129,16 +130,16 @@ class Edgegrad:
         with torch.no_grad():
             render(self._elsewhere, self._scene.camera, spp=1)
         # The same image for all: what it saw says where the kernel puts its samples.
-        options = {"spp": FORWARD_SPP, "seed": seed, "surface_samples": surface}
+        options = {"spp": FORWARD_SPP, "seed": seed}
         if self.part == "whole":
-            vertex, forward, backward = differentiate(self._scene, edge_samples=edge, **options)
+            vertex, forward, backward = differentiate(self._scene, sampling=Sampling(surface, edge), **options)
             return Gradient(forward + backward, **rigid(self._scene, vertex))
         if self.part == "interior":
-            vertex, _, seconds = differentiate(self._scene, visibility=False, **options)
+            vertex, _, seconds = differentiate(self._scene, visibility=False, sampling=Sampling(surface), **options)
             return Gradient(seconds, **rigid(self._scene, vertex))
         # The boundary alone is the difference to an interior from the same samples.
-        options["surface_samples"] = 64
-        both, _, seconds = differentiate(self._scene, edge_samples=edge, **options)
+        options["sampling"] = Sampling(64, edge)
+        both, _, seconds = differentiate(self._scene, **options)
         interior, _, _ = differentiate(self._scene, visibility=False, **options)
         return Gradient(seconds, **rigid(self._scene, both - interior))
 

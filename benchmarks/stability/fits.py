@@ -12,6 +12,7 @@ from torch import Tensor
 from edgegrad.camera.camera import Camera
 from edgegrad.fit.laplacian import LaplacianSolver
 from edgegrad.render import render
+from edgegrad.sampling import Sampling
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
@@ -89,7 +90,7 @@ def vertex_fit(steps: int = STEPS, preconditioned: bool = False, say: Say = lamb
     u = v if solve is None else solve.to_differential(v)
     mean, square = torch.zeros_like(u), torch.zeros_like(u)
     losses = []
-    samples: dict[str, Any] = {"surface_samples": 10_000, "edge_samples": 5_000}  # of each camera
+    samples: dict[str, Any] = {"sampling": Sampling(surface=10_000, edges=5_000)}  # of each camera
     rate = 3e-2 if preconditioned else 3e-3
     for step in range(1, steps + 1):
         say(f"vertices{', preconditioned' if preconditioned else ''}, step {step}")

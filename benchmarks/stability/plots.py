@@ -278,7 +278,7 @@ def _steps(found: dict[str, Any]) -> list[str]:
 The error of the derivative of a painted area by its size: a disc 31 px wide, stripes of 3.2 px with gaps as wide, and a
 rotated checkerboard of texels of 3.2 px. A shader declares them, or alpha or nearest texels paint them.
 Mean over {found["seeds"]} seeds ± its standard error, and the root mean square error of one image, with the default of everything
-but the spacing of the lines that find steps (`step_spacing`).
+but the spacing of the lines that find steps (`Sampling.discontinuity_spacing`).
 
 | spacing, px | {" | ".join(names)} | an image and its gradient, ms |
 |---{"|---" * (len(names) + 1)}|"""]  # fmt: skip

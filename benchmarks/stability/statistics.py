@@ -15,6 +15,7 @@ from edgegrad.camera.camera import Camera
 from edgegrad.camera.poses import rotation
 from edgegrad.optional import require
 from edgegrad.render import render
+from edgegrad.sampling import Sampling
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
@@ -38,7 +39,7 @@ from .painted import PAINTED
 F64 = torch.float64
 ALPHA = 0.01  # chance of any false alarm in a whole run, by Holm
 SEEDS, SINGLES = 256, 2048
-SAMPLES = {"surface_samples": 2_000, "edge_samples": 2_000, "spp": 16}
+SAMPLES = {"sampling": Sampling(surface=2_000, edges=2_000), "spp": 16}
 SPP = (1, 4, 16, 64, 256)
 
 Say = Callable[[str], Any]
@@ -220,7 +221,7 @@ def _vertices(scene: Scene, camera: Camera, seed: int, **options: Any) -> Tensor
     leaves = [mesh.verts.clone().requires_grad_() for mesh in scene.meshes]
     meshes = [mesh.replace(verts=v) for mesh, v in zip(scene.meshes, leaves, strict=True)]
     image = render(
-        scene.replace(meshes=meshes), camera, spp=4, grad_seed=seed, surface_samples=1, edge_samples=1, **options
+        scene.replace(meshes=meshes), camera, spp=4, sampling=Sampling(seed=seed, surface=1, edges=1), **options
     )
     adjoint = Problem({}, lambda parts: (scene, camera), None).cotangent(image)
     grads = torch.autograd.grad(image, leaves, adjoint, materialize_grads=True)

@@ -1,7 +1,7 @@
 """Discontinuities within faces: the error of the gradient against the spacing of the lines that find them.
 
 Each painting has a size t, and the derivative of its painted area by t is known. The lines of the report are those that
-`step_spacing` of render() lays through the image: what a shader declares, and what the kernel knows of itself.
+`Sampling.discontinuity_spacing` lays through the image: what a shader declares, and what the kernel knows of itself.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch import Tensor
 from edgegrad.camera.camera import Camera
 from edgegrad.points.hits import Hits
 from edgegrad.render import render
+from edgegrad.sampling import Sampling
 from edgegrad.scene.mesh import Mesh
 
 F64 = torch.float64
@@ -67,7 +68,7 @@ def derivative(case: Case, spacing: float, seed: int) -> Tensor:
     camera = Camera(torch.eye(4, dtype=F64), K, (SIZE, SIZE), "orthographic")
     t = torch.zeros((), dtype=F64, requires_grad=True)
     mesh, shader = case.paint(t)
-    image = render(mesh, camera, seed=seed, shader=shader, step_spacing=spacing)
+    image = render(mesh, camera, seed=seed, shader=shader, sampling=Sampling(discontinuity_spacing=spacing))
     return torch.autograd.grad(image[..., 0].sum(), t)[0]
 
 

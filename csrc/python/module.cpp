@@ -252,13 +252,14 @@ NB_MODULE(_core, m) {
     nb::class_<ImageOptions>(m, "ImageOptions").def(nb::new_(&make_image_options), "spp"_a, "filter"_a, "seed"_a);
     nb::class_<GradientOptions>(m, "GradientOptions")
         .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,
-                         bool boundary, bool intrinsics, bool discontinuities, double step_spacing, bool lit,
+                         bool boundary, bool intrinsics, bool discontinuities, double discontinuity_spacing, bool lit,
                          bool indirect, bool dry) {
-                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, intrinsics,
-                                        discontinuities, step_spacing, lit,  indirect,          dry,      !dry};
+                 return GradientOptions{
+                     surface_samples, edge_samples,          seed, interior_geometry, boundary, intrinsics,
+                     discontinuities, discontinuity_spacing, lit,  indirect,          dry,      !dry};
              }),
              "seed"_a, nb::kw_only(), "surface_samples"_a = -1, "edge_samples"_a = -1, "interior_geometry"_a = true,
-             "boundary"_a = true, "intrinsics"_a = true, "discontinuities"_a = true, "step_spacing"_a = 1.0,
+             "boundary"_a = true, "intrinsics"_a = true, "discontinuities"_a = true, "discontinuity_spacing"_a = 1.0,
              "lit"_a = false, "indirect"_a = false, "dry"_a = false);
     m.attr("WRAPS") = nb::make_tuple(wrap_names[0], wrap_names[1], wrap_names[2]);
     m.attr("TEXTURE_FILTERS") = nb::make_tuple(texture_filter_names[0], texture_filter_names[1]);

@@ -133,7 +133,7 @@ def _rendered(shot: Shot, meshes: Mapping[int, Mesh], spp: int) -> Tensor:
         background = background.expand(channels)
     if not placed:
         return background.expand(*shot.camera.size, channels)
-    return render(Scene(placed, background=background), shot.camera, spp=spp)
+    return render(Scene(placed, background=background), shot.camera, spp=spp, seed=0)
 
 
 def _diameter(points: np.ndarray) -> float:

@@ -82,12 +82,12 @@ def gradient_error() -> float:
     """
     import torch
 
-    from .. import Camera, Mesh, render
+    from .. import Camera, Mesh, Sampling, render
 
     verts = torch.tensor([[-0.7, -0.6, 0.0], [0.8, -0.3, 0.0], [-0.1, 0.75, 0.0]], dtype=torch.float64)
     mesh = Mesh(verts.clone().requires_grad_(), torch.tensor([[0, 1, 2]]), colors=torch.ones(3, 1))
     camera = Camera.orthographic((0, 0, 2), (0, 0, 0), height=2.0, size=(64, 64))
-    render(mesh, camera, spp=4, edge_samples=4096).sum().backward()
+    render(mesh, camera, spp=4, seed=0, sampling=Sampling(edges=4096)).sum().backward()
     assert mesh.verts.grad is not None
     found = mesh.verts.grad[:, :2]
     sides = verts.roll(-2, 0) - verts.roll(-1, 0)  # opposite to each vertex

@@ -128,7 +128,7 @@ def _write_overlay(path: Path, frame: Tensor, scene: Scene, camera: Camera, pose
 
     with torch.no_grad():
         moved = scene.transformed(pose.R, pose.t, pose.scale)
-        alpha = render_aovs(moved, camera, ["alpha"], 4)["alpha"][..., 0]
+        alpha = render_aovs(moved, camera, ["alpha"], 4, 0)["alpha"][..., 0]
     inside = (alpha > 0.5).float()[None, None]
     pool = torch.nn.functional.max_pool2d
     contour = (pool(inside, 3, 1, 1) + pool(-inside, 3, 1, 1))[0, 0] > 0.5

@@ -95,7 +95,7 @@ class Options:
     checkpoint_every  steps
     resume            go on from the checkpoint if there is one: the fit ends as if it had never stopped. A checkpoint of a fit
                       with other arguments is refused
-    render            further arguments of render(), such as light_samples
+    render            further arguments of render(), such as sampling
     """
 
     loss: str | Loss = "l2"

@@ -31,7 +31,7 @@ def check_mask_rows(views: Sequence[Observation], scene: Scene, cameras: Sequenc
     given = [(view.mask, camera) for view, camera in zip(views, cameras, strict=True) if view.mask is not None]
     for mask, camera in given[:MAX_VIEWS]:
         with torch.no_grad():
-            alpha = render_aovs(scene, camera, ["alpha"], spp=4)["alpha"]
+            alpha = render_aovs(scene, camera, ["alpha"], spp=4, seed=0)["alpha"]
         overlap += torch.stack([_intersection_and_union(alpha, image) for image in (mask, mask.flip(0))])
     as_given, turned = (overlap[:, 0] / overlap[:, 1].clamp(min=1e-30)).tolist()
     if turned > max(MIN_FLIPPED_IOU, as_given + MIN_IOU_GAIN):

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from ..check import check_finite
 from ..library import core
+from ..sampling import camera_seed
 from ..scene.scene import Scene
 from ..warnings import warn
 from . import memory as memory
 from .flat import Flat
-from .request import PER_CAMERA, SCHEMA, SLOTS, PackedCamera, Request, WantedTerms, derived_seed, label
+from .request import PER_CAMERA, SCHEMA, SLOTS, PackedCamera, Request, WantedTerms, label
 from .threads import threads
 
 Profile = dict[str, float]
@@ -93,7 +94,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 def forward_kernel(request: Request) -> tuple[Tensor, HitBuffers, list[Profile]]:
     """image (B, H, W, C), what the backward pass takes from it, and what the kernel did for each camera. Raises MemoryError."""
     with image_memory(request):
-        scene, options = kernel_scene(request.scene), request.image._asdict()
+        scene = kernel_scene(request.scene)
         B, height, width = request.cameras, request.camera.height, request.camera.width
         image = request.scene.colors.new_empty((B, height, width, request.channels))
         hits = HitBuffers.empty(request)
@@ -101,12 +102,11 @@ def forward_kernel(request: Request) -> tuple[Tensor, HitBuffers, list[Profile]]
         warn_of_ends(cameras)
         profiles = []
         for b in range(B):
-            options["seed"] = camera_seed(request.image.seed, b)
             profiles.append(
                 scene.forward(
                     camera=cameras[b],
                     channels=kernel_channels(request, b),
-                    options=core.ImageOptions(**options),
+                    options=request.image.for_kernel(b),
                     threads=threads(),
                     image=image[b].numpy(),
                     hits=kernel_hits(hits, b),
@@ -132,7 +132,7 @@ def backward_kernel(
     `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
     with gradient_memory(adjoint, request, wanted):
-        scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
+        scene, image = kernel_scene(request.scene), request.image.for_kernel()
         # Sums are taken in double whatever the arrays hold. NumPy has its zeros from the system, torch would wake all threads.
         grads = {name: np.zeros(request.slot(name).shape) for name in SLOTS if name in wanted}
         images = adjoint.detach().contiguous()
@@ -164,7 +164,7 @@ def jvp_kernel(hits: HitBuffers, request: Request, tangents: Mapping[str, Tensor
     """Derivatives (D, B, H, W, C) of the image in D directions, in the type of the image: `tangents` (D, …) by slot, zero
     where there is none. Raises MemoryError."""
     with derivatives_memory(request, tangents, directions):
-        scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
+        scene, image = kernel_scene(request.scene), request.image.for_kernel()
         given = {name: np.ascontiguousarray(t.detach().double().numpy()) for name, t in tangents.items()}
         adjoint = _channel_weights(request).expand(request.camera.height, request.camera.width, -1).contiguous()
         out = np.zeros((request.cameras, *adjoint.shape[:2], directions, request.channels))
@@ -200,7 +200,7 @@ def _channel_weights(request: Request) -> Tensor:
 def screen_gradient_kernel(adjoint: Tensor, hits: HitBuffers, request: Request) -> Tensor:
     """Return how the loss changes as what is seen in a pixel moves right and down: (B, H, W, 2). Raises MemoryError."""
     with derivatives_memory(request, ["verts"], 1):
-        scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
+        scene, image = kernel_scene(request.scene), request.image.for_kernel()
         out = np.zeros((*adjoint.shape[:3], 2))
         for b in range(request.cameras):
             scene.screen_gradient(
@@ -226,13 +226,13 @@ def _gradient_options(
 ) -> Any:
     options, terms = request.gradient, WantedTerms.from_request(request, wanted)
     return core.GradientOptions(
-        seed=camera_seed(options.grad_seed, camera),
+        seed=camera_seed(int(options.grad_seed), camera),
         surface_samples=options.surface_samples,
         edge_samples=options.edge_samples,
         interior_geometry=terms.motion,
         boundary=terms.boundary,
         discontinuities=terms.discontinuities,
-        step_spacing=options.step_spacing,
+        discontinuity_spacing=options.discontinuity_spacing,
         lit=lit,
         indirect=indirect,
         dry=dry,
@@ -243,11 +243,6 @@ def faces_with_textures(lit: Scene | None) -> np.ndarray | None:
     """Return which faces have a texture (F,) uint8, or None if none has one or the scene is not lit."""
     textured = None if lit is None else lit.textured_faces
     return None if textured is None else textured.numpy()
-
-
-def camera_seed(seed: int, camera: int) -> int:
-    """Return the seed of a camera of a batch: each has samples of its own."""
-    return seed if camera == 0 else derived_seed(seed, camera + 1)
 
 
 # -- memory -------------------------------------------------------------------------------------------------------------

@@ -14,8 +14,9 @@ from torch import Tensor
 from ..camera.camera import Camera
 from ..camera.convention_warnings import warn_if_behind
 from ..camera.lens import MOST_COEFFICIENTS
-from ..check import as_int, check_not_meta, check_positive, check_positive_int, check_shape
+from ..check import check_not_meta, check_positive_int, check_shape
 from ..library import core
+from ..sampling import Sampling, camera_seed, check_sampling, derived_seed, drawn_seed
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene, as_scene
 from .flat import Flat, flatten
@@ -49,16 +50,20 @@ class Channels(NamedTuple):
 class ImageOptions(NamedTuple):
     spp: int
     filter: str
-    seed: int
+    seed: Tensor  # () int64: a tensor, so that torch.compile and torch.vmap may draw it
+
+    def for_kernel(self, camera: int = 0) -> Any:
+        """Return the kernel's options of the image of a camera of the batch."""
+        return core.ImageOptions(self.spp, self.filter, camera_seed(int(self.seed), camera))
 
 
 class GradientOptions(NamedTuple):
     surface_samples: int  # −1: the default
     edge_samples: int  # −1: the default
-    grad_seed: int
+    grad_seed: Tensor  # () int64
     channels_vary: bool  # over a face; if not, moving it changes nothing inside
     visibility: bool  # whether what moves at silhouettes and other jumps counts
-    step_spacing: float  # px between the lines along which discontinuities are looked for
+    discontinuity_spacing: float  # px between the lines along which discontinuities are looked for
 
 
 class Request(NamedTuple):
@@ -112,7 +117,6 @@ _LABELS = {"texels": "texture", "alphas": "alpha"}
 PER_CAMERA = (*PackedCamera._fields, "vertex_attributes")  # slots with a row for each camera
 MOVING = ("verts", *(name for name in SLOTS if name in PackedCamera._fields))  # slots that move the image
 APPEARANCE = ("colors", "uvs", "texels", "vertex_attributes", "face_attributes")
-LEAST_SPACING = 1 / 64  # px, of step_spacing
 DISCONTINUITY_SLOTS = (*MOVING, "uvs", "alphas")  # slots that move alpha edges and texel edges
 
 
@@ -178,14 +182,12 @@ def make_request(
     scene: Scene | Mesh,
     camera: Camera,
     spp: int = 16,
-    seed: int = 0,
+    seed: int | Tensor | None = None,
     *,
-    surface_samples: int | None = None,
-    edge_samples: int | None = None,
-    visibility: bool = True,
     filter: str = "box",
-    grad_seed: int | None = None,
-    step_spacing: float = 1.0,
+    visibility: bool = True,
+    sampling: Sampling | None = None,
+    generator: torch.Generator | None = None,
     all_uvs: bool = False,
 ) -> Request:
     """Return the arguments of render(), checked; and whether texture coordinates that nothing needs are taken along. Raises
@@ -193,20 +195,16 @@ def make_request(
     scene = as_scene(scene)
     check_camera(camera)
     spp = check_positive_int("spp", spp, most=1 << 20)
-    seed = _check_seed("seed", seed)
-    grad_seed = derived_seed(seed) if grad_seed is None else _check_seed("grad_seed", grad_seed)
-    surface, edge = (
-        -1 if n is None else check_positive_int(name, n, most=1 << 40)
-        for name, n in (("surface_samples", surface_samples), ("edge_samples", edge_samples))
-    )
+    sampling = check_sampling(sampling)
     if not isinstance(visibility, bool):
         raise TypeError(f"visibility: expected True or False, got {type(visibility).__name__} ({visibility!r})")
     if filter not in FILTERS:
         raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
-    step_spacing = check_positive("step_spacing", step_spacing, least=LEAST_SPACING, most=64)
     if scene.background is not None and scene.background.dim() == 3:
         check_shape("background", scene.background, (*camera.size, "C"), fix="give it the camera's size")
     _check_devices(scene, camera)
+    image_seed = drawn_seed(seed, generator)
+    grad_seed = derived_seed(image_seed) if sampling.seed is None else torch.tensor(sampling.seed, device="cpu")
 
     flat = flatten(scene, all_uvs)
     if torch.compiler.is_compiling():
@@ -220,8 +218,15 @@ def make_request(
         flat,
         packed,
         Channels(False, flat.verts.new_empty((cameras, V, 0)), -1, flat.verts.new_empty((F, 0)), False, False),
-        ImageOptions(spp, filter, seed),
-        GradientOptions(surface, edge, grad_seed, _radiance_varies(scene), visibility, step_spacing),
+        ImageOptions(spp, filter, image_seed),
+        GradientOptions(
+            -1 if sampling.surface is None else sampling.surface,
+            -1 if sampling.edges is None else sampling.edges,
+            grad_seed,
+            _radiance_varies(scene),
+            visibility,
+            sampling.discontinuity_spacing,
+        ),
     )
 
 
@@ -259,15 +264,3 @@ def _radiance_varies(scene: Scene) -> bool:
         m.colors is not None or m.corner_colors is not None or (m.texture is not None and m.filter != "nearest")
         for m in scene.meshes
     )
-
-
-def _check_seed(name: str, seed: object) -> int:
-    number = as_int(name, seed)
-    if not 0 <= number < 2**63:
-        raise ValueError(f"{name}: expected an int from 0 to 2⁶³ − 1, got {number}")
-    return number
-
-
-def derived_seed(seed: int, stream: int = 1) -> int:
-    """Return a seed of its own for each stream: multiplication by an odd number is a bijection, so no two seeds meet."""
-    return (seed * 0x5851F42D4C957F2D + stream * 0x14057B7EF767814F) & (2**63 - 1)

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from ..kernel.derivatives import moves
 from ..kernel.first_order import apply, array, without_derivatives
-from ..kernel.request import derived_seed
 from ..kernel.threads import threads
 from ..library import core
 from ..points.hits import Hits
 from ..points.image_context import ImageContext
 from ..points.records import CurveRecords
 from ..points.surfaces import CameraView
+from ..sampling import derived_seed
 from ..scene.environment import Environment
 from ..scene.lights import Light, LightPoints
 from ..scene.material import Texture

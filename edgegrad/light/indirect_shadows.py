@@ -14,13 +14,13 @@ from torch import Tensor
 
 from ..kernel.counts import Watch
 from ..kernel.derivatives import moves
-from ..kernel.request import derived_seed
 from ..library import core
 from ..points.image_context import ImageContext
 from ..points.moving import Form, velocity
 from ..points.records import CurveRecords
 from ..points.shadows import ShadowLight
 from ..points.splat import SplatTerm
+from ..sampling import derived_seed
 from . import in_kernel
 from .bsdf import dot
 from .secondary_edges import world_velocity

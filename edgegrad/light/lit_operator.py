@@ -16,6 +16,7 @@ from ..check import values_visible
 from ..kernel.first_order import Tensors, apply
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request, make_request
+from ..sampling import Sampling
 from ..scene.scene import CLASSES, Scene
 from ..scene.tree import from_text, tensors_in, to_text
 from .radiance import Lighting
@@ -27,19 +28,14 @@ def lit_image(
     lighting: Lighting, scene: Scene, camera: Camera, request: Request, creases: bool | str = "auto"
 ) -> Tensor:
     """Return the image (H, W, C), or (B, H, W, C) for a batch of cameras, also of tensors without values."""
-    if values_visible(*tensors_in((scene, camera))):
+    image, gradient = request.image, request.gradient
+    if values_visible(image.seed, gradient.grad_seed, *tensors_in((scene, camera))):
         return lighting.image(scene, camera, request, creases)
     tensors: list[Tensor] = []
-    image, gradient = request.image, request.gradient
-    options = {
-        "filter": image.filter, "visibility": gradient.visibility, "step_spacing": gradient.step_spacing,
-        "creases": creases, "shadows": lighting.shadows,
-    }  # fmt: skip
-    recipe = to_text((scene, camera, tuple(options.items())), tensors)
-    numbers = (
-        image.spp, image.seed, gradient.surface_samples, gradient.edge_samples, gradient.grad_seed, lighting.samples,
-        lighting.bounces,
-    )  # fmt: skip
+    seeds = image.seed, gradient.grad_seed
+    options = image.filter, gradient.visibility, gradient.discontinuity_spacing, creases, lighting.shadows
+    recipe = to_text((scene, camera, seeds, options), tensors)
+    numbers = image.spp, gradient.surface_samples, gradient.edge_samples, lighting.samples, lighting.bounces
     if not torch.compiler.is_compiling():
         moving = tuple(k for k, tensor in enumerate(tensors) if tensor.is_floating_point())
         return apply(_LitImageOperation(recipe, numbers, moving), tensors)[0]
@@ -58,20 +54,17 @@ class _LitImageOperation(NamedTuple):
     """The operation (kernel/first_order.py) that renders `tensors`."""
 
     recipe: str  # what else the scene, the camera and the options are
-    numbers: Sequence[
-        int
-    ]  # spp, seed, surface samples and edge samples or −1, the gradient's seed, light samples, bounces
+    numbers: Sequence[int]  # spp, surface samples and edge samples or −1, light samples, bounces
     moving: Sequence[int]
 
     def image(self, tensors: Sequence[Tensor]) -> Tensor:
-        scene, camera, options = from_text(self.recipe, tensors, _CLASSES)
-        spp, seed, surface, edge, grad_seed, samples, bounces = self.numbers
-        own = dict(options)
-        lighting, creases = Lighting(own.pop("shadows"), samples, bounces), own.pop("creases")
-        counts = {"surface_samples": surface, "edge_samples": edge}
-        given = {name: count for name, count in counts.items() if count >= 0}
-        request = make_request(scene, camera, spp, seed, grad_seed=grad_seed, **given, **own)
-        return lighting.image(scene, camera, request, creases)
+        scene, camera, (seed, grad_seed), options = from_text(self.recipe, tensors, _CLASSES)
+        filter, visibility, spacing, creases, shadows = options
+        spp, *counts, lights, bounces = self.numbers
+        surface, edges = (None if count < 0 else count for count in counts)
+        sampling = Sampling(surface, edges, lights, spacing, creases, int(grad_seed))
+        request = make_request(scene, camera, spp, int(seed), filter=filter, visibility=visibility, sampling=sampling)
+        return Lighting(shadows, lights, bounces).image(scene, camera, request, creases)
 
     def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
         with torch.no_grad():

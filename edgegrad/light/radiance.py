@@ -7,7 +7,7 @@ with one point, or a few, of each light that has an extent. Spherical harmonics 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -22,6 +22,7 @@ from ..library import core
 from ..points.hits import Hits
 from ..points.image_context import ImageContext
 from ..points.splat import SplatTerm
+from ..sampling import Sampling
 from ..scene.appearance import coordinates
 from ..scene.environment import Environment
 from ..scene.lights import Light
@@ -50,8 +51,6 @@ CLOSER_STEPS = 8.0
 # Distance, in texels, from a texel edge at which both of its sides are shaded: the kernel reads the texel in which a point lies.
 NEXT_TO_TEXELS = 1e-4
 
-LIGHTING = ("shadows", "light_samples", "bounces")  # the options of render() that it is made of
-
 
 class Lighting(NamedTuple):
     """The options of render() for lit scenes."""
@@ -61,20 +60,15 @@ class Lighting(NamedTuple):
     bounces: int = 1  # how often light is scattered on its way, at most
 
     @classmethod
-    def from_options(cls, shadows: object = True, light_samples: object = 1, bounces: object = 1) -> Lighting:
+    def from_options(cls, shadows: object, bounces: object, sampling: Sampling) -> Lighting:
         """Raises TypeError or ValueError."""
         if not isinstance(shadows, bool):
             raise TypeError(f"shadows: expected True or False, got {type(shadows).__name__} ({shadows!r})")
         return cls(
             shadows,
-            check_positive_int("light_samples", light_samples, most=1 << 16),
+            sampling.lights,
             check_positive_int("bounces", bounces, most=core.MOST_BOUNCES),
         )
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Return the arguments of render() that it is made of."""
-        return dict(zip(LIGHTING, self, strict=True))
 
     def image(
         self,
@@ -125,7 +119,7 @@ class Lighting(NamedTuple):
             # Comparisons see borders, which visibility=False leaves out; and layers behind others have none.
             near_field=self.bounces > 1 and additive and request.gradient.visibility,
         )
-        image = render_shaded(scene, camera, lit, request, creases, False, traits, watch)
+        image = render_shaded(scene, camera, lit, request, creases, traits, watch)
         if not scene.is_lit:  # as the kernel has it where there are no mipmaps
             image = image.to(image_dtype(scene))
         # A graph from all tensors, whatever is in view and whatever is lit.

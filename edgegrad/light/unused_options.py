@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 
+from ..sampling import Sampling
 from ..scene.scene import Scene
 from ..warnings import warn
-from .radiance import LIGHTING
+from .radiance import Lighting
 
-# Options that only some ways of shading use, with their defaults.
-DEFAULTS = {"creases": "auto", "check_shader": False, "shadows": True, "light_samples": 1, "bounces": 1}
+CREASES = "sampling.creases"
+LIGHTING = ("shadows", "bounces", "sampling.lights")  # options of lit scenes
 
 
-def warn_of_unused(scene: Scene, with_shader: bool, options: Mapping[str, Any]) -> None:
+def warn_of_unused(scene: Scene, with_shader: bool, lighting: Lighting, sampling: Sampling) -> None:
     """Warn of each option that is not at its default and has no effect on an image of the scene."""
     if torch.compiler.is_compiling():
         return
-    for name, value in options.items():
-        why = why_unused(name, scene, with_shader) if name in DEFAULTS else ""
-        if why and (type(value) is not type(DEFAULTS[name]) or value != DEFAULTS[name]):
-            warn(f"unused {name}", f"{name}: {value!r} has no effect, for {why}; leave {name}= out")
+    given = lighting.shadows, lighting.bounces, sampling.lights, sampling.creases
+    for name, value, default in zip((*LIGHTING, CREASES), given, (True, 1, 1, "auto"), strict=True):
+        changed = type(value) is not type(default) or value != default
+        if changed and (why := why_unused(name, scene, with_shader)):
+            warn(f"unused {name}", f"{name}: {value!r} has no effect, for {why}; leave {name.split('.')[-1]}= out")
 
 
 def why_unused(name: str, scene: Scene, with_shader: bool) -> str:
@@ -31,8 +30,6 @@ def why_unused(name: str, scene: Scene, with_shader: bool) -> str:
         return "the shader computes the radiance, not the scene's lights and materials"
     if name in LIGHTING and not scene.is_lit:
         return "the scene has neither lights nor materials"
-    if name == "check_shader" and not with_shader:
-        return "there is no shader"
-    if name == "creases" and not with_shader and not scene.is_shaded:
+    if name == CREASES and not with_shader and not scene.is_shaded:
         return "colours and textures show by themselves at which edges they jump"
     return ""

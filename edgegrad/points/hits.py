@@ -294,9 +294,9 @@ class Hits:
         a, b   rows (N, C), a colour (C,), or a number
 
         torch.where() gives the same image, but no gradient for the border. Borders are found along lines through the image,
-        a pixel apart unless render() is given another step_spacing; two that lie closer may be missed. A shader must call
-        where(), floor() and nearest lookups equally often, in the same order, whatever its points. For hits that are not of
-        render()'s shader, where() is torch.where(). Raises TypeError or ValueError that names the argument.
+        a pixel apart by default (Sampling.discontinuity_spacing); two that lie closer may be missed. A shader must call where(),
+        floor() and nearest lookups equally often, in the same order, whatever its points. For hits that are not of render()'s
+        shader, where() is torch.where(). Raises TypeError or ValueError that names the argument.
         """
         s = _function("s", s)
         check_shape("s", s, (len(self),), (len(self), 1))

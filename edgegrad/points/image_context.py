@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..kernel.derivatives import moves
-from ..kernel.operators import camera_seed
 from ..kernel.request import Request
+from ..sampling import camera_seed
 from ..scene.scene import Scene
 from .discontinuities import Discontinuities
 from .hits import Hits
@@ -55,7 +55,7 @@ class ImageContext:
     def seeds(self, kind: str, count: int, first: int = 0) -> Tensor:
         """Return the seeds (count,) int64 of the samples of a kind from `first` on."""
         request = self.request
-        seed = camera_seed(request.image.seed, self._index) if kind.startswith("image") else self.sampler.grad_seed
+        seed = camera_seed(int(request.image.seed), self._index) if kind.startswith("image") else self.sampler.grad_seed
         return self.here(sample_seeds(seed, SEED_KINDS.index(kind), first, count))
 
     def seeds_of_pixels(self, kind: str, pixel: Tensor, each: int) -> Tensor:

@@ -111,7 +111,7 @@ class Sampler:
 
     @property
     def grad_seed(self) -> int:
-        return camera_seed(self._request.gradient.grad_seed, self._camera)
+        return camera_seed(int(self._request.gradient.grad_seed), self._camera)
 
     @property
     def _transparent(self) -> np.ndarray | None:
@@ -166,10 +166,9 @@ class Sampler:
 
     def _image(self, request: Request, camera: Any) -> dict[str, Any]:
         """Return the kernel's arguments for the image."""
-        options = request.image._replace(seed=camera_seed(request.image.seed, self._camera))
         return {
             "camera": camera,
-            "image": core.ImageOptions(**options._asdict()),
+            "image": request.image.for_kernel(self._camera),
             "threads": threads(),
             "hits": kernel_hits(self._hits),
         }
@@ -206,7 +205,7 @@ class Sampler:
             flat, options = request.scene, request.gradient
             surface, curves = self._scene(flat).samples(
                 camera=camera,
-                image=core.ImageOptions(**request.image._asdict()),
+                image=request.image.for_kernel(),
                 options=core.GradientOptions(
                     seed=self.grad_seed,
                     surface_samples=options.surface_samples,
@@ -215,7 +214,7 @@ class Sampler:
                     boundary=boundary,
                     intrinsics=intrinsics,
                     discontinuities=discontinuities,
-                    step_spacing=options.step_spacing,
+                    discontinuity_spacing=options.discontinuity_spacing,
                     lit=lit is not None,
                     indirect=indirect,
                 ),
@@ -292,7 +291,7 @@ class Sampler:
         """Return the kernel's arguments for samples on curves."""
         return {
             "camera": camera,
-            "image": core.ImageOptions(**request.image._asdict()),
+            "image": request.image.for_kernel(),
             "options": core.GradientOptions(seed=seed, intrinsics=intrinsics),
             "samples": samples,
             "least": self._least,

@@ -24,6 +24,7 @@ from ..camera.camera import Camera
 from ..check import as_tensor, check_finite, check_float, check_positive_int, check_shape
 from ..kernel.derivatives import moves
 from ..kernel.request import Request, make_request
+from ..sampling import Sampling
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene, as_scene
 from .hits import Hits
@@ -192,14 +193,15 @@ def primary_hits(
     scene: Scene | Mesh,
     camera: Camera,
     spp: int = 16,
-    seed: int = 0,
+    seed: int | None = None,
     *,
     filter: str = "box",
-    grad_seed: int | None = None,
+    sampling: Sampling | None = None,
+    generator: torch.Generator | None = None,
 ) -> PrimaryHits:
     """Return the hits of the rays of an image: render()'s samples, for a pipeline of your own. The arguments are render()'s,
     with one camera. Raises what render() raises."""
-    request = make_request(scene, camera, spp, seed, filter=filter, grad_seed=grad_seed)
+    request = make_request(scene, camera, spp, seed, filter=filter, sampling=sampling, generator=generator)
     if camera.batch is not None:
         raise ValueError(f"camera: expected one camera, got a batch of {camera.batch}; take camera[i] one by one")
     return PrimaryHits(as_scene(scene), request)
@@ -209,7 +211,7 @@ def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSa
     """Return samples for the gradient inside faces, fewer than those of the image: by default half a sample a pixel of surface.
 
     primary   of primary_hits()
-    count     of samples; see surface_samples of render()
+    count     of samples; see Sampling.surface
 
     Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
     """
@@ -224,7 +226,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
     """Samples for the gradient of what moves at edges.
 
     primary   of primary_hits()
-    count     of samples; see edge_samples of render()
+    count     of samples; see Sampling.edges
     creases   at which edges between two visible faces radiance may jump: True, at all; False, at none; or numbers at the corners
               of faces (F, 3, K), at those where these differ on both sides
 

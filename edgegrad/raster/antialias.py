@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..check import as_int, as_scalar, check_positive_int
+from ..check import as_scalar, check_positive_int
 from ..kernel.threads import threads
 from ..library import core
-from .exact import Sampling, exact_means
+from ..sampling import drawn_seed
+from .exact import exact_means
 from .tensors import check_image, check_positions, contiguous, ranges_of, to_kernel, triangles
 
 
@@ -59,7 +60,7 @@ def antialias(
     exact: bool = False,
     ranges: Tensor | None = None,
     spp: int = 16,
-    seed: int = 0,
+    seed: int | None = None,
 ) -> Tensor:
     """Return an image whose pixels are blended across silhouettes, so that it changes continuously with the vertices, (B, H, W,
     C).
@@ -93,8 +94,10 @@ def antialias(
         Whether pixels become means.
     ranges : (B, 2) int
         With `exact` and pos (V, 4): those that were rasterized.
-    spp, seed : int, default 16 and 0
-        With `exact`: samples a pixel, and which.
+    spp : int, default 16
+        With `exact`: samples per pixel.
+    seed : int, optional
+        With `exact`: of the samples; by default torch's generator draws one for each image.
     """
     (color, rast, pos), device = to_kernel(color=color, rast=rast, pos=pos)
     check_image("rast", rast, 4)
@@ -111,14 +114,16 @@ def antialias(
     if exact:
         spans = _spans(ranges, pos, faces, len(rast))
         known = pos if boost == 1 else pos.detach() + boost * (pos - pos.detach())
-        sampling = Sampling(check_positive_int("spp", spp), as_int("seed", seed))
+        spp = check_positive_int("spp", spp)
         images = []
         for b, (first, count) in enumerate(spans):
             own = faces[first : first + count]
             counted = rast[b].clone()
             _check_shown(b, rast[b, ..., 3], first, count)
             counted[..., 3] = torch.where(counted[..., 3] > 0, counted[..., 3] - first, 0)
-            images.append(exact_means(color[b], counted, known[b if len(known) > 1 else 0], own, sampling))
+            images.append(
+                exact_means(color[b], counted, known[b if len(known) > 1 else 0], own, spp, int(drawn_seed(seed)))
+            )
         return torch.stack(images).to(device)
     if topology_hash is None:
         topology_hash = TopologyHash(faces)

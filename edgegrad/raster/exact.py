@@ -17,12 +17,7 @@ from ..points.samples import attach_boundary, edge_samples, primary_hits
 from ..scene.mesh import Mesh
 
 
-class Sampling(NamedTuple):
-    spp: int
-    seed: int
-
-
-def exact_means(color: Tensor, rast: Tensor, pos: Tensor, tri: Tensor, sampling: Sampling) -> Tensor:
+def exact_means(color: Tensor, rast: Tensor, pos: Tensor, tri: Tensor, spp: int, seed: int) -> Tensor:
     """Return the means (H, W, C) of one image: color (H, W, C), rast (H, W, 4), pos (V, 4), tri (F, 3). Triangles are counted
     as in rast."""
     height, width = color.shape[:2]
@@ -33,7 +28,7 @@ def exact_means(color: Tensor, rast: Tensor, pos: Tensor, tri: Tensor, sampling:
         return background.view_as(color)
     K = torch.tensor([[width / 2, 0, width / 2], [0, height / 2, height / 2], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(torch.eye(4, dtype=torch.float64), K, (height, width), "orthographic")
-    primary = primary_hits(mesh, camera, sampling.spp, sampling.seed)
+    primary = primary_hits(mesh, camera, spp, seed)
     behind = background.view(height, width, -1).double()
     image = primary.image(shown.of_hits(primary.hits, owner).double(), behind)
     if pos.requires_grad and torch.is_grad_enabled():

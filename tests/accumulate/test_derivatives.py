@@ -16,6 +16,7 @@ from combinations import diagonal
 from finite_differences import Estimate, check, estimate, rotation
 from lit_scenes import vector
 from oracles.exact import exact_image
+from sampling_options import with_sampling
 from scenes import cube, front_camera, smooth_adjoint, smooth_colors
 from torch import Tensor
 
@@ -145,7 +146,7 @@ def derivatives(view: str, render: Render) -> Tensor:
 def compared(view: str, filter: str, samples: int, seeds: int, **options: bool) -> dict[str, tuple[float, Estimate]]:
     """The exact derivative by each parameter and edgegrad's."""
     exact = derivatives(view, partial(exact_image, order=9, filter=filter))
-    render = partial(eg.render, spp=64, surface_samples=samples, edge_samples=samples, filter=filter, **options)
+    render = partial(eg.render, spp=64, filter=filter, **with_sampling(options, surface=samples, edges=samples))
     runs = torch.stack([derivatives(view, partial(render, seed=seed)) for seed in range(seeds)])
     return {
         name: (truth, estimate(column.tolist()))

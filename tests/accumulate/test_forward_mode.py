@@ -33,7 +33,7 @@ def panorama() -> eg.Camera:
 
 
 PANORAMA = panorama()
-SAMPLES = {"surface_samples": 4000, "edge_samples": 4000}
+SAMPLES = {"sampling": eg.Sampling(surface=4000, edges=4000)}
 
 
 def mixed_scene() -> eg.Scene:
@@ -130,7 +130,7 @@ def test_forward_is_the_adjoint_of_reverse(scene, camera, filter):
     tangents = {
         x: torch.stack([u * float(any(x is y for y, _ in pairs)) for pairs in kinds.values()]) for x, u in tensors
     }
-    samples = {"surface_samples": 8000, "edge_samples": 8000}
+    samples = {"sampling": eg.Sampling(surface=8000, edges=8000)}
     # Any v will do; about J u itself, so that nothing cancels out.
     adjoints = eg.jvp(scene, camera, tangents, 4, 999, filter=filter, **samples)[1].detach()
     forward: dict[str, list[float]] = {kind: [] for kind in kinds}
@@ -187,8 +187,8 @@ def test_all_directions_take_one_pass(monkeypatch):
 
     jvp_kernel = operators.jvp_kernel
     monkeypatch.setattr(operators, "jvp_kernel", watched)
-    eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(12, 3, 3, dtype=F64)}, 4)
-    torch.func.jacfwd(lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4))(torch.zeros(3, dtype=F64))
+    eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(12, 3, 3, dtype=F64)}, 4, seed=0)
+    torch.func.jacfwd(lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4, seed=0))(torch.zeros(3, dtype=F64))
     assert calls == [12, 3]
 
 
@@ -196,12 +196,12 @@ def test_more_directions_than_memory(monkeypatch):
     monkeypatch.setattr(memory, "CHECKED_FROM", 0)
     monkeypatch.setattr(memory, "available", lambda: 20_000_000)
     with pytest.raises(MemoryError, match=r"jvp: .*\(samples in pixels 3.* GB.*ask for fewer directions"):
-        eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(2000, 3, 3, dtype=F64)}, 4)
+        eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(2000, 3, 3, dtype=F64)}, 4, seed=0)
 
 
 def test_derivatives_are_not_in_the_graph():
     verts = MESH.verts.clone().requires_grad_()
-    image, dots = eg.jvp(MESH.replace(verts=verts), CAMERA, {verts: torch.ones(1, 3, 3, dtype=F64)}, 4)
+    image, dots = eg.jvp(MESH.replace(verts=verts), CAMERA, {verts: torch.ones(1, 3, 3, dtype=F64)}, 4, seed=0)
     assert not image.requires_grad and not dots.requires_grad
 
 
@@ -210,14 +210,14 @@ def test_through_torch():
     cameras = eg.Camera.stack([CAMERA, CAMERA.replace(K=CAMERA.K * torch.tensor([[1.1], [1.1], [1.0]], dtype=F64))])
 
     def image(t: Tensor, camera: eg.Camera = CAMERA) -> Tensor:
-        return eg.render(eg.Scene(MESH.transformed(t=t), BACKGROUND), camera, 4)
+        return eg.render(eg.Scene(MESH.transformed(t=t), BACKGROUND), camera, 4, seed=0)
 
     zero, axes = torch.zeros(3, dtype=F64), torch.eye(3, dtype=F64)
     expected = torch.stack([torch.func.jvp(image, (zero,), (axis,))[1] for axis in axes])
     assert expected.abs().amax((1, 2, 3)).min() > 0.1
     assert torch.equal(torch.func.jacfwd(image)(zero), expected.movedim(0, -1))
     tangents = {MESH.verts: axes[:, None].expand(3, 3, 3)}
-    assert torch.equal(eg.jvp(TRIANGLE, CAMERA, tangents, 4)[1], expected)
+    assert torch.equal(eg.jvp(TRIANGLE, CAMERA, tangents, 4, seed=0)[1], expected)
     with forward_ad.dual_level():
         primal, tangent = forward_ad.unpack_dual(image(forward_ad.make_dual(zero, axes[1])))
         assert torch.equal(tangent, expected[1]) and torch.equal(primal, image(zero))
@@ -231,15 +231,17 @@ def test_through_torch():
 def test_types():
     scene, camera = TRIANGLE.to(torch.float32), CAMERA.to(torch.float32)
     verts = scene.meshes[0].verts
-    image, dots = eg.jvp(scene, camera, {verts: torch.ones(2, 3, 3)}, 4)
+    image, dots = eg.jvp(scene, camera, {verts: torch.ones(2, 3, 3)}, 4, seed=0)
     assert image.dtype == dots.dtype == torch.float32 and torch.equal(dots[0], dots[1])
-    assert eg.screen_gradient(scene, camera, ADJOINT.float()).dtype == torch.float32
+    assert eg.screen_gradient(scene, camera, ADJOINT.float(), seed=0).dtype == torch.float32
 
 
 def test_same_bits_at_any_number_of_threads():
     scene = mixed_scene()
     tangents = {x: u[None] for x, u in inputs(scene, CAMERA)["verts"]}
-    check_threads(lambda: [eg.jvp(scene, CAMERA, tangents, 4)[1], eg.screen_gradient(scene, CAMERA, ADJOINT)])
+    check_threads(
+        lambda: [eg.jvp(scene, CAMERA, tangents, 4, seed=0)[1], eg.screen_gradient(scene, CAMERA, ADJOINT, seed=0)]
+    )
 
 
 @pytest.mark.parametrize(
@@ -259,7 +261,7 @@ def test_same_bits_at_any_number_of_threads():
 )
 def test_tangents_that_do_not_fit(tangents, message):
     with pytest.raises((TypeError, ValueError), match=message):
-        eg.jvp(TRIANGLE, CAMERA, tangents)
+        eg.jvp(TRIANGLE, CAMERA, tangents, seed=0)
 
 
 # -- the gradient by places in the image ------------------------------------------------------------------------------
@@ -274,7 +276,7 @@ def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter
     """The image moves by (1, 0) and (0, 1) px, as the principal point does."""
     scene = scene()
     K = camera.K.clone().requires_grad_()
-    adjoint, samples = ADJOINT + 0.4, {"surface_samples": 12_000, "edge_samples": 12_000}
+    adjoint, samples = ADJOINT + 0.4, {"sampling": eg.Sampling(surface=12_000, edges=12_000)}
     places, sums = [], []
     for seed in range(16):
         image = eg.render(scene, camera.replace(K=K), 16, seed, filter=filter, **samples)
@@ -307,15 +309,15 @@ def test_screen_gradient_lies_where_things_are():
         agree(f"object {k}", estimate(by_place[k]), estimate(by_mesh[k]))
     half = ADJOINT.clone()
     half[:, : SIZE // 2] = 0
-    assert not eg.screen_gradient(scene, camera, half)[:, : SIZE // 2].any()
+    assert not eg.screen_gradient(scene, camera, half, seed=0)[:, : SIZE // 2].any()
 
 
 def test_screen_gradient_of_a_batch_and_of_what_does_not_fit():
     cameras = eg.Camera.stack([CAMERA, ORTHOGRAPHIC.replace(projection="perspective", K=CAMERA.K * 1.0)])
-    batch = eg.screen_gradient(TRIANGLE, cameras, ADJOINT.expand(2, SIZE, SIZE, 3))
+    batch = eg.screen_gradient(TRIANGLE, cameras, ADJOINT.expand(2, SIZE, SIZE, 3), seed=0)
     assert batch.shape == (2, SIZE, SIZE, 2)
-    assert torch.equal(batch[0], eg.screen_gradient(TRIANGLE, CAMERA, ADJOINT))
+    assert torch.equal(batch[0], eg.screen_gradient(TRIANGLE, CAMERA, ADJOINT, seed=0))
     with pytest.raises(ValueError, match="adjoint: expected shape"):
-        eg.screen_gradient(TRIANGLE, CAMERA, ADJOINT[:5])
+        eg.screen_gradient(TRIANGLE, CAMERA, ADJOINT[:5], seed=0)
     with pytest.raises(ValueError, match="adjoint: expected finite"):
-        eg.screen_gradient(TRIANGLE, CAMERA, ADJOINT * torch.nan)
+        eg.screen_gradient(TRIANGLE, CAMERA, ADJOINT * torch.nan, seed=0)

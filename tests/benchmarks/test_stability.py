@@ -179,7 +179,7 @@ def test_bounces_without_borders_are_rejected(name, monkeypatch):
     if name == "bounced-million":
         monkeypatch.setitem(CASES, name, dataclasses.replace(CASES[name], build=lambda: bounced.million(3)))
     problem = CASES[name].build()
-    options = {**problem.options, "surface_samples": 20_000, "edge_samples": 1, "visibility": False}
+    options = {**problem.options, "sampling": eg.Sampling(surface=20_000, edges=1), "visibility": False}
     row = measure.measure(case_of(dataclasses.replace(problem, options=options, spp=16)), Effort(seeds=(4,)))
     assert row["verdict"] == WRONG, row
 
@@ -193,7 +193,7 @@ def test_a_wrong_image_is_rejected(triangle):
 
 
 def test_noise_does_not_pass(triangle):
-    few = dataclasses.replace(triangle, options={"surface_samples": 3, "edge_samples": 3}, spp=1)
+    few = dataclasses.replace(triangle, options={"sampling": eg.Sampling(surface=3, edges=3)}, spp=1)
     assert measure.measure(case_of(few), Effort(seeds=(16,)))["verdict"] == NOISY
 
 
@@ -227,7 +227,7 @@ def shifted_triangle(visibility: bool = True) -> Problem:
     return Problem(
         {"shift": torch.zeros(1, dtype=torch.float64)},
         lambda parts: (scene.transformed(t=parts["shift"] * direction), camera), None, "finite differences", {"shift": 0.01},
-        options={"surface_samples": 20_000, "edge_samples": 20_000, "visibility": visibility},
+        options={"sampling": eg.Sampling(surface=20_000, edges=20_000), "visibility": visibility},
     )  # fmt: skip
 
 
@@ -338,7 +338,8 @@ def test_painted_areas(name):
 def test_painted_problems(name):
     """Image and gradient against exact integrals."""
     problem = PAINTED[name](front_camera(32))
-    problem.options["step_spacing"] = 0.25
+    sampling = problem.options.get("sampling", eg.Sampling())
+    problem.options["sampling"] = dataclasses.replace(sampling, discontinuity_spacing=0.25)
     effort = dataclasses.replace(QUICK, seeds=(*QUICK.seeds, 160), seconds=math.inf)
     row = measure.measure(Case("painted", name, "", lambda: problem), effort)
     assert row["verdict"] == RIGHT, row
@@ -412,5 +413,5 @@ LIT = [name for name, case in CASES.items() if case.group == "light" and not cas
 
 @pytest.mark.parametrize("name", LIT)
 def test_lit_extremes_are_finite(name: str) -> None:
-    image, grads = measure.sample(CASES[name].build(), 0, spp=4, surface_samples=500, edge_samples=500)
+    image, grads = measure.sample(CASES[name].build(), 0, spp=4, sampling=eg.Sampling(surface=500, edges=500))
     assert bool(image.isfinite().all()) and all(bool(grad.isfinite().all()) for grad in grads.values())

@@ -229,11 +229,14 @@ def test_what_lies_behind_the_camera_is_told() -> None:
     mesh = eg.Mesh(POINTS[:3], torch.tensor([[0, 1, 2]]))
     camera = eg.Camera.look_at((0, 0, 9), (0, 0, 0), size=(8, 8))
     with pytest.warns(UserWarning, match=r"all vertices lie behind the camera .* Camera\.from_opengl"):
-        eg.render(mesh, camera.replace(world_to_camera=FLIP.float() @ camera.world_to_camera), spp=1)
+        eg.render(mesh, camera.replace(world_to_camera=FLIP.float() @ camera.world_to_camera), spp=1, seed=0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         eg.render(
-            mesh, eg.Camera.stack([camera, camera.replace(world_to_camera=FLIP.float() @ camera.world_to_camera)]), 1
+            mesh,
+            eg.Camera.stack([camera, camera.replace(world_to_camera=FLIP.float() @ camera.world_to_camera)]),
+            1,
+            seed=0,
         )
 
 

@@ -119,7 +119,7 @@ def test_interior_derivatives_of_a_wall(lens: str) -> None:
     assert bool((b > 0).all()), "it must fill the view"
     radiance = (b / b.sum(1, keepdim=True)) @ wall.colors
     expected = radiance.reshape(H, grid, W, grid, 3).mean((1, 3))
-    image = eg.render(wall.replace(verts=verts), view, 64, surface_samples=100_000)
+    image = eg.render(wall.replace(verts=verts), view, 64, sampling=eg.Sampling(surface=100_000), seed=0)
     torch.testing.assert_close(image, expected, rtol=0, atol=5e-3)
     adjoint = smooth_adjoint(H, W, 3)
     truth, found = (torch.autograd.grad((value * adjoint).sum(), leaves) for value in (expected, image))
@@ -163,10 +163,10 @@ def test_batches_and_files(lens: str, tmp_path: Path) -> None:
     one = camera(lens)
     other = one.replace(distortion=0.5 * one.coefficients)
     many = eg.Camera.stack([one, other])
-    images = eg.render(colored_sphere(), many, 16)
-    torch.testing.assert_close(images[0], eg.render(colored_sphere(), one, 16), rtol=0, atol=0)
+    images = eg.render(colored_sphere(), many, 16, seed=0)
+    torch.testing.assert_close(images[0], eg.render(colored_sphere(), one, 16, seed=0), rtol=0, atol=0)
     shared = one.replace(distortion=many.distortion)
-    assert shared.batch == 2 and torch.equal(eg.render(colored_sphere(), shared, 16), images)
+    assert shared.batch == 2 and torch.equal(eg.render(colored_sphere(), shared, 16, seed=0), images)
     d = many.coefficients.clone().requires_grad_()
     loss(eg.Scene([colored_sphere()]), one.replace(distortion=d[1]), spp=16).backward()
     assert d.grad is not None and (d.grad[1] != 0).all() and (d.grad[0] == 0).all()
@@ -276,9 +276,9 @@ def test_threads_that_change_lenses_find_their_own() -> None:
         for s in (1.0, 1.1)
     ]
     mesh = colored_sphere()
-    right = [eg.render(mesh, view, 4) for view in views]
+    right = [eg.render(mesh, view, 4, seed=0) for view in views]
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda i: eg.render(mesh, views[i % 2], 4), range(12)))
+        found = list(pool.map(lambda i: eg.render(mesh, views[i % 2], 4, seed=0), range(12)))
     for i, image in enumerate(found):
         assert torch.equal(image, right[i % 2])
 
@@ -292,7 +292,7 @@ def test_a_lens_of_zeros_renders_as_its_pinhole(spp: int) -> None:
 
     def image_and_gradient(view: eg.Camera) -> tuple[Tensor, Tensor]:
         verts = mesh.verts.clone().requires_grad_()
-        image = eg.render(mesh.replace(verts=verts), view, spp)
+        image = eg.render(mesh.replace(verts=verts), view, spp, seed=0)
         return image.detach(), torch.autograd.grad((image * adjoint).sum(), verts)[0]
 
     for found, right in zip(image_and_gradient(zero), image_and_gradient(view), strict=True):
@@ -307,7 +307,9 @@ def test_gradient_by_coefficients_of_zero(index: int) -> None:
     direction = torch.eye(4, dtype=F64)[index]
 
     def loss_at(t: Tensor) -> Tensor:
-        image = eg.render(mesh, view.replace(distortion=t * direction), surface_samples=100_000, edge_samples=40_000)
+        image = eg.render(
+            mesh, view.replace(distortion=t * direction), sampling=eg.Sampling(surface=100_000, edges=40_000), seed=0
+        )
         return (image * adjoint).sum()
 
     def gradient_at(value: float) -> float:
@@ -331,7 +333,7 @@ def test_pixels_without_rays_show_nothing(lens: str) -> None:
         torch.tensor([[0, 1, 2]]),
         colors=torch.zeros((3, 3), dtype=F64),
     )
-    alone = eg.render(mesh, view, 16)
-    before = eg.render(eg.Scene([mesh, wall]), view, 16)
+    alone = eg.render(mesh, view, 16, seed=0)
+    before = eg.render(eg.Scene([mesh, wall]), view, 16, seed=0)
     assert float(alone.amax()) > 0.5
     torch.testing.assert_close(alone, before, rtol=0, atol=1e-12)

@@ -148,7 +148,7 @@ def balls() -> list[eg.Mesh]:
 @cameras
 def test_image_against_traced_rays(view: eg.Camera) -> None:
     scene = eg.Scene([*balls(), room()], BACKGROUND)
-    expected, image = traced(scene, view, 3, lambda x: directions(view, x)), eg.render(scene, view, 256)
+    expected, image = traced(scene, view, 3, lambda x: directions(view, x)), eg.render(scene, view, 256, seed=0)
     # The border of a face may pass anywhere between the rays of the grid.
     assert float((image - expected).abs().mean()) < 0.01
     assert float((image - expected).abs().max()) < 0.3
@@ -158,7 +158,7 @@ def test_turning_the_camera_shifts_the_image() -> None:
     """The shift is by whole pixels. Nothing is special about the seam, also where a filter reaches over it."""
     scene, view = eg.Scene([*balls(), room()], BACKGROUND), camera()
     for filter in ("box", "tent"):
-        image = eg.render(scene, view, 256, filter=filter)
+        image = eg.render(scene, view, 256, filter=filter, seed=0)
         for pixels in (7, 25):
             M = view.world_to_camera.clone()
             M[:3] = rotation((0.0, 1.0, 0.0), torch.tensor(math.tau * pixels / view.size[1], dtype=F64)) @ M[:3]
@@ -171,7 +171,7 @@ def test_more_than_one_turn() -> None:
     """The image repeats, and over the poles it is turned by 180° and upside down."""
     scene, view = eg.Scene(balls(), BACKGROUND), camera()
     H, W = view.size
-    once, more = eg.render(scene, view, 512), eg.render(scene, view.crop(-H, -W, 3 * H, 3 * W), 512, seed=1)
+    once, more = eg.render(scene, view, 512, seed=0), eg.render(scene, view.crop(-H, -W, 3 * H, 3 * W), 512, seed=1)
     over = once.roll(W // 2, 1).flip(0)
     expected = torch.cat([torch.cat([part] * 3, 1) for part in (over, once, over)])
     assert float((more - expected).abs().mean()) < 2e-3 and float((more - expected).abs().max()) < 0.06
@@ -223,7 +223,9 @@ def test_area_of_a_triangle(place: str, shift: int) -> None:
     white = eg.Mesh(corners, torch.tensor([[0, 1, 2]]), colors=torch.ones((3, 1), dtype=F64))
     view = view.replace(world_to_camera=M)
     expected = area(view, corners)
-    image = eg.render(eg.Scene([white], torch.zeros(1, dtype=F64)), view, 1024, edge_samples=200_000)
+    image = eg.render(
+        eg.Scene([white], torch.zeros(1, dtype=F64)), view, 1024, sampling=eg.Sampling(edges=200_000), seed=0
+    )
     assert float(image.detach().sum()) == pytest.approx(float(expected.detach()), rel=2e-3)
     truth, found = (torch.autograd.grad(value, leaves) for value in (expected, image.sum()))
     for name, a, b in zip(("corners", "world_to_camera"), truth, found, strict=True):
@@ -237,7 +239,9 @@ def test_area_by_intrinsics(place: str) -> None:
     corners = world(torch.tensor(TRIANGLES[place], dtype=F64))
     white = eg.Mesh(corners, torch.tensor([[0, 1, 2]]), colors=torch.ones((3, 1), dtype=F64))
     view = view.replace(K=K)
-    image = eg.render(eg.Scene([white], torch.zeros(1, dtype=F64)), view, 16, edge_samples=200_000)
+    image = eg.render(
+        eg.Scene([white], torch.zeros(1, dtype=F64)), view, 16, sampling=eg.Sampling(edges=200_000), seed=0
+    )
     (expected,), (found,) = (torch.autograd.grad(value, K) for value in (area(view, corners), image.sum()))
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=2e-3 * float(expected.abs().max()))
 
@@ -308,7 +312,7 @@ def test_edges_between_sub_cameras_count_once(filter: str) -> None:
         return eg.Scene([mesh], BACKGROUND), view
 
     fd = finite_difference(case, 0.005, 1024, 3, filter=filter)
-    right_ratio(fd, gradient(case, 4, edge_samples=50_000, filter=filter))
+    right_ratio(fd, gradient(case, 4, sampling=eg.Sampling(edges=50_000), filter=filter))
 
 
 # -- cameras ------------------------------------------------------------------------------------------------------------
@@ -328,11 +332,11 @@ def test_defaults_show_all_around() -> None:
 def test_batches_and_files(tmp_path: Path) -> None:
     scene, one = eg.Scene(balls(), BACKGROUND), camera()
     many = eg.Camera.stack([one, one.replace(world_to_camera=torch.eye(4, dtype=F64))])
-    torch.testing.assert_close(eg.render(scene, many, 16)[0], eg.render(scene, one, 16), rtol=0, atol=0)
+    torch.testing.assert_close(eg.render(scene, many, 16, seed=0)[0], eg.render(scene, one, 16, seed=0), rtol=0, atol=0)
     eg.save_camera(tmp_path / "camera.json", one)
     back = eg.load_camera(tmp_path / "camera.json", F64)
     assert torch.equal(back.K, one.K) and back.projection == "panorama"
-    assert torch.equal(eg.render(scene, back, 4), eg.render(scene, one, 4))
+    assert torch.equal(eg.render(scene, back, 4, seed=0), eg.render(scene, one, 4, seed=0))
 
 
 def test_plan() -> None:
@@ -342,7 +346,7 @@ def test_plan() -> None:
         mesh.verts.requires_grad_()
     plan = eg.plan(scene, camera())
     assert plan["interior"].samples > 0 and plan["boundary"].samples > 0 and plan["silhouettes"].on
-    asked = eg.plan(scene, camera(), surface_samples=10_000, edge_samples=5_000)
+    asked = eg.plan(scene, camera(), sampling=eg.Sampling(surface=10_000, edges=5_000))
     assert asked["boundary"].samples == pytest.approx(5_000, rel=0.01)
     pinhole = camera().replace(projection="perspective")
     sizes = [
@@ -356,7 +360,7 @@ def test_nothing_in_view() -> None:
     one = boundary(PLACES["ahead"]).meshes[0]
     one.verts.requires_grad_()
     view = camera((96, 192)).crop(60, -20, 30, 30)
-    image = eg.render(eg.Scene([one], BACKGROUND), view, 4)
+    image = eg.render(eg.Scene([one], BACKGROUND), view, 4, seed=0)
     torch.testing.assert_close(image.detach(), BACKGROUND.expand(30, 30, 3))
     image.sum().backward()
     assert one.verts.grad is not None and not one.verts.grad.any()

@@ -28,6 +28,7 @@ from around import (
 )
 from finite_differences import rotation
 from kernel_parts import parts
+from sampling_options import with_sampling
 from scenes import smooth_adjoint
 from torch import Tensor
 
@@ -208,7 +209,7 @@ def test_distortion_derivatives(view: eg.Camera) -> None:
 @cameras
 def test_image_against_traced_rays(view: eg.Camera) -> None:
     scene = eg.Scene([*(ball(place) for place in PLACES.values()), room()], BACKGROUND)
-    expected, image = traced(scene, view, 3, lambda x: directions(view, x)), eg.render(scene, view, 256)
+    expected, image = traced(scene, view, 3, lambda x: directions(view, x)), eg.render(scene, view, 256, seed=0)
     # The border of a face may pass anywhere between the rays of the grid.
     assert float((image - expected).abs().mean()) < 0.01
     assert float((image - expected).abs().max()) < 0.3
@@ -219,8 +220,8 @@ def test_a_narrow_crop_is_what_the_wide_image_shows_there() -> None:
     wide, scene = camera(22.0, size=(80, 96)), eg.Scene([ball(PLACES["ahead"]), room()], BACKGROUND)
     narrow = wide.crop(30, 40, 16, 20)
     assert (kernel_camera(pack_camera(wide)).sides, kernel_camera(pack_camera(narrow)).sides) == (6, 1)
-    part = eg.render(scene, wide, 256)[30:46, 40:60]
-    assert float((eg.render(scene, narrow, 256) - part).abs().max()) < 0.05
+    part = eg.render(scene, wide, 256, seed=0)[30:46, 40:60]
+    assert float((eg.render(scene, narrow, 256, seed=0) - part).abs().max()) < 0.05
 
 
 def test_what_lies_beyond_the_end_of_the_lens() -> None:
@@ -229,12 +230,12 @@ def test_what_lies_beyond_the_end_of_the_lens() -> None:
     scene, view = eg.Scene([white], torch.zeros(3, dtype=F64)), CAMERAS["fold"]
     angle = 1 / math.sqrt(0.27)
     with pytest.warns(UserWarning, match=rf"nothing beyond {math.degrees(angle):.4g}° from its axis"):
-        image = eg.render(scene, view, 256)
+        image = eg.render(scene, view, 256, seed=0)
     expected = math.pi * (2 / 3 * angle) ** 2 * float(torch.linalg.det(view.K))
     assert float(image[..., 0].sum()) == pytest.approx(expected, rel=2e-3)
     corner = view.crop(0, 0, 3, 3)
     verts = white.verts.clone().requires_grad_()
-    image = eg.render(scene.replace(meshes=[white.replace(verts=verts)]), corner, 4)
+    image = eg.render(scene.replace(meshes=[white.replace(verts=verts)]), corner, 4, seed=0)
     image.sum().backward()
     assert not image.any() and verts.grad is not None and not verts.grad.any()
 
@@ -242,7 +243,7 @@ def test_what_lies_beyond_the_end_of_the_lens() -> None:
 def test_no_warning_where_the_lens_ends_outside() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("edgegrad.kernel.operators.warn", lambda *_: pytest.fail("warned"))
-        eg.render(ball(PLACES["ahead"]), CAMERAS["usual"], 1)
+        eg.render(ball(PLACES["ahead"]), CAMERAS["usual"], 1, seed=0)
 
 
 # -- areas --------------------------------------------------------------------------------------------------------------
@@ -320,9 +321,9 @@ def test_gradient_around_the_antipode() -> None:
 def test_channels() -> None:
     """Alpha is the image of a white mesh, depth and position are those of the points that traced rays meet."""
     scene, view = eg.Scene([ball(PLACES["behind"]), room()], BACKGROUND), camera()
-    layers = eg.render_aovs(scene, view, ["image", "alpha", "position"], spp=256)
+    layers = eg.render_aovs(scene, view, ["image", "alpha", "position"], spp=256, seed=0)
     assert float((1 - layers["alpha"]).sum()) < 4 / 256  # floats let a ray in a million pass between two faces
-    torch.testing.assert_close(layers["image"], eg.render(scene, view, 256), rtol=0, atol=0)
+    torch.testing.assert_close(layers["image"], eg.render(scene, view, 256, seed=0), rtol=0, atol=0)
     places = [m.replace(colors=m.verts) for m in scene.meshes]
     expected = traced(scene.replace(meshes=places), view, 3, lambda x: directions(view, x))
     assert float((layers["position"] - expected).abs().mean()) < 0.05
@@ -344,7 +345,10 @@ def test_shader() -> None:
         meshes = [m.replace(verts=v) for m, v in zip(scene.meshes, verts, strict=True)]
         distorted = view.replace(world_to_camera=M, K=K, distortion=d)
         image = eg.render(
-            scene.replace(meshes=meshes), distorted, 64, surface_samples=100_000, edge_samples=50_000, **options
+            scene.replace(meshes=meshes),
+            distorted,
+            64,
+            **{"seed": 0, **with_sampling(options, surface=100_000, edges=50_000)},
         )
         found.append((image.detach(), *torch.autograd.grad((image * adjoint).sum(), leaves)))
     assert float((found[0][0] - found[1][0]).abs().mean()) < 0.01  # it is asked at one point of a face in a pixel
@@ -358,7 +362,7 @@ def test_batches_and_memory() -> None:
     wide = camera()
     narrow = wide.replace(K=wide.K * torch.tensor([[3.0, 1, 1], [1, 3.0, 1], [1, 1, 1]], dtype=F64))
     both_of_them = eg.Camera.stack([narrow, wide])
-    images = eg.render(scene, both_of_them, 16)
-    torch.testing.assert_close(images[0], eg.render(scene, narrow, 16), rtol=0, atol=0)
+    images = eg.render(scene, both_of_them, 16, seed=0)
+    torch.testing.assert_close(images[0], eg.render(scene, narrow, 16, seed=0), rtol=0, atol=0)
     sizes = [core.image_bytes(pass_size(make_request(scene, v)), 1)["vertices in view"] for v in (narrow, both_of_them)]
     assert sizes[1] == 6 * sizes[0]

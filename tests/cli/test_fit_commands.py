@@ -27,7 +27,9 @@ def sphere(tmp_path):
     for k, eye in enumerate([(4.0, 0, 0), (0, 0.1, 4.0), (-2, 3, -1)]):
         view = eg.Camera.look_at(eye, (0, 0, 0), (0.1, 0.9, 0.2), size=(32, 32))
         save_camera(tmp_path / f"c{k}.json", view)
-        write_image(tmp_path / f"m{k}.png", eg.render(larger.replace(face_colors=torch.ones(320, 3)), view, spp=64))
+        write_image(
+            tmp_path / f"m{k}.png", eg.render(larger.replace(face_colors=torch.ones(320, 3)), view, spp=64, seed=0)
+        )
     return tmp_path
 
 
@@ -57,7 +59,7 @@ def test_fit_texture(sphere, capsys):
     view = eg.Camera.look_at((0.3, 0.2, 3.0), (0, 0, 0), size=(32, 32))
     save_camera(sphere / "c.json", view)
     plain = eg.Mesh(torch.tensor(square.vertices), torch.tensor(square.faces))
-    write_image(sphere / "p.png", eg.render(plain, view, spp=64) * torch.tensor([1.0, 0.5, 0.2]))
+    write_image(sphere / "p.png", eg.render(plain, view, spp=64, seed=0) * torch.tensor([1.0, 0.5, 0.2]))
     options = ["--size", 8, "--steps", 60, "--out", sphere / "out"]
     assert run("fit-texture", sphere / "square.obj", sphere / "p.png", "--camera", sphere / "c.json", *options) == 0
     texture = read_image(sphere / "out" / "texture.png", channels=3)

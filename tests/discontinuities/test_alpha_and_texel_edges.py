@@ -149,13 +149,19 @@ FAST = ("disc before a surface", "board pose")
 @pytest.mark.unwatched
 @pytest.mark.parametrize("name", FAST)
 def test_finite_differences(name):
-    check_ratio(CASES[name], 0.01, spp=1024, seeds=4, step_spacing=1 / 16)
+    check_ratio(CASES[name], 0.01, spp=1024, seeds=4, sampling=eg.Sampling(discontinuity_spacing=1 / 16))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_all_finite_differences(name):
-    check_ratio(CASES[name], 0.01, spp=4096, seeds=48, step_spacing=1 / 32, surface_samples=50_000, edge_samples=50_000)
+    check_ratio(
+        CASES[name],
+        0.01,
+        spp=4096,
+        seeds=48,
+        sampling=eg.Sampling(discontinuity_spacing=1 / 32, surface=50_000, edges=50_000),
+    )
 
 
 # -- exact ------------------------------------------------------------------------------------------------------------
@@ -175,7 +181,7 @@ def area() -> float:
 @pytest.mark.parametrize("cutoff, share", [(0.5, 0.5), (0.25, 0.625), (0.0, 0.75), (-0.1, 1.0), (1.1, 0.0)])
 def test_area_of_a_masked_square(cutoff, share):
     mesh = front(alpha=LINE, alpha_cutoff=cutoff, wrap="clamp")
-    found = eg.render_aovs(mesh, FLAT, ["image", "alpha"], 256)
+    found = eg.render_aovs(mesh, FLAT, ["image", "alpha"], 256, seed=0)
     if cutoff == 0.0:  # the square is there where α is exactly its cutoff, in a quarter of it
         share = 1.0
     for name in ("image", "alpha"):
@@ -189,8 +195,8 @@ def test_derivatives_of_an_area(side):
     assert mesh.alpha is not None and mesh.uvs is not None
     verts, uvs, alpha = (t.clone().requires_grad_() for t in (mesh.verts, mesh.uvs, mesh.alpha))
     moving = mesh.replace(verts=verts, uvs=uvs, alpha=alpha)
-    options = {"step_spacing": 1 / 8, "edge_samples": 20_000}
-    eg.render(moving, FLAT, 4, **options).sum().backward()
+    options = {"sampling": eg.Sampling(discontinuity_spacing=1 / 8, edges=20_000)}
+    eg.render(moving, FLAT, 4, **{"seed": 0, **options}).sum().backward()
     assert verts.grad is not None and uvs.grad is not None and alpha.grad is not None
     # α = 2u − ½, so the alpha edge is at u = ½ + δ/2 where the cutoff rises by δ, and at ½ − δ where u does.
     assert alpha.grad.sum().item() == pytest.approx(0.5 * area(), rel=0.01)
@@ -206,7 +212,9 @@ def test_texel_edge_in_a_known_place():
     mesh = quad(1, texture=texture, filter="nearest", wrap="clamp")
     assert mesh.uvs is not None
     uvs = (0.1 + 0.7 * mesh.uvs).requires_grad_()
-    eg.render(mesh.replace(uvs=uvs), FLAT, 4, step_spacing=1 / 8).sum().backward()
+    eg.render(
+        mesh.replace(uvs=uvs), FLAT, 4, sampling=eg.Sampling(discontinuity_spacing=1 / 8), seed=0
+    ).sum().backward()
     assert uvs.grad is not None
     assert uvs.grad[:, 0].sum().item() == pytest.approx(0.75 * area() / 0.7, rel=0.01)
 
@@ -223,7 +231,7 @@ def test_texels_much_smaller_than_pixels(repeats):
     mesh = mesh.replace(alpha=given, uvs=0.013 + repeats * mesh.uvs * torch.tensor([1.0, 0.01], dtype=F64))
     found = []
     for seed in range(16):
-        eg.render(mesh, FLAT, 4, seed=seed, step_spacing=0.5).sum().backward()
+        eg.render(mesh, FLAT, 4, seed=seed, sampling=eg.Sampling(discontinuity_spacing=0.5)).sum().backward()
         assert given.grad is not None
         found.append(given.grad.sum().item())
         given.grad = None
@@ -241,7 +249,7 @@ def test_texels_much_smaller_than_pixels(repeats):
 def test_equals_the_twin(camera):
     """The twin is brute force over all faces."""
     scene = eg.Scene([masked(2), ball(), behind()], BACK)
-    ours, twin = eg.render(scene, camera, 256), reference.render(scene, camera, 8)
+    ours, twin = eg.render(scene, camera, 256, seed=0), reference.render(scene, camera, 8)
     assert (ours - twin).abs().mean().item() < 0.004
 
 
@@ -249,18 +257,20 @@ def test_parts_that_are_masked_are_seen_by_nobody():
     """Channels, ids, and shaders."""
     mesh = masked()
     scene = eg.Scene([mesh, behind()], BACK)
-    found = eg.render_aovs(scene, CAMERA, ["image", "alpha", "mesh_id"], 64)
+    found = eg.render_aovs(scene, CAMERA, ["image", "alpha", "mesh_id"], 64, seed=0)
     ids = found["mesh_id"][..., 0]
     points = torch.stack(torch.meshgrid(*[torch.arange(SIZE, dtype=F64) + 0.5] * 2, indexing="xy"), -1).reshape(-1, 2)
     faces = reference.closest_faces(scene, CAMERA, points).reshape(SIZE, SIZE)
     assert torch.equal(ids, torch.where(faces < 0, -1, (faces >= len(mesh.faces)).long()))
-    ones = eg.render(scene.replace(background=None), CAMERA, 64, shader=lambda hits: torch.ones_like(hits.position))
+    ones = eg.render(
+        scene.replace(background=None), CAMERA, 64, shader=lambda hits: torch.ones_like(hits.position), seed=0
+    )
     torch.testing.assert_close(ones[..., :1], found["alpha"])
 
 
 def test_uvs_need_no_texture():
     for scene in (quad(2, alpha=disc()), quad(2)):
-        found = eg.render_aovs(scene, FLAT, ["uv", "alpha"], 64)
+        found = eg.render_aovs(scene, FLAT, ["uv", "alpha"], 64, seed=0)
         mean = found["uv"].sum((0, 1)) / found["alpha"].sum()
         torch.testing.assert_close(mean, torch.full((2,), 0.5, dtype=F64), atol=1e-3, rtol=0)
 
@@ -276,7 +286,7 @@ SHADER = {
 def test_forward_mode_is_reverse_mode(move):
     """Both modes have the same samples, but for controls: they differ by noise."""
     at, found = case([masked(), behind()], move), {}
-    options = {"step_spacing": 1 / 8, "spp": 16, "edge_samples": 50_000, "surface_samples": 50_000}
+    options = {"sampling": eg.Sampling(discontinuity_spacing=1 / 8, edges=50_000, surface=50_000), "spp": 16}
     for seed in range(4):
         zero = torch.zeros((), dtype=F64)
         _, forward = torch.func.jvp(lambda t, seed=seed: loss(*at(t), seed=seed, **options), (zero,), (zero + 1,))
@@ -301,7 +311,7 @@ def test_shaders_have_the_same_discontinuities(move):
         assert colors is not None
         return hits.interpolate(colors)
 
-    options = {"step_spacing": 1 / 8, "edge_samples": 20_000, "surface_samples": 20_000}
+    options = {"sampling": eg.Sampling(discontinuity_spacing=1 / 8, edges=20_000, surface=20_000)}
     shaded, fused = gradient(at, 4, shader=own, **options), gradient(at, 4, **options)
     error = (shaded.error**2 + fused.error**2) ** 0.5
     assert abs(shaded.mean - fused.mean) < 4 * error + 0.01 * abs(fused.mean)
@@ -312,7 +322,7 @@ def test_shaders_have_the_same_discontinuities(move):
 def test_gradient_by_place(mesh):
     """Its sum is the derivative for moving all in the image."""
     scene, A = eg.Scene([mesh]), smooth_adjoint(SIZE, SIZE, 3)
-    options = {"step_spacing": 1 / 16, "edge_samples": 50_000}
+    options = {"sampling": eg.Sampling(discontinuity_spacing=1 / 16, edges=50_000)}
     total = torch.stack([eg.screen_gradient(scene, CAMERA, A, 16, s, **options).sum((0, 1)) for s in range(8)])  # type: ignore[arg-type]
     for axis in range(2):
         shift = torch.zeros(3, 3, dtype=F64)
@@ -328,7 +338,7 @@ def test_same_bits_at_any_number_of_threads():
     leaves = {n: getattr(mesh, n).clone().requires_grad_() for n in ("verts", "uvs", "alpha")}
 
     def compute() -> list[Tensor]:
-        image = eg.render(eg.Scene([mesh.replace(**leaves), behind()]), CAMERA, 8)
+        image = eg.render(eg.Scene([mesh.replace(**leaves), behind()]), CAMERA, 8, seed=0)
         return [image, *torch.autograd.grad((image * smooth_adjoint(*image.shape)).sum(), [*leaves.values()])]
 
     check_threads(compute)
@@ -362,4 +372,4 @@ def test_plan_says_what_is_looked_for():
 )
 def test_spacing_that_is_none(value, error, message):
     with pytest.raises(error, match=message):
-        eg.render(masked(), CAMERA, step_spacing=value)
+        eg.render(masked(), CAMERA, sampling=eg.Sampling(discontinuity_spacing=value), seed=0)

@@ -37,7 +37,11 @@ def test_a_straight_discontinuity_is_exact():
     """The area next to a line x = a across a square of side 2 is 2 (1 − a) scale² pixels; its derivative is −2 scale²."""
     a = torch.tensor(0.137, dtype=F64, requires_grad=True)
     image = eg.render(
-        square(), flat_camera(32), shader=lambda hits: hits.where(hits.position[:, 0] - a, 3.0, 1.0), step_spacing=0.5
+        square(),
+        flat_camera(32),
+        shader=lambda hits: hits.where(hits.position[:, 0] - a, 3.0, 1.0),
+        sampling=eg.Sampling(discontinuity_spacing=0.5),
+        seed=0,
     )
     (grad,) = torch.autograd.grad(image.sum(), a)
     scale = 0.4 * 32
@@ -54,7 +58,7 @@ def test_a_discs_area_grows_by_its_circumference(spacing: float):
             flat_camera(32),
             seed=seed,
             shader=lambda hits: hits.where(r - (hits.position[:, :2] - 0.05).norm(dim=1), 1.0, 0.0),
-            step_spacing=spacing,
+            sampling=eg.Sampling(discontinuity_spacing=spacing),
         )
         return torch.autograd.grad(image.sum(), r)[0]
 
@@ -95,7 +99,7 @@ def test_a_discontinuity_declared_twice_counts_once():
             # The product of two jumps at one place, 1 → 4, or the whole at once.
             return hits.where(s, 2.0, 1.0) * hits.where(-2 * s, 1.0, 2.0) if twice else hits.where(s, 4.0, 1.0)
 
-        return torch.autograd.grad(eg.render(square(), flat_camera(32), shader=shader).sum(), a)[0]
+        return torch.autograd.grad(eg.render(square(), flat_camera(32), shader=shader, seed=0).sum(), a)[0]
 
     assert torch.allclose(gradient(True), gradient(False))
 
@@ -111,7 +115,7 @@ def test_a_jump_of_the_function_is_not_declared():
         by_place = torch.where(hits.position[:, 1] > 0.7, 2.0, -1.0)
         return hits.where(by_mesh + a, 1.0, 0.0) + hits.where(by_place + a, 1.0, 0.0)
 
-    (grad,) = torch.autograd.grad(eg.render(scene, flat_camera(32), shader=shader).sum(), a)
+    (grad,) = torch.autograd.grad(eg.render(scene, flat_camera(32), shader=shader, seed=0).sum(), a)
     assert float(grad) == 0
 
 
@@ -165,7 +169,7 @@ def test_forward_mode_and_transforms():
 def test_discontinuities_that_differ_within_a_batch_are_refused():
     def image(a: Tensor, color: Tensor) -> Tensor:
         return eg.render(
-            ball(), front_camera(SIZE), shader=lambda hits: hits.where(hits.position[:, 0] - a, color, 0.0)
+            ball(), front_camera(SIZE), shader=lambda hits: hits.where(hits.position[:, 0] - a, color, 0.0), seed=0
         )
 
     ones, zeros = torch.ones((2, 3), dtype=F64), torch.zeros(2, dtype=F64)
@@ -205,14 +209,18 @@ def test_calls_that_are_not_always_made_are_refused():
     mesh = ball()
     with pytest.raises(ValueError, match=r"shader: expected as many calls of hits\.where\(\)"):
         eg.render(
-            mesh.replace(verts=mesh.verts.clone().requires_grad_()), front_camera(SIZE), shader=shader, edge_samples=3
+            mesh.replace(verts=mesh.verts.clone().requires_grad_()),
+            front_camera(SIZE),
+            shader=shader,
+            sampling=eg.Sampling(edges=3),
+            seed=0,
         )
 
 
 def test_bad_arguments_are_refused():
     def refused(shader: object, message: str, kind: type[Exception] = ValueError) -> None:
         with pytest.raises(kind, match=message):
-            eg.render(ball(), front_camera(SIZE), shader=shader)  # type: ignore[arg-type]
+            eg.render(ball(), front_camera(SIZE), shader=shader, seed=0)  # type: ignore[arg-type]
 
     refused(lambda hits: hits.where(hits.position, 1.0, 0.0), r"s: expected shape")
     refused(lambda hits: hits.where(hits.depth, hits.position[:5], 0.0), r"a: expected rows \(N, C\)")
@@ -281,7 +289,7 @@ def test_discontinuities_of_some_points_are_those_of_all():
             color = color.index_put(((~front).nonzero()[:, 0],), of_back(hits.select(~front)))
             return color.index_put((front.nonzero()[:, 0],), of_front(hits.select(front)))
 
-        image = eg.render(eg.Scene([back, front]), flat_camera(32), shader=shader, check_shader=True)
+        image = eg.render(eg.Scene([back, front]), flat_camera(32), shader=shader, check_shader=True, seed=0)
         return torch.autograd.grad((image * smooth_adjoint(32, 32, 1)).sum(), theta)[0]
 
     one, all = gradient(True), gradient(False)

@@ -83,7 +83,7 @@ def test_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = edgegrad.Mesh(corners, faces, face_colors=0.2 + 0.6 * torch.eye(4)[:, :3])
     edgegrad.save_mesh("model.glb", model)
     camera = edgegrad.Camera.look_at(eye=(0, 0, 3), target=(0, 0, 0), up=(0, 1, 0), fov_y=40, size=(32, 32))
-    shown = edgegrad.render_aovs(model, camera, ["image", "alpha"], spp=64)
+    shown = edgegrad.render_aovs(model, camera, ["image", "alpha"], spp=64, seed=0)
     edgegrad.write_image("photo.png", shown["image"])
     edgegrad.write_image("mask.png", edgegrad.image.srgb_to_linear(shown["alpha"]))
     names: dict[str, object] = {}

@@ -133,7 +133,7 @@ def images(
     camera = page["from_mitsuba"](page["look_at"](ORIGIN, TARGET, UP), fov_x=fov["fov"], size=SIZE)
     meshes = [quad(3.0).replace(material=material), quad(0.3, 0.4).replace(material=material)]
     scene = eg.Scene(meshes, lights=[light])
-    return eg.render(scene, camera, spp, light_samples=4, bounces=bounces).float(), expected
+    return eg.render(scene, camera, spp, sampling=eg.Sampling(lights=4), bounces=bounces, seed=0).float(), expected
 
 
 @pytest.mark.parametrize("name", CASES)

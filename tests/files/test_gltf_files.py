@@ -81,7 +81,7 @@ def test_gltf_masks_and_samplers(tmp_path):
     np.testing.assert_allclose(mesh.alpha, 0.75 * alpha / 255.0, atol=1e-6)
     # One texel of four is there, and a ray through another meets nothing.
     camera = eg.Camera.look_at([0.5, 0.5, 2.0], [0.5, 0.5, 0.0], size=(8, 8), fov_y=20.0)
-    seen = eg.render_aovs(mesh, camera, ["alpha"], 16)["alpha"]
+    seen = eg.render_aovs(mesh, camera, ["alpha"], 16, seed=0)["alpha"]
     assert 0.0 < seen.mean() < 1.0
     del sampler["wrapS"], sampler["magFilter"]
     file.write_bytes(alpha_mask_glb(alpha, sampler, alphaMode="MASK"))
@@ -98,7 +98,7 @@ def test_gltf_masks_without_alpha_in_a_texture(tmp_path):
             base = {"baseColorFactor": [1.0, 1.0, 1.0, opacity]}
             file.write_bytes(square_glb(material={"pbrMetallicRoughness": base, "alphaMode": "MASK"}, uv=uv))
             camera = eg.Camera.look_at([0.5, 0.5, 2.0], [0.5, 0.5, 0.0], size=(8, 8), fov_y=20.0)
-            seen = eg.render_aovs(load_mesh(file), camera, ["alpha"], 4)["alpha"].mean()
+            seen = eg.render_aovs(load_mesh(file), camera, ["alpha"], 4, seed=0)["alpha"].mean()
             assert seen == (1.0 if shows else 0.0)
 
 
@@ -115,7 +115,7 @@ def test_gltf_masks_by_alpha_of_vertices(tmp_path, type_):
         file.write_bytes(square_glb({"pbrMetallicRoughness": base, "alphaMode": "MASK"}, colors=colors, uv=uv))
         mesh = load_mesh(file)
         uvs = mesh.uvs.double().requires_grad_()
-        seen = eg.render_aovs(mesh.replace(uvs=uvs).to(torch.float64), camera, ["alpha"], 64)["alpha"]
+        seen = eg.render_aovs(mesh.replace(uvs=uvs).to(torch.float64), camera, ["alpha"], 64, seed=0)["alpha"]
         assert seen.mean().item() == pytest.approx(0.375, abs=2e-3)
         assert seen[:, 0].mean() == 0 and seen[:, -1].mean() == 1
         # A larger alpha everywhere: the border at x = cutoff / 0.8 − δ / 0.8 moves left.
@@ -127,7 +127,7 @@ def test_gltf_masks_by_alpha_of_vertices(tmp_path, type_):
     for share, shown in ((0.5, 0.0), (0.75, 1.0)):  # 0.4 and 0.6 in all
         same[:, 3] = np.array(share * scale).astype(type_)
         file.write_bytes(square_glb({"pbrMetallicRoughness": base, "alphaMode": "MASK"}, colors=same))
-        assert eg.render_aovs(load_mesh(file), camera, ["alpha"], 4)["alpha"].mean() == shown
+        assert eg.render_aovs(load_mesh(file), camera, ["alpha"], 4, seed=0)["alpha"].mean() == shown
 
 
 def test_gltf_masks_by_a_texture_and_by_vertices(tmp_path):

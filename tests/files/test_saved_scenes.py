@@ -71,7 +71,7 @@ def saved(path, scene, cameras=None):
 
 
 def seen(scene):
-    return eg.render(scene, CAMERA, spp=8, seed=1, light_samples=4)
+    return eg.render(scene, CAMERA, spp=8, seed=1, sampling=eg.Sampling(lights=4))
 
 
 @pytest.mark.parametrize("kind", ["glb", "gltf"])

@@ -95,11 +95,10 @@ def test_sample_counts_where_surfaces_light_each_other():
 
 def test_more_samples_are_better():
     """Gradients from one sample of each kind and from many: finite, and the many closer to those of very many."""
-    truth = image_and_gradients(TRIANGLE, CAMERA, surface_samples=200_000, edge_samples=200_000)
+    truth = image_and_gradients(TRIANGLE, CAMERA, sampling=eg.Sampling(surface=200_000, edges=200_000))
     errors = []
     for n in (1, 100, 10_000):
-        options = {"surface_samples": n, "edge_samples": n}
-        runs = [image_and_gradients(TRIANGLE, CAMERA, grad_seed=seed, **options) for seed in range(8)]
+        runs = [image_and_gradients(TRIANGLE, CAMERA, sampling=eg.Sampling(n, n, seed=seed)) for seed in range(8)]
         assert all(torch.equal(run[0], truth[0]) for run in runs)  # the image has samples of its own
         errors.append(max(relative_error(run[1], truth[1]) for run in runs))
     # The largest of 8, measured 5, 0.08 and 0.002. Independent samples would gain a factor of 10 in each step.
@@ -113,7 +112,9 @@ def test_visibility_false_leaves_the_interior(scene):
     twin = gradients(reference.render(scene, camera, grid=12), leaves, ADJOINT)
     twin[-1][-1] = 0  # of K: fixed, but not to the twin
     alone, both = (
-        gradients(eg.render(scene, camera, 144, visibility=on, surface_samples=100_000), leaves, ADJOINT)
+        gradients(
+            eg.render(scene, camera, 144, visibility=on, sampling=eg.Sampling(surface=100_000), seed=0), leaves, ADJOINT
+        )
         for on in (False, True)
     )
     for i, (ours, theirs) in enumerate(zip(alone, twin, strict=True)):

@@ -101,7 +101,7 @@ class Film:
             scene = eg.Scene([mesh], background=srgb_to_linear(self.background), lights=lights)
             with torch.no_grad():
                 picture = linear_to_srgb(
-                    eg.render(scene, self.camera, spp=self.spp, light_samples=1, seed=k).clamp(0.0, 1.0)
+                    eg.render(scene, self.camera, spp=self.spp, sampling=eg.Sampling(lights=1), seed=k).clamp(0.0, 1.0)
                 )
         if self.hand is not None and self.hand[0] <= k < self.hand[1]:
             picture = _before(picture, (k - self.hand[0]) / (self.hand[1] - self.hand[0]))

@@ -22,7 +22,7 @@ def clutter(size, seed=0):
     return torch.from_numpy(image).float()
 
 
-def photograph(view, *meshes, seed=0, gain=(1.3, 1.0, 0.8), light_samples=1):
+def photograph(view, *meshes, seed=0, gain=(1.3, 1.0, 0.8), sampling=None):
     """Return meshes, by default the bracket, in the light of a sun and a sky, blurred as a lens does, noisy and compressed."""
     lit = [mesh.replace(material=eg.Material()) for mesh in meshes or [bracket()]]
     lights = [
@@ -31,7 +31,7 @@ def photograph(view, *meshes, seed=0, gain=(1.3, 1.0, 0.8), light_samples=1):
     ]
     scene = eg.Scene(lit, clutter(view.size[0], seed), lights)
     with torch.no_grad():
-        image = eg.render(scene, view, 32, 1 << 40, light_samples=light_samples)
+        image = eg.render(scene, view, 32, 1 << 40, sampling=sampling)
     seen = smoothed((image * torch.tensor(gain)).clamp(0, 1).movedim(-1, 0), 0.7).movedim(0, -1)
     values = linear_to_srgb(seen)
     values = values + 0.015 * torch.randn(values.shape, generator=torch.Generator().manual_seed(seed))
@@ -47,10 +47,10 @@ def compressed(display, quality):
 
 def coverage(view):
     """Return the share (H, W, 1) of each pixel that the bracket covers."""
-    return eg.render_aovs(bracket(), view, ["alpha"], spp=64)["alpha"]
+    return eg.render_aovs(bracket(), view, ["alpha"], spp=64, seed=0)["alpha"]
 
 
 def depth_of(view, *meshes):
     """Return depths (H, W, 1) of meshes, by default the bracket; 0 where they do not cover a pixel."""
-    seen = eg.render_aovs(eg.Scene(list(meshes) or [bracket()]), view, ["alpha", "depth"], spp=16)
+    seen = eg.render_aovs(eg.Scene(list(meshes) or [bracket()]), view, ["alpha", "depth"], spp=16, seed=0)
     return torch.where(seen["alpha"] > 0.99, seen["depth"] / seen["alpha"].clamp(min=0.01), 0.0)

@@ -79,7 +79,7 @@ def test_the_motion_of_a_step(dofs, kind):
     view = view.to(torch.float64)
     if kind == "perspective":
         view = view.replace(distortion=torch.tensor([0.1, 0.0, 0.01, 0.0]).double())
-    picture = eg.render(eg.Scene([bracket()], BACKGROUND), view)
+    picture = eg.render(eg.Scene([bracket()], BACKGROUND), view, seed=0)
     task = task_of(picture, view, background=BACKGROUND)
     task = replace(task, dofs=dofs)
     level = task.level(1.0, 0.0, 1.0, 4, dofs)

@@ -37,7 +37,7 @@ def test_an_ambiguous_pose_may_be_shifted(taken):
 def test_a_result_is_judged_by_the_limit_of_the_terms_that_it_is_from(photograph_share, monkeypatch):
     """Colours that show 62 % of the edges converged, though the terms of photographs would need more."""
     view = camera(48)
-    image = eg.render(eg.Scene([bracket()], torch.tensor([0.1, 0.2, 0.3])), view, spp=16)
+    image = eg.render(eg.Scene([bracket()], torch.tensor([0.1, 0.2, 0.3])), view, spp=16, seed=0)
     search = photo_search.PhotoSearch(task_of(image, view), pose_from_matrix("pose", START), [None], 48, 8, 10, 1e-3, 0)
     assert search.colors_first
     colors = SimpleNamespace(

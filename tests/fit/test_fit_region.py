@@ -20,11 +20,11 @@ from edgegrad.fit.region import OUTLIERS, Palette, smoothed
 from edgegrad.fit.views import region_views, views_of
 
 
-def picture(light_samples=1):
+def picture(lights=1):
     """Render the vase in a light, in front of clutter, and compress it."""
     mesh = vase(RADII)
     colors = 0.45 + 0.25 * torch.sin(3.0 * mesh.verts)
-    return photograph(VIEW, mesh.replace(colors=colors), seed=7, light_samples=light_samples)
+    return photograph(VIEW, mesh.replace(colors=colors), seed=7, sampling=eg.Sampling(lights=lights))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_finds_a_shape_and_its_translation():
     fit = fit_scene(scene, VIEW, picture(16), given, loss="region", spp=8, progress=False)
     assert fit.converged and fit.steps < 150, (fit.reason, fit.steps)
     torch.testing.assert_close(fit.values["radii"], RADII, rtol=0.08, atol=0.0)
-    shown = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=64)["alpha"]
+    shown = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=64, seed=0)["alpha"]
     assert losses.iou(fit.render(), shown) < 0.04
 
 
@@ -56,7 +56,7 @@ def test_finds_a_pose(method):
     """A bracket without colours starts 12.3° and 8.4 % of its size off."""
     view = camera(128)
     given = {"pose": PoseParameter(Pose(START[:3, :3], START[:3, 3]))}
-    image = photograph(view, seed=2, light_samples=16)
+    image = photograph(view, seed=2, sampling=eg.Sampling(lights=16))
     fit = fit_scene(bracket(plain=True), view, image, given, loss="region", method=method, spp=8, progress=False)
     degrees, percent = errors(fit.poses["pose"])
     assert degrees < 2.0 and percent < 2.0 and fit.converged, (degrees, percent, fit.reason)
@@ -93,7 +93,7 @@ def test_finds_a_shape_from_several_views():
     fit = fit_shape(eg.Mesh(*sphere(2)), views, images, loss="region", levels=2, steps=80, spp=4, progress=False)
 
     def off(mesh):
-        shown = [[eg.render_aovs(m, view, ["alpha"], spp=32)["alpha"] for m in (mesh, true)] for view in views]
+        shown = [[eg.render_aovs(m, view, ["alpha"], spp=32, seed=0)["alpha"] for m in (mesh, true)] for view in views]
         return sum(float(losses.iou(*pair)) for pair in shown) / len(views)
 
     assert off(fit.mesh) < 0.05 < 0.25 < off(fit.start.meshes[0])
@@ -101,7 +101,7 @@ def test_finds_a_shape_from_several_views():
 
 def test_loss_and_curvature_are_those_of_the_likelihood(taken):
     regions = RegionLoss(region_views(views_of(VIEW, taken)), 0)
-    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=16)["alpha"]
+    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=16, seed=0)["alpha"]
     regions.renew(0, alpha)
     sharp = regions.blur  # what the picture shows
     assert sharp in CONTOUR_BLURS
@@ -153,7 +153,7 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
 def test_colours_are_counted_anew_where_the_object_has_moved(taken):
     """They stay if the object has left the picture."""
     regions = RegionLoss(region_views(views_of(VIEW, taken)), 0)
-    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
+    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"], seed=0)["alpha"]
     regions.renew(0, alpha)
     first = regions.posteriors[0]
     regions.renew(0, torch.roll(alpha, 10, 1))
@@ -167,7 +167,7 @@ def test_weights_leave_pixels_out(taken):
     weights = torch.ones(96, 96)
     weights[:, 60:] = 0.0
     malformed = torch.where(weights[..., None] > 0.0, taken, taken.flip(0))
-    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
+    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"], seed=0)["alpha"]
     found = []
     for image in (taken, malformed):
         views = region_views(views_of(VIEW, image, None, weights))
@@ -180,7 +180,7 @@ def test_weights_leave_pixels_out(taken):
 
 
 def test_radiance_and_weights_of_any_unit(taken):
-    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
+    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"], seed=0)["alpha"]
     found = []
     for unit, weight in ((1.0, 1.0), (40.0, 0.01)):
         regions = RegionLoss(region_views(views_of(VIEW, unit * taken, None, torch.full((96, 96), weight))), 0)

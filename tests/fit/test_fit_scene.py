@@ -273,7 +273,7 @@ def test_saves_the_materials_it_found(tmp_path):
         ({"steps": 0}, ValueError, "steps: expected an int from 1"),
         ({"resume": True}, ValueError, "resume: expected a checkpoint"),
         ({"checkpoint": "/nowhere/at/all"}, FileNotFoundError, "checkpoint: expected the folder"),
-        ({"render": {"spps": 3}}, ValueError, "render: expected arguments of render() among surface_samples"),
+        ({"render": {"spps": 3}}, ValueError, "render: expected arguments of render() among filter"),
         ({"render": {"spp": 3}}, ValueError, "got 'spp'; it is an option of its own"),
         (
             {"loss": lambda image, target: image.mean()},

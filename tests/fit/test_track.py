@@ -114,7 +114,7 @@ def test_depth_for_each_frame(film, frames):
     depths = []
     for pose in film.poses[:4]:
         moved = plain.transformed(pose[:3, :3].float(), pose[:3, 3].float())
-        channels = eg.render_aovs(eg.Scene([moved]), film.camera, ["depth", "alpha"])
+        channels = eg.render_aovs(eg.Scene([moved]), film.camera, ["depth", "alpha"], seed=0)
         alpha = channels["alpha"][..., 0]
         depths.append(torch.where(alpha > 0.99, channels["depth"][..., 0] / alpha, torch.nan))
     for pose in track(plain, frames[:4], film.camera, film.poses[0], depth=depths):

@@ -116,7 +116,7 @@ def test_few_samples_estimate_what_is_exact(name: str, rough: bool, filter: str)
     if rough:
         adjoint = torch.randn(48, 48, 3, generator=torch.Generator().manual_seed(3), dtype=F64)
     gradient = Gradient(SCENES[name](), adjoint)
-    few = partial(eg.render, spp=1, surface_samples=400, filter=filter, visibility=False)
+    few = partial(eg.render, spp=1, sampling=eg.Sampling(surface=400), filter=filter, visibility=False)
     found = torch.stack([gradient(partial(few, seed=seed)) for seed in range(40)])
     exact = gradient(partial(exact_image, order=8, filter=filter, visibility=False))
     error = found.std(0) / len(found) ** 0.5
@@ -136,7 +136,7 @@ def test_a_smooth_loss_needs_few_samples() -> None:
 
     samples, _ = default_samples(mesh, camera, adjoint)
     assert samples < 0.5 * eg.plan(mesh.replace(verts=mesh.verts.clone().requires_grad_()), camera)["interior"].samples
-    true = interior(9, surface_samples=400_000)
+    true = interior(9, sampling=eg.Sampling(surface=400_000))
     error = torch.stack([(interior(seed) - true).norm() for seed in range(6)]).square().mean().sqrt()
     assert error < 0.045 * true.norm()
 
@@ -158,7 +158,7 @@ def test_a_rough_loss_gets_its_samples(signs: bool) -> None:
         image = eg.render(mesh.replace(verts=verts), camera, seed=seed, visibility=False, **options)
         return torch.autograd.grad(image, verts, rough)[0]
 
-    true = interior(9, surface_samples=200_000)
+    true = interior(9, sampling=eg.Sampling(surface=200_000))
     error = torch.stack([(interior(seed) - true).norm() for seed in range(8)]).square().mean().sqrt()
     assert error < 1.5 * true.norm()  # 1.1 without a control; rough is rough
 
@@ -169,7 +169,13 @@ def test_hardly_any_samples() -> None:
 
     def depth(samples: int, seed: int) -> Tensor:
         verts = mesh.verts.clone().requires_grad_()
-        image = eg.render(mesh.replace(verts=verts), camera, visibility=False, surface_samples=samples, grad_seed=seed)
+        image = eg.render(
+            mesh.replace(verts=verts),
+            camera,
+            visibility=False,
+            sampling=eg.Sampling(surface=samples, seed=seed),
+            seed=0,
+        )
         return torch.autograd.grad(image, verts, adjoint)[0].sum(0)
 
     true = depth(200_000, 0)
@@ -239,7 +245,9 @@ def test_default_samples_at_creases(name: str) -> None:
         return torch.cat(torch.autograd.grad((image * adjoint).sum(), verts))
 
     def estimate(seed: int, edge_samples: int | None = None) -> Tensor:
-        return gradient(lambda scene: eg.render(scene, camera, grad_seed=seed, edge_samples=edge_samples))
+        return gradient(
+            lambda scene: eg.render(scene, camera, sampling=eg.Sampling(seed=seed, edges=edge_samples), seed=0)
+        )
 
     if name in ("a sphere", "waves, seen flat"):
         true = gradient(lambda scene: exact_image(scene, camera))
@@ -263,12 +271,14 @@ def test_hidden_creases_seen_through_a_gap() -> None:
 
     def gradient(**options: int) -> Tensor:
         moved = ball.verts.clone().requires_grad_()
-        image = eg.render(eg.Scene([ball.replace(verts=moved), wall]), camera, **options)
+        image = eg.render(eg.Scene([ball.replace(verts=moved), wall]), camera, **{"seed": 0, **options})
         (found,) = torch.autograd.grad((image * adjoint).sum(), [moved])
         return found
 
-    true = gradient(spp=256, edge_samples=1_000_000)
-    found = torch.stack([gradient(spp=1, seed=seed, grad_seed=seed, edge_samples=100_000) for seed in range(24)])
+    true = gradient(spp=256, sampling=eg.Sampling(edges=1_000_000))
+    found = torch.stack(
+        [gradient(spp=1, seed=seed, sampling=eg.Sampling(seed=seed, edges=100_000)) for seed in range(24)]
+    )
     assert float((found.mean(0) - true).norm()) < 0.1 * float(true.norm())
 
 

@@ -53,7 +53,7 @@ def test_large_textured_triangles_agree_with_exact_derivatives(ball: bool, filte
         return list(torch.autograd.grad((render(moved, CAMERA) * ADJOINT).sum(), list(leaves.values())))
 
     exact = gradients(partial(exact_image, order=7, filter=filter))
-    samples = partial(eg.render, spp=4, filter=filter, surface_samples=20_000)
+    samples = partial(eg.render, spp=4, filter=filter, sampling=eg.Sampling(surface=20_000))
     runs = [gradients(partial(samples, seed=seed)) for seed in range(8)]
     for i, (field, truth) in enumerate(zip(fields, exact, strict=True)):
         along = [(run[i] * truth).sum().item() for run in runs]
@@ -79,7 +79,7 @@ def test_pixels_complement_one_another() -> None:
         assert texture is not None
         texture = texture.clone().requires_grad_()
         textured = scene.replace(meshes=[scene.meshes[0].replace(texture=texture)])
-        eg.render(textured, CAMERA, spp=1, seed=seed, surface_samples=spp * 48**2).backward(ADJOINT)
+        eg.render(textured, CAMERA, spp=1, seed=seed, sampling=eg.Sampling(surface=spp * 48**2)).backward(ADJOINT)
         assert texture.grad is not None
         return texture.grad
 
@@ -105,7 +105,7 @@ def test_limb_of_a_fine_mesh() -> None:
     """Faces at the limb of 1.3 M faces are seen less wide than floats are apart: they were hit by rounding and hid the
     edge next to them, 2 % of the boundary term. The same sphere with coarser faces has the same gradient."""
     camera, adjoint = front_camera(64), smooth_adjoint(64, 64, 3)
-    samples = {"surface_samples": 200_000, "edge_samples": 200_000}
+    samples = {"sampling": eg.Sampling(surface=200_000, edges=200_000)}
     fine, coarse = (translation(icosphere(n), camera, adjoint, **samples) for n in (8, 5))
     assert (fine - coarse).norm() < 0.005 * coarse.norm()
 
@@ -119,8 +119,8 @@ def test_tangles_are_sampled_where_they_show() -> None:
 
     def gradient(seed: int, samples: int) -> Tensor:
         verts = tangle.verts.clone().requires_grad_()
-        options = {"seed": seed, "surface_samples": samples, "edge_samples": 2 * samples}
-        eg.render(tangle.replace(verts=verts), camera, **options).backward(adjoint)
+        options = {"seed": seed, "sampling": eg.Sampling(surface=samples, edges=2 * samples)}
+        eg.render(tangle.replace(verts=verts), camera, **{"seed": 0, **options}).backward(adjoint)
         assert verts.grad is not None
         return verts.grad
 
@@ -132,7 +132,7 @@ def test_tangles_are_sampled_where_they_show() -> None:
     def growing(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
         return eg.Scene([mesh.replace(verts=mesh.verts + (0.1 + theta) * noise)]), camera
 
-    check_ratio(growing, 0.0005, spp=512, seeds=5, surface_samples=4000, edge_samples=8000)
+    check_ratio(growing, 0.0005, spp=512, seeds=5, sampling=eg.Sampling(surface=4000, edges=8000))
 
 
 def test_hidden_layers() -> None:
@@ -213,7 +213,12 @@ def test_nothing_slips_through_a_fine_mesh() -> None:
     slipped = 0
     for seed in range(6):
         image = eg.render(
-            mesh.replace(verts=verts, colors=colors), camera, 1, seed, surface_samples=200_000, visibility=False
+            mesh.replace(verts=verts, colors=colors),
+            camera,
+            1,
+            seed,
+            sampling=eg.Sampling(surface=200_000),
+            visibility=False,
         )
         (gradient,) = torch.autograd.grad(image, verts, adjoint)
         slipped += int(gradient[hidden].any(-1).sum())

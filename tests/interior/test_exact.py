@@ -97,7 +97,7 @@ def test_gradients(name: str, projection: str) -> None:
     for surface, edge in ((4_000, 2_000), (16_000, 8_000)):
         samples: dict[str, list[Tensor]] = {key: [] for key in exact}
         for seed in range(SEEDS):
-            options = {"spp": 16, "seed": seed, "surface_samples": surface, "edge_samples": edge}
+            options = {"spp": 16, "seed": seed, "sampling": eg.Sampling(surface=surface, edges=edge)}
             got = gradients(scene, camera, partial(eg.render, **options))
             for key, value in got.items():
                 samples[key].append(value)
@@ -119,7 +119,7 @@ def test_boundary_error_falls_like_one_over_n(name: str) -> None:
     scene, camera = SCENES[name](), front_camera(SIZE)
 
     def verts_gradient(edge: int, seed: int, visibility: bool = True, surface: int = 64) -> Tensor:
-        options = {"grad_seed": seed, "surface_samples": surface, "edge_samples": edge, "visibility": visibility}
+        options = {"sampling": eg.Sampling(seed=seed, surface=surface, edges=edge), "visibility": visibility}
         grads = gradients(scene, camera, partial(eg.render, spp=1, **options))
         return torch.cat([g for key, g in grads.items() if key.startswith("verts")])
 
@@ -145,15 +145,19 @@ def test_a_wrong_gradient_is_rejected() -> None:
     scene, camera = one_triangle(), front_camera(SIZE)
     exact = gradients(scene, camera, exact_image)["verts 0"]
     samples = [
-        gradients(scene, camera, lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed))["verts 0"]
+        gradients(
+            scene, camera, lambda s, c, seed=seed: eg.render(s, c, spp=1, sampling=eg.Sampling(seed=seed), seed=0)
+        )["verts 0"]
         for seed in range(SEEDS)
     ]
     assert mean_z2(samples, exact) < 3
     assert mean_z2([s + torch.stack(samples).std(0) for s in samples], exact) > 10
     interior = [
-        gradients(scene, camera, lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed, visibility=False))[
-            "verts 0"
-        ]
+        gradients(
+            scene,
+            camera,
+            lambda s, c, seed=seed: eg.render(s, c, spp=1, sampling=eg.Sampling(seed=seed), visibility=False, seed=0),
+        )["verts 0"]
         for seed in range(SEEDS)
     ]
     assert mean_z2(interior, exact) > 100

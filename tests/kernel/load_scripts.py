@@ -25,7 +25,7 @@ SPHERE = icosphere(4)
 def step(k=0, size=48):
     verts = (SPHERE.verts * (1.0 + 0.001 * k)).requires_grad_()
     colors = SPHERE.colors.clone().requires_grad_()
-    image = eg.render(SPHERE.replace(verts=verts, colors=colors), front_camera(size), spp=4)
+    image = eg.render(SPHERE.replace(verts=verts, colors=colors), front_camera(size), spp=4, seed=0)
     image.square().mean().backward()
     return hashlib.sha256(b"".join(t.detach().numpy().tobytes() for t in (image, verts.grad, colors.grad))).hexdigest()
 """

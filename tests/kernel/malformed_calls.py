@@ -94,7 +94,7 @@ def call(values: dict[str, Any], entry: str = "render") -> list[Tensor]:
     if entry == "profile":
         found = eg.profile(scene, camera, repeats=1, **options)
         return [torch.tensor(found.samples["image_samples"])]
-    image = eg.render(scene, camera, **options)
+    image = eg.render(scene, camera, **{"seed": 0, **options})
     if not image.requires_grad:
         return [image]
     adjoint = values.get(ADJOINT, torch.linspace(-1, 1, image.numel(), dtype=image.dtype).reshape(image.shape))
@@ -216,9 +216,7 @@ BAD_INTS = [-1, -(2**63), 2**63, 10**30, 1.5, 2.0, NAN, "4", True, [4], torch.te
 BAD_OPTIONS: dict[str, list[object]] = {
     "spp": [*BAD_INTS, 0, None, 2**20 + 1],
     "seed": [*BAD_INTS, None],
-    "grad_seed": BAD_INTS,
-    "surface_samples": [*BAD_INTS, 0, 2**41],
-    "edge_samples": [*BAD_INTS, 0, 2**41],
+    "sampling": eg.Sampling(seed=BAD_INTS, surface=[*BAD_INTS, 0, 2**41], edges=[*BAD_INTS, 0, 2**41]),
     "visibility": [0, 1, "yes", None, torch.tensor(True)],
     "filter": ["sinc", "", None, 3, b"box", [], ("box",)],
     "size": [(0, 4), (-1, 4), (4, 0), (4,), (4, 4, 4), 4, None, "ab", (4.0, 4), (4, 2**17), (2**70, 4), (True, 4), (None, 4)],

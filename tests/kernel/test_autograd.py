@@ -35,10 +35,10 @@ BATCH = eg.Camera.stack([CAMERA, OTHER])
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_without_gradients(mode):
-    expected = eg.render(TRIANGLE, CAMERA, 4)
+    expected = eg.render(TRIANGLE, CAMERA, 4, seed=0)
     with mode():
         mesh = MESH.replace(verts=leaf(MESH.verts) * 1.0)
-        image = eg.render(eg.Scene(mesh, BACKGROUND), CAMERA, 4)
+        image = eg.render(eg.Scene(mesh, BACKGROUND), CAMERA, 4, seed=0)
     assert torch.equal(image, expected) and not image.requires_grad
 
 
@@ -50,13 +50,13 @@ def test_with_what_was_made_in_inference_mode():
     assert scene.meshes[0].colors.is_inference() and camera.K.is_inference()
     t = leaf(torch.zeros(3, dtype=F64))
     mesh = scene.meshes[0].replace(verts=MESH.verts + t)
-    image = eg.render(eg.Scene(mesh, BACKGROUND), camera, 4)
+    image = eg.render(eg.Scene(mesh, BACKGROUND), camera, 4, seed=0)
     assert torch.equal(gradients(image, [t])[0], gradients(triangle(MESH.verts + t), [t])[0])
 
 
 def test_image_requires_gradients_if_anything_does():
-    assert not eg.render(TRIANGLE, CAMERA, 4).requires_grad
-    assert eg.render(TRIANGLE, CAMERA.replace(K=leaf(CAMERA.K)), 4).requires_grad
+    assert not eg.render(TRIANGLE, CAMERA, 4, seed=0).requires_grad
+    assert eg.render(TRIANGLE, CAMERA.replace(K=leaf(CAMERA.K)), 4, seed=0).requires_grad
 
 
 def test_only_what_requires_a_gradient_gets_one():
@@ -65,7 +65,7 @@ def test_only_what_requires_a_gradient_gets_one():
         scene, camera, leaves = with_leaves(mixed_scene(), CAMERA)
         for i, tensor in enumerate(leaves):
             tensor.requires_grad_(i == chosen)
-        image = eg.render(scene, camera, 4)
+        image = eg.render(scene, camera, 4, seed=0)
         image.backward(smooth_adjoint(*image.shape))
         assert [tensor.grad is not None for tensor in leaves] == [i == chosen for i in range(len(leaves))]
         assert torch.equal(leaves[chosen].grad, everything[chosen])
@@ -89,7 +89,9 @@ class Model(torch.nn.Module):
 def test_in_a_module_with_an_optimiser():
     model = Model()
     with torch.no_grad():
-        target = eg.render(eg.Scene(MESH.to(F32).transformed(t=[0.1, -0.05, 0.0]), BACKGROUND.to(F32)), CAMERA, 64)
+        target = eg.render(
+            eg.Scene(MESH.to(F32).transformed(t=[0.1, -0.05, 0.0]), BACKGROUND.to(F32)), CAMERA, 64, seed=0
+        )
     optimiser = torch.optim.Adam(model.parameters(), lr=0.02)
     losses = []
     for step in range(15):
@@ -107,16 +109,16 @@ def test_the_loop_in_the_readme(monkeypatch):
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
     (loop,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "optimizer.step()" in block)
     target = eg.render(MESH.transformed(t=[0.05, -0.03, 0.0]), CAMERA, 64, seed=1 << 40)
-    seeds, render = [], eg.render
+    states, render = [], eg.render
 
-    def watched(*args, seed: int, **options) -> Tensor:
-        seeds.append(seed)
-        return render(*args, seed=seed, **options)
+    def watched(*args, **options) -> Tensor:
+        states.append(torch.get_rng_state())
+        return render(*args, **options)
 
     monkeypatch.setattr(eg, "render", watched)
     names = {"torch": torch, "eg": eg, "mesh": MESH, "camera": CAMERA, "target": target}
     exec(loop.replace("range(200)", "range(40)"), names)
-    assert len(set(seeds)) == len(seeds) == 40
+    assert len(states) == 40 and not torch.equal(states[0], states[1])
     fitted, start = (render(MESH.replace(verts=v), CAMERA, 64) for v in (names["verts"], MESH.verts))
     assert (fitted - target).norm() < 0.6 * (start - target).norm()
 
@@ -145,7 +147,7 @@ def test_twice_in_one_graph():
 
 def test_backward_twice():
     verts = leaf(MESH.verts)
-    image = eg.render(MESH.replace(verts=verts), CAMERA, 4)
+    image = eg.render(MESH.replace(verts=verts), CAMERA, 4, seed=0)
     first, second = (torch.autograd.grad(image, verts, ADJOINT, retain_graph=True)[0] for _ in range(2))
     assert torch.equal(first, second)
     torch.autograd.grad(image, verts, ADJOINT)
@@ -156,14 +158,14 @@ def test_backward_twice():
 def test_gradient_is_linear_in_the_adjoint():
     """The samples do not depend on the adjoint's size, nor on its sign."""
     verts = leaf(MESH.verts)
-    image = eg.render(MESH.replace(verts=verts), CAMERA, 4)
+    image = eg.render(MESH.replace(verts=verts), CAMERA, 4, seed=0)
     one, other = (torch.autograd.grad(image, verts, s * ADJOINT, retain_graph=True)[0] for s in (1, -4))
     torch.testing.assert_close(other, -4 * one, rtol=1e-12, atol=0)
     assert not torch.autograd.grad(image, verts, torch.zeros_like(ADJOINT))[0].any()
 
 
 def triangle(verts: Tensor, camera: eg.Camera = CAMERA) -> Tensor:
-    return eg.render(eg.Scene(MESH.replace(verts=verts), BACKGROUND), camera, 4)
+    return eg.render(eg.Scene(MESH.replace(verts=verts), BACKGROUND), camera, 4, seed=0)
 
 
 @pytest.mark.parametrize("value", [torch.nan, -torch.inf])
@@ -183,8 +185,8 @@ def test_verts_changed_in_place_before_backward():
     for dtype in (F32, F64):
         mesh = MESH.to(dtype)
         verts = leaf(mesh.verts)
-        expected = gradients(eg.render(mesh.replace(verts=verts), CAMERA, 4), [verts])
-        image = eg.render(mesh.replace(verts=verts), CAMERA, 4)
+        expected = gradients(eg.render(mesh.replace(verts=verts), CAMERA, 4, seed=0), [verts])
+        image = eg.render(mesh.replace(verts=verts), CAMERA, 4, seed=0)
         with torch.no_grad():
             verts += 0.3
         if dtype == F32:

@@ -54,7 +54,7 @@ def compiled() -> Iterator[Callable[..., Callable[..., Tensor]]]:
 def test_compile_mesh_transformed_inside(compiled):
     def function(verts, R, t, scale, world_to_camera):
         scene = eg.Scene(MESH.replace(verts=verts).transformed(R, t, scale), BACKGROUND)
-        return eg.render(scene, CAMERA.replace(world_to_camera=world_to_camera), 4)
+        return eg.render(scene, CAMERA.replace(world_to_camera=world_to_camera), 4, seed=0)
 
     values = (MESH.verts, torch.eye(3, dtype=F64), torch.zeros(3, dtype=F64), torch.ones((), dtype=F64))
     compiled(function, [leaf(x) for x in (*values, CAMERA.world_to_camera)])
@@ -73,7 +73,9 @@ def test_compile_everything_inside(compiled):
             eg.Mesh(verts * 0.5, faces),
         ]
         camera = eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=fov, size=(SIZE, SIZE))
-        return eg.render(eg.Scene(meshes, background), camera, 4, filter="tent", surface_samples=100, grad_seed=5)
+        return eg.render(
+            eg.Scene(meshes, background), camera, 4, filter="tent", sampling=eg.Sampling(surface=100, seed=5), seed=0
+        )
 
     floats = (MESH.verts, MESH.colors, ADJOINT[:4, :3].sigmoid(), MESH.verts[:, :2], ADJOINT, CAMERA.K[2] * 4 + 1)
     arguments = [leaf(x.to(F32)) for x in (*floats, torch.tensor(40.0))]
@@ -85,7 +87,7 @@ def test_compile_once_for_many_integers(compiled):
 
     def function(verts, seed, spp, samples):
         mesh = MESH.replace(verts=verts)
-        return eg.render(mesh, CAMERA, spp, seed, surface_samples=samples, edge_samples=samples + 1)
+        return eg.render(mesh, CAMERA, spp, seed, sampling=eg.Sampling(surface=samples, edges=samples + 1))
 
     calls = [(0, 4, 100), (1, 5, 101), (7, 6, 99), (2**40 + 1, 4, 100), (2**63 - 1, 4, 100)]
     compiled(function, *[(leaf(MESH.verts), *call) for call in calls])
@@ -101,7 +103,7 @@ def refuses_what_is_not_finite(function, verts, *arguments):
 
 def test_compile_other_numbers_of_vertices(compiled):
     def function(verts, faces, colors):
-        return eg.render(eg.Mesh(verts, faces, colors=colors), CAMERA, 4)
+        return eg.render(eg.Mesh(verts, faces, colors=colors), CAMERA, 4, seed=0)
 
     calls = [(leaf(m.verts), m.faces, leaf(m.colors)) for m in (cube(), icosphere(0), icosphere(1))]
     refuses_what_is_not_finite(compiled(function, *calls), *calls[-1])
@@ -144,7 +146,9 @@ def test_compile_all_that_lights_a_scene(compiled):
             eg.AreaLight.rectangle(place, sky[0, 0] / 4, sky[1, 0] / 4, power),
         ]
         camera = eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=40.0, size=(10, 8))
-        return eg.render(eg.Scene(meshes, lights=lights), camera, 2, seed, surface_samples=samples, shadows=seed < 9)
+        return eg.render(
+            eg.Scene(meshes, lights=lights), camera, 2, seed, sampling=eg.Sampling(surface=samples), shadows=seed < 9
+        )
 
     draw = torch.Generator().manual_seed(3)
     sky = 0.2 + torch.rand((3, 4, 3), dtype=F64, generator=draw)
@@ -159,7 +163,7 @@ def test_compile_all_that_lights_a_scene(compiled):
 def test_compile_mipmaps_and_batches(compiled):
     def function(verts, texture, K):
         mesh = eg.Mesh(verts, MESH.faces, texture=texture, uvs=verts[:, :2], uv_faces=MESH.faces, filter="mipmap")
-        return eg.render(mesh, CAMERA.replace(K=K), 4)
+        return eg.render(mesh, CAMERA.replace(K=K), 4, seed=0)
 
     compiled(function, [leaf(MESH.verts), leaf(ADJOINT.to(F32)), leaf(CAMERA.K.expand(2, 3, 3))])
 
@@ -167,6 +171,6 @@ def test_compile_mipmaps_and_batches(compiled):
 @pytest.mark.slow  # the C++ compiler takes up to a minute the first time
 def test_compile_inductor(compiled):
     def function(verts, t):
-        return eg.render(MESH.replace(verts=verts).transformed(t=t), CAMERA, 4)
+        return eg.render(MESH.replace(verts=verts).transformed(t=t), CAMERA, 4, seed=0)
 
     compiled(function, [leaf(MESH.verts), leaf(torch.zeros(3, dtype=F64))], backend="inductor")

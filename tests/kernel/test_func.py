@@ -15,7 +15,7 @@ SECOND = "second derivatives of a rendered image are not available.*Gauss-Newton
 
 
 def triangle(verts: Tensor, camera: eg.Camera = CAMERA) -> Tensor:
-    return eg.render(eg.Scene(MESH.replace(verts=verts), BACKGROUND), camera, 4)
+    return eg.render(eg.Scene(MESH.replace(verts=verts), BACKGROUND), camera, 4, seed=0)
 
 
 def linear(verts: Tensor) -> Tensor:
@@ -28,13 +28,13 @@ def quadratic(verts: Tensor) -> Tensor:
 
 def shaded(verts: Tensor) -> Tensor:
     scene = eg.Scene(MESH.replace(verts=verts), BACKGROUND)
-    return (eg.render(scene, CAMERA, 4, shader=lambda hits: hits.position.square()) * ADJOINT).sum()
+    return (eg.render(scene, CAMERA, 4, shader=lambda hits: hits.position.square(), seed=0) * ADJOINT).sum()
 
 
 def lit(verts: Tensor) -> Tensor:
     mesh = MESH.replace(verts=verts, material=eg.Material())
     scene = eg.Scene(mesh, BACKGROUND, lights=[eg.PointLight(torch.tensor([1.0, 2.0, 3.0]), 20.0)])
-    return (eg.render(scene, CAMERA, 4) * ADJOINT).sum()
+    return (eg.render(scene, CAMERA, 4, seed=0) * ADJOINT).sum()
 
 
 def first_order(loss: Callable[[Tensor], Tensor], verts: Tensor) -> Tensor:
@@ -138,10 +138,10 @@ def view_from(eye: Tensor, fov_y: Tensor | float = 40.0) -> eg.Camera:
 
 BATCHES = {
     "verts": (triangle, MESH.verts + SHIFTS[:, None]),
-    "translation": (lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4), SHIFTS),
-    "colours": (lambda c: eg.render(MESH.replace(colors=c), CAMERA, 4), MESH.colors + SHIFTS[:, None]),
-    "background": (lambda b: eg.render(eg.Scene(MESH, b), CAMERA, 4), SHIFTS),
-    "texture": (lambda t: eg.render(textured(t), CAMERA, 4), ADJOINT[:6, :6].reshape(2, 3, 6, 3)),
+    "translation": (lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4, seed=0), SHIFTS),
+    "colours": (lambda c: eg.render(MESH.replace(colors=c), CAMERA, 4, seed=0), MESH.colors + SHIFTS[:, None]),
+    "background": (lambda b: eg.render(eg.Scene(MESH, b), CAMERA, 4, seed=0), SHIFTS),
+    "texture": (lambda t: eg.render(textured(t), CAMERA, 4, seed=0), ADJOINT[:6, :6].reshape(2, 3, 6, 3)),
     "world_to_camera": (
         lambda m: triangle(MESH.verts, CAMERA.replace(world_to_camera=m)),
         CAMERA.world_to_camera + torch.nn.functional.pad(SHIFTS[:, :, None], (3, 0, 0, 1)),

@@ -31,19 +31,19 @@ def lit(
 ) -> Tensor:
     shiny = eg.Material(eg.Texture(image, UVS, BALL.faces, filter="linear"), roughness=0.4)
     lights = [eg.PointLight(place, 20.0), eg.Environment(RADIANCE)]
-    return eg.render(eg.Scene([eg.Mesh(verts, BALL.faces, material=shiny), FLOOR], lights=lights), camera, 1)
+    return eg.render(eg.Scene([eg.Mesh(verts, BALL.faces, material=shiny), FLOOR], lights=lights), camera, 1, seed=0)
 
 
 def mipmapped(image: Tensor) -> Tensor:
     """Not lit, but shaded by PyTorch."""
     return eg.render(
-        eg.Mesh(BALL.verts, BALL.faces, texture=image, uvs=UVS, uv_faces=BALL.faces, filter="mipmap"), CAMERA
+        eg.Mesh(BALL.verts, BALL.faces, texture=image, uvs=UVS, uv_faces=BALL.faces, filter="mipmap"), CAMERA, seed=0
     )
 
 
 def emitter(radiance: Tensor) -> Tensor:
     meshes = [FLOOR, eg.AreaLight.rectangle(PLACE, vector(0.5, 0, 0), vector(0, 0.5, 0), radiance)]
-    return eg.render(eg.Scene(meshes), CAMERA, 1)
+    return eg.render(eg.Scene(meshes), CAMERA, 1, seed=0)
 
 
 TWO = torch.tensor([1.0, 1.2], dtype=F64)
@@ -99,7 +99,7 @@ def test_a_batch_of_scenes_and_cameras() -> None:
 
     def image(place: Tensor) -> Tensor:
         scene = eg.Scene([BALL.replace(material=eg.Material())], lights=[eg.PointLight(place, 20.0)])
-        return eg.render_aovs(scene, cameras, ["image", "alpha"], 1)["image"]
+        return eg.render_aovs(scene, cameras, ["image", "alpha"], 1, seed=0)["image"]
 
     batch = PLACE * TWO[:, None]
     assert torch.equal(torch.vmap(image)(batch), torch.stack([image(p) for p in batch]))
@@ -120,12 +120,12 @@ def test_what_was_made_in_inference_mode(shader) -> None:
 
     def gradient(scene: eg.Scene, camera: eg.Camera) -> Tensor:
         moved = scene.replace(meshes=[mesh.transformed(t=t) for mesh in scene.meshes])
-        return torch.autograd.grad((eg.render(moved, camera, 1, shader=shader) * ADJOINT).sum(), t)[0]
+        return torch.autograd.grad((eg.render(moved, camera, 1, shader=shader, seed=0) * ADJOINT).sum(), t)[0]
 
     shiny = BALL.replace(material=eg.Material(0.5, roughness=0.4))
     scene = eg.Scene([shiny, FLOOR], lights=[eg.PointLight(PLACE, 20.0), eg.Environment(RADIANCE)])
     with torch.inference_mode():
         copy, camera = scene.to(F64, copy=True), CAMERA.to(F64, copy=True)
-        image = eg.render(copy, camera, 1)
-    assert copy.meshes[0].verts.is_inference() and torch.equal(image, eg.render(scene, CAMERA, 1))
+        image = eg.render(copy, camera, 1, seed=0)
+    assert copy.meshes[0].verts.is_inference() and torch.equal(image, eg.render(scene, CAMERA, 1, seed=0))
     assert torch.equal(gradient(copy, camera), gradient(scene, CAMERA)) and gradient(scene, CAMERA).any()

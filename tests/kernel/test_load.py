@@ -229,10 +229,10 @@ def interrupted(kind):
     "What becomes of a long render into which Ctrl-C comes after half a second."
     before, sent = step(), []
     mesh, camera = SPHERE.replace(verts=SPHERE.verts.clone().requires_grad_()), front_camera(512 if kind == "image" else 64)
-    many = {"surface samples": {"surface_samples": 1 << 26}, "edge samples": {"edge_samples": 1 << 26}}.get(kind, {})
+    many = {"surface samples": eg.Sampling(surface=1 << 26), "edge samples": eg.Sampling(edges=1 << 26)}.get(kind)
     image, spp = None, 1 << 10
     if many:
-        image = eg.render(mesh, camera, spp=1, **many).sum()
+        image = eg.render(mesh, camera, spp=1, sampling=many).sum()
     if kind == "last tile":  # of two; the calling thread has the one with 2 pixels, another thread that with 16
         torch.set_num_threads(2)
         mesh = SPHERE.replace(verts=(18.0 * SPHERE.verts + torch.tensor([16.0, 0.0, 0.0])).requires_grad_())

@@ -40,7 +40,7 @@ F64 = torch.float64
 
 
 def render(scene: object = None, view: object = CAMERA, **options: object) -> torch.Tensor:
-    return eg.render(mesh() if scene is None else scene, view, **{"spp": 1, **options})
+    return eg.render(mesh() if scene is None else scene, view, **{"seed": 0, "spp": 1, **options})
 
 
 def test_check_tells_messages_apart():
@@ -60,8 +60,18 @@ RENDER = {
     "spp of a tensor of floats": (lambda: render(spp=torch.tensor(1.5)), T, "spp: expected an int, got Tensor"),
     "spp zero": (lambda: render(spp=0), V, "spp: expected an int from 1 to 1048576, got 0"),
     "seed too large": (lambda: render(seed=2**63), V, "seed: expected an int from 0 to 2⁶³ − 1", str(2**63)),
-    "grad_seed": (lambda: render(grad_seed=0.5), T, "grad_seed: expected an int, got float (0.5)"),
-    "surface_samples": (lambda: render(surface_samples=0), V, "surface_samples: expected an int from 1", "got 0"),
+    "seed of a gradient": (lambda: eg.Sampling(seed=0.5), T, "sampling.seed: expected an int, got float (0.5)"),
+    "samples of surfaces": (lambda: eg.Sampling(surface=0), V, "sampling.surface: expected an int from 1", "got 0"),
+    "samples of edges": (lambda: eg.Sampling(edges=1.5), T, "sampling.edges: expected an int, got float (1.5)"),
+    "points of lights": (lambda: eg.Sampling(lights=0), V, "sampling.lights: expected an int from 1", "got 0"),
+    "creases": (lambda: eg.Sampling(creases="all"), V, "sampling.creases: expected \"auto\", True or False, got 'all'"),
+    "no sampling": (lambda: render(sampling={"edges": 4}), T, "sampling: expected an edgegrad.Sampling, got dict"),
+    "no generator": (lambda: render(generator=3), T, "generator: expected a torch.Generator, got int"),
+    "seed and generator": (
+        lambda: render(seed=3, generator=torch.Generator()),
+        V,
+        "seed: expected None together with a generator",
+    ),
     "visibility": (lambda: render(visibility=1), T, "visibility: expected True or False, got int (1)"),
     "filter": (lambda: render(filter="lanczos"), V, "filter: expected one of box, tent, gaussian, got 'lanczos'"),
     "background of another size": (
@@ -79,7 +89,9 @@ def test_messages_of_render(call, error, parts):
 
 def test_numbers_that_are_not_python_numbers_are_fine():
     size = tuple(np.array([8, 8]))
-    image = render(view=camera(size=size), spp=np.int64(2), seed=torch.tensor(3), surface_samples=np.int32(4))
+    image = render(
+        view=camera(size=size), spp=np.int64(2), seed=torch.tensor(3), sampling=eg.Sampling(surface=np.int32(4))
+    )
     assert image.shape == (8, 8, 3)
 
 
@@ -276,17 +288,23 @@ def test_index_into_another_mesh_in_place() -> None:
             meshes = [eg.Mesh(VERTS.clone(), FACES.clone()) for _ in range(2)]
             meshes[changed].faces[2, 1] = bad
             with pytest.raises(ValueError, match="faces: expected indices from 0 to"):
-                eg.render(eg.Scene(meshes), CAMERA)
+                eg.render(eg.Scene(meshes), CAMERA, seed=0)
 
 
 @pytest.mark.parametrize(
     "call, parts",
     [
-        (lambda: eg.render_aovs(mesh(colors=VERTS), None, ["depth"]), ["camera: expected a Camera, got NoneType"]),
-        (lambda: eg.jvp(mesh(colors=VERTS), camera(), {VERTS: VERTS[None]}, sp=3), ["jvp: expected only", "got 'sp'"]),
-        (lambda: eg.jvp(mesh(colors=VERTS), camera(), None), ["tangents: expected a mapping", "got NoneType"]),
         (
-            lambda: eg.screen_gradient(mesh(colors=VERTS), camera(), torch.zeros(8, 8, 3), bounces=2),
+            lambda: eg.render_aovs(mesh(colors=VERTS), None, ["depth"], seed=0),
+            ["camera: expected a Camera, got NoneType"],
+        ),
+        (
+            lambda: eg.jvp(mesh(colors=VERTS), camera(), {VERTS: VERTS[None]}, sp=3, seed=0),
+            ["jvp: expected only", "got 'sp'"],
+        ),
+        (lambda: eg.jvp(mesh(colors=VERTS), camera(), None, seed=0), ["tangents: expected a mapping", "got NoneType"]),
+        (
+            lambda: eg.screen_gradient(mesh(colors=VERTS), camera(), torch.zeros(8, 8, 3), bounces=2, seed=0),
             ["screen_gradient: expected only", "got 'bounces'"],
         ),
     ],

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.quick
 
 
 def operator_inputs(scene: eg.Scene) -> tuple:
-    return make_request(scene, CAMERA, 4, surface_samples=200, edge_samples=200, grad_seed=3).pack()
+    return make_request(scene, CAMERA, 4, sampling=eg.Sampling(surface=200, edges=200, seed=3)).pack()
 
 
 SCENES = {"colors": lambda: TRIANGLE, "mixed": mixed_scene, "float32": lambda: TRIANGLE.to(F32)}
@@ -23,7 +23,9 @@ SCENES = {"colors": lambda: TRIANGLE, "mixed": mixed_scene, "float32": lambda: T
 @pytest.mark.parametrize("wanted", ["11111111111", "10000110000"])
 def test_opcheck_of_auxiliary_channels(wanted):
     names = ["image", "alpha", "position", "depth", "shading_normal", "normal", "barycentrics"]
-    inputs = with_channels(make_request(TRIANGLE, CAMERA, 4, surface_samples=200, edge_samples=200), names).pack()
+    inputs = with_channels(
+        make_request(TRIANGLE, CAMERA, 4, sampling=eg.Sampling(surface=200, edges=200)), names
+    ).pack()
     image, *forward = torch.ops.edgegrad.render(*inputs)
     assert image.shape == (1, SIZE, SIZE, 17)
     torch.library.opcheck(torch.ops.edgegrad.render.default, inputs)
@@ -55,7 +57,7 @@ def test_opcheck_render_backward(wanted, scene):
 
 @pytest.mark.parametrize("moving", ["11111111111", "10000000000", "01000001101"])
 def test_opcheck_render_jvp(moving):
-    request = make_request(mixed_scene(), CAMERA, 4, surface_samples=200, edge_samples=200)
+    request = make_request(mixed_scene(), CAMERA, 4, sampling=eg.Sampling(surface=200, edges=200))
     _, *hits = torch.ops.edgegrad.render(*request.pack())
     slots = [request.slot(name) for name in SLOTS]
     tangents = [torch.ones(2, *x.shape, dtype=F64) if m == "1" else None for m, x in zip(moving, slots, strict=True)]

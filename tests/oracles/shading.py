@@ -23,16 +23,16 @@ from .mesh_light_sampling import EmissiveMeshSampler
 from .resampled import Glossy, resampled
 
 
-def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
+def radiance(hits: Hits, shadows: bool = True, lights_each: int = 1) -> Tensor:
     """Return what render() takes as the radiance (N, C) in direct light, also for hits of trace()."""
     note_jumps(hits, False)
-    L, lights = reference(hits, shadows, light_samples), moving_emitters(hits)
-    return L + by_texel_edges(hits, lights, shadows, light_samples) if lights else L
+    L, lights = reference(hits, shadows, lights_each), moving_emitters(hits)
+    return L + by_texel_edges(hits, lights, shadows, lights_each) if lights else L
 
 
-def reference(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
+def reference(hits: Hits, shadows: bool = True, lights_each: int = 1) -> Tensor:
     """Return what in_kernel.radiance() returns: (N, C), without the derivative by texel edges of lights."""
-    lighting = Lighting(shadows, light_samples)
+    lighting = Lighting(shadows, lights_each)
     return of_each_mesh(hits, lambda own, index: _of_mesh(own, index, lighting))
 
 

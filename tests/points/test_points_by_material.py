@@ -8,6 +8,7 @@ import pytest
 import torch
 from lit_scenes import F64, ball, plane, vector
 from oracles import shading
+from sampling_options import with_sampling
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -94,7 +95,7 @@ def test_a_shader_of_its_own_gives_what_render_gives():
         for seed in range(12):
             own = {name: value.clone().requires_grad_() for name, value in leaves().items()}
             options: dict[str, Any] = {"shader": shader(own)} if by_shader else {}
-            image = eg.render(scene(**own), CAMERA, spp=16, seed=seed, surface_samples=3000, **options)
+            image = eg.render(scene(**own), CAMERA, spp=16, seed=seed, **with_sampling(options, surface=3000))
             weights = torch.linspace(0.5, 1.5, 20, dtype=F64)[:, None]
             got = torch.autograd.grad((image.mean(2) * weights).sum(), list(own.values()))
             values.append(torch.cat([image.detach().mean((0, 1)), got[0], got[1], got[2].sum((0, 1))]))

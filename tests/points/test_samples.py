@@ -97,7 +97,7 @@ def test_no_rays_and_no_hits():
 
 def test_a_convex_body_sees_what_its_faces_look_at():
     mesh = ball(3)
-    hits = eg.primary_hits(mesh, front_camera(SIZE)).hits
+    hits = eg.primary_hits(mesh, front_camera(SIZE), seed=0).hits
     light = torch.tensor([3.0, 2.0, 1.5], dtype=F64)
     facing = (hits.normal * (light - hits.position)).sum(1)
     visible = hits.visible(light)
@@ -119,7 +119,7 @@ def test_what_joins_at_an_edge_hides_what_lies_beyond_and_no_more(dtype: torch.d
         fov_y=40.0,
         size=(48, 48),
     )
-    hits = eg.primary_hits(mesh, camera, spp=4).hits
+    hits = eg.primary_hits(mesh, camera, spp=4, seed=0).hits
     z = hits.position[:, 2].double() - far
     floor = hits.face < 2
     behind = torch.tensor([far, far + 3.0, far - 1.0], dtype=dtype)
@@ -156,7 +156,7 @@ def test_rays_pass_through_what_is_masked():
 
 
 def test_points_to_see_are_checked():
-    hits = eg.primary_hits(ball(), front_camera(SIZE)).hits
+    hits = eg.primary_hits(ball(), front_camera(SIZE), seed=0).hits
     with pytest.raises(ValueError, match=r"points: expected shape"):
         hits.visible(torch.zeros(2, 3))
 
@@ -179,7 +179,7 @@ def views() -> dict[str, eg.Camera]:
 @pytest.mark.parametrize("view", views())
 def test_places_show_what_pixels_do(view: str):
     """Compare what is seen at a place, the ray that goes there and its derivative by the place with the hits of an image."""
-    primary = eg.primary_hits(ball(1), views()[view], spp=4)
+    primary = eg.primary_hits(ball(1), views()[view], spp=4, seed=0)
     hits, frame = primary.hits, primary.context
     x = hits.pixel
     places = frame.sampler.hits_at(x)
@@ -240,9 +240,7 @@ def test_a_pipeline_of_ones_own_is_the_shaders(own_interior: bool):
             camera,
             seed=seed,
             shader=lambda hits: hits.interpolate(colors) * (1 + 0.5 * hits.position),
-            creases=False,
-            surface_samples=20000,
-            edge_samples=20000,
+            sampling=eg.Sampling(creases=False, surface=20000, edges=20000),
             spp=16,
         )
 
@@ -272,7 +270,7 @@ def test_jumps_at_edges_alone_move_a_silhouette():
     mesh = eg.Mesh(size * corner, torch.tensor([[0, 1, 2], [0, 2, 3]]))
     K = torch.tensor([[10.0, 0, 12], [0, 10.0, 12], [0, 0, 1]], dtype=F64)
     camera = eg.Camera(torch.eye(4, dtype=F64), K, (SIZE, SIZE), "orthographic")
-    primary = eg.primary_hits(mesh, camera)
+    primary = eg.primary_hits(mesh, camera, seed=0)
     edges = eg.edge_samples(primary, 400, creases=False)
     image = torch.zeros((SIZE, SIZE, 1), dtype=F64)
     attached = eg.attach_boundary(image, edges, edges.jump(torch.ones((len(edges.hits), 1), dtype=F64)))
@@ -281,7 +279,7 @@ def test_jumps_at_edges_alone_move_a_silhouette():
     assert torch.allclose(grad, torch.tensor(8 * 0.5 * 100.0, dtype=F64), rtol=1e-6)
     with pytest.raises(RuntimeError, match="second derivatives"):
         verts = (size * corner).detach().requires_grad_()
-        edges = eg.edge_samples(eg.primary_hits(mesh.replace(verts=verts), camera), 400)
+        edges = eg.edge_samples(eg.primary_hits(mesh.replace(verts=verts), camera, seed=0), 400)
         jump = edges.jump(torch.ones((len(edges.hits), 1), dtype=F64))
         (first,) = torch.autograd.grad(eg.attach_boundary(image, edges, jump).square().sum(), verts, create_graph=True)
         torch.autograd.grad(first.sum(), verts)
@@ -290,7 +288,7 @@ def test_jumps_at_edges_alone_move_a_silhouette():
 def test_attached_edges_keep_the_type_and_have_no_second_derivatives():
     """The image's own graph does not have how coverage moves, so second derivatives by it are refused, too."""
     verts, color = ball().verts.clone().requires_grad_(), torch.rand(3, dtype=F64, requires_grad=True)
-    primary = eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE))
+    primary = eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE), seed=0)
     edges = eg.edge_samples(primary, 200)
     jump = edges.jump(torch.ones((len(edges.hits), 3), dtype=F64))
     image = primary.image(torch.ones((len(primary.hits), 3), dtype=F64), color)
@@ -301,7 +299,7 @@ def test_attached_edges_keep_the_type_and_have_no_second_derivatives():
         torch.autograd.grad(by_verts.sum(), color)
 
     def single(verts: Tensor) -> Tensor:
-        edges = eg.edge_samples(eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE)), 200)
+        edges = eg.edge_samples(eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE), seed=0), 200)
         return eg.attach_boundary(
             torch.zeros(SIZE, SIZE, 3), edges, edges.jump(torch.ones((len(edges.hits), 3), dtype=F64))
         )
@@ -311,7 +309,7 @@ def test_attached_edges_keep_the_type_and_have_no_second_derivatives():
 
 
 def test_what_parts_are_given_is_checked():
-    primary = eg.primary_hits(ball(), front_camera(SIZE))
+    primary = eg.primary_hits(ball(), front_camera(SIZE), seed=0)
     edges = eg.edge_samples(primary, 100)
     with pytest.raises(ValueError, match=r"radiance: expected shape"):
         primary.image(torch.zeros(3, 3))
@@ -332,4 +330,4 @@ def test_what_parts_are_given_is_checked():
         eg.attach_boundary(None, edges, torch.zeros(len(edges), 3))  # type: ignore[arg-type]
     w = torch.eye(4).expand(2, 4, 4)
     with pytest.raises(ValueError, match=r"camera: expected one camera, got a batch of 2"):
-        eg.primary_hits(ball(), front_camera(SIZE).replace(world_to_camera=w))
+        eg.primary_hits(ball(), front_camera(SIZE).replace(world_to_camera=w), seed=0)

@@ -11,6 +11,7 @@ from shader_scenes import F64, SIZE, bumpy, by_hand, cameras, colored, network, 
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad.points.check_shader import check_shader
 
 
 def gradients(scene: eg.Scene, camera: eg.Camera, shaded: bool, seed: int, **options: object) -> dict[str, Tensor]:
@@ -42,7 +43,7 @@ def gradients(scene: eg.Scene, camera: eg.Camera, shaded: bool, seed: int, **opt
 def test_the_same_as_the_kernels_own(kind: str, view: str, filter: str):
     scene = colored()[0] if kind == "colors" else textured()
     camera = cameras()[view]
-    options = {"filter": filter, "surface_samples": 20000, "edge_samples": 20000}
+    options = {"filter": filter, "sampling": eg.Sampling(surface=20000, edges=20000)}
     many = 6
     own = [gradients(scene, camera, False, seed, **options) for seed in range(many)]
     twin = [gradients(scene, camera, True, 100 + seed, **options) for seed in range(many)]
@@ -64,7 +65,7 @@ def test_a_wall_without_curves():
     wall = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=smooth_colors(verts.detach()))
     found = []
     for shader in (None, lambda hits: hits.interpolate(wall.colors, "vertex")):
-        image = eg.render(wall, front_camera(SIZE), 16, surface_samples=100_000, shader=shader)
+        image = eg.render(wall, front_camera(SIZE), 16, sampling=eg.Sampling(surface=100_000), shader=shader, seed=0)
         found.append(torch.autograd.grad((image * smooth_adjoint(SIZE, SIZE, 3)).sum(), verts)[0])
     assert found[0].abs().max() > 0
     torch.testing.assert_close(found[1], found[0], rtol=0.02, atol=0.01 * float(found[0].abs().max()))
@@ -75,7 +76,7 @@ def test_tensors_that_only_the_shader_uses_get_no_boundary_and_no_kernel_gradien
     gain = torch.ones(3, dtype=F64, requires_grad=True)
     colors = scene.meshes[0].colors
     assert colors is not None
-    image = eg.render(scene, camera, shader=lambda hits: gain * hits.interpolate(colors))
+    image = eg.render(scene, camera, shader=lambda hits: gain * hits.interpolate(colors), seed=0)
     assert image.requires_grad
     grad = torch.autograd.grad(image.sum(), gain)[0]
     assert scene.background is not None
@@ -85,9 +86,9 @@ def test_tensors_that_only_the_shader_uses_get_no_boundary_and_no_kernel_gradien
 
 
 def coverage(scene: eg.Scene, camera: eg.Camera) -> Tensor:
-    return eg.render(scene.replace(background=None), camera, shader=lambda hits: torch.ones_like(hits.position[:, :1]))[
-        ..., 0
-    ]
+    return eg.render(
+        scene.replace(background=None), camera, shader=lambda hits: torch.ones_like(hits.position[:, :1]), seed=0
+    )[..., 0]
 
 
 # -- as any PyTorch ---------------------------------------------------------------------------------------------------
@@ -150,7 +151,9 @@ def test_graphs_of_all_kinds():
     assert not value.requires_grad and torch.equal(value, lit(leaf, colors).detach())
     linear = torch.nn.Linear(3, 2)
     with torch.autocast("cpu", torch.bfloat16):
-        half = eg.render(icosphere(1).to(torch.float32), front_camera(8), shader=lambda hits: linear(hits.position))
+        half = eg.render(
+            icosphere(1).to(torch.float32), front_camera(8), shader=lambda hits: linear(hits.position), seed=0
+        )
     assert half.dtype == torch.float32
     half.sum().backward()
     assert linear.weight.grad is not None and bool(linear.weight.grad.any())
@@ -169,7 +172,7 @@ def test_cameras_of_a_batch():
     mesh = icosphere(2).replace(verts=verts)
     images = eg.render(mesh, batch, seed=4, shader=shader)
     assert torch.equal(images[0], eg.render(mesh, camera, seed=4, shader=shader))
-    other = eg.render(mesh, camera.replace(world_to_camera=moved), spp=256, shader=shader)
+    other = eg.render(mesh, camera.replace(world_to_camera=moved), spp=256, shader=shader, seed=0)
     assert float((images[1] - other).abs().mean()) < 0.02
 
 
@@ -190,19 +193,22 @@ REFUSED = {
 def test_what_is_refused(name: str):
     shader, error, text = REFUSED[name]
     with pytest.raises(error, match=text):
-        eg.render(icosphere(1), front_camera(8), shader=shader, check_shader=True)
+        if text == "each point by itself":
+            check_shader(icosphere(1), front_camera(8), shader)
+        else:
+            eg.render(icosphere(1), front_camera(8), shader=shader, seed=0)
 
 
 def test_more_arguments_that_are_refused():
     with pytest.raises(ValueError, match="creases: expected"):
-        eg.render(icosphere(1), front_camera(8), shader=lambda hits: hits.position, creases="all")  # type: ignore[arg-type]
+        eg.Sampling(creases="all")
     plain = eg.Mesh(icosphere(1).verts, icosphere(1).faces)
     with pytest.raises(ValueError, match="as many channels as the background"):
-        eg.render(eg.Scene([plain], torch.zeros(2)), front_camera(8), shader=lambda hits: hits.position)
+        eg.render(eg.Scene([plain], torch.zeros(2)), front_camera(8), shader=lambda hits: hits.position, seed=0)
     with pytest.raises(RuntimeError, match=r"torch\.vmap"):
-        torch.vmap(lambda v: eg.render(icosphere(1).replace(verts=v), front_camera(8), shader=lambda h: h.position))(
-            torch.stack([icosphere(1).verts] * 2)
-        )
+        torch.vmap(
+            lambda v: eg.render(icosphere(1).replace(verts=v), front_camera(8), shader=lambda h: h.position, seed=0)
+        )(torch.stack([icosphere(1).verts] * 2))
 
 
 # -- each face in a pixel shaded once -----------------------------------------------------------------------------------
@@ -260,8 +266,8 @@ def test_a_batch_of_attributes_of_faces_under_vmap():
             mesh.replace(verts=verts),
             camera,
             shader=lambda hits: hits.interpolate(colors),
-            edge_samples=20000,
-            surface_samples=20000,
+            sampling=eg.Sampling(edges=20000, surface=20000),
+            seed=0,
         )
 
     def gradient(colors: Tensor) -> tuple[Tensor, ...]:
@@ -304,7 +310,7 @@ def test_nothing_in_view_has_gradients_of_zero():
     net = network(6)
     verts = (mesh.verts + 100.0).requires_grad_()
     image = eg.render(
-        mesh.replace(verts=verts), camera, shader=lambda h: net(torch.cat([h.position, h.normal], 1))
+        mesh.replace(verts=verts), camera, shader=lambda h: net(torch.cat([h.position, h.normal], 1)), seed=0
     )  # fmt: skip
     for gradient in torch.autograd.grad(image.sum(), [verts, *net.parameters()]):
         assert float(gradient.abs().max()) == 0

@@ -160,7 +160,9 @@ def derivative(case: Case, seeds: int) -> Estimate:
     values = []
     for seed in range(seeds):
         theta = torch.zeros((), dtype=F64, requires_grad=True)
-        value = loss(case, theta, 1000 + seed, 16, surface_samples=60000, edge_samples=60000, step_spacing=1 / 16)
+        value = loss(
+            case, theta, 1000 + seed, 16, sampling=eg.Sampling(surface=60000, edges=60000, discontinuity_spacing=1 / 16)
+        )
         values.append(torch.autograd.grad(value, theta)[0].item())
     return estimate(values)
 
@@ -204,7 +206,7 @@ def test_creases_are_found_where_the_shader_jumps():
 
     def found(creases: bool | str) -> float:
         theta = torch.zeros((), dtype=F64, requires_grad=True)
-        options = {"surface_samples": 60000, "edge_samples": 60000, "creases": creases}
+        options = {"sampling": eg.Sampling(surface=60000, edges=60000, creases=creases)}
         return torch.autograd.grad(loss(own, theta, 7, 16, **options), theta)[0].item()
 
     assert abs(found(True) - full.mean) < 0.03 * abs(full.mean)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.watched
 F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
 ALONG = torch.tensor([0.7, 0.6, -0.2], dtype=F64)
-SAMPLES = {"surface_samples": 20_000, "edge_samples": 20_000}
+SAMPLES = {"sampling": eg.Sampling(surface=20_000, edges=20_000)}
 ORTHOGRAPHIC = eg.Camera.orthographic((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, (48, 48)).to(F64)
 # Off the borders of pixels, where the box filter's adjoint jumps.
 ORTHOGRAPHIC = ORTHOGRAPHIC.replace(K=ORTHOGRAPHIC.K + torch.tensor([[0, 0, 0.31], [0, 0, 0.27], [0, 0, 0]], dtype=F64))
@@ -70,7 +70,7 @@ def test_a_thin_strip_is_not_taken_for_one_line() -> None:
     for seed in range(4):
         moving = verts.clone().requires_grad_()
         scene = eg.Scene(eg.Mesh(moving, faces, face_colors=torch.ones(2, 1, dtype=F64)))
-        eg.render(scene, camera, spp=4, seed=seed, edge_samples=4000).sum().backward()
+        eg.render(scene, camera, spp=4, seed=seed, sampling=eg.Sampling(edges=4000)).sum().backward()
         assert moving.grad is not None
         grads.append(moving.grad)
     # The sum of the image is the area of the strip in pixels: a parallelogram that its upper side widens.
@@ -112,7 +112,7 @@ def test_curves_of_which_no_sample_is_seen(flat: bool) -> None:
     check(
         lambda theta: [mesh.transformed(t=sign * depth + theta * ALONG) for mesh, sign in ((back, 1.0), (front, -1.0))],
         spp=256,
-        edge_samples=10_000,
+        sampling=eg.Sampling(edges=10_000),
     )
 
 
@@ -141,8 +141,10 @@ def test_few_samples_are_unbiased(edge_samples: int | None) -> None:
     exact = gradient(lambda shift: exact_image(scene(shift), camera))
     found = []
     for seed in range(100):
-        options = {"seed": seed, "edge_samples": edge_samples}
-        found.append(gradient(lambda shift, options=options: eg.render(scene(shift), camera, spp=1, **options)))
+        options = {"seed": seed, "sampling": eg.Sampling(edges=edge_samples)}
+        found.append(
+            gradient(lambda shift, options=options: eg.render(scene(shift), camera, spp=1, **{"seed": 0, **options}))
+        )
     mean, error = torch.stack(found).mean(0), torch.stack(found).std(0) / len(found) ** 0.5
     assert float(((mean - exact) / error).abs().max()) < 4.0, (mean, error, exact)
 
@@ -157,7 +159,7 @@ def test_what_lies_closer_than_the_input_tells(spacings: int) -> None:
     front, back = (eg.Mesh(v, faces, face_colors=torch.full((2, 3), c)) for v, c in ((corners, 0.2), (behind, 0.9)))
     camera = eg.Camera.look_at((0.1, 0.2, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (32, 32))
     adjoint = torch.linspace(0.0, 1.0, 32)[:, None, None].expand(32, 32, 3)
-    (eg.render(eg.Scene([front, back]), camera) * adjoint).sum().backward()
+    (eg.render(eg.Scene([front, back]), camera, seed=0) * adjoint).sum().backward()
     assert behind.grad is not None
     assert bool(behind.grad.any()) == (spacings < 8)
 
@@ -175,7 +177,9 @@ def test_copies_that_are_not_quite_in_one_place(apart: float, least: float, most
 
     def gradient(verts: Tensor, faces: Tensor) -> Tensor:
         verts = verts.clone().requires_grad_()
-        image = eg.render(eg.Mesh(verts, faces, face_colors=colors), camera, edge_samples=400_000)
+        image = eg.render(
+            eg.Mesh(verts, faces, face_colors=colors), camera, sampling=eg.Sampling(edges=400_000), seed=0
+        )
         return torch.autograd.grad((image * torch.stack([x, y, x * y], -1)).sum(), verts)[0].double()
 
     true = gradient(ball.verts.float(), ball.faces)
@@ -194,7 +198,7 @@ def test_closed_surfaces_in_one_place() -> None:
     def gradient(copies: list[Tensor]) -> Tensor:
         verts = ball.verts.clone().requires_grad_()
         scene = eg.Scene([eg.Mesh(verts, faces, face_colors=colors) for faces in copies])
-        image = eg.render(scene, camera, edge_samples=400_000)
+        image = eg.render(scene, camera, sampling=eg.Sampling(edges=400_000), seed=0)
         return torch.autograd.grad((image * adjoint).sum(), verts)[0]
 
     one, three = gradient([ball.faces]), gradient([ball.faces, ball.faces.flip(1), ball.faces])
@@ -214,7 +218,7 @@ def test_what_a_convex_surface_hides_moves_nothing() -> None:
         turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=F64))
         verts = (sphere.verts @ turn * turn.det()).float().requires_grad_()
         mesh = eg.Mesh(verts, faces, face_colors=colors)
-        image = eg.render(eg.Scene(mesh, BACKGROUND), camera, seed=seed, edge_samples=400_000)
+        image = eg.render(eg.Scene(mesh, BACKGROUND), camera, seed=seed, sampling=eg.Sampling(edges=400_000))
         image.square().sum().backward()
         corners = camera.project(verts.detach().double())[faces]
         front = torch.linalg.det((corners - corners[:, :1])[:, 1:]) < 0

@@ -31,7 +31,7 @@ def edge_on_grid(n: int) -> tuple[eg.Mesh, eg.Camera]:
 
 def backward(mesh: eg.Mesh, camera: eg.Camera, seed: int = 0, edge_samples: int | None = None) -> Tensor:
     verts = mesh.verts.clone().requires_grad_()
-    image = eg.render(mesh.replace(verts=verts), camera, spp=1, seed=seed, edge_samples=edge_samples)
+    image = eg.render(mesh.replace(verts=verts), camera, spp=1, seed=seed, sampling=eg.Sampling(edges=edge_samples))
     (grad,) = torch.autograd.grad(image.sum(), verts)
     return grad
 
@@ -81,7 +81,9 @@ def test_time_of_copies_grows_with_their_number() -> None:
         meshes = [flat.replace(verts=flat.verts.clone().requires_grad_()) for _ in range(copies)]
         taken = []
         for seed in range(3):
-            image = eg.render(eg.Scene(meshes), camera, spp=1, seed=seed, edge_samples=500 * copies).sum()
+            image = eg.render(
+                eg.Scene(meshes), camera, spp=1, seed=seed, sampling=eg.Sampling(edges=500 * copies)
+            ).sum()
             began = time.process_time()
             torch.autograd.grad(image, [mesh.verts for mesh in meshes])
             taken.append(time.process_time() - began)

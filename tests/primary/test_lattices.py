@@ -96,7 +96,9 @@ def gradients(scene: eg.Scene, camera: eg.Camera, seeds: int, edge_samples: int)
     for seed in range(seeds):
         verts = [mesh.verts.clone().requires_grad_() for mesh in scene.meshes]
         meshes = [mesh.replace(verts=v) for mesh, v in zip(scene.meshes, verts, strict=True)]
-        image = eg.render(eg.Scene(meshes, scene.background), camera, spp=1, seed=seed, edge_samples=edge_samples)
+        image = eg.render(
+            eg.Scene(meshes, scene.background), camera, spp=1, seed=seed, sampling=eg.Sampling(edges=edge_samples)
+        )
         found.append(list(torch.autograd.grad((image * ADJOINT).sum(), verts)))
     return found
 

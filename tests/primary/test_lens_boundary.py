@@ -116,7 +116,7 @@ def derivative(value: Callable[[Tensor, Tensor], Tensor], view: eg.Camera) -> tu
 
 def found(view: eg.Camera, loss: Callable[[Tensor], Tensor], scene: eg.Scene, **options: object) -> list[Tensor]:
     K, d = view.K.clone().requires_grad_(), view.coefficients.clone().requires_grad_()
-    image = eg.render(scene, view.replace(K=K, distortion=d), 4, **options)  # type: ignore[arg-type]
+    image = eg.render(scene, view.replace(K=K, distortion=d), 4, **{"seed": 0, **options})  # type: ignore[arg-type]
     K_bar, d_bar = torch.autograd.grad(loss(image), [K, d])
     return [K_bar[:2], d_bar]
 
@@ -137,7 +137,7 @@ def test_area(lens: str, mirror: int) -> None:
     """A white room before grey is an ellipse, for what is radial π |det K| ρ²: its area, and the derivative of that."""
     view = camera(lens, mirror)
     scene = eg.Scene([white_room()], torch.full((1,), 0.25, dtype=F64))
-    image = eg.render(scene, view, 256)
+    image = eg.render(scene, view, 256, seed=0)
     inside = area(outline(lens, view.K, view.coefficients))
     assert float(image.sum()) == pytest.approx(float(0.75 * inside + 0.25 * image.numel()), rel=1e-3)
     truth = derivative(lambda K, d: 0.75 * area(outline(lens, K, d)), view)
@@ -177,7 +177,7 @@ def test_line_integral_in_a_crop(lens: str, filter: str) -> None:
     truth = derivative(lambda K, d: (weight * outline(lens, K, d, 5_000)).sum(), view)
     scene = eg.Scene([white_room()], torch.zeros(1, dtype=F64))
     for gradient, expected in zip(
-        found(view, lambda image: (image * adjoint).sum(), scene, filter=filter, edge_samples=20_000),
+        found(view, lambda image: (image * adjoint).sum(), scene, filter=filter, sampling=eg.Sampling(edges=20_000)),
         truth,
         strict=True,
     ):
@@ -227,14 +227,14 @@ def case(lens: str, what: str) -> Case:
 @pytest.mark.unwatched
 @pytest.mark.parametrize(("lens", "what"), [("fold", "d0"), ("decentred", "K02"), ("all around", "d0")])
 def test_finite_differences(lens: str, what: str) -> None:
-    check_ratio(case(lens, what), 0.01, spp=512, seeds=3, surface_samples=100_000)
+    check_ratio(case(lens, what), 0.01, spp=512, seeds=3, sampling=eg.Sampling(surface=100_000))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("what", ["d0", "d1", "d2", "K00", "K02", "vertices"])
 def test_every_finite_difference(lens: str, what: str) -> None:
-    check_ratio(case(lens, what), 0.01, spp=4096, seeds=6, surface_samples=200_000)
+    check_ratio(case(lens, what), 0.01, spp=4096, seeds=6, sampling=eg.Sampling(surface=200_000))
 
 
 # -- all modes of differentiation ------------------------------------------------------------------------------------------
@@ -245,17 +245,17 @@ def test_forward_mode_and_gradient_by_place(lens: str) -> None:
     """The room is white, so that nothing but the lens boundary moves."""
     view, scene = camera(lens), eg.Scene([white_room()], torch.zeros(1, dtype=F64))
     adjoint = smooth_adjoint(*SIZE, 1)
-    reverse = found(view, lambda image: (image * adjoint).sum(), scene, edge_samples=20_000)
+    reverse = found(view, lambda image: (image * adjoint).sum(), scene, sampling=eg.Sampling(edges=20_000))
     K_dot = torch.tensor([[0.3, 0.1, -0.5], [0.0, 0.2, 0.4], [0.0, 0.0, 0.0]], dtype=F64)
     d_dot = 0.01 * torch.linspace(1, 2, len(view.coefficients), dtype=F64)
 
     def image(K: Tensor, d: Tensor) -> Tensor:
-        return eg.render(scene, view.replace(K=K, distortion=d), 4, edge_samples=20_000)
+        return eg.render(scene, view.replace(K=K, distortion=d), 4, sampling=eg.Sampling(edges=20_000), seed=0)
 
     forward = torch.func.jvp(image, (view.K, view.coefficients), (K_dot, d_dot))[1]
     expected = float((reverse[0] * K_dot[:2]).sum() + (reverse[1] * d_dot).sum())
     assert float((forward * adjoint).sum()) == pytest.approx(expected, rel=5e-3)
-    place = eg.screen_gradient(scene, view, adjoint, edge_samples=20_000).sum((0, 1))
+    place = eg.screen_gradient(scene, view, adjoint, sampling=eg.Sampling(edges=20_000), seed=0).sum((0, 1))
     check(place, reverse[0][:, 2], 5e-3)
 
 
@@ -264,7 +264,7 @@ def test_channels(lens: str) -> None:
     """Alpha is the area, and position jumps from the room to zero."""
     view = camera(lens)
     K, d = view.K.clone().requires_grad_(), view.coefficients.clone().requires_grad_()
-    layers = eg.render_aovs(white_room(), view.replace(K=K, distortion=d), ["alpha", "position"], spp=4)
+    layers = eg.render_aovs(white_room(), view.replace(K=K, distortion=d), ["alpha", "position"], spp=4, seed=0)
     truth = derivative(lambda K, d: area(outline(lens, K, d)), view)
     for gradient, expected in zip(
         torch.autograd.grad(layers["alpha"].sum(), [K, d], retain_graph=True), truth, strict=True
@@ -277,18 +277,18 @@ def test_shader(lens: str) -> None:
     """The gradient is that without a shader. The places of samples show something: a ray goes there."""
     scene = eg.Scene([white_room()], torch.full((1,), 0.25, dtype=F64))
     view, adjoint = camera(lens), smooth_adjoint(*SIZE, 1)
-    expected = found(view, lambda image: (image * adjoint).sum(), scene, edge_samples=20_000)
+    expected = found(view, lambda image: (image * adjoint).sum(), scene, sampling=eg.Sampling(edges=20_000))
 
     def plain(hits: eg.Hits) -> Tensor:
         return torch.ones((len(hits), 1), dtype=F64)
 
     for gradient, truth in zip(
-        found(view, lambda image: (image * adjoint).sum(), scene, edge_samples=20_000, shader=plain),
+        found(view, lambda image: (image * adjoint).sum(), scene, sampling=eg.Sampling(edges=20_000), shader=plain),
         expected,
         strict=True,
     ):
         check(gradient, truth, 5e-3)
-    primary = eg.primary_hits(scene, view.replace(K=view.K.clone().requires_grad_()))
+    primary = eg.primary_hits(scene, view.replace(K=view.K.clone().requires_grad_()), seed=0)
     samples = eg.edge_samples(primary, creases=False)
     assert len(samples) > 500 and len(samples.hits) == len(samples)
     assert bool(primary.context.sampler.rays_at(samples.x).along.isfinite().all())

@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.quick, pytest.mark.watched]
 F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
 ALONG = torch.tensor([0.7, 0.6, -0.2], dtype=F64)
-SAMPLES = {"surface_samples": 20_000, "edge_samples": 20_000}
+SAMPLES = {"sampling": eg.Sampling(surface=20_000, edges=20_000)}
 
 
 def tilted_cube(half: float = 0.5) -> eg.Mesh:
@@ -89,7 +89,7 @@ def test_flat_shading() -> None:
         )
 
     exact = verts_gradient(exact_image)
-    got = verts_gradient(lambda s, c: eg.render(s, c, edge_samples=200_000))
+    got = verts_gradient(lambda s, c: eg.render(s, c, sampling=eg.Sampling(edges=200_000), seed=0))
     assert (got - exact).norm() < 0.005 * exact.norm()
     silhouettes = verts_gradient(lambda s, c: exact_image(one_color(s), c))
     assert (silhouettes - exact).norm() > 0.3 * exact.norm()  # the creases are what this test is about
@@ -108,7 +108,9 @@ def test_smooth_mesh_pays_for_silhouettes_alone() -> None:
     counts, grads = {}, {}
     for kind, mesh in kinds.items():
         verts = mesh.verts.clone().requires_grad_()
-        eg.render(mesh.replace(verts=verts), camera, edge_samples=3000, surface_samples=50_000).backward(adjoint)
+        eg.render(mesh.replace(verts=verts), camera, sampling=eg.Sampling(edges=3000, surface=50_000), seed=0).backward(
+            adjoint
+        )
         grads[kind] = verts.grad
         counts[kind] = default_samples(mesh, camera, adjoint)[1]
     assert counts["vertex"] == counts["corner"] == counts["face"]
@@ -142,7 +144,7 @@ def test_loss_of_a_sparse_adjoint() -> None:
     integral."""
     mesh, camera = tilted_cube(), front_camera(48)
     with torch.no_grad():
-        covered = eg.render(mesh.replace(face_colors=torch.ones(12, 1, dtype=F64)), camera, spp=256)[..., 0]
+        covered = eg.render(mesh.replace(face_colors=torch.ones(12, 1, dtype=F64)), camera, spp=256, seed=0)[..., 0]
     y, x = (index[0].item() for index in torch.where((covered > 0.3) & (covered < 0.7)))
     adjoint = torch.zeros(48, 48, 3, dtype=F64)
     adjoint[y, x] = torch.tensor([1.0, -0.5, 0.3], dtype=F64)
@@ -155,7 +157,10 @@ def test_loss_of_a_sparse_adjoint() -> None:
 
     exact = verts_gradient(exact_image)
     got = torch.stack(
-        [verts_gradient(lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed)) for seed in range(64)]
+        [
+            verts_gradient(lambda s, c, seed=seed: eg.render(s, c, spp=1, sampling=eg.Sampling(seed=seed), seed=0))
+            for seed in range(64)
+        ]
     )
     error = (got.std(0) / 8).norm()
     assert error < 0.02 * exact.norm()
@@ -191,7 +196,7 @@ def test_vertex_in_the_eye() -> None:
         verts = torch.tensor([others[0], at_eye, others[1]], dtype=F64) + noise * torch.tensor([[1.0], [1e-9], [1.0]])
         verts.requires_grad_()
         mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=torch.eye(3, dtype=F64))
-        eg.render(mesh, camera, spp=1).sum().backward()
+        eg.render(mesh, camera, spp=1, seed=0).sum().backward()
         assert verts.grad is not None and verts.grad.isfinite().all()
 
 
@@ -207,7 +212,7 @@ def test_corners_on_the_border_up_to_rounding() -> None:
     ]
     colors = torch.ones((3, 1), dtype=F64, requires_grad=True)
     image = eg.render(
-        eg.Mesh(torch.tensor(verts, dtype=F64), torch.tensor([[0, 1, 2]]), colors=colors), camera, spp=256
+        eg.Mesh(torch.tensor(verts, dtype=F64), torch.tensor([[0, 1, 2]]), colors=colors), camera, spp=256, seed=0
     )
     image.sum().backward()
     assert colors.grad is not None
@@ -227,7 +232,9 @@ def test_slivers_hidden_by_a_hair(angle: float) -> None:
         corners = [[-0.6, 0.2, 0.0], [0.7, 0.2, 0.0], [0.1, -0.8, -0.2], [0.1, 0.2 - inside, 0.5]]
         verts = (torch.tensor(corners, dtype=F64) @ turn).requires_grad_()
         for seed in range(4):
-            image = eg.render(eg.Mesh(verts, faces, colors=colors), camera, seed=seed, surface_samples=50_000)
+            image = eg.render(
+                eg.Mesh(verts, faces, colors=colors), camera, seed=seed, sampling=eg.Sampling(surface=50_000)
+            )
             image.square().sum().backward()
         assert verts.grad is not None
         whole, hidden = float(verts.grad.norm()), float(verts.grad[3].norm())

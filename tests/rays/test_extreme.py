@@ -241,7 +241,7 @@ def test_a_signal_handler_stops_the_making_of_geometry(soup: bool):
     def step() -> Tensor:
         core.clear_geometry()
         leaf = verts.clone().requires_grad_()
-        eg.render(eg.Mesh(leaf, faces), camera, spp=1).sum().backward()
+        eg.render(eg.Mesh(leaf, faces), camera, spp=1, seed=0).sum().backward()
         assert leaf.grad is not None
         return leaf.grad
 

@@ -43,7 +43,7 @@ def image_and_gradients(
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     mesh = eg.Mesh(leaves["verts"], cube().faces, colors=leaves["colors"])
     camera = eg.Camera(leaves["world_to_camera"], leaves["K"], (12, 12), projection)
-    image = eg.render(eg.Scene(mesh, leaves["background"]), camera, 8)
+    image = eg.render(eg.Scene(mesh, leaves["background"]), camera, 8, seed=0)
     image.backward((adjoint * ADJOINT).to(image.dtype))
     return {"image": image.detach(), **{name: leaf.grad for name, leaf in leaves.items()}}
 
@@ -90,7 +90,7 @@ def shaded(world: float, shader: Callable[[eg.Hits], Tensor] | None) -> tuple[Te
     emitter = eg.Mesh(above, faces, material=eg.Material(emission=torch.tensor([5.0, 4.0, 3.0])))
     metal = eg.Mesh(verts, faces, material=eg.Material(metallic=1.0, roughness=0.5))
     scene = eg.Scene([metal, emitter], lights=[eg.DirectionalLight(torch.tensor([0.2, -0.3, -1.0]), 3.0)])
-    image = eg.render(scene, eg.Camera.look_at((0, 0, 4 * world), (0, 0, 0), size=(12, 12)), shader=shader)
+    image = eg.render(scene, eg.Camera.look_at((0, 0, 4 * world), (0, 0, 0), size=(12, 12)), shader=shader, seed=0)
     image.backward(ADJOINT.to(image.dtype))
     assert verts.grad is not None
     return image.detach(), world * verts.grad
@@ -225,7 +225,7 @@ def test_skies_of_any_brightness(brightness: float):
     radiance = torch.full((2, 4, 1), brightness, requires_grad=True)
     ball = cube().replace(colors=None, material=eg.Material(metallic=1.0, roughness=0.5))
     camera = eg.Camera.look_at((1.0, 1.5, 3.0), (0.0, 0.0, 0.0), size=(12, 12))
-    image = eg.render(eg.Scene([ball], lights=[eg.Environment(radiance)]), camera)
+    image = eg.render(eg.Scene([ball], lights=[eg.Environment(radiance)]), camera, seed=0)
     image.mean().backward()
     assert radiance.grad is not None
     # The image is linear in the sky.

@@ -109,7 +109,7 @@ def products(channels: dict[str, Tensor]) -> dict[str, Tensor]:
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 def test_values_are_exact_integrals(projection: str) -> None:
     scene, camera = two_meshes(), CAMERAS[projection]()
-    found = eg.render_aovs(scene, camera, AFFINE, spp=4096)
+    found = eg.render_aovs(scene, camera, AFFINE, spp=4096, seed=0)
     for name in AFFINE:
         exact = exact_image(as_colors(scene, camera, name), camera)
         assert found[name].shape == exact.shape
@@ -131,7 +131,7 @@ def test_shading_normals() -> None:
     normals = reference.radiance(one, camera, points)
     normals = normals / normals.norm(dim=-1, keepdim=True).clamp(min=1e-300)
     expected = normals.reshape(12, grid, 12, grid, 3).mean((1, 3))
-    found = eg.render_aovs(mesh, camera, ["shading_normal", "alpha"], spp=4096)
+    found = eg.render_aovs(mesh, camera, ["shading_normal", "alpha"], spp=4096, seed=0)
     assert (found["shading_normal"] - expected).abs().max() < 0.02  # the grid's error where an edge cuts a pixel
     # Within a face, far more exactly: one pixel wholly inside a face that is seen nearly face on.
     inside = (found["alpha"][..., 0] == 1) & (expected.norm(dim=-1) > 0.99)
@@ -141,14 +141,14 @@ def test_shading_normals() -> None:
 @pytest.mark.parametrize("lens", CAMERAS)
 def test_ids_are_of_the_ray_through_the_centre(lens: str) -> None:
     scene, camera = two_meshes(), CAMERAS[lens]()
-    found = eg.render_aovs(scene, camera, ["face_id", "mesh_id"])
+    found = eg.render_aovs(scene, camera, ["face_id", "mesh_id"], seed=0)
     assert list(found) == ["face_id", "mesh_id"]
     assert all(x.shape == (SIZE, SIZE, 1) and x.dtype == torch.int64 and not x.requires_grad for x in found.values())
     mesh, face = found["mesh_id"][..., 0], found["face_id"][..., 0]
     if lens == "distorted":  # projecting the middle of what is said to be seen stays within reach of the pixel
         offset = torch.tensor([0, len(scene.meshes[0].faces)])
         assert set(mesh.unique().tolist()) == {-1, 0, 1} and (face[mesh < 0] == -1).all()
-        alpha = eg.render_aovs(scene, camera, ["alpha"], spp=256)["alpha"][..., 0]
+        alpha = eg.render_aovs(scene, camera, ["alpha"], spp=256, seed=0)["alpha"][..., 0]
         assert ((mesh >= 0) == (alpha > 0.5))[(alpha == 0) | (alpha == 1)].all()
         middles = torch.cat([m.verts[m.faces].mean(1) for m in scene.meshes])
         y, x = torch.nonzero(mesh >= 0).unbind(-1)
@@ -189,7 +189,9 @@ def test_a_pixel_holds_premultiplied_sums() -> None:
     verts = torch.tensor([[-2.0, -2.0, 5.0], [0.0, 4.0, 5.0], [0.0, -3.0, 5.0]])
     K = torch.tensor([[8.0, 0.0, 4.25], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]])
     camera = eg.Camera(torch.eye(4), K, (8, 8))
-    found = eg.render_aovs(eg.Mesh(verts, torch.tensor([[0, 1, 2]])), camera, ["depth", "alpha", "normal"], spp=256)
+    found = eg.render_aovs(
+        eg.Mesh(verts, torch.tensor([[0, 1, 2]])), camera, ["depth", "alpha", "normal"], spp=256, seed=0
+    )
     alpha, depth = found["alpha"][4, 4, 0], found["depth"][4, 4, 0]
     assert 0.2 < alpha < 0.3 and abs(depth / alpha - 5) < 1e-5
     assert torch.equal(found["normal"][4, 3], torch.tensor([0.0, 0.0, -1.0]))
@@ -207,7 +209,7 @@ def test_gradients_of_exact_integrals(projection: str) -> None:
     for seed in range(6):
         theta = torch.zeros(3, dtype=F64, requires_grad=True)
         channels = eg.render_aovs(
-            *moved(scene, camera, theta), AFFINE, 16, seed, surface_samples=10_000, edge_samples=20_000
+            *moved(scene, camera, theta), AFFINE, 16, seed, sampling=eg.Sampling(surface=10_000, edges=20_000)
         )
         for name, product in products(channels).items():
             found[name].append(torch.autograd.grad(product, theta, retain_graph=True)[0])
@@ -238,7 +240,7 @@ def finite_difference_ratio(lens: str, k: int, names: list[str], step: float = 5
             differences[name].append(((high[name] - low[name]) / (2 * step)).item())
     for seed in range(8):
         theta = torch.zeros(3, dtype=F64, requires_grad=True)
-        options: dict[str, Any] = {"surface_samples": 20_000, "edge_samples": 40_000}
+        options: dict[str, Any] = {"sampling": eg.Sampling(surface=20_000, edges=40_000)}
         for name, product in products(eg.render_aovs(*moved(scene, camera, theta), names, 16, seed, **options)).items():
             gradients[name].append(torch.autograd.grad(product, theta, retain_graph=True)[0][k].item())
     for name in names:
@@ -274,10 +276,12 @@ def test_channels_that_jump_between_faces_have_creases(name: str) -> None:
 
     def gradient(visibility: bool, **options: Any) -> Tensor:
         verts = mesh.verts.clone().requires_grad_()
-        found = eg.render_aovs(mesh.replace(verts=verts), camera, [name], visibility=visibility, **options)[name]
+        found = eg.render_aovs(
+            mesh.replace(verts=verts), camera, [name], visibility=visibility, **{"seed": 0, **options}
+        )[name]
         return torch.autograd.grad((found * patch * torch.tensor([1.0, 0.3, -0.6][: found.shape[-1]])).sum(), verts)[0]
 
-    many = {"surface_samples": 20_000, "edge_samples": 20_000}
+    many = {"sampling": eg.Sampling(surface=20_000, edges=20_000)}
     moving, still = (gradient(visibility, **many) for visibility in (True, False))
     if name == "shading_normal":
         assert torch.equal(moving, still)
@@ -294,8 +298,8 @@ def test_sharp_shading_normals_of_split_vertices() -> None:
         for name in ("normal", "shading_normal"):
             verts = mesh.verts.clone().requires_grad_()
             split = eg.Mesh(verts[mesh.faces.reshape(-1)], torch.arange(mesh.faces.numel()).reshape(-1, 3))
-            options: dict[str, Any] = {"visibility": visibility, "surface_samples": 20_000, "edge_samples": 20_000}
-            found = eg.render_aovs(split, camera, [name], **options)[name]
+            options: dict[str, Any] = {"visibility": visibility, "sampling": eg.Sampling(surface=20_000, edges=20_000)}
+            found = eg.render_aovs(split, camera, [name], **{"seed": 0, **options})[name]
             out += [found.detach(), torch.autograd.grad(products({name: found})[name], verts)[0]]
         return out
 
@@ -325,9 +329,9 @@ def test_a_batch_of_cameras_and_float32() -> None:
     one = front_camera(SIZE)
     other = one.replace(world_to_camera=one.world_to_camera + torch.tensor([[0.0, 0, 0, 0.2]] * 3 + [[0.0] * 4]))
     both = one.replace(world_to_camera=torch.stack([one.world_to_camera, other.world_to_camera]))
-    batch = eg.render_aovs(scene, both, AOVS, 16)
+    batch = eg.render_aovs(scene, both, AOVS, 16, seed=0)
     for i, camera in enumerate((one, other)):
-        single = eg.render_aovs(scene, camera, AOVS, 16)
+        single = eg.render_aovs(scene, camera, AOVS, 16, seed=0)
         for name in AOVS:
             assert batch[name].shape == (2, *single[name].shape)
             assert batch[name].dtype == (torch.int64 if name in IDS else torch.float32)
@@ -335,7 +339,7 @@ def test_a_batch_of_cameras_and_float32() -> None:
                 assert torch.equal(batch[name][i], single[name])
     # The gradient by each camera is that of its own channels.
     world = both.world_to_camera.clone().requires_grad_()
-    found = eg.render_aovs(scene, both.replace(world_to_camera=world), ["depth", "alpha"], 16)
+    found = eg.render_aovs(scene, both.replace(world_to_camera=world), ["depth", "alpha"], 16, seed=0)
     (grad,) = torch.autograd.grad(cast(Tensor, sum(products({n: x[0] for n, x in found.items()}).values())), world)
     assert (grad[1] == 0).all() and (grad[0] != 0).any()
 
@@ -345,11 +349,11 @@ def test_transforms() -> None:
     """Forward mode and reverse mode give one number, and torch.vmap is a loop."""
     scene, camera = two_meshes(), front_camera(SIZE)
     names = ["alpha", "depth", "normal", "shading_normal", "uv", "position", "barycentrics"]
-    many: dict[str, Any] = {"surface_samples": 10_000, "edge_samples": 20_000}
+    many: dict[str, Any] = {"sampling": eg.Sampling(surface=10_000, edges=20_000)}
     direction = torch.tensor([0.3, 1.0, 0.2], dtype=F64)
 
     def channels(theta: Tensor) -> dict[str, Tensor]:
-        return eg.render_aovs(*moved(scene, camera, theta), names, 16, **many)
+        return eg.render_aovs(*moved(scene, camera, theta), names, 16, **{"seed": 0, **many})
 
     still = channels(torch.zeros(3, dtype=F64))
     primal, tangent = cast(Any, torch.func.jvp)(channels, (torch.zeros(3, dtype=F64),), (direction,))
@@ -359,11 +363,11 @@ def test_transforms() -> None:
         (reverse,) = torch.autograd.grad(product, theta, retain_graph=True)
         forward = products({name: tangent[name]})[name]
         assert abs(forward - reverse @ direction) < 0.03 * (reverse * direction).abs().sum(), name
-    ids = torch.func.vmap(lambda t: eg.render_aovs(*moved(scene, camera, t), ["face_id", "alpha"]))
+    ids = torch.func.vmap(lambda t: eg.render_aovs(*moved(scene, camera, t), ["face_id", "alpha"], seed=0))
     rows = torch.stack([torch.zeros(3, dtype=F64), 0.1 * direction])
     found = ids(rows)
     for i, row in enumerate(rows):
-        for name, x in eg.render_aovs(*moved(scene, camera, row), ["face_id", "alpha"]).items():
+        for name, x in eg.render_aovs(*moved(scene, camera, row), ["face_id", "alpha"], seed=0).items():
             assert torch.equal(found[name][i], x)
 
 
@@ -371,14 +375,14 @@ def test_jvp_of_channels() -> None:
     scene, camera = two_meshes(), front_camera(SIZE)
     verts = scene.meshes[0].verts
     tangents = {verts: torch.stack([torch.ones_like(verts), verts])}
-    found, derivatives = eg.jvp(scene, camera, tangents, aovs=["alpha", "depth"])
+    found, derivatives = eg.jvp(scene, camera, tangents, aovs=["alpha", "depth"], seed=0)
     assert {n: x.shape for n, x in found.items()} == dict.fromkeys(["alpha", "depth"], (SIZE, SIZE, 1))
     assert {n: x.shape for n, x in derivatives.items()} == dict.fromkeys(["alpha", "depth"], (2, SIZE, SIZE, 1))
-    image, image_dot = eg.jvp(scene, camera, tangents)
-    both = eg.jvp(scene, camera, tangents, aovs=["image", "alpha"])
+    image, image_dot = eg.jvp(scene, camera, tangents, seed=0)
+    both = eg.jvp(scene, camera, tangents, aovs=["image", "alpha"], seed=0)
     assert torch.equal(both[0]["image"], image) and both[1]["image"].shape == image_dot.shape
     with pytest.raises(ValueError, match="aovs: expected channels with derivatives, got 'face_id'"):
-        eg.jvp(scene, camera, tangents, aovs=["face_id"])
+        eg.jvp(scene, camera, tangents, aovs=["face_id"], seed=0)
 
 
 def test_a_texture_gets_the_images_gradient() -> None:
@@ -386,9 +390,11 @@ def test_a_texture_gets_the_images_gradient() -> None:
     mesh, camera = textured(icosphere(1)), front_camera(SIZE)
     assert mesh.texture is not None
     texture = mesh.texture.clone().requires_grad_()
-    found = eg.render_aovs(mesh.replace(texture=texture), camera, ["image", "uv", "alpha"], surface_samples=50_000)
+    found = eg.render_aovs(
+        mesh.replace(texture=texture), camera, ["image", "uv", "alpha"], sampling=eg.Sampling(surface=50_000), seed=0
+    )
     (grad,) = torch.autograd.grad(products(found)["image"], texture)
-    alone = eg.render(mesh.replace(texture=texture), camera, surface_samples=50_000)
+    alone = eg.render(mesh.replace(texture=texture), camera, sampling=eg.Sampling(surface=50_000), seed=0)
     (truth,) = torch.autograd.grad((alone * smooth_adjoint(*alone.shape)).sum(), texture)
     assert (grad - truth).norm() < 0.02 * truth.norm()
 
@@ -409,7 +415,7 @@ def test_a_texture_gets_the_images_gradient() -> None:
 def test_messages(aovs: object, error: type[Exception], message: str) -> None:
     scene = eg.Scene([textured(icosphere(0)), icosphere(0)])
     with pytest.raises(error, match=message):
-        eg.render_aovs(scene, front_camera(SIZE), aovs)  # type: ignore[arg-type]
+        eg.render_aovs(scene, front_camera(SIZE), aovs, seed=0)  # type: ignore[arg-type]
 
 
 def test_faces_without_area() -> None:
@@ -418,8 +424,8 @@ def test_faces_without_area() -> None:
     faces = torch.cat([mesh.faces, torch.tensor([[3, 3, 4], [5, 5, 5]])])
     verts = mesh.verts.clone().requires_grad_()
     names = ["normal", "shading_normal", "depth"]
-    found = eg.render_aovs(eg.Mesh(verts, faces), front_camera(SIZE), names)
-    plain = eg.render_aovs(eg.Mesh(mesh.verts, mesh.faces), front_camera(SIZE), names)
+    found = eg.render_aovs(eg.Mesh(verts, faces), front_camera(SIZE), names, seed=0)
+    plain = eg.render_aovs(eg.Mesh(mesh.verts, mesh.faces), front_camera(SIZE), names, seed=0)
     assert all(torch.equal(found[name], plain[name]) for name in names)
     (grad,) = torch.autograd.grad(cast(Tensor, sum(products(found).values())), verts)
     assert grad.isfinite().all()

@@ -27,7 +27,7 @@ SCENES = {
     "triangles": occluded_triangle,
     "plain": lambda: cube().replace(colors=None),
     "one colour": one_colour,
-    "creases": creased,
+    "sampling": eg.Sampling(creases=creased),
     "texture": textured,
     "inside": inside,
     "nowhere": nowhere,
@@ -68,7 +68,7 @@ def step(kernel, scene, camera=CAMERA, kinds=(), adjoint=None, **options) -> dic
     """Return what the kernel did in the backward pass of render(), summed over the cameras; zeros if there was none."""
     scene, camera = requiring(scene, camera, kinds)
     kernel.scenes.clear(), kernel.forward.clear(), kernel.backward.clear()
-    image = eg.render(scene, camera, **{"spp": 4, **options})
+    image = eg.render(scene, camera, **{"seed": 0, "spp": 4, **options})
     if image.requires_grad:
         image.backward(torch.ones_like(image) if adjoint is None else adjoint)
     done = {name: 0.0 for name in (*COUNTS, *PARTS)}
@@ -129,7 +129,7 @@ def test_samples_are_an_upper_bound(kernel):
 
 def test_options_reach_the_plan():
     scene, camera = requiring(one_triangle(), CAMERA, ("verts",))
-    planned = eg.plan(scene, camera, 7, surface_samples=123, edge_samples=45, filter="gaussian", seed=3)
+    planned = eg.plan(scene, camera, 7, sampling=eg.Sampling(surface=123, edges=45), filter="gaussian", seed=3)
     assert planned["image"].samples == 24 * 24 * 7
     assert planned["interior"].samples == 123 and planned["boundary"].samples == 45
     assert planned.samples == 24 * 24 * 7 + 123 + 45
@@ -153,7 +153,7 @@ def test_no_grad(kernel):
     scene, camera = requiring(textured(), CAMERA, KINDS)
     with torch.no_grad():
         planned = eg.plan(scene, camera)
-        assert not eg.render(scene, camera, spp=4).requires_grad
+        assert not eg.render(scene, camera, spp=4, seed=0).requires_grad
     assert [name for name, term in planned.items() if term.on] == ["scene", "ray structure", "image", "textures"]
     assert not kernel.backward
 
@@ -231,7 +231,7 @@ def test_no_texture_code_without_a_texture(kernel):
 def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
     """Tensors that autograd saves: the inputs, coverage, depth, and which faces were hit."""
     scene, camera = requiring(cube(), CAMERA, ("verts",))
-    node = eg.render(scene, camera, spp=4).grad_fn
+    node = eg.render(scene, camera, spp=4, seed=0).grad_fn
     while not hasattr(node, "saved_tensors"):
         node = node.next_functions[0][0]
     coverage, depth, hit, seen, *inputs = node.saved_tensors
@@ -242,7 +242,7 @@ def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
     flat.append(torch.zeros(1, 8))  # distortion
     flat += [torch.zeros(1, 8, 0), torch.zeros(12, 0)]  # attributes of vertices and of faces: none
     assert [tuple(t.shape) for t in inputs] == [tuple(t.shape) for t in flat]
-    assert eg.render(cube(), CAMERA, spp=4).grad_fn is None
+    assert eg.render(cube(), CAMERA, spp=4, seed=0).grad_fn is None
     assert eg.plan(cube(), CAMERA)["kept for backward"].bytes == 0
 
 
@@ -378,7 +378,7 @@ def test_plan_prints_as_a_table():
 def test_errors_are_those_of_render(function, change, error):
     arguments = {"scene": cube(), "camera": CAMERA, **change}
     with pytest.raises(error) as expected:
-        eg.render(**arguments)
+        eg.render(**{"seed": 0, **arguments})
     with pytest.raises(error) as got:
         function(**arguments)
     assert str(got.value) == str(expected.value)
@@ -389,7 +389,7 @@ def test_with_a_shader():
     planned = eg.plan(scene, camera, 4, shader=lambda hits: hits.normal)
     assert planned["shader"].on and planned["interior"].on and planned["boundary"].on and planned["samples"].bytes > 0
     assert not planned["creases"].on and "colors gradient" not in planned
-    assert eg.plan(scene, camera, 4, shader=lambda hits: hits.normal, creases=True)["creases"].on
+    assert eg.plan(scene, camera, 4, shader=lambda hits: hits.normal, sampling=eg.Sampling(creases=True))["creases"].on
     assert not eg.plan(creased(), CAMERA, shader=lambda hits: hits.normal)["boundary"].on
     with torch.no_grad():
         assert not eg.plan(creased(), CAMERA, shader=lambda hits: hits.normal)["samples"].on
@@ -403,5 +403,11 @@ def test_a_shader_that_does_not_fit_is_refused_before_it_runs(monkeypatch: pytes
     monkeypatch.setattr(memory, "available", lambda: 100 << 20)
     asked = []
     with pytest.raises(MemoryError, match=r"render with a shader: expected to need at most the 105 MB .* lower"):
-        eg.render(creased(), CAMERA, shader=lambda hits: asked.append(hits) or hits.normal, surface_samples=10**7)
+        eg.render(
+            creased(),
+            CAMERA,
+            shader=lambda hits: asked.append(hits) or hits.normal,
+            sampling=eg.Sampling(surface=10**7),
+            seed=0,
+        )
     assert not asked

@@ -55,7 +55,7 @@ def test_bits_are_those_of_single_images(threads: int) -> None:
 
 def test_a_list_where_sizes_differ_and_images_without_loss() -> None:
     verts, shared = leaves()
-    images = eg.render_batch(pairs(verts, shared, sizes=True), spp=2)
+    images = eg.render_batch(pairs(verts, shared, sizes=True), spp=2, seed=0)
     assert isinstance(images, list) and [image.shape[1] for image in images] == [20, 21, 22, 23, 24]
     images[1].sum().backward()
     assert [v.grad is not None and bool(v.grad.any()) for v in verts] == [False, True, False, False, False]
@@ -69,22 +69,22 @@ def test_lit_scenes_and_lenses_come_one_by_one() -> None:
     )
     distorted = camera(1).replace(distortion=torch.tensor([0.05, 0.0, 0.0, 0.0]))
     given = [(lit, camera(0)), (eg.Mesh(mesh.verts.float(), mesh.faces, colors=mesh.verts.float().abs()), distorted)]
-    images = eg.render_batch(given, spp=4)
+    images = eg.render_batch(given, spp=4, seed=0)
     assert isinstance(images, Tensor)
     for image, pair in zip(images, given, strict=True):
-        assert torch.equal(image, eg.render(*pair, spp=4))
+        assert torch.equal(image, eg.render(*pair, spp=4, seed=0))
 
 
 def test_errors_of_lit_scenes_name_the_pair() -> None:
     mesh = icosphere(0)
     lit = eg.Scene([mesh.replace(material=eg.Material())], lights=[eg.DirectionalLight(torch.tensor([0.0, 0, -1]))])
     camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (4, 4))
-    with pytest.raises(ValueError, match=r"pairs\[0\]: light_samples: expected"):
-        eg.render_batch([(lit, camera)], light_samples=0)
+    with pytest.raises(ValueError, match=r"pairs\[0\]: bounces: expected"):
+        eg.render_batch([(lit, camera)], bounces=0, seed=0)
     with pytest.raises(TypeError, match=r"pairs\[1\]: camera: expected"):
-        eg.render_batch([(lit, camera), (lit, 3)])  # pyright: ignore[reportArgumentType]
+        eg.render_batch([(lit, camera), (lit, 3)], seed=0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="pairs: expected at least one"):
-        eg.render_batch([])
+        eg.render_batch([], seed=0)
 
 
 def test_warnings_point_at_the_caller_and_errors_at_the_pair() -> None:
@@ -92,10 +92,10 @@ def test_warnings_point_at_the_caller_and_errors_at_the_pair() -> None:
     given = pairs(verts, shared)
     away = eg.Camera.look_at((0.0, 0.5, 3.0), (0.0, 0.0, 9.0), (0.0, 1.0, 0.0), 40.0, (20, 24))
     with pytest.warns(UserWarning, match="behind") as seen:
-        eg.render_batch([given[0], (given[1][0], away)], spp=2)
+        eg.render_batch([given[0], (given[1][0], away)], spp=2, seed=0)
     assert [warning.filename for warning in seen] == [__file__]
     with pytest.raises(ValueError, match=r"pairs\[0\]: filter: expected"):
-        eg.render_batch(given, filter="none")
+        eg.render_batch(given, filter="none", seed=0)
     with pytest.raises(ValueError, match=r"pairs\[3\]: seed: expected"):
         eg.render_batch(given, seed=[0, 1, 2, -1, 4])  # while others are rendered already
 
@@ -103,7 +103,7 @@ def test_warnings_point_at_the_caller_and_errors_at_the_pair() -> None:
 def test_second_derivatives_and_wrong_arguments() -> None:
     verts, shared = leaves()
     given = pairs(verts, shared)
-    images = eg.render_batch(given, spp=2)
+    images = eg.render_batch(given, spp=2, seed=0)
     assert isinstance(images, Tensor)
     with pytest.raises(RuntimeError, match="second derivatives"):
         torch.autograd.grad(images.square().sum(), verts[0], create_graph=True)
@@ -117,4 +117,4 @@ def test_second_derivatives_and_wrong_arguments() -> None:
         (given, {"sp": 3}, TypeError, "render_batch: expected only the options"),
     ):
         with pytest.raises(error, match=words):
-            eg.render_batch(wrong, **options)  # pyright: ignore[reportArgumentType]
+            eg.render_batch(wrong, **{"seed": 0, **options})  # pyright: ignore[reportArgumentType]

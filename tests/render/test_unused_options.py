@@ -26,28 +26,26 @@ def shader(hits: eg.Hits) -> torch.Tensor:
     [
         (UNLIT, {"bounces": 2}, "bounces"),
         (UNLIT, {"shadows": False}, "shadows"),
-        (UNLIT, {"light_samples": 4}, "light_samples"),
-        (UNLIT, {"creases": True}, "creases"),
-        (UNLIT, {"check_shader": True}, "check_shader"),
+        (UNLIT, {"sampling": eg.Sampling(lights=4)}, "sampling.lights"),
+        (UNLIT, {"sampling": eg.Sampling(creases=True)}, "sampling.creases"),
         (MIPMAPS, {"bounces": 2}, "bounces"),
-        (LIT, {"check_shader": True}, "check_shader"),
         (LIT, {"bounces": 2, "shader": shader}, "bounces"),
         (LIT, {"shadows": False, "shader": shader}, "shadows"),
-        (UNLIT, {"light_samples": 4, "shader": shader}, "light_samples"),
+        (UNLIT, {"sampling": eg.Sampling(lights=4), "shader": shader}, "sampling.lights"),
     ],
 )
 def test_an_option_without_effect_is_named(scene: eg.Scene, options: dict[str, Any], name: str) -> None:
+    own, field = options[name.split(".")[0]], name.split(".")[-1]
+    value = getattr(own, field) if name != field else own
     for function in (eg.render, eg.plan):
-        with pytest.warns(
-            UserWarning, match=f"^{name}: {options[name]} has no effect, for .*; leave {name}= out$"
-        ) as seen:
+        with pytest.warns(UserWarning, match=f"^{name}: {value} has no effect, for .*; leave {field}= out$") as seen:
             function(scene, CAMERA, 1, **options)
         assert len(seen) == 1 and seen[0].filename == __file__
 
 
 def test_channels_and_profiles_name_it_too() -> None:
     with pytest.warns(UserWarning, match=r"^bounces: 2 has no effect"):
-        eg.render_aovs(UNLIT, CAMERA, ["image", "depth"], 1, bounces=2)
+        eg.render_aovs(UNLIT, CAMERA, ["image", "depth"], 1, bounces=2, seed=0)
     with pytest.warns(UserWarning, match=r"^bounces: 2 has no effect"):
         eg.profile(UNLIT, CAMERA, spp=1, repeats=1, bounces=2)
 
@@ -55,8 +53,16 @@ def test_channels_and_profiles_name_it_too() -> None:
 def test_an_option_with_effect_or_at_its_default_is_not_named() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        eg.render(LIT, CAMERA, 1, bounces=2, shadows=False, light_samples=2, creases=True)
-        eg.render(UNLIT, CAMERA, 1, shader=shader, creases=False, check_shader=True)
-        eg.render(MIPMAPS, CAMERA, 1, creases=False)
-        eg.render(UNLIT, CAMERA, 1, bounces=1, shadows=True, light_samples=1, creases="auto", check_shader=False)
-        eg.render_aovs(LIT, CAMERA, ["depth"], 1, bounces=2)
+        eg.render(LIT, CAMERA, 1, bounces=2, shadows=False, sampling=eg.Sampling(lights=2, creases=True), seed=0)
+        eg.render(UNLIT, CAMERA, 1, shader=shader, sampling=eg.Sampling(creases=False), seed=0)
+        eg.render(MIPMAPS, CAMERA, 1, sampling=eg.Sampling(creases=False), seed=0)
+        eg.render(
+            UNLIT,
+            CAMERA,
+            1,
+            bounces=1,
+            shadows=True,
+            sampling=eg.Sampling(lights=1, creases="auto"),
+            seed=0,
+        )
+        eg.render_aovs(LIT, CAMERA, ["depth"], 1, bounces=2, seed=0)

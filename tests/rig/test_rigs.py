@@ -315,7 +315,7 @@ def test_gradients_of_bodies_that_occlude_each_other(depth: float) -> None:
         return (eg.render(scene, camera, spp=spp, seed=seed, **samples) * weight).sum().double()
 
     angles = torch.tensor([0.1, -0.3, 0.15, 0.2], dtype=torch.float64, requires_grad=True)
-    samples = {"surface_samples": 400_000, "edge_samples": 400_000}
+    samples = {"sampling": eg.Sampling(surface=400_000, edges=400_000)}
     (found,) = torch.autograd.grad(loss(angles, 4, 1, **samples), angles)
     h = 0.02
     with torch.no_grad():

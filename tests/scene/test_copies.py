@@ -39,7 +39,7 @@ def saved(thing: object) -> object:
 
 
 def image(thing: object) -> Tensor:
-    return eg.render(SCENE, thing, 4) if isinstance(thing, eg.Camera) else eg.render(thing, CAMERA, 4)
+    return eg.render(SCENE, thing, 4, seed=0) if isinstance(thing, eg.Camera) else eg.render(thing, CAMERA, 4, seed=0)
 
 
 def tensors(thing: object) -> dict[str, Tensor]:

@@ -202,7 +202,7 @@ def test_images_in_reverse_and_forward_mode() -> None:
 
     def loss(theta: Tensor, seed: int) -> Tensor:
         image = eg.render(
-            scene(uvs + theta * motion, wraps), camera, 4, seed=seed, surface_samples=400, light_samples=12
+            scene(uvs + theta * motion, wraps), camera, 4, seed=seed, sampling=eg.Sampling(surface=400, lights=12)
         )
         return (image * weights).sum()
 
@@ -227,7 +227,7 @@ def test_texture_coordinates_in_single_precision() -> None:
         uvs = COORDINATES["askew"].to(dtype).requires_grad_()
         lit = scene(COORDINATES["askew"]).to(dtype)
         floor, emitter = lit.meshes
-        image = eg.render(lit.replace(meshes=[floor, emitter.replace(uvs=uvs)]), camera.to(dtype), 4)
+        image = eg.render(lit.replace(meshes=[floor, emitter.replace(uvs=uvs)]), camera.to(dtype), 4, seed=0)
         assert image.dtype == dtype
         return torch.autograd.grad(image.sum(), uvs)[0]
 
@@ -272,7 +272,7 @@ def test_an_emitter_that_is_masked_gives_no_light_there() -> None:
         lit = eg.Scene([plane(4.0, material=eg.Material(torch.pi * vector(1, 1, 1) / 4)), emitter])
         with torch.no_grad():
             found = [
-                torch.stack([eg.render(lit, camera, 1024, seed=s, light_samples=16) for s in range(4)]),
+                torch.stack([eg.render(lit, camera, 1024, seed=s, sampling=eg.Sampling(lights=16)) for s in range(4)]),
                 reference(hits_of(lit, 20_000, PLACE, ASIDE)),
             ]
         for values in found:

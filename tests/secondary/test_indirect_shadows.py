@@ -16,7 +16,7 @@ from torch import Tensor
 import edgegrad as eg
 
 PLACE = (-3.0, 1.2, 0.2)
-FEW = {"surface_samples": 4_000, "edge_samples": 16_000}
+FEW = {"sampling": eg.Sampling(surface=4_000, edges=16_000)}
 
 
 def bright_spot() -> Tensor:
@@ -108,7 +108,7 @@ def test_both_modes_and_any_number_of_threads() -> None:
     case, zero = case_of("emitter", "caster"), torch.zeros((), dtype=F64)
 
     def image(theta: Tensor) -> Tensor:
-        return eg.render(*case(theta), 1, 0, bounces=3, surface_samples=2_000, edge_samples=1_000)
+        return eg.render(*case(theta), 1, 0, bounces=3, sampling=eg.Sampling(surface=2_000, edges=1_000))
 
     def derivatives() -> tuple[Tensor, Tensor]:
         moved: Tensor = torch.func.jvp(image, (zero,), (torch.ones_like(zero),))[1]
@@ -130,7 +130,7 @@ def test_plan() -> None:
         not eg.plan(scene, camera, 16)[row].on and not eg.plan(scene, camera, 16, bounces=2, visibility=False)[row].on
     )
     assert eg.plan(scene, camera, 16, bounces=2)[row].samples == 32 * 32 * 16 // 8
-    assert eg.plan(scene, camera, 16, bounces=2, edge_samples=70)[row].samples == 70
+    assert eg.plan(scene, camera, 16, bounces=2, sampling=eg.Sampling(edges=70))[row].samples == 70
     still, _ = case_of("emitter", "nothing")(torch.zeros((), dtype=F64))
     turned = camera.replace(K=camera.K.clone().requires_grad_())
     assert not eg.plan(still, turned, 16, bounces=2)[row].on

@@ -112,8 +112,8 @@ def gradients(case: Case, seeds: int, **options: object) -> list[float]:
 def check(case: Case, seeds: int = 4, samples: int = 4_000) -> None:
     """The gradient with shadows is that without, which has the same samples at silhouettes and no shadow boundaries. The slack of
     1.5 % is for offsets of 1e-4; with chance it stays below 4.5 %, so that a gradient 5 % off fails."""
-    found = gradients(case, seeds, edge_samples=samples)
-    right = gradients(case, seeds, edge_samples=samples, shadows=False)
+    found = gradients(case, seeds, sampling=eg.Sampling(edges=samples))
+    right = gradients(case, seeds, sampling=eg.Sampling(edges=samples), shadows=False)
     size = abs(estimate(right).mean)
     off = estimate([a - b for a, b in zip(found, right, strict=True)])
     assert 4 * off.error < 0.03 * size, f"too noisy to decide 5 %: {off} of {size}"
@@ -174,7 +174,7 @@ CLEARLY_APART = 3e-3  # world units: the derivative has changed by half a percen
 def test_a_light_above_the_eye_and_upright_edges(shape: str, offset: float) -> None:
     """The shadow of one edge lies on the silhouette of another one on the same line."""
     near, apart = (
-        estimate(gradients(Case(shape, above=2.0, offset=away), 8, edge_samples=8_000, surface_samples=8_000))
+        estimate(gradients(Case(shape, above=2.0, offset=away), 8, sampling=eg.Sampling(edges=8_000, surface=8_000)))
         for away in (offset, CLEARLY_APART)
     )
     finite_differences.check(shape, apart.mean, near, slack=0.01)
@@ -186,7 +186,7 @@ def test_a_light_above_the_eye_and_upright_edges(shape: str, offset: float) -> N
 def test_a_light_above_the_eye_against_differences(shape: str, offset: float) -> None:
     """The step is short, for within 0.01 the derivative by the box changes by 2 %."""
     case = Case(shape, above=2.0, offset=offset)
-    found = estimate(gradients(case, 12, edge_samples=16_000, surface_samples=16_000))
+    found = estimate(gradients(case, 12, sampling=eg.Sampling(edges=16_000, surface=16_000)))
     right_ratio(finite_difference(case, 0.003, 8192, 20), found)
 
 
@@ -196,7 +196,10 @@ def test_with_indirect_light(offset: float) -> None:
     near, apart = (
         estimate(
             gradients(
-                lit("point", shape="box", offset=away), 32, edge_samples=60_000, surface_samples=60_000, bounces=2
+                lit("point", shape="box", offset=away),
+                32,
+                sampling=eg.Sampling(edges=60_000, surface=60_000),
+                bounces=2,
             )
         )
         for away in (offset, CLEARLY_APART)

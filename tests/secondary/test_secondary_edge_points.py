@@ -50,7 +50,7 @@ def gradients(
 ) -> dict[str, Tensor]:
     own = leaves_of(strip)
     scene = own.scene(*(MATERIALS[name] for name in materials))
-    counts = {"edge_samples": samples, "surface_samples": 1}
+    counts = {"sampling": eg.Sampling(edges=samples, surface=1)}
     given: dict[str, Any] = {"bounces": 2, **counts, **options}
     image = eg.render(scene, own.camera, 1, 0, shadows=False, **given)
     found = torch.autograd.grad((weights.to(image) * image).sum(), list(own.tensors.values()))
@@ -141,7 +141,9 @@ def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
     def image(receiver: Tensor, reflector: Tensor, own: Tensor, pose: Tensor, K: Tensor) -> Tensor:
         moved = Strip(receiver, reflector, own, strip.camera.replace(world_to_camera=pose, K=K), strip.light)
         scene = moved.scene(MATERIALS["lambert"], MATERIALS["glossy"])
-        return eg.render(scene, moved.camera, 1, bounces=2, shadows=False, edge_samples=5_000, surface_samples=1)
+        return eg.render(
+            scene, moved.camera, 1, bounces=2, shadows=False, sampling=eg.Sampling(edges=5_000, surface=1), seed=0
+        )
 
     check_both_modes(image, values, tangents, weights)
 
@@ -151,7 +153,7 @@ def test_plan() -> None:
     scene = strip.scene(MATERIALS["lambert"], MATERIALS["lambert"])
     off, two, four = (eg.plan(scene, strip.camera, 64, bounces=n)[row] for n in (1, 2, 4))
     assert not off.on and two.samples == 6 * 8 * 64 // 8 and four.samples == 3 * two.samples
-    assert eg.plan(scene, strip.camera, 64, bounces=4, edge_samples=50)[row].samples == 150
+    assert eg.plan(scene, strip.camera, 64, bounces=4, sampling=eg.Sampling(edges=50))[row].samples == 150
     assert not eg.plan(scene, strip.camera, 64, bounces=2, visibility=False)[row].on
     still = Strip.standard().scene(MATERIALS["lambert"], MATERIALS["lambert"])
     assert eg.plan(still, strip.camera, 64, bounces=4)[row].samples == two.samples  # the camera moves alone
@@ -163,7 +165,7 @@ def test_plan() -> None:
 
 def check(case: Case, spp: int, seeds: int, bounces: int, surface_samples: int, edge_samples: int) -> None:
     change = indirect_change(case, 0.1, spp, seeds, bounces)
-    options = {"surface_samples": surface_samples, "edge_samples": edge_samples}
+    options = {"sampling": eg.Sampling(surface=surface_samples, edges=edge_samples)}
     print(right_ratio(change, indirect_gradient(case, 0.1, seeds, bounces, **options)))
 
 
@@ -229,6 +231,6 @@ def test_what_stands_on_the_reflector(dtype: torch.dtype) -> None:
         slopes.append(0.0)
         for at, share in GAUSS:
             theta = torch.tensor(at * h, dtype=F64, requires_grad=True)
-            value = loss(theta, 1, 50 + seed, edge_samples=1_500_000, surface_samples=1)
+            value = loss(theta, 1, 50 + seed, sampling=eg.Sampling(edges=1_500_000, surface=1))
             slopes[-1] += share * float(torch.autograd.grad(value, theta)[0])
     print(right_ratio(estimate(changes), estimate(slopes)))

@@ -43,7 +43,7 @@ def gradients_of(found: Border, samples: int, bounces: int = 2) -> tuple[Tensor,
     """Return the gradients of the weighted image by all tensors."""
     weights = weights_of(Strip.standard())
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in found.leaves.items()}
-    options: dict[str, Any] = {"shadows": False, "bounces": bounces, "edge_samples": samples, "surface_samples": 1}
+    options: dict[str, Any] = {"shadows": False, "bounces": bounces, "sampling": eg.Sampling(edges=samples, surface=1)}
     image = eg.render(found.scene(leaves), found.camera, 1, 0, **options)
     return torch.autograd.grad((weights.to(image) * image).sum(), list(leaves.values()))
 
@@ -194,7 +194,9 @@ def test_alpha_edge_of_the_reflector() -> None:
     receiver, reflector = two_faces(standard(), ("glossy", "glossy"))
     uvs = torch.stack([uv[0] * at[:, 0] + uv[1], at[:, 1]], 1)
     scene = lit([receiver, reflector.replace(uvs=uvs, uv_faces=reflector.faces, alpha=alpha[None, :], wrap="clamp")])
-    image = eg.render(scene, strip.camera, 1, 0, shadows=False, bounces=2, edge_samples=400_000, surface_samples=1)
+    image = eg.render(
+        scene, strip.camera, 1, 0, shadows=False, bounces=2, sampling=eg.Sampling(edges=400_000, surface=1)
+    )
     found = torch.autograd.grad((weights.to(image) * image).sum(), (alpha, uv))
     for a, b in zip(found, expected, strict=True):
         assert float((a - b).norm() / b.norm()) < 0.02, (a, b)

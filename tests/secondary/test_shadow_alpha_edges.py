@@ -95,20 +95,26 @@ MOTIONS = [
 @pytest.mark.unwatched
 @pytest.mark.parametrize(("motion", "light"), MOTIONS)
 def test_shadow_of_an_alpha_edge(motion: str, light: str) -> None:
-    found = estimate([gradient(motion, LIGHTS[light], seed, Setting, edge_samples=6_000) for seed in range(4)])
+    found = estimate(
+        [gradient(motion, LIGHTS[light], seed, Setting, sampling=eg.Sampling(edges=6_000)) for seed in range(4)]
+    )
     check(f"{light}, {motion}", exact(motion, infinite=light == "sun", kind=Setting), found)
 
 
 @pytest.mark.parametrize("kind", [Repeated, Seam])
 @pytest.mark.parametrize("motion", ["one corner", "light moves"])
 def test_shadow_of_alpha_edges_along_edges(motion: str, kind: type[Setting]) -> None:
-    found = estimate([gradient(motion, LIGHTS["point"], seed, kind, edge_samples=12_000) for seed in range(4)])
+    found = estimate(
+        [gradient(motion, LIGHTS["point"], seed, kind, sampling=eg.Sampling(edges=12_000)) for seed in range(4)]
+    )
     check(f"{kind.__name__}, {motion}", exact(motion, kind=kind), found)
 
 
 @pytest.mark.parametrize("motion", ["one corner", "u moves"])
 def test_shadow_of_nearest_texels(motion: str) -> None:
-    found = estimate([gradient(motion, LIGHTS["point"], seed, Nearest, edge_samples=12_000) for seed in range(4)])
+    found = estimate(
+        [gradient(motion, LIGHTS["point"], seed, Nearest, sampling=eg.Sampling(edges=12_000)) for seed in range(4)]
+    )
     check(f"nearest, {motion}", exact(motion, kind=Nearest), found)
 
 
@@ -117,13 +123,13 @@ def test_shadow_of_nearest_texels(motion: str) -> None:
     [m if m in ("light moves", "u moves") else pytest.param(m, marks=pytest.mark.slow) for m in Setting.motions],
 )
 def test_penumbra_of_an_alpha_edge(motion: str) -> None:
-    found = estimate([gradient(motion, panel, seed, Setting, edge_samples=8_000) for seed in range(4)])
+    found = estimate([gradient(motion, panel, seed, Setting, sampling=eg.Sampling(edges=8_000)) for seed in range(4)])
     check(f"panel, {motion}", of_panel(motion, Setting), found)
 
 
 @pytest.mark.parametrize("motion", ["alpha rises", "u moves"])
 def test_shadow_of_an_alpha_edge_before_an_even_sky(motion: str) -> None:
-    found = estimate([gradient(motion, sky, seed, Setting, edge_samples=60_000) for seed in range(6)])
+    found = estimate([gradient(motion, sky, seed, Setting, sampling=eg.Sampling(edges=60_000)) for seed in range(6)])
     check(f"sky, {motion}", of_sky(motion, Setting), found)
 
 
@@ -181,13 +187,13 @@ def test_curved_alpha_edges(name: str) -> None:
     """Central differences of images by a regular grid of rays."""
     at = FD_CASES[name]
     truth = by_quadrature(at, 0.02, 24)
-    found = derivative(at, 6, step_spacing=1 / 8, edge_samples=8000, surface_samples=20_000)
+    found = derivative(at, 6, sampling=eg.Sampling(discontinuity_spacing=1 / 8, edges=8000, surface=20_000))
     assert found.error < 0.005 * abs(truth), f"too noisy to decide: {found}"
     assert abs(found.mean - truth) < 0.02 * abs(truth), f"difference {truth}, gradient {found}"
 
 
 def test_a_blended_face_casts_the_shadow_of_a_masked_one() -> None:
-    options = {"edge_samples": 8000, "surface_samples": 20_000}
+    options = {"sampling": eg.Sampling(edges=8000, surface=20_000)}
     blended, masked = (
         derivative(case("alpha", "point", mode, camera=ASIDE), 2, **options) for mode in ("BLEND", "MASK")
     )
@@ -200,7 +206,7 @@ def seen(alpha: Tensor) -> Tensor:
     floor, leaf = plane(2.0, material=eg.Material(0.8)), quad(alpha=alpha, material=eg.Material(0.3))
     leaf = leaf.replace(verts=0.6 * leaf.verts + vector(0, 0, 1))
     scene = eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0.3, -0.2, 2.6), 10.0)])
-    return eg.render(scene, ASIDE, spp=4) * torch.linspace(0, 1, 32, dtype=torch.float64)[:, None]
+    return eg.render(scene, ASIDE, spp=4, seed=0) * torch.linspace(0, 1, 32, dtype=torch.float64)[:, None]
 
 
 def gradient_of_alpha() -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from finite_differences import Estimate, estimate, right_ratio
+from sampling_options import with_sampling
 from shadow_scenes import CASES, Case
 from torch import Tensor
 
@@ -40,8 +41,8 @@ def gradient(case: Case, seeds: int) -> Estimate:
     for seed in range(seeds):
         theta = torch.zeros((), dtype=torch.float64, requires_grad=True)
         scene, camera = case.at(theta)
-        many = {"surface_samples": 30_000, "edge_samples": 30_000}
-        image = eg.render(scene, camera, spp=64, seed=1000 + seed, light_samples=4, **many)
+        many = {"sampling": eg.Sampling(surface=30_000, edges=30_000)}
+        image = eg.render(scene, camera, spp=64, seed=1000 + seed, **with_sampling(many, lights=4))
         found.append(torch.autograd.grad((image * adjoint()).sum(), theta)[0].item())
     return estimate(found)
 

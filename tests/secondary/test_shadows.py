@@ -10,6 +10,7 @@ import pytest
 import torch
 from finite_differences import check, estimate
 from lit_scenes import vector
+from sampling_options import with_sampling
 from torch import Tensor
 
 import edgegrad as eg
@@ -124,8 +125,7 @@ def gradient(
         seed=seed,
         filter="tent",
         shader=visibility,
-        creases=False,
-        **options,
+        **with_sampling(options, creases=False),
     )
     return torch.autograd.grad((image * adjoint()).sum(), theta)[0].item()
 
@@ -270,7 +270,7 @@ def test_masked_faces_cast_no_shadow(mode, alpha):
         appearance = {"alpha": torch.full((2, 2), alpha), "material": eg.Material(0.5, alpha_mode=mode)}
         sheet = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, **appearance)
         scene = eg.Scene([sheet, floor], lights=[eg.PointLight(torch.tensor([1.2, 2.5, 2.5]), 15.0)])
-        image = eg.render(scene, camera, spp=16, shadows=shadows)
+        image = eg.render(scene, camera, spp=16, shadows=shadows, seed=0)
         (image * torch.linspace(-1, 1, 32)[:, None, None]).sum().backward()
         found.append(verts.grad)
     with_shadows, without = found
@@ -307,7 +307,7 @@ def test_shadows_fall_on_each_of_two_transparent_sheets():
         scene = eg.Scene(
             [*meshes, eg.Mesh(caster, faces, material=eg.Material(0.3))], lights=[eg.PointLight(light, 30.0)]
         )
-        image = eg.render(scene, camera, spp=16, edge_samples=1 << 14)
+        image = eg.render(scene, camera, spp=16, sampling=eg.Sampling(edges=1 << 14), seed=0)
         (image * weights).sum().backward()
         assert caster.grad is not None and light.grad is not None
         return torch.cat([caster.grad, light.grad[None]])

@@ -40,7 +40,7 @@ def test_layers_in_any_order_of_meshes(background: float | None) -> None:
     sheets = [sheet(-0.5 * k, L, a) for k, (L, a) in enumerate(zip(RADIANCES, alphas, strict=True))]
     behind = None if background is None else torch.full((3,), background, dtype=F64)
     for order in ([0, 1, 2, 3], [2, 0, 3, 1]):
-        image = eg.render(eg.Scene([sheets[k] for k in order], behind), from_above(8), spp=4)
+        image = eg.render(eg.Scene([sheets[k] for k in order], behind), from_above(8), spp=4, seed=0)
         assert torch.allclose(
             image, torch.full_like(image, over(list(RADIANCES), alphas, background or 0.0)), atol=1e-9
         )
@@ -48,10 +48,10 @@ def test_layers_in_any_order_of_meshes(background: float | None) -> None:
 
 def test_what_lies_before_something_opaque_and_an_environment() -> None:
     floor = plane().replace(verts=plane().verts - vector(0, 0, 2), material=eg.Material(0.0, emission=0.3))
-    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25), floor]), from_above(8), spp=4)
+    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25), floor]), from_above(8), spp=4, seed=0)
     assert torch.allclose(image, torch.full_like(image, over([0.9], [0.25], 0.3)), atol=1e-9)
     sky = eg.Environment(torch.tensor([0.6, 0.6, 0.6], dtype=F64))
-    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25)], lights=[sky]), from_above(8), spp=4)
+    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25)], lights=[sky]), from_above(8), spp=4, seed=0)
     assert torch.allclose(image, torch.full_like(image, over([0.9], [0.25], 0.6)), atol=1e-9)
 
 
@@ -60,7 +60,7 @@ def test_gradient_by_an_environment_that_is_seen_through(image_of_directions: bo
     """The image is linear in what shows behind the sheet."""
     radiance = torch.full((3,), 0.6, dtype=F64, requires_grad=True)
     sky = eg.Environment(radiance.expand(2, 4, 3) if image_of_directions else radiance)
-    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25, size=0.5)], lights=[sky]), from_above(8), spp=4)
+    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25, size=0.5)], lights=[sky]), from_above(8), spp=4, seed=0)
     (found,) = torch.autograd.grad(image.sum(), radiance)
     seen_through = 64 * (1 - 0.25 * 0.25)  # a quarter of the image is covered, of which a quarter is the sheet's own
     torch.testing.assert_close(found, torch.full_like(found, seen_through), rtol=1e-9, atol=0)
@@ -72,7 +72,7 @@ def test_gradients_by_alpha_radiance_and_background() -> None:
     background = torch.full((3,), 0.4, dtype=F64, requires_grad=True)
     scene = eg.Scene([sheet(0, L0, a0), sheet(-1, L1, a1)], background)
     adjoint = torch.rand(8, 8, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
-    loss = (eg.render(scene, from_above(8), spp=4, surface_samples=40_000) * adjoint).sum()
+    loss = (eg.render(scene, from_above(8), spp=4, sampling=eg.Sampling(surface=40_000), seed=0) * adjoint).sum()
     found = torch.autograd.grad(loss, [*values, background])
     expected = (a0 * L0 + (1 - a0) * (a1 * L1 + (1 - a1) * background)).expand(8, 8, 3)
     wanted = torch.autograd.grad((expected * adjoint).sum(), [*values, background])
@@ -94,7 +94,9 @@ def test_a_shader_is_composed_with_what_it_gives_behind() -> None:
         x = torch.tensor(0.0, dtype=F64, requires_grad=True)
         meshes = [mesh.replace(alpha=alpha) for mesh, alpha in zip(scene.meshes, alphas, strict=True)]
         meshes[1] = meshes[1].replace(verts=meshes[1].verts + torch.stack([x, 0 * x, 0 * x]))
-        image = eg.render(scene.replace(meshes=meshes), from_above(8), 16, shader=shader, edge_samples=20_000)
+        image = eg.render(
+            scene.replace(meshes=meshes), from_above(8), 16, shader=shader, sampling=eg.Sampling(edges=20_000), seed=0
+        )
         return image.detach(), list(torch.autograd.grad((image * adjoint).sum(), [*alphas, x]))
 
     (image, gradients), (wanted, others) = found(shader), found(None)
@@ -119,7 +121,7 @@ def test_a_texture_behind_moves_inside_and_the_border_of_the_first_sheet() -> No
         material = eg.Material(0.0, emission=eg.Texture(texture), alpha_mode="BLEND")
         second = second.replace(verts=second.verts + back, material=material)
         scene = eg.Scene([first.replace(verts=first.verts + front), second])
-        image = eg.render(scene, from_above(24), spp=spp, seed=3, surface_samples=60_000, edge_samples=20_000)
+        image = eg.render(scene, from_above(24), spp=spp, seed=3, sampling=eg.Sampling(surface=60_000, edges=20_000))
         return (image * adjoint).sum()
 
     zero, step = torch.zeros(3, dtype=F64), 0.02
@@ -141,7 +143,7 @@ def test_shadows_of_thin_and_thick_sheets() -> None:
     light = eg.DirectionalLight(vector(0, 0, -1))
     floor = plane().replace(verts=plane().verts - vector(0, 0, 1), material=eg.Material(1.0))
     dark, bright = (
-        eg.render(eg.Scene([sheet(0, 0.0, alpha), floor], lights=[light]), from_above(4), spp=1).mean()
+        eg.render(eg.Scene([sheet(0, 0.0, alpha), floor], lights=[light]), from_above(4), spp=1, seed=0).mean()
         for alpha in (0.6, 0.4)
     )
     assert float(dark) == 0 and abs(float(bright) - 0.6 / torch.pi) < 1e-6
@@ -152,7 +154,7 @@ def test_forward_mode_and_unlit_meshes() -> None:
 
     def seen(a: Tensor) -> Tensor:
         sheets = eg.Scene([sheet(0, 0.9, a), sheet(-1, 0.5, 1.0)])
-        return eg.render(sheets, from_above(4), spp=1, surface_samples=20_000)
+        return eg.render(sheets, from_above(4), spp=1, sampling=eg.Sampling(surface=20_000), seed=0)
 
     image, moved = torch.func.jvp(seen, (alpha,), (torch.ones((), dtype=F64),))[:2]
     assert torch.allclose(image, torch.full_like(image, 0.3 * 0.9 + 0.7 * 0.5))
@@ -176,7 +178,7 @@ def check_growth(heights: dict[float, tuple[float, float]], opacity: float, behi
     found = []
     for seed in range(4):
         scene = sheets(heights, square.replace(verts=square.verts * (1 + grown)))
-        image = eg.render(scene, camera, spp=4, seed=seed, edge_samples=2000)
+        image = eg.render(scene, camera, spp=4, seed=seed, sampling=eg.Sampling(edges=2000))
         found.append(torch.autograd.grad(image.sum(), grown)[0].item())
     through = 1.0
     for z, (_, alpha) in heights.items():
@@ -218,7 +220,7 @@ def behind_glass(kind: str, t: Tensor, covered: bool) -> tuple[eg.Scene, eg.Came
 )
 def test_all_that_moves_behind_a_transparent_sheet(kind: str) -> None:
     """It moves as without the transparent sheet, of which six tenths come through."""
-    options = {"edge_samples": 6000, "surface_samples": 20_000, "step_spacing": 0.125}
+    options = {"sampling": eg.Sampling(edges=6000, surface=20_000, discontinuity_spacing=0.125)}
     through, alone = (
         derivative(lambda t, covered=covered: behind_glass(kind, t, covered), 4, **options) for covered in (True, False)
     )
@@ -250,6 +252,6 @@ def test_borders_of_nearest_texels_are_searched_where_they_move(
     material = eg.Material(eg.Texture(image, filter="nearest"), alpha_mode="BLEND")
     mesh = start.replace(verts=values["verts"], uvs=values["uvs"], alpha=values["alpha"], material=material)
     scene = eg.Scene(mesh, lights=[eg.PointLight((0.3, 0.2, 2.0), values["light"])])
-    loss = eg.render(scene, from_above(4), spp=1).sum()
+    loss = eg.render(scene, from_above(4), spp=1, seed=0).sum()
     torch.autograd.grad(loss, values[moving])
     assert bool(searches) == searched

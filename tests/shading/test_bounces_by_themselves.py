@@ -15,7 +15,7 @@ from torch import Tensor
 import edgegrad as eg
 
 STEP, SEEDS = 0.05, 6
-SAMPLES: dict[str, Any] = {"surface_samples": 150_000, "edge_samples": 50_000}
+SAMPLES: dict[str, Any] = {"sampling": eg.Sampling(surface=150_000, edges=50_000)}
 
 
 def moved(theta: Tensor, floor: str) -> tuple[eg.Scene, eg.Camera]:

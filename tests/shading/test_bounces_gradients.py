@@ -17,7 +17,7 @@ def check(scene: str, motion: str, spp: int, seeds: int, h: float = 0.1, bounces
     print(right_ratio(change, indirect_gradient(case, h, seeds, bounces, **samples)))
 
 
-OPEN = {"surface_samples": 60_000, "edge_samples": 10_000}
+OPEN = {"sampling": eg.Sampling(surface=60_000, edges=10_000)}
 
 
 @pytest.mark.slow
@@ -29,7 +29,7 @@ def test_all_motions_of_paths_that_no_border_crosses(motion: str, bounces: int) 
 
 @pytest.mark.slow
 def test_strip_between_plates() -> None:
-    check("plates", "strip y", 4096, 6, surface_samples=1 << 18, edge_samples=1 << 16)
+    check("plates", "strip y", 4096, 6, sampling=eg.Sampling(surface=1 << 18, edges=1 << 16))
 
 
 @pytest.mark.slow
@@ -41,4 +41,4 @@ def test_strip_between_glossy_plates(glossy: str, roughness: float) -> None:
     scene = found._replace(meshes=found.meshes | {glossy: found.meshes[glossy].replace(material=material)})
     case = scene.moving("strip", (0.0, 1.0, 0.0))
     change = indirect_change(case, 0.1, 8192, 12)
-    print(right_ratio(change, indirect_gradient(case, 0.1, 12, surface_samples=1_000, edge_samples=60_000)))
+    print(right_ratio(change, indirect_gradient(case, 0.1, 12, sampling=eg.Sampling(surface=1_000, edges=60_000))))

@@ -69,9 +69,9 @@ def test_images_whose_points_have_several_paths(room: str) -> None:
     scene, camera = ALL_ROOMS[room](), towards_room(12)
     with torch.no_grad():
         several, single = (
-            torch.stack([eg.render(scene, camera, 16, seed, bounces=2, light_samples=n) for seed in range(16)]).mean(
-                (1, 2)
-            )
+            torch.stack(
+                [eg.render(scene, camera, 16, seed, bounces=2, sampling=eg.Sampling(lights=n)) for seed in range(16)]
+            ).mean((1, 2))
             for n in (1, 2)
         )
     error = ((several.var(0) + single.var(0)) / 16).sqrt()  # of the mean over the image, by channels
@@ -89,7 +89,7 @@ def furnace(albedo: Tensor) -> eg.Scene:
 def test_white_furnace(bounces: int) -> None:
     albedo = torch.full((3,), 0.8, dtype=F64, requires_grad=True)
     camera = eg.Camera.look_at((0.3, 0.1, 0.2), (1.0, 0.4, 0.1), fov_y=60.0, size=(32, 32))
-    image = eg.render(furnace(albedo), camera, 16, bounces=bounces, surface_samples=20_000).mean()
+    image = eg.render(furnace(albedo), camera, 16, bounces=bounces, sampling=eg.Sampling(surface=20_000), seed=0).mean()
     (gradient,) = torch.autograd.grad(image, albedo)
     expected = sum(0.8**k for k in range(bounces + 1))
     slope = sum(k * 0.8 ** (k - 1) for k in range(1, bounces + 1))
@@ -111,7 +111,7 @@ def test_gradients_of_a_room() -> None:
         return (weights * eg.render(eg.Scene(meshes), camera, 256, 0, bounces=3, **options)).sum()
 
     wall, emission = (leaf.clone().requires_grad_() for leaf in leaves.values())
-    value = loss(wall, emission, surface_samples=40_000)
+    value = loss(wall, emission, sampling=eg.Sampling(surface=40_000))
     by_wall, by_emission = torch.autograd.grad(value, [wall, emission])
     assert abs(float((by_emission * emission).sum() / value.detach()) - 1) < 0.02
     step = torch.full((3,), 0.1, dtype=F64)
@@ -122,12 +122,12 @@ def test_gradients_of_a_room() -> None:
 
 def test_one_bounce_is_direct_light_and_more_add_to_it() -> None:
     scene, camera = box_room(), towards_room(12)
-    images = [eg.render(scene, camera, 16, bounces=n) for n in (1, 2, 3)]
-    assert torch.equal(images[0], eg.render(scene, camera, 16))
+    images = [eg.render(scene, camera, 16, bounces=n, seed=0) for n in (1, 2, 3)]
+    assert torch.equal(images[0], eg.render(scene, camera, 16, seed=0))
     means = [float(image.mean()) for image in images]
     assert means[0] < 0.95 * means[1] < 0.95 * means[2]
     alone = eg.Scene([quad((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), base_color=0.5), emitter()])
-    flat = [eg.render(alone, towards_room(12), 16, bounces=n).mean() for n in (1, 2)]
+    flat = [eg.render(alone, towards_room(12), 16, bounces=n, seed=0).mean() for n in (1, 2)]
     assert torch.allclose(*flat, rtol=0.02)  # nothing scatters to the floor: the light is black
 
 
@@ -136,7 +136,7 @@ def test_channels_batches_and_transforms() -> None:
     camera = towards_room(8)
 
     def image(color: Tensor) -> Tensor:
-        return eg.render(box_room("point", floor={"base_color": color}), camera, 4, bounces=3)
+        return eg.render(box_room("point", floor={"base_color": color}), camera, 4, bounces=3, seed=0)
 
     found, moved = torch.func.jvp(image, (color,), (torch.ones(3, dtype=F64),))
     leaf = color.clone().requires_grad_()
@@ -145,11 +145,12 @@ def test_channels_batches_and_transforms() -> None:
     assert abs(float(moved.sum()) - float(gradient.sum())) < 1e-9 * float(gradient.sum())
     scene = box_room("point")
     assert torch.equal(
-        eg.render(scene, camera, 4, bounces=3), eg.render_aovs(scene, camera, ["image"], 4, bounces=3)["image"]
+        eg.render(scene, camera, 4, bounces=3, seed=0),
+        eg.render_aovs(scene, camera, ["image"], 4, bounces=3, seed=0)["image"],
     )
-    pair = eg.render(scene, eg.Camera.stack([camera, camera]), 4, bounces=3)
+    pair = eg.render(scene, eg.Camera.stack([camera, camera]), 4, bounces=3, seed=0)
     assert torch.allclose(pair[0].mean(), pair[1].mean(), rtol=0.1) and torch.equal(
-        pair[0], eg.render(scene, camera, 4, bounces=3)
+        pair[0], eg.render(scene, camera, 4, bounces=3, seed=0)
     )
 
 
@@ -177,12 +178,12 @@ def test_borders_without_samples_are_refused() -> None:
             with pytest.raises(ValueError, match=f"bounces: {name} requires a gradient.*{why}"):
                 function(other, camera, 4, bounces=2)
     # Without borders there is nothing to leave out; and direct light has all of them.
-    assert eg.render(room(leaf, **sheet), camera, 4, bounces=3, visibility=False).requires_grad
-    assert eg.render(room(leaf, **sheet), camera, 4).requires_grad
+    assert eg.render(room(leaf, **sheet), camera, 4, bounces=3, visibility=False, seed=0).requires_grad
+    assert eg.render(room(leaf, **sheet), camera, 4, seed=0).requires_grad
     with torch.no_grad():
-        eg.render(room(leaf, **sheet), camera, 4, bounces=3)
+        eg.render(room(leaf, **sheet), camera, 4, bounces=3, seed=0)
     with pytest.raises(ValueError, match="bounces: expected an int from 1"):
-        eg.render(scene, camera, 4, bounces=0)
+        eg.render(scene, camera, 4, bounces=0, seed=0)
 
 
 def test_creases_that_no_light_reaches_directly() -> None:
@@ -206,7 +207,7 @@ def test_what_moves(bounces: int) -> None:
     leaves = [mesh.verts.clone().requires_grad_() for mesh in scene.meshes]
     moved = scene.replace(meshes=[mesh.replace(verts=v) for mesh, v in zip(scene.meshes, leaves, strict=True)])
     pose = camera.world_to_camera.clone().requires_grad_()
-    image = eg.render(moved, camera.replace(world_to_camera=pose), 4, bounces=bounces)
+    image = eg.render(moved, camera.replace(world_to_camera=pose), 4, bounces=bounces, seed=0)
     gradients = torch.autograd.grad(image.sum(), [*leaves, pose])
     assert all(bool(gradient.isfinite().all()) and float(gradient.abs().sum()) > 0 for gradient in gradients)
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from bounce_scenes import SIZE, adjoint, case_of, indirect_change
 from finite_differences import Case, Estimate, estimate
+from sampling_options import with_sampling
 
 import edgegrad as eg
 from edgegrad.light.radiance import CLOSER_STEPS
@@ -34,9 +35,11 @@ def of_few_samples(case: Case) -> Estimate:
         value = 0.0
         for sign, bounces in ((1, 2), (-1, 1)):
             theta = torch.tensor(at, dtype=F64, requires_grad=True)
-            options: dict[str, Any] = {"surface_samples": 2_000, "edge_samples": 2_000}
+            options: dict[str, Any] = {"sampling": eg.Sampling(surface=2_000, edges=2_000)}
             spacing = 1.0 if bounces > 1 else 1 / CLOSER_STEPS  # of the same samples
-            image = eg.render(*case(theta), 1, seed, bounces=bounces, step_spacing=spacing, **options)
+            image = eg.render(
+                *case(theta), 1, seed, bounces=bounces, **with_sampling(options, discontinuity_spacing=spacing)
+            )
             (slope,) = torch.autograd.grad((adjoint()[:, :, None] * image).sum() / SIZE**2, theta)
             value += sign * float(slope)
         found.append(value)

@@ -306,7 +306,9 @@ MOST = {("softbox", 0.2): 0.14, ("softbox", 0.6): 0.126, ("ball", 0.3): 0.577, (
 @pytest.mark.parametrize(("kind", "roughness"), MOST)
 def test_noise_of_emitters_is_bounded(kind: str, roughness: float):
     scene, camera = studio(kind, roughness)
-    images = torch.stack([eg.render(scene, camera, spp=16, light_samples=4, seed=seed) for seed in range(8)]).double()
+    images = torch.stack(
+        [eg.render(scene, camera, spp=16, sampling=eg.Sampling(lights=4), seed=seed) for seed in range(8)]
+    ).double()
     found = float(images.var(0).mean().sqrt() / images.mean())
     assert 0 < found < MOST[kind, roughness], found
 

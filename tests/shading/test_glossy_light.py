@@ -124,10 +124,10 @@ def test_points_are_unbiased(name: str, roughness: float):
 def test_nothing_arrives_from_a_black_sky_of_one_texel_but_derivatives():
     radiance = torch.zeros(3, requires_grad=True)
     scene, camera = metal(eg.Environment(radiance), 0.3), from_front(16)
-    image = eg.render(scene, camera, spp=16)
+    image = eg.render(scene, camera, spp=16, seed=0)
     assert float(image.detach().abs().max()) == 0
     image.sum().backward()
-    white = float(eg.render(metal(eg.Environment(torch.ones(3)), 0.3), camera, spp=64).sum())
+    white = float(eg.render(metal(eg.Environment(torch.ones(3)), 0.3), camera, spp=64, seed=0).sum())
     assert radiance.grad is not None and float(radiance.grad.sum()) == pytest.approx(white, rel=0.03)
 
 
@@ -143,7 +143,9 @@ def from_front(size: int) -> eg.Camera:
 @pytest.mark.parametrize(("roughness", "most"), [(0.5, 0.05), (0.2, 0.03), (0.05, 0.02)])
 def test_noise_under_an_even_sky(roughness: float, most: float):
     scene, camera = metal(eg.Environment(torch.ones(32, 64, 3)), roughness), from_front(32)
-    images = torch.stack([eg.render(scene, camera, spp=16, light_samples=4, seed=seed) for seed in range(8)])
+    images = torch.stack(
+        [eg.render(scene, camera, spp=16, sampling=eg.Sampling(lights=4), seed=seed) for seed in range(8)]
+    )
     inside = images[:, 10:22, 10:22].double()
     assert 0 < float((inside.std(0) / inside.mean(0)).mean()) < most
     # White metal gives back all but what it would scatter more than once.

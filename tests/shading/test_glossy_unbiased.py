@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from light_oracle import Ball, Oracle, around
+from sampling_options import with_sampling
 from scipy.stats import t as student
 from torch import Tensor
 
@@ -30,8 +31,8 @@ F64 = torch.float64
 ALPHA = 0.01 / len(GLOSSY)
 SUMS = 16  # random, of pixels
 SEEDS, ORACLES, DIFFERENCES = 256, 32, 8
-FEW: dict[str, Any] = {"spp": 16, "surface_samples": 1_000, "edge_samples": 1_000}
-MANY: dict[str, Any] = {"spp": 64, "surface_samples": 4_000, "edge_samples": 100}
+FEW: dict[str, Any] = {"spp": 16, "sampling": eg.Sampling(surface=1_000, edges=1_000)}
+MANY: dict[str, Any] = {"spp": 64, "sampling": eg.Sampling(surface=4_000, edges=100)}
 STILL = ("brightness", "base colour", "roughness", "metallic", "normals", "alpha")  # what moves nothing
 
 
@@ -39,7 +40,7 @@ Render = Callable[[eg.Scene, eg.Camera, int], Tensor]
 
 
 def few(scene: eg.Scene, camera: eg.Camera, seed: int) -> Tensor:
-    return eg.render(scene, camera, seed=seed, light_samples=1, **FEW)
+    return eg.render(scene, camera, seed=seed, **with_sampling(FEW, lights=1))
 
 
 def sky_emitters() -> list[Ball]:

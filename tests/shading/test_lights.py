@@ -23,6 +23,7 @@ from lit_scenes import (
     uniform,
     vector,
 )
+from sampling_options import with_sampling
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -141,7 +142,7 @@ def test_negative_light_takes_away_what_it_would_give(kind: str):
     def image(sign: float) -> tuple[Tensor, Tensor]:
         scale = torch.tensor(sign, dtype=F64, requires_grad=True)
         mesh = ball(1).replace(material=eg.Material(0.8, metallic=0.5, roughness=0.6))
-        made = eg.render(eg.Scene([mesh], torch.zeros(3), lights=[light(scale)]), from_above(8), spp=4)
+        made = eg.render(eg.Scene([mesh], torch.zeros(3), lights=[light(scale)]), from_above(8), spp=4, seed=0)
         return made.detach(), torch.autograd.grad(made.sum(), scale)[0]
 
     (above, slope), (below, same) = image(1.0), image(-1.0)
@@ -187,7 +188,7 @@ def test_area_light_of_one_side():
 
 def image_of(light: Any, material: eg.Material = WHITE, **options: Any) -> Tensor:
     lights = light if isinstance(light, list) else [light]
-    return eg.render(eg.Scene([plane(material=material)], lights=lights), from_above(), **options)
+    return eg.render(eg.Scene([plane(material=material)], lights=lights), from_above(), **{"seed": 0, **options})
 
 
 def test_directional_light_on_a_plane():
@@ -199,7 +200,9 @@ def test_directions_of_any_length() -> None:
     """Any length but zero will do."""
     scene = plane(material=eg.Material(base_color=0.5))
     images = [
-        eg.render(eg.Scene([scene], lights=[eg.DirectionalLight(length * vector(0.3, 0.2, -1.0))]), from_above())
+        eg.render(
+            eg.Scene([scene], lights=[eg.DirectionalLight(length * vector(0.3, 0.2, -1.0))]), from_above(), seed=0
+        )
         for length in (1.0, 1e-14, 1e-30, 1e30)
     ]
     assert images[0].max() > 0.1
@@ -264,12 +267,14 @@ def by_light(name: str) -> Case:
 )
 def test_gradients_by_lights_are_finite_differences(name: str):
     wide = name in ("emitter", "radiance")
-    options = {"shadows": False, "light_samples": 8 if wide else 1}
-    exact = by_quadrature(by_light(name), 1e-3, 4 if name == "emitter" else 8, **options)
+    options = {"shadows": False, "sampling": eg.Sampling(lights=8 if wide else 1)}
+    exact = by_quadrature(
+        by_light(name), 1e-3, 4 if name == "emitter" else 8, shadows=False, lights_each=8 if wide else 1
+    )
     check(
         name,
         exact,
-        gradient(by_light(name), 12 if name == "radiance" else 4, surface_samples=10_000, edge_samples=500, **options),
+        gradient(by_light(name), 12 if name == "radiance" else 4, **with_sampling(options, surface=10_000, edges=500)),
     )
 
 

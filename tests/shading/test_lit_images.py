@@ -27,7 +27,7 @@ def test_shadow_boundaries_by_what_the_light_adds() -> None:
     camera, found = CAMERAS["perspective"], []
     weights = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(1))
     for shader in (None, lambda hits: radiance.radiance(hits, True, 1)):
-        image = eg.render(scene, camera, spp=4, shader=shader, edge_samples=4000)
+        image = eg.render(scene, camera, spp=4, shader=shader, sampling=eg.Sampling(edges=4000), seed=0)
         found.append(torch.autograd.grad((weights * image).sum(), [leaves["verts"], leaves["point"]]))
     for a, b in zip(*found, strict=True):
         assert float((a - b).norm()) < 1e-4 * float(a.norm()) > 0
@@ -42,7 +42,7 @@ def test_shadow_boundaries_with_nearest_texels() -> None:
         uvs, faces = torch.eye(3)[:, :2], torch.arange(3).expand(len(scene.meshes[0].faces), 3)
         glow = eg.Texture(torch.full((1, 1, 3), 0.3, dtype=F64), uvs, faces, filter=filter)
         glowing = scene.meshes[0].replace(material=eg.Material(emission=glow))
-        image = eg.render(scene.replace(meshes=[glowing, scene.meshes[1]]), CAMERAS["perspective"], spp=4)
+        image = eg.render(scene.replace(meshes=[glowing, scene.meshes[1]]), CAMERAS["perspective"], spp=4, seed=0)
         found.append(torch.autograd.grad(image.sum(), [leaves["verts"], leaves["point"]]))
     for a, b in zip(*found, strict=True):
         assert float((a - b).norm()) < 1e-5 * float(a.norm()) > 0
@@ -82,7 +82,7 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
     for scene, options in (
         (pictured, {"spp": 7, "seed": 5}),
         (plain, {"spp": 1}),
-        (plain, {"light_samples": 3, "filter": "tent", "spp": 4}),
+        (plain, {"sampling": eg.Sampling(lights=3), "filter": "tent", "spp": 4}),
         (pictured, {"shadows": False, "spp": 4}),
     ):
         found = []
@@ -94,7 +94,7 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
                         patch.setattr(radiance, "is_fused", lambda scene: False)
                     keep = lambda self: (again.append(found := kept(self)), found)[1]  # noqa: E731
                     patch.setattr(discontinuous_pixels.DiscontinuousPixels, "found", keep)
-                found.append(eg.render(scene, camera, **options))
+                found.append(eg.render(scene, camera, **{"seed": 0, **options}))
         assert float(found[0].max()) > 0.1
         assert float((found[0] - found[1]).abs().max()) <= 1e-12 * float(found[0].abs().max())
     assert ("point" not in words) or any(int(pixels.sum()) > 10 for pixels, _ in again)
@@ -102,7 +102,7 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
 
 def test_the_same_whole_image_on_any_number_of_threads() -> None:
     scene = scene_of(SCENES[-1], numbers_of(SCENES[-1]))
-    check_threads(lambda: [eg.render(scene, CAMERAS["perspective"].resized((64, 64)), spp=4)])
+    check_threads(lambda: [eg.render(scene, CAMERAS["perspective"].resized((64, 64)), spp=4, seed=0)])
 
 
 def test_radiance_that_is_not_finite_is_named() -> None:
@@ -110,7 +110,7 @@ def test_radiance_that_is_not_finite_is_named() -> None:
     ball = icosphere(2)
     scene = eg.Scene([eg.Mesh(ball.verts.float(), ball.faces, material=eg.Material())], lights=[light])
     with pytest.raises(ValueError, match=r"expected finite numbers, got .*inf"):
-        eg.render(scene, CAMERAS["perspective"])
+        eg.render(scene, CAMERAS["perspective"], seed=0)
 
 
 def test_all_tensors_get_gradients_though_the_image_depends_on_few() -> None:
@@ -125,7 +125,7 @@ def test_all_tensors_get_gradients_though_the_image_depends_on_few() -> None:
     )  # fmt: skip
     camera = CAMERAS["perspective"].replace(distortion=distortion)
     sun = eg.DirectionalLight(torch.tensor([-0.2, -0.5, -1.0]), 2.0)
-    image = eg.render(eg.Scene([mesh], lights=[sun, emitter]), camera, 4)
+    image = eg.render(eg.Scene([mesh], lights=[sun, emitter]), camera, 4, seed=0)
     leaves = [mesh.verts, alpha, emitter.position, emitter.direction, distortion]
     found = torch.autograd.grad(image.sum(), leaves)
     assert all(bool(torch.isfinite(g).all()) for g in found)
@@ -145,7 +145,7 @@ def test_extremes_are_finite(dtype: torch.dtype) -> None:
         scene = eg.Scene(
             [mesh], lights=[eg.PointLight(position), eg.SpotLight(position, torch.tensor([0.0, 0.0, -1.0]))]
         )
-        image = eg.render(scene, eg.Camera.look_at((0.3, 0.2, 3.0), (0.0, 0.0, 0.0), size=(16, 16)), spp=4)
+        image = eg.render(scene, eg.Camera.look_at((0.3, 0.2, 3.0), (0.0, 0.0, 0.0), size=(16, 16)), spp=4, seed=0)
         grads = torch.autograd.grad(image.sum(), [verts, roughness, position])
         assert bool(torch.isfinite(image).all()) and all(bool(torch.isfinite(g).all()) for g in grads)
 
@@ -181,7 +181,13 @@ def test_textured_faces_by_samples_of_pixels(samples: int | None, view: str, fil
     for seed in range(12 if samples is None else 48):
         texture = texture.detach().requires_grad_()
         image = eg.render(
-            pyramid(texture), camera, spp=64, seed=seed, filter=filter, surface_samples=samples, visibility=False
+            pyramid(texture),
+            camera,
+            spp=64,
+            seed=seed,
+            filter=filter,
+            sampling=eg.Sampling(surface=samples),
+            visibility=False,
         )
         (gradient,) = torch.autograd.grad((weights * image).sum(), texture)
         found.append([float((gradient * texture).sum().detach()), float((weights * image).sum().detach())])
@@ -207,7 +213,7 @@ def test_textured_faces_take_a_sample_a_pixel() -> None:
         return float(torch.stack(found).std(0).norm())
 
     moving = scene_of("point texture", {k: v.requires_grad_() for k, v in numbers_of("point texture").items()})
-    covered = float(eg.render_aovs(moving, camera, ["alpha"], 16)["alpha"].sum().detach())
+    covered = float(eg.render_aovs(moving, camera, ["alpha"], 16, seed=0)["alpha"].sum().detach())
     planned = eg.plan(moving, camera, spp=16)["interior"].samples
     assert covered < planned < 4 * covered
-    assert spread() < 0.6 * spread(surface_samples=planned // 8)
+    assert spread() < 0.6 * spread(sampling=eg.Sampling(surface=planned // 8))

@@ -256,7 +256,7 @@ def test_glossy_surfaces_of_many_channels_are_those_of_few() -> None:
                 scene.meshes[1].replace(material=None), torch.linspace(3.0, 1.0, 20, dtype=F64)[:3]
             )
             scene = scene.replace(meshes=[scene.meshes[0], emitter])
-        image = eg.render(scene, CAMERAS["perspective"], spp=64, light_samples=4)[..., :3]
+        image = eg.render(scene, CAMERAS["perspective"], spp=64, sampling=eg.Sampling(lights=4), seed=0)[..., :3]
         grads = torch.autograd.grad(image.mean(), list(leaves.values()))
         found.append([image.mean((0, 1)), grads[0][:3], grads[1][:3], grads[2][..., :3].sum((0, 1))])
     for a, b in zip(*found, strict=True):

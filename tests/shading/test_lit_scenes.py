@@ -36,7 +36,9 @@ WHITE = eg.Material(base_color=1.0)
 def shadowed(light: Any, **options: Any) -> Tensor:
     blocker = eg.Mesh(plane(0.25).verts + vector(0, 0, 0.5), plane().faces, material=eg.Material(0.0))
     side = eg.Camera.look_at([0.0, -4.0, 2.0], [0.0, 0.0, 0.1], (0.0, 0.0, 1.0), 40.0, (16, 16))
-    return eg.render(eg.Scene([plane(1.0, material=WHITE), blocker], lights=[light]), side, 64, **options)
+    return eg.render(
+        eg.Scene([plane(1.0, material=WHITE), blocker], lights=[light]), side, 64, **{"seed": 0, **options}
+    )
 
 
 @pytest.mark.parametrize("kind", ["directional", "point"])
@@ -75,7 +77,7 @@ def test_an_emitter_in_floats_does_not_hide_itself_in_a_scene_of_doubles(dtype: 
     )
     ground = plane(material=eg.Material(base_color=0.7), colors=torch.ones((4, 1), dtype=F64))
     images = [
-        eg.render(eg.Scene([ground, emitter.to(to)]), from_above(), spp=1, shadows=shadows)
+        eg.render(eg.Scene([ground, emitter.to(to)]), from_above(), spp=1, shadows=shadows, seed=0)
         for to, shadows in ((dtype, True), (F64, False))
     ]
     assert torch.allclose(*images, rtol=1e-5, atol=1e-7)
@@ -87,14 +89,16 @@ def test_options_of_shadows():
     assert float(with_.sum()) < 0.99 * float(without.sum())
     for kwargs, error in (
         ({"shadows": 1}, TypeError),
-        ({"light_samples": 0}, ValueError),
-        ({"light_samples": 1.5}, TypeError),
+        ({"sampling": {"lights": 1}}, TypeError),
     ):
         with pytest.raises(error, match=next(iter(kwargs))):
             shadowed(light, **kwargs)
     light = eg.Environment([1.0])
     noise = [
-        torch.stack([shadowed(light, light_samples=n, seed=seed) for seed in range(6)]).var(0).mean().sqrt()
+        torch.stack([shadowed(light, sampling=eg.Sampling(lights=n), seed=seed) for seed in range(6)])
+        .var(0)
+        .mean()
+        .sqrt()
         for n in (1, 16)
     ]
     assert noise[1] < 0.4 * noise[0]
@@ -135,7 +139,9 @@ def test_random_numbers_of_a_pixel_are_its_own():
     """A change in one corner leaves the noise of all other pixels as it is, with a constant seed."""
     emitter = eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0])
     floor, dot = plane(1.0, material=WHITE), ball(0, material=WHITE).transformed(scale=0.1, t=vector(-0.8, 0.8, 0.1))
-    images = [eg.render(eg.Scene(m, lights=[emitter]), from_above(), shadows=False) for m in ([floor], [floor, dot])]
+    images = [
+        eg.render(eg.Scene(m, lights=[emitter]), from_above(), shadows=False, seed=0) for m in ([floor], [floor, dot])
+    ]
     same = (images[0] == images[1]).all(2)
     assert bool(same[4:].all()) and bool(same[:, 4:].all()) and not bool(same[:4, :4].all())
 
@@ -193,7 +199,7 @@ def test_a_light_moved_by_a_matrix_that_enlarges():
 def test_a_scene_of_materials_without_a_light_says_so():
     scene = eg.Scene([plane(material=eg.Material(0.5))])
     with pytest.warns(UserWarning, match="scene: no light falls"):
-        assert float(eg.render(scene, from_above(4), spp=1).abs().max()) == 0
+        assert float(eg.render(scene, from_above(4), spp=1, seed=0).abs().max()) == 0
 
 
 def test_to_and_detach_take_everything_along():
@@ -214,24 +220,24 @@ def test_to_and_detach_take_everything_along():
 
 def test_renders_in_every_way():
     scene, camera = everything()
-    image = eg.render(scene, camera, 4)
-    assert image.dtype == F64 and torch.equal(image, eg.render(scene, camera, 4))
-    single = eg.render(scene.to(torch.float32), camera.to(torch.float32), 4)
+    image = eg.render(scene, camera, 4, seed=0)
+    assert image.dtype == F64 and torch.equal(image, eg.render(scene, camera, 4, seed=0))
+    single = eg.render(scene.to(torch.float32), camera.to(torch.float32), 4, seed=0)
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double().mean(), image.mean(), rtol=0.02, atol=0)
     batch = camera.replace(world_to_camera=camera.world_to_camera.expand(2, 4, 4))
-    assert eg.render(scene, batch, 4).shape == (2, 16, 16, 3)
-    aovs = eg.render_aovs(scene, camera, ["alpha", "image", "mesh_id"], 4)
+    assert eg.render(scene, batch, 4, seed=0).shape == (2, 16, 16, 3)
+    aovs = eg.render_aovs(scene, camera, ["alpha", "image", "mesh_id"], 4, seed=0)
     assert list(aovs) == ["alpha", "image", "mesh_id"] and torch.equal(aovs["image"], image)
-    plan = eg.plan(scene, camera, 4, light_samples=3)
+    plan = eg.plan(scene, camera, 4, sampling=eg.Sampling(lights=3))
     assert plan["lights"].on and plan["shadows"].on and "9 points of lights" in plan["lights"].why
     assert not eg.plan(scene, camera, shadows=False)["shadows"].on
     with pytest.raises(ValueError, match="screen_gradient: expected a scene without materials"):
-        eg.screen_gradient(scene, camera, image)
+        eg.screen_gradient(scene, camera, image, seed=0)
     with pytest.raises(ValueError, match="reference: expected a scene without materials"):
         reference.render(scene, camera)
     with pytest.raises(ValueError, match="intensity: expected numbers, got a meta tensor"):
-        eg.render(scene.replace(lights=[eg.PointLight([0.0, 0, 1], torch.ones((), device="meta"))]), camera)
+        eg.render(scene.replace(lights=[eg.PointLight([0.0, 0, 1], torch.ones((), device="meta"))]), camera, seed=0)
 
 
 def test_forward_mode_is_reverse_mode():
@@ -246,14 +252,14 @@ def test_forward_mode_is_reverse_mode():
         )
 
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-    image = eg.render(of(**leaves), camera, 4)
+    image = eg.render(of(**leaves), camera, 4, seed=0)
     g = torch.Generator().manual_seed(2)
     dots = {name: torch.randn((2, *v.shape), dtype=F64, generator=g) for name, v in values.items()}
     moved = of(**values)
     material = moved.meshes[0].material
     assert material is not None
     own = {"position": moved.lights[0].position, "roughness": material.roughness, "verts": moved.meshes[1].verts}
-    _, image_dot = eg.jvp(moved, camera, {own[name]: dots[name] for name in own}, 4)
+    _, image_dot = eg.jvp(moved, camera, {own[name]: dots[name] for name in own}, 4, seed=0)
     weight = torch.randn(image.shape, dtype=F64, generator=g)
     by = dict(zip(leaves, torch.autograd.grad((image * weight).sum(), list(leaves.values())), strict=True))
     reverse = sum((dots[name] * by[name]).reshape(2, -1).sum(1) for name in by)
@@ -271,7 +277,7 @@ def test_one_number_for_all_channels():
     ]
     for light in make:
         images = [
-            eg.render(eg.Scene([ball(1, material=WHITE)], lights=[light(c)]), from_above(8), 1)
+            eg.render(eg.Scene([ball(1, material=WHITE)], lights=[light(c)]), from_above(8), 1, seed=0)
             for c in (2.0, torch.full((3,), 2.0))
         ]
         assert torch.equal(*images) and images[0].any()
@@ -293,7 +299,7 @@ def test_a_visible_environment_is_the_background():
             ]
         )
         camera = eg.Camera(w2c, torch.tensor([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]], dtype=F64), (16, 16))
-        return eg.render(eg.Scene([far], lights=[eg.Environment(radiance)]), camera)
+        return eg.render(eg.Scene([far], lights=[eg.Environment(radiance)]), camera, seed=0)
 
     found = image(radiance, turned)
     pixels = torch.arange(16, dtype=F64)
@@ -313,8 +319,8 @@ def test_a_visible_environment_is_the_background():
         high, low = ((image(radiance, vector(k * h).sum()) * weight).sum() for k in (1, -1))
     torch.testing.assert_close(by[1], (high - low) / (2 * h), rtol=1e-4, atol=0)
     hidden = eg.Environment(radiance, visible=False)
-    assert float(eg.render(eg.Scene([far], lights=[hidden]), from_above()).detach().abs().sum()) == 0
-    shown = eg.render(eg.Scene([far], vector(1, 2, 3), lights=[eg.Environment(radiance)]), from_above())
+    assert float(eg.render(eg.Scene([far], lights=[hidden]), from_above(), seed=0).detach().abs().sum()) == 0
+    shown = eg.render(eg.Scene([far], vector(1, 2, 3), lights=[eg.Environment(radiance)]), from_above(), seed=0)
     torch.testing.assert_close(shown[0, 0], vector(1, 2, 3))
 
 
@@ -335,7 +341,7 @@ def test_second_derivatives_raise_before_a_background(kind: str) -> None:
     lights = [eg.PointLight(torch.zeros(3, dtype=F64), 3.0)] if kind == "lit" else []
     camera = eg.Camera.look_at((0.0, 0, -2), (0.0, 0, 1), size=(16, 16))
     shader = (lambda hits: hits.sample(texture)) if kind == "shader" else None
-    image = eg.render(eg.Scene([mesh], background, lights), camera, spp=4, shader=shader)
+    image = eg.render(eg.Scene([mesh], background, lights), camera, spp=4, shader=shader, seed=0)
     (gradient,) = torch.autograd.grad(image.pow(3).sum(), background, create_graph=True)
     with pytest.raises(RuntimeError, match="second derivatives"):
         torch.autograd.grad(gradient.sum(), verts)
@@ -347,7 +353,7 @@ def test_a_gradient_of_the_image_that_is_not_finite_is_named(bad: float) -> None
     verts = QUAD.clone().requires_grad_()
     mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=WHITE)
     camera = eg.Camera.look_at((0.0, 0, -2), (0.0, 0, 1), size=(16, 16))
-    image = eg.render(eg.Scene([mesh], lights=[eg.PointLight(torch.zeros(3, dtype=F64), 3.0)]), camera, spp=4)
+    image = eg.render(eg.Scene([mesh], lights=[eg.PointLight(torch.zeros(3, dtype=F64), 3.0)]), camera, spp=4, seed=0)
     adjoint = torch.zeros_like(image)
     adjoint[1, 14, 2] = bad
     with pytest.raises(ValueError, match=r"the gradient of the image: expected finite numbers, got .* at \[1, 14, 2\]"):
@@ -368,7 +374,7 @@ def test_nothing_in_view_has_gradients_of_zero(filter: str):
         emitter = torch.tensor([0, 0, -5], dtype=F64) if light is eg.PointLight else torch.ones((9, 3), dtype=F64)
         material = eg.Material(eg.Texture(texels, uvs, faces, filter=filter))
         mesh = ball(1).replace(verts=verts, material=material).transformed(t=vector(place, 0, 0))
-        image = eg.render(eg.Scene([mesh], lights=[light(emitter.requires_grad_())]), from_above(8), spp=4)
+        image = eg.render(eg.Scene([mesh], lights=[light(emitter.requires_grad_())]), from_above(8), spp=4, seed=0)
         for own in torch.autograd.grad(image.sum(), [verts, texels, emitter]):
             assert float(own.abs().max()) == 0
 
@@ -378,9 +384,9 @@ def test_emitters_that_are_masked_are_said_to_lack_a_gradient() -> None:
     emitter = plane(0.5, material=eg.Material(emission=1.0, two_sided=True), alpha=alpha).transformed(t=vector(0, 0, 1))
     moving = emitter.replace(alpha=alpha.clone().requires_grad_())
     with pytest.warns(UserWarning, match="an alpha edge ends a mesh that emits"):
-        eg.render(eg.Scene([floor, moving]), from_above())
+        eg.render(eg.Scene([floor, moving]), from_above(), seed=0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        eg.render(eg.Scene([floor, emitter]), from_above())
+        eg.render(eg.Scene([floor, emitter]), from_above(), seed=0)
         leaf = moving.replace(material=eg.Material())
-        eg.render(eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0.3, 0.2, 3))]), from_above())
+        eg.render(eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0.3, 0.2, 3))]), from_above(), seed=0)

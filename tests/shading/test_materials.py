@@ -128,7 +128,7 @@ def test_lambert_under_a_constant_environment():
     base, E = vector(0.8, 0.5, 0.2), vector(1.0, 2.0, 3.0)
     torch.testing.assert_close(at_origin(eg.Material(base), [eg.Environment(E)]), base * E, rtol=0.005, atol=0)
     scene = eg.Scene([ball(3, smooth=False, material=eg.Material(base))], lights=[eg.Environment(E)])
-    image = eg.render(scene, from_above(16, 1.2), light_samples=64)
+    image = eg.render(scene, from_above(16, 1.2), sampling=eg.Sampling(lights=64), seed=0)
     torch.testing.assert_close(image.mean((0, 1)), base * E, rtol=0.005, atol=0)
 
 
@@ -175,13 +175,13 @@ def test_emission_alone_is_the_unlit_image():
     colors = torch.rand((4, 3), dtype=F64, generator=torch.Generator().manual_seed(4))
     unlit = plane(0.8, colors=colors)
     emitting = plane(0.8, material=eg.Material(0.0, emission=colors))
-    images = [eg.render(eg.Scene([mesh]), from_above(), 64) for mesh in (unlit, emitting)]
+    images = [eg.render(eg.Scene([mesh]), from_above(), 64, seed=0) for mesh in (unlit, emitting)]
     torch.testing.assert_close(images[1].mean((0, 1)), images[0].mean((0, 1)), rtol=0.01, atol=0)
     torch.testing.assert_close(*images, rtol=0.1, atol=0.05)
     # Next to a mesh that is lit, one without a material keeps its colours.
     both = eg.Scene([unlit, ball(1, material=eg.Material()).transformed(t=vector(0, 0, -9))])
     torch.testing.assert_close(
-        eg.render(both, from_above(), 64)[4:12, 4:12], images[0][4:12, 4:12], rtol=0.1, atol=0.05
+        eg.render(both, from_above(), 64, seed=0)[4:12, 4:12], images[0][4:12, 4:12], rtol=0.1, atol=0.05
     )
 
 
@@ -284,7 +284,7 @@ def test_edges_where_no_light_jumps(specular: bool):
         eg.SpotLight([0.0, 0.5, -4.0], [0.0, 0, 1.0], 9.0, outer_angle=0.05),
     ]
     for emitters in (lights[:1], lights[1:]):
-        hits = eg.primary_hits(eg.Scene([ball_], lights=emitters), from_above()).hits
+        hits = eg.primary_hits(eg.Scene([ball_], lights=emitters), from_above(), seed=0).hits
         radiance(hits)
         noted = hits._surfaces.crease_attributes().double()
         edges: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
@@ -340,7 +340,7 @@ def by_material(name: str) -> Case:
 def test_gradients_by_materials_are_finite_differences(name: str):
     moves, options = name in ("verts", "flat"), {"shadows": False}
     exact = by_quadrature(by_material(name), 0.02 if moves else 1e-3, 24 if moves else 8, **options)
-    samples = {"surface_samples": 40_000 if moves else 30_000, "edge_samples": 40_000 if moves else 1000}
+    samples = {"sampling": eg.Sampling(surface=40_000 if moves else 30_000, edges=40_000 if moves else 1000)}
     check(name, exact, gradient(by_material(name), 12 if name == "verts" else 8, **samples, **options))
 
 
@@ -358,7 +358,9 @@ def test_gradients_by_texture_coordinates(filter: str):
         return eg.Scene([mesh], lights=[eg.PointLight([1.0, 1.0, 3.0], 50.0)]), from_above(16, 1.9)
 
     exact = by_quadrature(case, 0.1, 56)
-    check(filter, exact, gradient(case, 20, surface_samples=20_000, edge_samples=500, step_spacing=0.125))
+    check(
+        filter, exact, gradient(case, 20, sampling=eg.Sampling(surface=20_000, edges=500, discontinuity_spacing=0.125))
+    )
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------------

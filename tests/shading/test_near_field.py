@@ -49,7 +49,7 @@ def test_without_differences_noise_has_no_bound(monkeypatch: pytest.MonkeyPatch)
         for seed in range(6):
             theta = torch.zeros((), dtype=F64, requires_grad=True)
             scene, camera = camera_of(corner())(theta)
-            counts: dict[str, Any] = {"surface_samples": 4_000, "edge_samples": 1_000}
+            counts: dict[str, Any] = {"sampling": eg.Sampling(surface=4_000, edges=1_000)}
             further, direct = (eg.render(scene, camera, 1, seed, bounces=n, **counts).mean() for n in (2, 1))
             found.append(float(torch.autograd.grad(further - direct, theta)[0]))
         return estimate(found).error
@@ -69,12 +69,12 @@ def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
     def image(pose: Tensor) -> Tensor:
         moved = scene.camera.replace(world_to_camera=pose)
         lit = eg.Scene(list(scene.meshes.values()), lights=list(scene.lights))
-        return eg.render(lit, moved, 1, bounces=2, surface_samples=2_000, edge_samples=1_000)
+        return eg.render(lit, moved, 1, bounces=2, sampling=eg.Sampling(surface=2_000, edges=1_000), seed=0)
 
     check_both_modes(image, [pose], [tangent], weights)
 
 
-COUNTS = {"surface_samples": 100_000, "edge_samples": 100_000}
+COUNTS = {"sampling": eg.Sampling(surface=100_000, edges=100_000)}
 # Edges of rooms do not run along rows of pixels: where they come to the next row, all along, the derivative jumps.
 ROLLED = eg.Camera.look_at((0.3, 0.35, 3.5), (0.05, -0.1, 0.0), (0.4, 1.0, 0.0), 45.6, (32, 32)).to(F64)
 
@@ -134,7 +134,7 @@ def test_a_wider_filter_has_the_same_slope() -> None:
             moved = camera.replace(
                 world_to_camera=camera.world_to_camera + theta * ASIDE[: len(camera.world_to_camera)]
             )
-            options: dict[str, Any] = {"filter": filter, "surface_samples": 60_000, "edge_samples": 320_000}
+            options: dict[str, Any] = {"filter": filter, "sampling": eg.Sampling(surface=60_000, edges=320_000)}
             image = eg.render(scene, moved, 1, seed, bounces=2, **options)
             found.append(float(torch.autograd.grad(image.mean(), theta)[0]))
     a, b = (estimate(found) for found in slopes.values())

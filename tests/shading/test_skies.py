@@ -69,7 +69,7 @@ class Case:
             sky = eg.Environment(torch.tensor([RADIANCE], dtype=F64), visible=False)
             scene = eg.Scene([mesh, ground], lights=[sky])
             image = eg.render(
-                scene, self.camera, spp=256, seed=seed, light_samples=4, edge_samples=samples, surface_samples=samples
+                scene, self.camera, spp=256, seed=seed, sampling=eg.Sampling(lights=4, edges=samples, surface=samples)
             )
             flux = image[top:bottom, left:right].sum()
             values.append(flux.item())

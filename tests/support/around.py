@@ -110,7 +110,9 @@ def check_area(view: eg.Camera, corners: Tensor) -> None:
     white = eg.Mesh(corners, torch.tensor([[0, 1, 2]]), colors=torch.ones((3, 1), dtype=F64))
     view = view.replace(world_to_camera=M, K=K, distortion=d)
     expected = area(view, corners)
-    image = eg.render(eg.Scene([white], torch.zeros(1, dtype=F64)), view, 1024, edge_samples=200_000)
+    image = eg.render(
+        eg.Scene([white], torch.zeros(1, dtype=F64)), view, 1024, sampling=eg.Sampling(edges=200_000), seed=0
+    )
     assert float(image.detach().sum()) == pytest.approx(float(expected.detach()), rel=1e-3)
     truth, found = (torch.autograd.grad(value, leaves) for value in (expected, image.sum()))
     for name, a, b in zip(("corners", "world_to_camera", "K", "distortion"), truth, found, strict=True):
@@ -170,8 +172,8 @@ FAINT = 0.02
 
 def check_gradient(case: Case, spp: int = 2048, seeds: int = 4, step: float = 0.005, filter: str = "box") -> None:
     fd = finite_difference(case, step, spp, seeds, filter=filter)
-    found = gradient(case, 4, surface_samples=100 * spp, edge_samples=50_000, filter=filter)
-    high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256) for h in (0.01, -0.01))
+    found = gradient(case, 4, sampling=eg.Sampling(surface=100 * spp, edges=50_000), filter=filter)
+    high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256, seed=0) for h in (0.01, -0.01))
     size = float((high - low).abs().sum()) / 0.02
     assert size > 0, "nothing that moves is in view"
     noise = math.hypot(fd.error, found.error)

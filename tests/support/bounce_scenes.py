@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from finite_differences import Case, Estimate, estimate
 from room_scenes import F64
+from sampling_options import with_sampling
 from scenes import icosphere
 from torch import Tensor
 
@@ -300,7 +301,13 @@ def indirect_gradient(case: Case, h: float, seeds: int, bounces: int = 2, **opti
             for sign, n in ((1, bounces), (-1, 1)):
                 theta = torch.tensor(at * h, dtype=F64, requires_grad=True)
                 spacing = 1.0 if n > 1 else 1 / CLOSER_STEPS  # of the same samples
-                image = eg.render(*case(theta), 1, 1000 + seed, bounces=n, step_spacing=spacing, **options)
+                image = eg.render(
+                    *case(theta),
+                    1,
+                    1000 + seed,
+                    bounces=n,
+                    **with_sampling(options, discontinuity_spacing=spacing),
+                )
                 (slope,) = torch.autograd.grad((adjoint()[:, :, None] * image).sum() / SIZE**2, theta)
                 values[seed] += sign * share * float(slope)
     return estimate(values)

@@ -57,7 +57,7 @@ def with_leaves(scene: eg.Scene, camera: eg.Camera) -> tuple[eg.Scene, eg.Camera
 def image_and_gradients(scene: eg.Scene, camera: eg.Camera, **options) -> list[Tensor]:
     """The image, and the gradient of one loss of it in every floating-point tensor of scene and camera."""
     scene, camera, leaves = with_leaves(scene, camera)
-    image = eg.render(scene, camera, **{"spp": 4, **options})
+    image = eg.render(scene, camera, **{"spp": 4, "seed": 0, **options})
     return [image.detach(), *gradients(image, leaves)]
 
 

@@ -21,6 +21,7 @@ from torch.nn.functional import normalize
 
 from edgegrad.camera.camera import Camera
 from edgegrad.camera.poses import rotation
+from edgegrad.sampling import Sampling
 from edgegrad.scene.lights import DirectionalLight, PointLight
 from edgegrad.scene.material import Material
 from edgegrad.scene.mesh import Mesh
@@ -127,7 +128,7 @@ ROOMS = 1.5, 1.0  # the length of each, and half of their width and height
 LIGHT_AT = vector(0.3, 0.7, 0.8)  # what it sends through the hole itself ends on black walls
 
 
-def hole(half: float, roughness: float | None, size: int, fine: int, spp: int, samples: dict[str, int]) -> Problem:
+def hole(half: float, roughness: float | None, size: int, fine: int, spp: int, samples: dict[str, Any]) -> Problem:
     """Two closed rooms, black but for the walls at their far ends, and a wall between them with a square hole. A point light in
     one lights its far wall; the camera sees the other's."""
     length, width = ROOMS
@@ -199,12 +200,12 @@ def _scattered(got: Tensor, color: Tensor, roughness: float | None, v: Tensor, l
 
 @group.add("keyhole", "two closed rooms; light comes through a hole of 0.6 % of the wall between them", seeds=32)
 def keyhole() -> Problem:
-    return hole(0.08, None, 1, 6, 150_000, {"surface_samples": 300_000, "edge_samples": 100_000})
+    return hole(0.08, None, 1, 6, 150_000, {"sampling": Sampling(surface=300_000, edges=100_000)})
 
 
 @group.add("bounced-mirror", "a mirror-like wall, roughness 0.2, that shows another through a hole", 0.2, seeds=32)
 def mirror(roughness: float) -> Problem:
-    return hole(0.2, roughness, 8, 28, 1024, {"surface_samples": 10_000, "edge_samples": 150_000})
+    return hole(0.2, roughness, 8, 28, 1024, {"sampling": Sampling(surface=10_000, edges=150_000)})
 
 
 @group.add("integrating-sphere", "a light inside of a closed ball of albedo 0.9, 8 bounces", seeds=32)
@@ -232,7 +233,7 @@ def inside() -> Problem:
         further = sum(rho**k for k in range(1, bounces)) / R**2
         return pixels(camera, parts["brightness"] * rho / math.pi * (first + further), weights)
 
-    samples = {"surface_samples": 10_000, "edge_samples": 1_000}
+    samples = {"sampling": Sampling(surface=10_000, edges=1_000)}
     return problem(parts, make, exact, spp=64, options={"bounces": bounces, **samples})
 
 
@@ -245,7 +246,7 @@ def inside() -> Problem:
 def furnace(bounces: int) -> Problem:
     """All shines and scatters alike, so everywhere there is a point's own light times 1 + ρ + … + ρⁿ."""
     parts = {"albedo": vector(1.0, 0.9, 0.5), "emission": vector(0.06, 0.12, 0.5)}
-    samples = {"surface_samples": 10_000, "edge_samples": 1}
+    samples = {"sampling": Sampling(surface=10_000, edges=1)}
     return _furnace(parts, bounces, spp=1024, options={"bounces": bounces, **samples})
 
 
@@ -253,7 +254,7 @@ def furnace(bounces: int) -> Problem:
 def cancelling(bounces: int) -> Problem:
     """The block moves in two directions. Relative to the whole brightness, 15 % would be left without secondary edges."""
     parts = {"albedo": vector(1.0), "emission": vector(0.2), "block": torch.zeros(2, dtype=F64)}
-    samples = {"surface_samples": 20_000, "edge_samples": 8_000}
+    samples = {"sampling": Sampling(surface=20_000, edges=8_000)}
     return _furnace(parts, bounces, spp=256, options={"bounces": bounces, **samples})
 
 
@@ -324,7 +325,7 @@ def standing() -> Problem:
         sent = parts["brightness"] / travels.norm() * parts["colour of the floor"] / math.pi
         return pixels(camera, got[:, None] * sent * parts["colour of the wall"] / math.pi, weights)
 
-    samples = {"surface_samples": 20_000, "edge_samples": 200_000}
+    samples = {"sampling": Sampling(surface=20_000, edges=200_000)}
     return problem(parts, make, exact, spp=1024, options={"bounces": 2, **samples})
 
 
@@ -369,5 +370,5 @@ def million(subdivisions: int) -> Problem:
         sent = parts["brightness"] / travels.norm() * parts["colour of the lit plate"] / math.pi
         return pixels(camera, got[:, None] * sent * parts["colour of the seen plate"] / math.pi, weights)
 
-    samples = {"surface_samples": 20_000, "edge_samples": 200_000}
+    samples = {"sampling": Sampling(surface=20_000, edges=200_000)}
     return problem(parts, make, exact, spp=2048, options={"bounces": 2, **samples})

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from edgegrad.camera.camera import Camera
 from edgegrad.camera.poses import rotation
+from edgegrad.sampling import Sampling
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
@@ -52,7 +53,7 @@ class Problem:
     adjoint: Tensor | None = None  # (H, W, C), smooth_adjoint when None
     faint: bool = False  # the image's error is relative to all of it, not to what the scene adds to its background
     spp: int = 64
-    options: dict[str, Any] = field(default_factory=lambda: {"surface_samples": 20_000, "edge_samples": 20_000})
+    options: dict[str, Any] = field(default_factory=lambda: {"sampling": Sampling(surface=20_000, edges=20_000)})
 
     def cotangent(self, image: Tensor) -> Tensor:
         return smooth_adjoint(*image.shape) if self.adjoint is None else self.adjoint

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from edgegrad.sampling import Sampling
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import PointLight
 from edgegrad.scene.material import Material, Texture, vertex_normals
@@ -154,7 +155,7 @@ def mapped(make_light: MakeLight, roughness: float, metallic: float, filter: str
     finer = 1 if filter == "mipmap" else 16
     return Problem(
         parts, make, None, "finite differences", steps=steps, finer=finer, adjoint=adjoint(SIZE),
-        options={"light_samples": 4},
+        options={"sampling": Sampling(lights=4)},
     )  # fmt: skip
 
 

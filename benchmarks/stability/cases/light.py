@@ -12,6 +12,7 @@ from torch import Tensor
 
 from edgegrad.camera.camera import Camera
 from edgegrad.camera.poses import rotation
+from edgegrad.sampling import Sampling
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import AreaLight, DirectionalLight, Light, PointLight, SpotLight
 from edgegrad.scene.material import Material, vertex_normals
@@ -37,7 +38,7 @@ ANY = {  # what moves, and along which directions (n, 3)
     "camera": torch.stack([vector(1.0, 0.2, 0.3), vector(-0.1, 0.9, 0.6)]),
 }
 # At borders a tenth of the noise that the default leaves in a picture of 32², which is made for speed.
-MANY_EDGES = {"light_samples": 4, "edge_samples": 10_000}
+MANY_EDGES = {"sampling": Sampling(lights=4, edges=10_000)}
 STANDING = {**ANY, "caster": torch.stack([vector(1.0, 0.4, 0.0), vector(-0.3, 1.0, 0.0)]), "receiver": None}
 
 
@@ -134,7 +135,7 @@ def stage(
     steps |= {name: 0.005 * value for name, value in (material or {}).items() if value > 0}
     steps |= {name: step[name] if isinstance(step, Mapping) else step for name in moves if name in parts}
     settings: dict[str, Any] = {
-        "finer": 16, "options": {"light_samples": 4}, "adjoint": adjoint(),
+        "finer": 16, "options": {"sampling": Sampling(lights=4)}, "adjoint": adjoint(),
         "image": lambda scene, camera: lit_image(scene, camera, 6, 8), **fields,
     }  # fmt: skip
     return Problem(
@@ -223,7 +224,7 @@ def spot() -> Problem:
 
     # As the camera comes nearer the rim grows: where it only shifts, nearly all cancels.
     moves = {**ANY, "receiver": None, "camera": -EYE[None] / EYE.norm()}
-    return stage(make_light, moves=moves, options={"surface_samples": 100_000})
+    return stage(make_light, moves=moves, options={"sampling": Sampling(surface=100_000)})
 
 
 @group.add("sun-low", "a sun 3° above the plane", more=2)
@@ -257,7 +258,7 @@ def opposed() -> Problem:
 @group.add("million", "a caster of 3.1 M faces", slow=True)
 def million() -> Problem:
     """Each side of the box in fine squares; the float64 of the vertices keeps them flat."""
-    many = {"edge_samples": 300_000, "surface_samples": 200_000}
+    many = {"sampling": Sampling(edges=300_000, surface=200_000)}
     return stage(point(), caster=_fine(floating(), 9), equal=floating(), options=many)
 
 
@@ -297,7 +298,7 @@ def small_panel() -> Problem:
 def bright_sky() -> Problem:
     image = torch.full((8, 16, 1), 1e-3, dtype=F64)
     image[4, 14] = 1e3  # about where the light is
-    many = {"light_samples": 4, "edge_samples": 50_000, "surface_samples": 50_000}
+    many = {"sampling": Sampling(lights=4, edges=50_000, surface=50_000)}
     moves = {**ANY, "light": None, "caster": None}  # of the caster nearly all cancels
     return stage(
         lambda at, level: Environment(level * image, visible=False), moves=moves, options=many, spp=256, step=0.03,

@@ -7,6 +7,7 @@ import math
 import torch
 from oracles.exact import exact_image
 
+from edgegrad.sampling import Sampling
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
@@ -37,7 +38,7 @@ def speck() -> Problem:
     far = tilted_cube(5e2).transformed(t=vector(-4e5, 3.6e5, -1e6))
     return everything(
         Scene([near, far], background()), upright(ORIGIN), names=(" of the near", " of the far"), camera_too=False,
-        options={"surface_samples": 400_000, "edge_samples": 400_000},
+        options={"sampling": Sampling(surface=400_000, edges=400_000)},
     )  # fmt: skip
 
 

@@ -114,7 +114,8 @@ def check_seen(name: str, scene: Scene, cameras: Sequence[Camera], pose: Pose) -
     moved = scene.transformed(pose.R, pose.t, pose.scale)
     with torch.no_grad():
         covered = sum(
-            float(render_aovs(without_colors(moved), camera, ["alpha"], CHECK_SPP)["alpha"].sum()) for camera in cameras
+            float(render_aovs(without_colors(moved), camera, ["alpha"], CHECK_SPP, 0)["alpha"].sum())
+            for camera in cameras
         )
     if covered < VISIBLE:
         raise ValueError(

@@ -55,7 +55,7 @@ def warn_of_units(scene: Scene, cameras: Sequence[Camera], depths: Sequence[Tens
         if depth is None:
             continue
         with torch.no_grad():
-            seen = render_aovs(without_colors(scene), camera, ["depth", "alpha"], UNIT_SPP)
+            seen = render_aovs(without_colors(scene), camera, ["depth", "alpha"], UNIT_SPP, 0)
         alpha = seen["alpha"][..., 0]
         inside = (alpha > 0.5) & depth.isfinite()
         measured.append(depth[inside].double())
