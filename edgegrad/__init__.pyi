@@ -17,6 +17,7 @@ from .io import (
     write_image,
 )
 from .live import viewer
+from .noise import noise
 from .plan import Plan, plan
 from .points.hits import Hits
 from .points.rays import trace
@@ -95,6 +96,7 @@ __all__ = [
     "load_rig",
     "load_robot",
     "load_scene",
+    "noise",
     "plan",
     "primary_hits",
     "profile",
