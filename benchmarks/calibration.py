@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import CameraFit, calibrate, fit_camera
+from edgegrad.fit import calibrate, fit_camera
+from edgegrad.fit.pose.fit_camera import CameraFit
 
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])
 LENS = torch.tensor([-0.15, 0.05, 0.001, -0.001], dtype=torch.float64)

@@ -25,7 +25,7 @@ def scene(roughness: Tensor) -> eg.Scene:
     sky = torch.full((16, 32, 3), 0.3)
     sky[3, 6:8], sky[5, 20] = 80.0, 120.0
     mesh = eg.Mesh(verts, torch.tensor(ball.faces), normals=verts, material=metal)
-    return eg.Scene([mesh], lights=[eg.Environment(sky)])
+    return eg.Scene([mesh], lights=[eg.lights.Environment(sky)])
 
 
 def main() -> None:

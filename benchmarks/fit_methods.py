@@ -15,6 +15,7 @@ import small_fits
 import torch
 
 import edgegrad as eg
+from edgegrad.fit.descent.fit_scene import Progress
 
 PROBLEMS = {
     "pose": small_fits.pose, "light and colours": small_fits.light_and_colors,
@@ -29,7 +30,7 @@ def followed(problem: Callable[[], small_fits.Problem], method: str) -> list[tup
     found, spent = [], 0.0
     began = time.process_time()
 
-    def look(progress: eg.fit.Progress) -> None:
+    def look(progress: Progress) -> None:
         nonlocal spent, began
         spent += time.process_time() - began
         found.append((spent, loss(progress.scene, progress.cameras)))

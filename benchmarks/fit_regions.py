@@ -17,8 +17,9 @@ from photographs import photograph
 from vases import RADII, VIEW, vase
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses
+from edgegrad.fit import Parameter, PoseParameter, fit_scene, losses
 from edgegrad.fit.descent.result import Fit
+from edgegrad.fit.placement import Pose
 
 OFF = torch.tensor([1.2, 0.8, 1.2, 0.8])
 

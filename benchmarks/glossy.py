@@ -38,7 +38,7 @@ class Images:
         verts = torch.nn.functional.normalize(icosphere(5).verts.float(), dim=1)
         metal = eg.Material(base_color=torch.ones(3), metallic=1.0, roughness=roughness)
         mesh = eg.Mesh(verts, icosphere(5).faces, normals=verts, material=metal)
-        self.scene = eg.Scene([mesh], lights=[eg.Environment(sky(kind))])
+        self.scene = eg.Scene([mesh], lights=[eg.lights.Environment(sky(kind))])
         self.camera = eg.Camera.look_at((0.0, 0.3, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (SIZE, SIZE))
         self.light_samples = light_samples
 
@@ -84,11 +84,13 @@ class LightImages:
         if kind in QUADS:
             center, u, v, radiance = QUADS[kind]
             vectors = torch.tensor(center), torch.tensor(u), torch.tensor(v)
-            light = eg.AreaLight.rectangle(*vectors, radiance, two_sided=False)
+            light = eg.shapes.rectangle(
+                *vectors, material=eg.Material(base_color=0.0, emission=radiance, two_sided=False)
+            )
         else:
             place, size = LIGHT_BALL
             verts = torch.nn.functional.normalize(icosphere(3).verts.float(), dim=1) * size + torch.tensor(place)
-            light = eg.AreaLight.of(eg.Mesh(verts, icosphere(3).faces), 10.0)
+            light = eg.Mesh(verts, icosphere(3).faces).replace(material=eg.Material(base_color=0.0, emission=10.0))
         self.scene = eg.Scene([ball, floor, light])
         self.camera = eg.Camera.look_at((0.0, 1.6, 3.6), (0.0, 0.35, 0.0), (0.0, 1.0, 0.0), 36.0, (SIZE, SIZE))
 

@@ -52,7 +52,7 @@ def ball(kind: str, roughness: float) -> tuple[Parameters, Callable[[Parameters]
         material = eg.Material(p["base color"], metallic=p["metallic"], roughness=p["roughness"])
         mesh = eg.Mesh(verts + p["translation"], icosphere(5).faces, normals=verts + p["normals"], material=material)
         radiance = image * p["texels"].repeat_interleave(8, 0).repeat_interleave(8, 1)
-        return eg.Scene([mesh], lights=[eg.Environment(radiance)])
+        return eg.Scene([mesh], lights=[eg.lights.Environment(radiance)])
 
     return given, scene
 
@@ -73,7 +73,8 @@ def sheet() -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
         map_ = eg.Texture(image, p["uvs"], faces)
         material = eg.Material(torch.tensor([0.9, 0.6, 0.3]), metallic=0.8, roughness=0.2, normal_map=map_)
         return eg.Scene(
-            [eg.Mesh(verts, faces, material=material)], lights=[eg.PointLight(torch.tensor([1.0, 1.0, 3.0]), 30.0)]
+            [eg.Mesh(verts, faces, material=material)],
+            lights=[eg.lights.PointLight(torch.tensor([1.0, 1.0, 3.0]), 30.0)],
         )
 
     return {"uvs": (verts[:, :2] + 1) / 2}, scene
@@ -136,7 +137,7 @@ class MitsubaGradients:
         self.mi, self.dr = mi, dr = mitsuba.load()
         dr.set_thread_count(torch.get_num_threads())
         (mesh,), (light,) = scene.meshes, scene.lights
-        assert isinstance(light, eg.Environment) and mesh.normals is not None
+        assert isinstance(light, eg.lights.Environment) and mesh.normals is not None
         mitsuba.register(mi, dr)
         props = mi.Properties()
         props["bsdf"] = mi.load_dict(

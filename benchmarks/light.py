@@ -46,8 +46,9 @@ def images(bench: Bench) -> list[Row]:
     globe = build("globe", 512, rows=143)
     (mesh,) = globe.scene.meshes
     lights = [
-        eg.PointLight(torch.tensor([2.0, 3.0, 2.5]), 30.0), eg.DirectionalLight(torch.tensor([0.5, -1.0, -0.6]), 2.0)
-    ]  # fmt: skip
+        eg.lights.PointLight(torch.tensor([2.0, 3.0, 2.5]), 30.0),
+        eg.lights.DirectionalLight(torch.tensor([0.5, -1.0, -0.6]), 2.0),
+    ]
     unlit, lit = eg.Scene([mesh]), eg.Scene([mesh.replace(material=eg.Material())], lights=lights)
     kernel = Kernel(mesh, globe.camera, globe.adjoint)
     threads = torch.get_num_threads()

@@ -69,7 +69,7 @@ def ours(seed: int) -> Tensor:
         )
         for x, y, metallic, roughness in places()
     ]
-    scene = eg.Scene(meshes, lights=[eg.Environment(sky(), visible=False)])
+    scene = eg.Scene(meshes, lights=[eg.lights.Environment(sky(), visible=False)])
     return eg.render(scene, camera(), spp=16, sampling=eg.Sampling(lights=16), seed=seed)
 
 

@@ -127,7 +127,7 @@ def rendered(name: str, mesh: eg.Mesh, photographs: Sequence[Tensor], kind: Kind
         image = _covered(image, alpha, _view(photographs[(seed + 1) % len(photographs)], rng), rng)
     picture = _worn(image, 0.7, 0.0, 85, rng) if easy else _worn(image, BLUR, NOISE, QUALITY, rng)
     seen = eg.Mesh(mesh.verts, mesh.faces) if kind == "plain" else mesh
-    alike = eg.find_symmetries(seen, ALIKE) if kind == "plain" else None
+    alike = eg.Symmetries.find(seen, ALIKE) if kind == "plain" else None
     return Case(name, seen, picture, camera, truth, symmetries=alike)
 
 
@@ -207,10 +207,10 @@ def _lit(
     way[1], way[2] = -way[1].abs() - 0.3, 0.7 * way[2].abs()  # from above, and from the camera's side
     way = F.normalize(way, dim=0)
     lights = [
-        eg.DirectionalLight(way, float(rng.uniform(1.5, 3.5))),
-        eg.Environment(torch.from_numpy(rng.uniform(0.3, 0.6, 3)).float(), visible=False),
+        eg.lights.DirectionalLight(way, float(rng.uniform(1.5, 3.5))),
+        eg.lights.Environment(torch.from_numpy(rng.uniform(0.3, 0.6, 3)).float(), visible=False),
     ]
-    meshes = [mesh.replace(material=eg.Material(), normals=eg.vertex_normals(mesh.verts, mesh.faces)) for mesh in given]
+    meshes = [mesh.replace(material=eg.Material(), normals=mesh.vertex_normals()) for mesh in given]
     if shadow:
         across = F.normalize(torch.linalg.cross(way, torch.from_numpy(rng.normal(size=3)).float()), dim=0)
         along = torch.linalg.cross(way, across)

@@ -45,7 +45,8 @@ from objects import pebble
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, fit_camera, fit_pose, fit_poses
+from edgegrad.fit import fit_camera, fit_pose, fit_poses
+from edgegrad.fit.pose.result import PoseFit
 
 from . import photo_edges, photo_folder
 from .photo_cases import Case, Kind, Placed, clutter, rendered, several

@@ -27,7 +27,8 @@ from scipy import ndimage
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Fit, fit_shape, fit_texture, regularizers, visual_hull
+from edgegrad.fit import fit_shape, fit_texture, regularizers, visual_hull
+from edgegrad.fit.descent.result import Fit
 from edgegrad.image import linear_to_srgb, srgb_to_linear
 
 BRIGHT = 0.15  # of the brightest channel, sRGB
@@ -114,7 +115,7 @@ def refined(mesh: eg.Mesh, photos: list[Photo], rounds: int = 3) -> Iterator[eg.
             mesh, cameras, images, TEXELS, masks=masks, weights=weights, lr=0.05, steps=steps, spp=4, views_per_step=4
         ).mesh
 
-    found = textured(eg.unwrap(mesh, TEXELS), 60)
+    found = textured(eg.textures.unwrap(mesh, TEXELS), 60)
     yield found
     for _ in range(rounds):
         known = found

@@ -57,7 +57,7 @@ class Step:
     def operators(self) -> None:
         verts, texture = self.verts.clone().requires_grad_(), self.texture.clone().requires_grad_()
         pos = self.clip_space(verts)
-        rast, _ = dr.rasterize(dr.RasterizeContext(output_db=False), pos, self.faces, (SIZE, SIZE))
+        rast, _ = dr.rasterize(dr.RasterizeGLContext(output_db=False), pos, self.faces, (SIZE, SIZE))
         uv, _ = dr.interpolate(self.uvs[None], rast, self.faces)
         color = torch.where(rast[..., 3:] > 0, dr.texture(texture[None], uv), 0.0)
         image = dr.antialias(color, rast, pos, self.faces, self.topology)
@@ -77,7 +77,7 @@ def batch(lit: bool) -> Callable[[], None]:
     """Return a step of render_batch() over meshes that share vertices."""
     mesh = icosphere(3)
     camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (64, 64))
-    lights = [eg.DirectionalLight(torch.tensor([0.0, -0.3, -1.0]))] if lit else []
+    lights = [eg.lights.DirectionalLight(torch.tensor([0.0, -0.3, -1.0]))] if lit else []
     material = eg.Material() if lit else None
 
     def step() -> None:

@@ -68,19 +68,22 @@ def bodies(count: int, first: int, size: int) -> None:
 def in_light(mesh: eg.Mesh, lights: list[Any]) -> eg.Scene:
     """Return the mesh as a matte surface with smooth normals before black."""
     assert mesh.colors is not None
-    normals = eg.vertex_normals(mesh.verts, mesh.faces)
+    normals = mesh.vertex_normals()
     material = eg.Material(base_color=mesh.colors)
     return eg.Scene([mesh.replace(colors=None, normals=normals, material=material)], lights=lights)
 
 
 def harmonic(posed: eg.Mesh, light: Tensor) -> eg.Scene:
-    return in_light(posed, [eg.SphericalHarmonics(light.to(posed.verts))])
+    return in_light(posed, [eg.lights.SphericalHarmonics(light.to(posed.verts))])
 
 
 def sunny(posed: eg.Mesh, sky: Tensor, sun: Tensor, tint: Tensor) -> eg.Scene:
     """Light the mesh by a sun in the direction `sun`, which casts shadows, and a sky that casts none."""
     like = posed.verts
-    lights = [eg.DirectionalLight(-sun.to(like), 1.0, color=tint.to(like)), eg.SphericalHarmonics(sky.to(like))]
+    lights = [
+        eg.lights.DirectionalLight(-sun.to(like), 1.0, color=tint.to(like)),
+        eg.lights.SphericalHarmonics(sky.to(like)),
+    ]
     return in_light(posed, lights)
 
 
@@ -104,12 +107,12 @@ def sun_and_sky(seed: int) -> list[Any]:
     sky = torch.zeros(9, 3)
     sky[0], sky[1] = 3.0, 0.8
     return [
-        eg.DirectionalLight(torch.tensor([x, -1.2, z]), 1.6, color=torch.tensor([1.0, 0.95, 0.85])),
-        eg.SphericalHarmonics(sky),
+        eg.lights.DirectionalLight(torch.tensor([x, -1.2, z]), 1.6, color=torch.tensor([1.0, 0.95, 0.85])),
+        eg.lights.SphericalHarmonics(sky),
     ]
 
 
-def visible(rig: eg.Rig, posed: eg.Mesh, camera: eg.Camera) -> Tensor:
+def visible(rig: eg.rig.Rig, posed: eg.Mesh, camera: eg.Camera) -> Tensor:
     """Return for each joint (J,) whether its limb covers more than SEEN pixels."""
     skin = rig.deformer.skins[0]  # type: ignore[attr-defined]
     shares = eg.render(posed.replace(colors=skin.weights.to(posed.verts)), camera, 16)
@@ -156,7 +159,7 @@ TURNED = [
 ]  # fmt: skip
 
 
-def model() -> tuple[eg.Rig, Any]:
+def model() -> tuple[eg.rig.Rig, Any]:
     """Return the body model anny, of which the bones TURNED rotate."""
     import anny  # type: ignore[import-not-found]
     import roma
@@ -171,11 +174,11 @@ def model() -> tuple[eg.Rig, Any]:
         poses = roma.Rigid(turns, torch.zeros_like(turns[..., 0])).to_homogeneous()
         return given(poses, phenotype)["vertices"]
 
-    controls = {"rotations": eg.Control(torch.zeros(len(TURNED), 3), names=tuple(TURNED), rotates=True)}
+    controls = {"rotations": eg.rig.Control(torch.zeros(len(TURNED), 3), names=tuple(TURNED), rotates=True)}
     controls |= {
-        name: eg.Control(torch.tensor(0.5), torch.tensor(0.0), torch.tensor(1.0)) for name in given.phenotype_labels
+        name: eg.rig.Control(torch.tensor(0.5), torch.tensor(0.0), torch.tensor(1.0)) for name in given.phenotype_labels
     }
-    return eg.Rig.from_function(function, given.get_triangular_faces(), controls, batched=True), given
+    return eg.rig.Rig.from_function(function, given.get_triangular_faces(), controls, batched=True), given
 
 
 def model_bodies(count: int, first: int, size: int, degrees: float = 20.0) -> None:
@@ -222,7 +225,7 @@ def model_bodies(count: int, first: int, size: int, degrees: float = 20.0) -> No
 
 def arms(count: int, first: int, size: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        rig = eg.load_robot(arm.write(Path(folder) / "arm.urdf"))
+        rig = eg.rig.load(arm.write(Path(folder) / "arm.urdf"))
     for seed in range(first, first + count):
         truth, _, found, _, _ = robot.trial(rig, 8, size, seed)
         millimetres, degrees = robot.errors(found, truth)
@@ -282,11 +285,11 @@ def evaluation(count: int, first: int, size: int) -> None:
     quads = torch.stack([p, q, q + sides, p + sides], -1).reshape(-1, 4)
     faces = torch.cat([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     share = torch.exp(-0.5 * ((verts[:, 1:2] - torch.linspace(0.0, 2.0, joints)) / 0.05).square())
-    hierarchy = eg.Joints(
+    hierarchy = eg.rig.Joints(
         [f"joint {k}" for k in range(joints)], [-1, *(max(0, k - 1 - k % 3) for k in range(1, joints))],
         0.1 * torch.rand(joints, 3, generator=g), torch.zeros(joints, 3),
     )  # fmt: skip
-    rig = eg.Rig.from_arrays(eg.Mesh(verts, faces, colors=torch.rand(len(verts), 3, generator=g)), hierarchy, share)
+    rig = eg.rig.Rig.from_arrays(eg.Mesh(verts, faces, colors=torch.rand(len(verts), 3, generator=g)), hierarchy, share)
     camera = eg.Camera.look_at((0.0, 1.0, 4.0), (0.0, 1.0, 0.0), up=(0, 1, 0), fov_y=40, size=(size, size))
     target = torch.rand(size, size, 3, generator=g)
     own, whole = [], []

@@ -17,11 +17,12 @@ from edgegrad.camera.camera import Camera
 from edgegrad.files.load import load_scene
 from edgegrad.preview import framing
 from edgegrad.scene.environment import Environment
-from edgegrad.scene.lights import AreaLight, Light, PointLight
+from edgegrad.scene.lights import Light, PointLight
 from edgegrad.scene.material import Material
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 from edgegrad.scene.tree import tensors_in
+from edgegrad.shapes import rectangle
 
 BACKGROUND = (0.15, 0.25, 0.4)
 
@@ -341,7 +342,8 @@ def _lit_point(size: int, subdivisions: int = 6) -> Built:
 
 def _lit_area(size: int, subdivisions: int = 6) -> Built:
     at, u, v = (torch.tensor(x, dtype=torch.float64) for x in (LIGHT_AT, (0.0, 0.3, 0.0), (0.4, 0.0, 0.1)))
-    panel = AreaLight.rectangle(at, u, v, 8.0, two_sided=False)  # u × v points down
+    emitting = Material(base_color=0.0, emission=8.0, two_sided=False)
+    panel = rectangle(at, u, v, material=emitting)  # u × v points down
     return _lit(size, panel, "area light", subdivisions)
 
 

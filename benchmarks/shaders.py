@@ -55,20 +55,20 @@ def steps_of_time() -> dict[str, Callable[[int], None]]:
     textured = eg.Mesh(mesh.verts, mesh.faces, texture=texture, uvs=uvs, uv_faces=mesh.faces)
     net = network()
 
-    def lit(hits: eg.Hits) -> Tensor:
+    def lit(hits: eg.points.Hits) -> Tensor:
         return hits.sample(texture) * (harmonics(hits.shading_normal) @ light)
 
-    def learned(hits: eg.Hits) -> Tensor:
+    def learned(hits: eg.points.Hits) -> Tensor:
         return net(torch.cat([hits.position, hits.view], 1))
 
-    def disc(hits: eg.Hits) -> Tensor:
+    def disc(hits: eg.points.Hits) -> Tensor:
         return hits.where(0.5 - (hits.position[:, :2] - 0.1).norm(dim=1), 0.9, 0.2 + 0.2 * hits.position)
 
-    def smooth(hits: eg.Hits) -> Tensor:
+    def smooth(hits: eg.points.Hits) -> Tensor:
         inside = (0.5 - (hits.position[:, :2] - 0.1).norm(dim=1)).sigmoid()[:, None]
         return 0.9 * inside + (1 - inside) * (0.2 + 0.2 * hits.position)
 
-    def run(mesh: eg.Mesh, seed: int, shader: Callable[[eg.Hits], Tensor] | None = None) -> None:
+    def run(mesh: eg.Mesh, seed: int, shader: Callable[[eg.points.Hits], Tensor] | None = None) -> None:
         image = eg.render(mesh, camera, seed=seed, shader=shader)
         (image * adjoint).sum().backward()
 
@@ -127,7 +127,7 @@ def noise(seeds: int = 64) -> None:
     finer = camera.replace(K=torch.cat([fine * camera.K[:2], camera.K[2:]]), size=(64 * fine, 64 * fine))
     texture = torch.rand((64, 64, 3), generator=torch.Generator().manual_seed(0), dtype=F64)
 
-    def textured(hits: eg.Hits) -> Tensor:
+    def textured(hits: eg.points.Hits) -> Tensor:
         return hits.sample(texture, uv=0.5 + 0.4 * hits.position[:, :2])
 
     cases = {

@@ -64,11 +64,12 @@ RETURNED = {
 def references() -> dict[str, str]:
     """Roles by the names under which docstrings speak of public things."""
     found = {}
-    for module in (edgegrad, edgegrad.fit):
+    parts = edgegrad.lights, edgegrad.points, edgegrad.rig, edgegrad.shapes, edgegrad.textures
+    for module in (edgegrad, edgegrad.fit, *parts):
         for name in module.__all__:
             thing, path = getattr(module, name), f"{module.__name__}.{name}"
             if inspect.isclass(thing):
-                found |= {name: f":py:class:`~{path}`"} if module is edgegrad else {}
+                found |= {name: f":py:class:`~{path}`"} if module is not edgegrad.fit else {}
                 for member, value in inspect.getmembers(thing):
                     if not member.startswith("_") and inspect.isfunction(value) and value.__doc__:
                         found[f"{name}.{member}"] = f":py:meth:`{name}.{member} <{path}.{member}>`"

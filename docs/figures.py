@@ -157,10 +157,8 @@ def corner_room() -> eg.Scene:
         quad((*a, 0.0), (*d, 0.0), (*d, 2.0), (*a, 2.0), base_color=red),
         quad((*b, 0.0), (*b, 2.0), (*c, 2.0), (*c, 0.0), base_color=green),
     ]
-    lamp = eg.AreaLight.rectangle(
-        torch.tensor([0.0, 0.0, 1.98]), torch.tensor([0.4, 0.0, 0.0]), torch.tensor([0.0, -0.4, 0.0]), 7.0,
-        two_sided=False,
-    )  # fmt: skip
+    emitting = eg.Material(base_color=0.0, emission=7.0, two_sided=False)
+    lamp = eg.shapes.rectangle((0.0, 0.0, 1.98), (0.4, 0.0, 0.0), (0.0, -0.4, 0.0), material=emitting)
     box = trimesh.creation.box((0.6, 0.7, 0.7), trimesh.transformations.rotation_matrix(0.4, (0, 0, 1), (0, 0, 0)))
     verts = torch.tensor(box.vertices, dtype=torch.float32) + torch.tensor([-0.2, 0.15, 0.5])
     return eg.Scene([*walls, lamp, eg.Mesh(verts, torch.tensor(box.faces), material=eg.Material(white))])

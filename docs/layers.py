@@ -14,7 +14,7 @@ import grimp
 
 FOLDER = Path(__file__).parent
 # Names for users alone, which nothing inside imports.
-LEFT_OUT = {"image", "io", "lights", "notebook", "__main__", "_core"}
+LEFT_OUT = {"image", "lights", "notebook", "shapes", "textures", "__main__", "_core"}
 INK, BLUE, GREY = "#222222", "#1f6fb2", "#b9bec6"
 
 

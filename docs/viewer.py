@@ -18,7 +18,8 @@ from selenium import webdriver
 
 import edgegrad as eg
 from edgegrad.demo import airliner
-from edgegrad.fit import PoseFit, fit_pose
+from edgegrad.fit import fit_pose
+from edgegrad.fit.pose.result import PoseFit
 
 FLAGS = ("headless=new", "no-sandbox", "use-gl=angle", "use-angle=swiftshader", "enable-unsafe-swiftshader",
          "window-size=1240,780")  # fmt: skip

@@ -17,7 +17,8 @@ from torch import Tensor
 from .camera.camera import Camera
 from .camera.poses import rotation
 from .files.image import read_image
-from .fit import PoseFit, fit_pose
+from .fit import fit_pose
+from .fit.pose.result import PoseFit
 from .optional import require
 from .render import render
 from .scene.mesh import Mesh

@@ -1,7 +1,5 @@
-"""Images from and to files, and their colours."""
+"""Colours of images: linear, as everywhere in edgegrad, and in sRGB."""
 
-from .files.depth import read_depth
-from .files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
-from .files.mask import read_mask
+from .files.image import linear_to_srgb, srgb_to_linear
 
-__all__ = ["linear_to_srgb", "read_depth", "read_image", "read_mask", "srgb_to_linear", "write_image"]
+__all__ = ["linear_to_srgb", "srgb_to_linear"]

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import RigFit, fit_rig
+from edgegrad.fit import fit_rig
+from edgegrad.fit.rig.result import RigFit
 
 SIZE = 192
 LIMIT = 0.75  # radians, of each component of a rotation
@@ -33,7 +34,7 @@ class Errors(NamedTuple):
     direction: Tensor  # in the world
 
     @staticmethod
-    def of(rig: eg.Rig, found: Tensor, truth: Tensor) -> Errors:
+    def of(rig: eg.rig.Rig, found: Tensor, truth: Tensor) -> Errors:
         """Return the errors of rotation vectors (20, 3)."""
         R, S = roma.rotvec_to_rotmat(found), roma.rotvec_to_rotmat(truth)
         along = torch.tensor(figure.BONES_ALONG, dtype=torch.float64)[..., None]
@@ -48,7 +49,7 @@ class Errors(NamedTuple):
 
 def trial(
     seed: int, degrees: float = 40.0, size: int = SIZE, **options: object
-) -> tuple[eg.Rig, Tensor, list[Tensor], RigFit]:
+) -> tuple[eg.rig.Rig, Tensor, list[Tensor], RigFit]:
     """Return the rig, its true pose, its masks, and what is found."""
     rig = figure.figure(colored=True).with_limits(rotations=(-LIMIT, LIMIT))
     cameras, truth = figure.cameras(size), figure.pose(seed, degrees)
@@ -56,7 +57,7 @@ def trial(
     return rig, truth, masks, fit_rig(rig, cameras, masks=masks, seed=seed, **options)
 
 
-def pictures(rig: eg.Rig, truth: Tensor, fit: RigFit, size: int) -> list[dict[str, Tensor]]:
+def pictures(rig: eg.rig.Rig, truth: Tensor, fit: RigFit, size: int) -> list[dict[str, Tensor]]:
     """Return pictures of two cameras: the true pose, where the fit starts, what it finds."""
     shown = {"target": rig.posed(truth), "start": rig.posed(), "fit": fit.posed()}
     white = torch.ones(3)

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Fit, Parameter, fit_scene
+from edgegrad.fit import Parameter, fit_scene
+from edgegrad.fit.descent.result import Fit
 
 SIZE, SHOWN = 64, 160  # pixels on a side, of the pictures and of what is drawn
 WALLS = {
@@ -32,8 +33,8 @@ def scene(colors: dict[str, Tensor]) -> eg.Scene:
         eg.Mesh(torch.tensor(corners, dtype=torch.float32), faces, material=eg.Material(colors[name]))
         for name, (_, corners) in WALLS.items()
     ]
-    along = torch.tensor([0.25, 0.0, 0.0]), torch.tensor([0.0, -0.25, 0.0])
-    emitter = eg.AreaLight.rectangle(torch.tensor([1.1, 1.1, 3.2]), *along, 60.0)
+    emitting = eg.Material(base_color=0.0, emission=60.0)
+    emitter = eg.shapes.rectangle((1.1, 1.1, 3.2), (0.25, 0.0, 0.0), (0.0, -0.25, 0.0), material=emitting)
     return eg.Scene([*walls, emitter])
 
 

@@ -60,7 +60,7 @@ def limb(start: Tensor, end: Tensor, width: float, thick: float, n: int) -> tupl
     return unit @ axes + 0.5 * (start + end), torch.tensor(faces)
 
 
-def figure(fine: int = 6, colored: bool = False) -> eg.Rig:
+def figure(fine: int = 6, colored: bool = False) -> eg.rig.Rig:
     """Return a figure of some 120 vertices a limb at 6. Where a limb meets its parent's, its vertices hang on both."""
     verts, faces, weights, colors, count = [], [], [], [], 0
     g = torch.Generator().manual_seed(3)
@@ -80,9 +80,9 @@ def figure(fine: int = 6, colored: bool = False) -> eg.Rig:
     starts = torch.tensor([bone[2] for bone in BONES])
     parents = [bone[1] for bone in BONES]
     local = torch.stack([starts[k] - (starts[p] if p >= 0 else 0.0) for k, p in enumerate(parents)])
-    joints = eg.Joints([bone[0] for bone in BONES], parents, local, torch.zeros(len(BONES), 3))
+    joints = eg.rig.Joints([bone[0] for bone in BONES], parents, local, torch.zeros(len(BONES), 3))
     mesh = eg.Mesh(torch.cat(verts), torch.cat(faces), colors=torch.cat(colors) if colored else None)
-    return eg.Rig.from_arrays(mesh, joints, torch.cat(weights))
+    return eg.rig.Rig.from_arrays(mesh, joints, torch.cat(weights))
 
 
 def cameras(size: int, count: int = 4) -> list[eg.Camera]:

@@ -15,7 +15,8 @@ import roma
 import torch
 
 import edgegrad as eg
-from edgegrad.fit import CameraFit, fit_camera
+from edgegrad.fit import fit_camera
+from edgegrad.fit.pose.fit_camera import CameraFit
 
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])
 TURN, SHIFT, ZOOM = 8.0, 0.08, 0.15  # degrees, object sizes, part of the focal length

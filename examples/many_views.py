@@ -25,7 +25,6 @@ import objects
 import shape
 import torch
 import torch.distributed as dist
-import trimesh
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
@@ -71,8 +70,8 @@ class Loss(torch.nn.Module):
 
     def __init__(self, pictures: Pictures, task: Task) -> None:
         super().__init__()
-        ball = trimesh.creation.icosphere(subdivisions=task.subdivisions)
-        verts, self.faces = torch.tensor(ball.vertices), torch.tensor(ball.faces)
+        ball = eg.shapes.sphere(subdivisions=task.subdivisions, dtype=torch.float64)
+        verts, self.faces = ball.verts, ball.faces
         self.pictures, self.spp = pictures, task.spp
         self.smooth = LaplacianSolver(self.faces, len(verts), smoothness=19.0)
         self.coordinates = torch.nn.Parameter(self.smooth.to_differential(verts))

@@ -19,29 +19,28 @@ from typing import Any, NamedTuple
 import objects
 import torch
 import torch.nn.functional as F
-import trimesh
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Fit, Parameter, fit_scene
+from edgegrad.fit import Parameter, fit_scene
+from edgegrad.fit.descent.result import Fit
 
 ROUGHNESS, METALLIC = 0.3, 0.7
 GOLD = torch.tensor([0.9, 0.65, 0.25])
 VIEWS = 8
 
 
-def sky() -> eg.Environment:
+def sky() -> eg.lights.Environment:
     """Return a sky that is brighter above than below, with three lights."""
     image = torch.linspace(0.9, 0.15, 64)[:, None, None] * torch.tensor([0.9, 1.0, 1.15]).expand(64, 128, 3)
     for row, column, size, radiance in ((12, 20, 9, 6.0), (20, 84, 7, 9.0), (34, 52, 8, 4.0)):
         image[row : row + size, column : column + size] = radiance
-    return eg.Environment(image)
+    return eg.lights.Environment(image)
 
 
 def ball() -> eg.Mesh:
-    shape = trimesh.creation.icosphere(subdivisions=4)
-    verts = torch.tensor(shape.vertices, dtype=torch.float32)
-    return eg.Mesh(verts, torch.tensor(shape.faces), normals=verts)
+    sphere = eg.shapes.sphere()
+    return sphere.replace(normals=sphere.verts)
 
 
 class Made(NamedTuple):
@@ -119,7 +118,7 @@ def main() -> None:
     if not isinstance(scan.texture, Tensor):
         parser.error("MESH: expected a mesh with a texture")
     numbers = torch.tensor(ROUGHNESS), torch.tensor(METALLIC)
-    scan = scan.replace(normals=eg.vertex_normals(scan.verts, scan.faces))
+    scan = scan.replace(normals=scan.vertex_normals())
     things = (
         ("ball", ball(), Made(GOLD, *numbers), partial(fit, method="gauss-newton", steps=50, spp=4, tolerance=0.0)),
         ("scan", scan, Made(scan.texture, *numbers), fit_textured),

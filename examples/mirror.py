@@ -13,7 +13,6 @@ import argparse
 import math
 
 import torch
-import trimesh
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 from tqdm import tqdm
@@ -26,7 +25,7 @@ BASE, ALPHA = 0.95, 0.2**2
 SMOOTH = 6e-3  # how much a rough environment costs: hardly any light comes from the texels around the poles
 
 
-def metal(hits: eg.Hits) -> Tensor:
+def metal(hits: eg.points.Hits) -> Tensor:
     """Return the radiance of the metal in the light of the scene."""
     (light,) = hits.lights
     points = hits.light_points(light, by=eg.lights.points_by_material)
@@ -70,15 +69,14 @@ def roughness(image: Tensor) -> Tensor:
 
 def fit(steps: int = 200, size: int = SIZE) -> tuple[list[Tensor], Tensor]:
     """Return pictures of the ball (target, end), and the environment that was found."""
-    made = trimesh.creation.icosphere(4)
     material = eg.Material(torch.full((3,), BASE), metallic=1.0, roughness=ALPHA**0.5)  # by which points are drawn
-    verts, faces = torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces)
-    ball = eg.Mesh(verts, faces, normals=eg.vertex_normals(verts, faces), material=material)
+    ball = eg.shapes.sphere(subdivisions=4, material=material)
+    ball = ball.replace(normals=ball.vertex_normals())
     places = [(3.3, 1.2, 1.1), (-1.9, -1.0, 2.9), (-1.5, 1.0, -3.1), (2.0, -1.2, -2.9)]
     cameras = [eg.Camera.look_at(place, (0.0, 0.0, 0.0), fov_y=34.0, size=(size, size)) for place in places]
 
     def picture(radiance: Tensor, k: int, spp: int, seed: int) -> Tensor:
-        scene = eg.Scene([ball], lights=[eg.Environment(radiance, visible=False)])
+        scene = eg.Scene([ball], lights=[eg.lights.Environment(radiance, visible=False)])
         return eg.render(scene, cameras[k], spp, seed, shader=metal)
 
     def mean(radiance: Tensor, k: int, seed: int) -> Tensor:

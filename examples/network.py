@@ -31,7 +31,7 @@ def torus(tube: Tensor) -> eg.Mesh:
     return eg.Mesh(middle + tube * (surface - middle) / 0.1, torch.tensor(made.faces))
 
 
-def glossy(hits: eg.Hits) -> Tensor:
+def glossy(hits: eg.points.Hits) -> Tensor:
     """Return the radiance of paint with a highlight (Blinn 1977)."""
     light = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.7]), dim=0)
     half = torch.nn.functional.normalize(hits.view + light, dim=1)
@@ -48,7 +48,7 @@ class Paint(torch.nn.Module):
         layers = [m for a, b in itertools.pairwise(sizes) for m in (torch.nn.Linear(a, b), torch.nn.SiLU())]
         self.layers = torch.nn.Sequential(*layers[:-1], torch.nn.Softplus())
 
-    def forward(self, hits: eg.Hits) -> Tensor:
+    def forward(self, hits: eg.points.Hits) -> Tensor:
         return self.layers(torch.cat([hits.position, hits.shading_normal, hits.view], 1))
 
 

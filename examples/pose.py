@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, fit_pose
+from edgegrad.fit import fit_pose
+from edgegrad.fit.pose.result import PoseFit
 
 SIZE = 256
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])

@@ -28,7 +28,7 @@ def pictures(verts: Tensor, colors: Tensor, R: Tensor, size: int, exact: bool) -
     """Return pictures (B, size, size, 3)."""
     _, tri, side = cube()
     pos = in_clip_space(verts, R, 3.5, perspective(2.2))
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (size, size))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (size, size))
     image, _ = dr.interpolate(colors[None], rast, side)
     return dr.antialias(image, rast, pos, tri, exact=exact)
 

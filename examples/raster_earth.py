@@ -58,7 +58,7 @@ class Globe:
     def picture(self, texture: Tensor, R: Tensor, distance: Tensor, size: int, mipmaps: bool) -> Tensor:
         """Return pictures (B, size, size, 3)."""
         pos = in_clip_space(self.verts, R, distance, perspective(far=60.0))
-        rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos, self.tri, (size, size))
+        rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos, self.tri, (size, size))
         uv, uv_da = dr.interpolate(self.uv[None], rast, self.tri, rast_db, "all")
         image = dr.texture(texture, uv, uv_da if mipmaps else None)
         return torch.where(rast[..., 3:] > 0, image, 1.0)

@@ -52,7 +52,7 @@ class Ball:
         """Return pictures (B, size, size, 3), whose eye moves around the ball."""
         pos = in_clip_space(self.verts, R, 3.0, perspective())
         eye = 3.0 * R[:, 2]  # of which R makes (0, 0, 3)
-        rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos, self.tri, (size, size))
+        rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos, self.tri, (size, size))
         view = self.verts - eye[:, None]
         mirrored = view - 2 * (view * self.verts).sum(2, keepdim=True) * self.verts  # a unit sphere is its own normal
         mirrored, mirrored_da = dr.interpolate(mirrored, rast, self.tri, rast_db, "all")

@@ -28,7 +28,7 @@ def picture(q: Tensor, size: int) -> Tensor:
     """Return pictures (B, size, size, 3) of quaternions (B, 4)."""
     verts, tri, side = cube()
     pos = in_clip_space(verts, of_quaternions(q), 6.0, perspective())
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (size, size))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (size, size))
     image, _ = dr.interpolate(COLORS[None], rast, side)
     return dr.antialias(image, rast, pos, tri)
 

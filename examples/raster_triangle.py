@@ -18,7 +18,7 @@ def picture(size: int = 256) -> Tensor:
     """Return (H, W, 3), row 0 at the bottom."""
     pos = torch.tensor([[[-0.8, -0.8, 0, 1], [0.8, -0.8, 0, 1], [0, 0.8, 0, 1]]])
     tri = torch.tensor([[0, 1, 2]], dtype=torch.int32)
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (size, size))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (size, size))
     image, _ = dr.interpolate(torch.eye(3)[None], rast, tri)
     return image[0]
 

@@ -33,7 +33,7 @@ def camera(size: int) -> eg.Camera:
     return found.replace(world_to_camera=found.world_to_camera.double(), K=found.K.double())
 
 
-def postures(robot: eg.Rig, count: int, seed: int) -> Tensor:
+def postures(robot: eg.rig.Rig, count: int, seed: int) -> Tensor:
     """Return angles (count, m), well within the limits."""
     control, generator = robot.controls["angles"], torch.Generator().manual_seed(seed)
     share = torch.rand(count, len(control.rest), generator=generator, dtype=F64)
@@ -113,7 +113,7 @@ def normal_equations(
 
 
 def trial(
-    robot: eg.Rig, count: int, size: int, seed: int
+    robot: eg.rig.Rig, count: int, size: int, seed: int
 ) -> tuple[eg.Camera, eg.Camera, eg.Camera, list[eg.Scene], list[Tensor]]:
     """Return truth, start and fit, the scenes and their masks."""
     truth = camera(size)
@@ -134,7 +134,7 @@ def main() -> None:
     parser.add_argument("--out", default="robot.png")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        robot = eg.load_robot(args.urdf or arm.write(Path(folder) / "arm.urdf"))
+        robot = eg.rig.load(args.urdf or arm.write(Path(folder) / "arm.urdf"))
     began = time.perf_counter()
     truth, start, found, scenes, targets = trial(robot, args.postures, args.size, args.seed)
     for name, one in (("start", start), ("fit", found)):

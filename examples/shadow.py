@@ -51,19 +51,18 @@ class Shape:
 
 def ground() -> eg.Mesh:
     """Return the white plane z = 0."""
-    corners = torch.tensor([[-6.0, -6.0, 0.0], [6.0, -6.0, 0.0], [6.0, 6.0, 0.0], [-6.0, 6.0, 0.0]])
     white = eg.Material(base_color=torch.tensor([0.8, 0.8, 0.8]))
-    return eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=white)
+    return eg.shapes.rectangle(u=(6.0, 0.0, 0.0), v=(0.0, 6.0, 0.0), material=white)
 
 
-def lights(count: int = 12) -> list[eg.DirectionalLight]:
+def lights(count: int = 12) -> list[eg.lights.DirectionalLight]:
     """Return lights around the axis, some high, some low."""
     found = []
     for k in range(count):
         azimuth, elevation = 2 * math.pi * k / count + 0.2, math.radians((80.0, 55.0, 38.0)[k % 3])
         flat = math.cos(elevation)
         direction = torch.tensor([flat * math.cos(azimuth), flat * math.sin(azimuth), -math.sin(elevation)])
-        found.append(eg.DirectionalLight(direction, math.pi / math.sin(elevation)))
+        found.append(eg.lights.DirectionalLight(direction, math.pi / math.sin(elevation)))
     return found
 
 
@@ -100,7 +99,7 @@ def look(shape: Shape, distance: Tensor) -> Tensor:
     """Return a picture of the shape itself, which the fit never sees."""
     camera = eg.Camera.look_at((1.6, -2.4, 2.6), (0.0, 0.0, HEIGHT), (0.0, 0.0, 1.0), 34.0, (SIZE, SIZE))
     sky = torch.zeros(9, 3).index_fill(0, torch.tensor(0), 1.5)
-    suns = [eg.DirectionalLight(torch.tensor([-1.0, 0.6, -1.0]), 2.5), eg.SphericalHarmonics(sky)]
+    suns = [eg.lights.DirectionalLight(torch.tensor([-1.0, 0.6, -1.0]), 2.5), eg.lights.SphericalHarmonics(sky)]
     with torch.no_grad():
         return eg.render(eg.Scene(shape.mesh(distance), lights=suns), camera, 64)
 

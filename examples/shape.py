@@ -22,7 +22,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 import edgegrad as eg
-from edgegrad.fit import Fit, fit_shape
+from edgegrad.fit import fit_shape
+from edgegrad.fit.descent.result import Fit
 
 # Radiance by the normal: constant, and a colour for each axis. Vertex colours, so no light has to be sampled.
 EVEN = 0.5
@@ -30,7 +31,7 @@ LIGHT = torch.tensor([[0.30, 0.10, 0.02], [0.05, 0.25, 0.10], [0.12, 0.02, 0.30]
 
 
 def lit(mesh: eg.Mesh) -> eg.Mesh:
-    normals = F.normalize(eg.vertex_normals(mesh.verts, mesh.faces), dim=1)
+    normals = F.normalize(mesh.vertex_normals(), dim=1)
     return mesh.replace(colors=EVEN + normals @ LIGHT.to(normals))
 
 
@@ -57,8 +58,7 @@ def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures"
     ]
     low, high = mesh.verts.aminmax(dim=0)
     diagonal = float((high - low).norm())
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.35 * diagonal)
-    start = eg.Mesh(torch.tensor(ball.vertices).float() + (low + high) / 2, torch.tensor(ball.faces))
+    start = eg.shapes.sphere((low + high) / 2, 0.35 * diagonal, subdivisions=3)
     options = {"levels": 3, "steps": 150, "spp": 4} | options
     images, masks = ([found[name] for found in seen] for name in ("image", "alpha"))
     if given == "pictures":

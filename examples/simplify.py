@@ -38,8 +38,8 @@ def simplified(mesh: eg.Mesh, faces: int) -> eg.Mesh:
 
 
 def textured(mesh: eg.Mesh, source: eg.Mesh, texels: int = 256) -> eg.Mesh:
-    mesh = eg.unwrap(mesh, size=texels)
-    return mesh.replace(texture=eg.bake(mesh, source, texels))
+    mesh = eg.textures.unwrap(mesh, size=texels)
+    return mesh.replace(texture=eg.textures.bake(mesh, source, texels))
 
 
 def simplify(mesh: eg.Mesh, faces: int = 300, steps: int = 100) -> tuple[eg.Mesh, Differences]:

@@ -12,7 +12,6 @@ import argparse
 from typing import NamedTuple
 
 import torch
-import trimesh
 from torch import Tensor
 from tqdm import tqdm
 
@@ -27,7 +26,7 @@ class Paint(NamedTuple):
     radius: Tensor
     stripe: Tensor  # width
 
-    def __call__(self, hits: eg.Hits) -> Tensor:
+    def __call__(self, hits: eg.points.Hits) -> Tensor:
         p = hits.position
         stripes = hits.floor(p[:, 1] / self.stripe)[:, None] % 2
         ground = stripes * WHITE + (1 - stripes) * BLUE
@@ -41,8 +40,7 @@ TRUTH = Paint(torch.tensor([0.15, 0.1]), torch.tensor(0.45), torch.tensor(0.21))
 
 def fit(steps: int = 120) -> tuple[list[Tensor], Paint]:
     """Return pictures (target, start, end), and what was found."""
-    made = trimesh.creation.icosphere(4)
-    mesh = eg.Mesh(torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces))
+    mesh = eg.shapes.sphere()
     camera = eg.Camera.look_at((0.0, 0.0, 4.0), (0.0, 0.0, 0.0), fov_y=32.0, size=(SIZE, SIZE))
     with torch.no_grad():
         target = eg.render(mesh, camera, 64, 10_000, shader=TRUTH)

@@ -49,18 +49,16 @@ def knot(along: int = 160, around: int = 20) -> eg.Mesh:
         texture=stripes * hue + (1 - stripes) * 0.85,
         uvs=uvs,
         uv_faces=uv_index[:, halves].reshape(-1, 3),
-        normals=eg.vertex_normals(verts, faces),
+        normals=eg.Mesh(verts, faces).vertex_normals(),
         material=eg.Material(),
     )
 
 
 def ground() -> eg.Mesh:
     """Return a checkerboard at z = 0."""
-    corners = torch.tensor([[-4.0, -4.0, 0.0], [4.0, -4.0, 0.0], [4.0, 4.0, 0.0], [-4.0, 4.0, 0.0]])
-    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     board = 0.42 + 0.1 * ((torch.arange(8)[:, None] + torch.arange(8)) % 2)[..., None] * torch.ones(3)
     board = board.repeat_interleave(16, 0).repeat_interleave(16, 1)
-    return eg.Mesh(corners, faces, texture=board, uvs=corners[:, :2] / 8 + 0.5, uv_faces=faces, material=eg.Material())
+    return eg.shapes.rectangle(u=(4.0, 0.0, 0.0), v=(0.0, 4.0, 0.0), material=eg.Material()).replace(texture=board)
 
 
 class Guess(NamedTuple):
@@ -78,11 +76,11 @@ class Guess(NamedTuple):
 
     def scene(self) -> eg.Scene:
         sky = torch.zeros(9, 3).index_fill(0, torch.tensor(0), 1.0) * torch.tensor([0.9, 1.1, 1.4])
-        sunlight = eg.DirectionalLight(self.sun, 2.6, torch.tensor([1.0, 0.93, 0.8]))
+        sunlight = eg.lights.DirectionalLight(self.sun, 2.6, torch.tensor([1.0, 0.93, 0.8]))
         return eg.Scene(
             [knot().transformed(self.R, self.shift), ground()],
             background=torch.tensor([0.35, 0.5, 0.75]),
-            lights=[sunlight, eg.SphericalHarmonics(sky)],
+            lights=[sunlight, eg.lights.SphericalHarmonics(sky)],
         )
 
     def errors(self, truth: Guess) -> tuple[float, float, float]:
@@ -115,7 +113,7 @@ def fit(target: Tensor, camera: eg.Camera, steps: int = 150) -> Guess:
     rates = Guess(0.015, 0.015, 0.03)  # pyright: ignore[reportArgumentType]
     optimizer = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(found, rates, strict=True)])
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=1e-4)
-    for step in tqdm(range(steps), desc="sun"):
+    for _ in tqdm(range(steps), desc="sun"):
         loss = (eg.render(found.scene(), camera, 8) - target).square().mean()
         optimizer.zero_grad()
         loss.backward()

@@ -15,7 +15,8 @@ from typing import Any
 import objects
 
 import edgegrad as eg
-from edgegrad.fit import Fit, fit_texture
+from edgegrad.fit import fit_texture
+from edgegrad.fit.descent.result import Fit
 
 
 def fit(mesh: eg.Mesh, size: int = 256, texels: int = 256, **options: Any) -> Fit:

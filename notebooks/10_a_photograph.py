@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene
+from edgegrad.fit import Parameter, PoseParameter, fit_scene
 from edgegrad.image import linear_to_srgb, srgb_to_linear
 
 photo = srgb_to_linear(torch.tensor(skimage.data.coffee() / 255.0).float())
@@ -104,7 +104,7 @@ start = {"saucer": torch.tensor(0.15), "cup": torch.tensor([0.55, 0.95, 0.35])}
 
 # %%
 def fitted(camera, R, t, shape, **options):
-    pose = PoseParameter(Pose(R, t), of=eg.Scene(saucer_and_cup(shape)), rotation=0.01, shift=0.005)
+    pose = PoseParameter((R, t), of=eg.Scene(saucer_and_cup(shape)), rotation=0.01, shift=0.005)
     free = {name: Parameter(0.01, value, low=0.02, high=1.2) for name, value in shape.items()}
     given = {"pose": pose, **free}
     return fit_scene(

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 11. Things that bend
 #
-# A *rig* is a differentiable function from few numbers to meshes: a skinned character, a body model, a robot. `load_rig` reads
-# one from a glTF file, `Rig.from_function` takes any function, `load_robot` a URDF. Here a body of twenty joints is made from
+# A *rig* is a differentiable function from few numbers to meshes: a skinned character, a body model, a robot. `eg.rig.load` reads
+# one from a glTF file, `Rig.from_function` takes any function, `eg.rig.load` a URDF. Here a body of twenty joints is made from
 # arrays, bent, and its pose found again from four silhouettes.
 #
 # It needs `pip install '.[rigs]'`, and a clone of the repository for the body of `examples/figure.py`.

@@ -60,8 +60,8 @@ print(image.shape, image.dtype)
 
 # %%
 moving = verts.clone().requires_grad_()
-primary = eg.primary_hits(scene.replace(meshes=[triangle.replace(verts=moving)]), camera)
-edges = eg.edge_samples(primary, count=60)
+primary = eg.points.primary_hits(scene.replace(meshes=[triangle.replace(verts=moving)]), camera)
+edges = eg.points.edge_samples(primary, count=60)
 
 # The velocity across the edge, straight from the formula: ends of edges move, what is between them follows.
 corners, moved = camera.project(verts), camera.project(verts + torch.tensor([[0.0, 0, 0], [0.0, 0, 0], [1e-3, 0, 0]]))

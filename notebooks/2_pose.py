@@ -126,7 +126,7 @@ w, t = torch.zeros(3, requires_grad=True), torch.zeros(3, requires_grad=True)
 optimizer = torch.optim.Adam([w, t], lr=0.02)
 schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.98)
 losses, turned = [], []
-for step in range(140):
+for _ in range(140):
     optimizer.zero_grad()
     value = (eg.render(posed(w, t), camera, spp=4) - target).square().mean()
     value.backward()

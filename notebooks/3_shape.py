@@ -45,7 +45,7 @@ B = torch.tensor([[0.30, 0.10, 0.02], [0.05, 0.25, 0.10], [0.12, 0.02, 0.30]])
 
 
 def lit(mesh):
-    normals = F.normalize(eg.vertex_normals(mesh.verts, mesh.faces), dim=1)
+    normals = F.normalize(mesh.vertex_normals(), dim=1)
     return mesh.replace(colors=0.5 + normals @ B)
 
 
@@ -60,8 +60,7 @@ with torch.no_grad():
 images, masks = [s["image"] for s in seen], [s["alpha"] for s in seen]
 show(images, [f"view {k + 1}" for k in range(8)], rows=2)
 
-ball = trimesh.creation.icosphere(subdivisions=4)
-sphere = eg.Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces))
+sphere = eg.shapes.sphere(subdivisions=4)
 
 # %% [markdown]
 # ## The gradient of the vertices

@@ -90,19 +90,20 @@ shape.apply_translation([0, 0, 0.85])
 verts, faces = torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces)
 colors = 0.5 + 0.3 * torch.sin(3.0 * verts + torch.tensor([0.0, 1.0, 2.0]))
 matt, plastic = eg.Material(), eg.Material(metallic=0.0, roughness=0.25)
-ring = eg.Mesh(verts, faces, colors=colors, normals=eg.vertex_normals(verts, faces), material=matt)
-square = torch.tensor([[-3.0, -3.0, 0.0], [3.0, -3.0, 0.0], [3.0, 3.0, 0.0], [-3.0, 3.0, 0.0]])
+ring = eg.Mesh(verts, faces, colors=colors, material=matt)
+ring = ring.replace(normals=ring.vertex_normals())
 gray = eg.Material(base_color=torch.tensor([0.6, 0.6, 0.6]))
-ground = eg.Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=gray)
+ground = eg.shapes.rectangle(u=(3.0, 0.0, 0.0), v=(0.0, 3.0, 0.0), material=gray)
 camera = eg.Camera.look_at((0.9, -3.4, 2.6), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0), 40.0, (80, 80))
 
 position = torch.tensor([1.3, -0.9, 3.2])
-light = eg.PointLight(position, 25.0)
+light = eg.lights.PointLight(position, 25.0)
 vector = torch.tensor
-panel = eg.AreaLight.rectangle(position, vector([0.6, 0.0, 0.2]), vector([0.0, 0.5, 0.1]), 16.0)
+emitting = eg.Material(base_color=0.0, emission=16.0)
+panel = eg.shapes.rectangle(position, (0.6, 0.0, 0.2), (0.0, 0.5, 0.1), material=emitting)
 height = torch.linspace(1, -1, 16)[:, None, None].expand(16, 32, 3)
 up_is_z = vector([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-sky = eg.Environment(0.5 + 0.4 * height * vector([0.2, 0.6, 1.0]), rotation=up_is_z)
+sky = eg.lights.Environment(0.5 + 0.4 * height * vector([0.2, 0.6, 1.0]), rotation=up_is_z)
 
 
 def picture(material, light, **options):
@@ -131,7 +132,9 @@ right = torch.tensor([1.0, 0.0, 0.0])
 
 
 def lit(place, lift=0.0):
-    return eg.Scene([ring.transformed(t=lift * vector([0.0, 0.0, 1.0])), ground], lights=[eg.PointLight(place, 25.0)])
+    return eg.Scene(
+        [ring.transformed(t=lift * vector([0.0, 0.0, 1.0])), ground], lights=[eg.lights.PointLight(place, 25.0)]
+    )
 
 
 def derivative(seeds, **options):
@@ -206,13 +209,12 @@ show(
 # mirrors shows how rough it is; what it mirrors at its outline, how much of a metal.
 
 # %%
-ball = trimesh.creation.icosphere(subdivisions=3)
-verts = torch.tensor(ball.vertices, dtype=torch.float32)
-ball = eg.Mesh(verts, torch.tensor(ball.faces), normals=verts)
+ball = eg.shapes.sphere(subdivisions=3)
+ball = ball.replace(normals=ball.verts)
 image = torch.linspace(0.9, 0.2, 32)[:, None, None].repeat(1, 64, 3)
 for row, column, radiance in ((6, 10, 6.0), (10, 42, 9.0), (17, 26, 4.0)):
     image[row : row + 4, column : column + 4] = radiance
-studio = eg.Environment(image, visible=False)
+studio = eg.lights.Environment(image, visible=False)
 eyes = [(3.2, 0.8, 1.0), (-1.1, -0.6, 3.2), (-3.2, 1.2, -1.2), (1.0, -1.0, -3.3)]
 cameras = [eg.Camera.look_at(eye, (0, 0, 0), (0, 1, 0), 40.0, (48, 48)) for eye in eyes]
 
@@ -252,7 +254,8 @@ plt.tight_layout()
 colors = {"floor": vector([0.75, 0.75, 0.75]), "left": vector([0.7, 0.2, 0.15]), "right": vector([0.25, 0.35, 0.7])}
 o, x, y, z, xy, yz, xz = ([2.0 * float(axis in name) for axis in "xyz"] for name in ("", *"xyz", "xy", "yz", "xz"))
 walls = {"floor": vector([o, x, xy, y]), "left": vector([o, y, yz, z]), "right": vector([o, z, xz, x])}
-bulb = eg.AreaLight.rectangle(vector([1.1, 1.1, 3.2]), vector([0.25, 0.0, 0.0]), vector([0.0, -0.25, 0.0]), 60.0)
+emitting = eg.Material(base_color=0.0, emission=60.0)
+bulb = eg.shapes.rectangle((1.1, 1.1, 3.2), (0.25, 0.0, 0.0), (0.0, -0.25, 0.0), material=emitting)
 halves = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 

@@ -184,17 +184,17 @@ print(f"radius of the tube: 0.22 at the start, {tube.item():.4f} found, 0.3 in t
 #
 # ## Parts to build from
 #
-# `render(…, shader=fn)` is made of public parts. Here it is by hand; `eg.trace` follows any other rays, for reflections
+# `render(…, shader=fn)` is made of public parts. Here it is by hand; `eg.points.trace` follows any other rays, for reflections
 # or light that bounces.
 
 # %%
 tube = torch.tensor(0.3, requires_grad=True)
-primary = eg.primary_hits(torus(tube), camera)
+primary = eg.points.primary_hits(torus(tube), camera)
 image = primary.image(glossy(primary.hits))  # with the gradient inside faces
-edges = eg.edge_samples(primary, creases=False)
+edges = eg.points.edge_samples(primary, creases=False)
 with torch.no_grad():
     jump = edges.jump(glossy(edges.hits))
-image = eg.attach_boundary(image, edges, jump)  # and of what moves at silhouettes
+image = eg.points.attach_boundary(image, edges, jump)  # and of what moves at silhouettes
 by_parts = torch.autograd.grad(image.sum(), tube)[0].item()
 print(primary, edges, f"gradient {by_parts:.0f}", sep="\n")
 

@@ -87,14 +87,14 @@ def lit() -> Arrays:
     blocker = torch.tensor([[-0.4, -0.3, 0.8], [0.4, -0.3, 0.9], [0.0, 0.4, 0.8]])
     material = eg.Material(base_color=base, roughness=rough, metallic=0.3)
     meshes = [
-        eg.Mesh(verts, faces, material=material, normals=eg.vertex_normals(verts, faces)),
+        eg.Mesh(verts, faces, material=material, normals=eg.Mesh(verts, faces).vertex_normals()),
         eg.Mesh(blocker, torch.tensor([[0, 1, 2]]), material=eg.Material()),
     ]
     position = leaf(torch.tensor([0.5, 1.5, 2.5]))
     sky = leaf(colors(8 * 16).reshape(8, 16, 3))
     edges = torch.tensor([[-1.0, 1.0, 2.0], [0.5, 0.0, 0.0], [0.0, 0.5, 0.2]])
-    square = eg.AreaLight.rectangle(*edges, radiance=3.0)
-    lights = [eg.PointLight(position, 4.0), square, eg.Environment(sky)]
+    square = eg.shapes.rectangle(*edges, material=eg.Material(base_color=0.0, emission=3.0))
+    lights = [eg.lights.PointLight(position, 4.0), square, eg.lights.Environment(sky)]
     view = camera()
     image = eg.render(eg.Scene(meshes, lights=lights), view, spp=8, seed=5)
     leaves = {"verts": verts, "base": base, "rough": rough, "position": position, "sky": sky}
@@ -106,7 +106,7 @@ def shaded() -> Arrays:
     verts, faces = grid()
     verts = leaf(verts)
 
-    def stripes(hits: eg.Hits) -> Tensor:
+    def stripes(hits: eg.points.Hits) -> Tensor:
         wave = torch.sin(7 * hits.position[:, :1]) * hits.normal[:, 1:2]
         return torch.cat([wave, wave.square(), hits.position[:, 2:]], 1)
 
@@ -184,7 +184,9 @@ def under(lights: Callable[[], Sequence[Any]], options: dict[str, Any], **look: 
         verts, base, rough = leaf(verts), leaf(colors(len(verts))), leaf(torch.tensor(0.3))
         caster = leaf(torch.tensor([[-0.4, -0.3, 0.6], [0.5, -0.3, 0.9], [0.0, 0.6, 0.7]]))
         alpha = None if "alpha_mode" not in look else colors(64, 1).reshape(8, 8)
-        flat = eg.Mesh(verts, faces, material=eg.Material(base, 0.6, rough), normals=eg.vertex_normals(verts, faces))
+        flat = eg.Mesh(
+            verts, faces, material=eg.Material(base, 0.6, rough), normals=eg.Mesh(verts, faces).vertex_normals()
+        )
         uvs = torch.tensor([[0.1, 0.1], [0.9, 0.2], [0.4, 0.8]])
         over = eg.Mesh(
             caster, torch.tensor([[0, 1, 2]]), uvs=uvs, uv_faces=torch.tensor([[0, 1, 2]]), alpha=alpha,
@@ -199,13 +201,13 @@ def under(lights: Callable[[], Sequence[Any]], options: dict[str, Any], **look: 
 
 
 def point() -> list[Any]:
-    return [eg.PointLight(torch.tensor([0.5, 1.5, 2.5]), 4.0)]
+    return [eg.lights.PointLight(torch.tensor([0.5, 1.5, 2.5]), 4.0)]
 
 
 def cone_and_sun() -> list[Any]:
     down = torch.tensor([-0.1, -0.5, -1.0])
-    cone = eg.SpotLight(torch.tensor([0.2, 0.6, 2.0]), down, 5.0, inner_angle=0.2, outer_angle=0.5)
-    return [cone, eg.DirectionalLight(torch.tensor([0.4, -0.6, -1.0]), 1.5)]
+    cone = eg.lights.SpotLight(torch.tensor([0.2, 0.6, 2.0]), down, 5.0, inner_angle=0.2, outer_angle=0.5)
+    return [cone, eg.lights.DirectionalLight(torch.tensor([0.4, -0.6, -1.0]), 1.5)]
 
 
 def shining_mesh() -> list[Any]:
@@ -215,7 +217,7 @@ def shining_mesh() -> list[Any]:
 
 
 def sky() -> list[Any]:
-    return [eg.Environment(colors(8 * 16).reshape(8, 16, 3)), eg.SphericalHarmonics(colors(9) / 3)]
+    return [eg.lights.Environment(colors(8 * 16).reshape(8, 16, 3)), eg.lights.SphericalHarmonics(colors(9) / 3)]
 
 
 def minified() -> Arrays:
@@ -229,7 +231,7 @@ def minified() -> Arrays:
     )
     material = eg.Material(eg.Texture(texture, filter="mipmap"), 0.2, 0.5, normal_map=bumps)
     mesh = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, material=material)
-    light = eg.DirectionalLight(torch.tensor([0.2, -0.3, -1.0], dtype=torch.float64), 2.0)
+    light = eg.lights.DirectionalLight(torch.tensor([0.2, -0.3, -1.0], dtype=torch.float64), 2.0)
     image = eg.render(eg.Scene(mesh, lights=[light]), camera().to(torch.float64), spp=4, seed=11)
     return gradients(image, verts=verts, texture=texture, uvs=uvs)
 
@@ -239,7 +241,7 @@ def stepping() -> Arrays:
     verts, faces = grid()
     verts, edge = leaf(verts), leaf(torch.tensor(0.1))
 
-    def shade(hits: eg.Hits) -> Tensor:
+    def shade(hits: eg.points.Hits) -> Tensor:
         light = hits.lights[0]
         points = hits.light_points(light)
         arriving = light.arriving(points, hits.position) * hits.visible_from(light, points).reshape(-1, 1)
@@ -275,7 +277,7 @@ def rasterized() -> Arrays:
     w = 2.5 - verts[:, 2:] + 0.3 * verts[:, :1]
     pos = torch.cat([verts[:, :2] * 1.6, w - 1.5, w], 1)[None]
     tri = faces.int()
-    rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos, tri, SIZE)
+    rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, SIZE)
     uv, uv_da = dr.interpolate((verts[None, :, :2] + 1) / 2, rast, tri, rast_db, diff_attrs="all")
     color = dr.texture(texture, uv, uv_da, filter_mode="linear-mipmap-linear")
     both = [dr.antialias(color, rast, pos, tri), dr.antialias(color, rast, pos, tri, exact=True)]

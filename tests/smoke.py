@@ -34,7 +34,7 @@ def light() -> None:
     camera = eg.Camera.look_at((0, 3, 5), (0, 0, 0), size=(48, 48))
 
     def total(x: torch.Tensor, seed: int) -> torch.Tensor:
-        sun = eg.DirectionalLight(torch.stack([x, -torch.ones_like(x), -0.3 * torch.ones_like(x)]), 3.0)
+        sun = eg.lights.DirectionalLight(torch.stack([x, -torch.ones_like(x), -0.3 * torch.ones_like(x)]), 3.0)
         return eg.render(
             eg.Scene([mesh, floor], lights=[sun]), camera, spp=64, seed=seed, sampling=eg.Sampling(edges=20_000)
         ).sum()
@@ -71,7 +71,7 @@ def extras() -> None:
         "matplotlib": ("figures", fit.plot),
         "torchmetrics": ("fit", lambda: ssim(image, image)),
         "gpytoolbox": ("fit", lambda: fit_shape(mesh, [camera], [image], levels=2, steps=1, progress=False)),
-        "xatlas": ("fit", lambda: eg.unwrap(mesh)),
+        "xatlas": ("fit", lambda: eg.textures.unwrap(mesh)),
     }
     for library, (extra, call) in needs.items():
         if importlib.util.find_spec(library) is None:

@@ -9,7 +9,7 @@ import importlib.metadata
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -130,7 +130,7 @@ class Edgegrad:
         with torch.no_grad():
             render(self._elsewhere, self._scene.camera, spp=1)
         # The same image for all: what it saw says where the kernel puts its samples.
-        options = {"spp": FORWARD_SPP, "seed": seed}
+        options: dict[str, Any] = {"spp": FORWARD_SPP, "seed": seed}
         if self.part == "whole":
             vertex, forward, backward = differentiate(self._scene, sampling=Sampling(surface, edge), **options)
             return Gradient(forward + backward, **rigid(self._scene, vertex))

@@ -19,7 +19,9 @@ from torch import Tensor
 
 from ..camera.camera import Camera
 from ..optional import require
-from .depth import pixel_rays
+from .depth import depth_image, pixel_rays
+
+__all__ = ["add", "adi", "depth_image", "mspd", "mssd", "vsd"]
 
 BOUND_POINTS = 256  # for lower bounds
 

@@ -29,9 +29,9 @@ from ..check import check_flag, check_positive
 from .dataset import Dataset, Target
 from .depth import depth_image
 from .errors import add, adi, mspd, mssd, vsd
+from .files import Estimate
 from .frame import Frame, Truth
 from .model import Model
-from .results import Estimate
 
 SYMMETRY_STEP = 0.01  # of continuous symmetries: bop_toolkit's max_sym_disc_step
 TENTHS = [0.05 * k for k in range(1, 11)]  # of VSD's tau and threshold, and of MSSD's in diameters

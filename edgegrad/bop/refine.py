@@ -16,7 +16,7 @@ from ..fit.pose.fit_pose import fit_pose
 from ..fit.pose.pose import angle
 from ..fit.pose.result import PoseFit
 from .dataset import Dataset
-from .results import Estimate
+from .files import Estimate
 
 MIN_CROP = 16  # pixels of the crop on its longer side
 

@@ -13,7 +13,8 @@ from .arguments import add_steps, count, millimetres, number
 from .outputs import make_folder
 
 if TYPE_CHECKING:
-    from ..bop import Estimate, Refined
+    from ..bop.files import Estimate
+    from ..bop.refine import Refined
 
 
 def add(commands: Any) -> None:
@@ -70,7 +71,8 @@ def _add_files(parser: argparse.ArgumentParser) -> None:
 def _errors(args: argparse.Namespace) -> int:
     """Print recalls as BOP19 defines them (AR of VSD, MSSD and MSPD), recalls of ADD(-S) below 10 % of the diameter, and median
     errors, by object and of all."""
-    from ..bop import Dataset, evaluate, read_results
+    from ..bop import Dataset, evaluate
+    from ..bop.files import read_results
     from ..files.paths import check_suffix, write_text
 
     if args.out is not None:
@@ -93,7 +95,8 @@ def _refine(args: argparse.Namespace) -> int:
     grows by that of all its rows."""
     from tqdm import tqdm
 
-    from ..bop import Dataset, read_results, refine, write_results
+    from ..bop import Dataset, refine
+    from ..bop.files import read_results, write_results
     from ..files.paths import check_suffix
     from . import INTERRUPTED
 
@@ -141,7 +144,7 @@ def _refine(args: argparse.Namespace) -> int:
 
 def _done(args: argparse.Namespace, given: Sequence[Estimate]) -> list[Estimate]:
     """Return the rows of an earlier run. Raises ValueError."""
-    from ..bop import read_results
+    from ..bop.files import read_results
 
     if args.out.exists() and args.results.exists() and args.out.samefile(args.results):
         raise ValueError(f"--out: expected another file than {args.results}, got the same; its poses would be lost")

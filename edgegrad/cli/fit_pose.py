@@ -37,7 +37,7 @@ from .inputs import (
 )  # fmt: skip
 
 if TYPE_CHECKING:
-    from ..fit import PoseFit
+    from ..fit.pose.result import PoseFit
 
 
 def add(commands: Any) -> None:

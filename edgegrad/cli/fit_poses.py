@@ -11,7 +11,7 @@ from .arguments import add_depth, add_out, add_size, add_steps, add_view, number
 from .inputs import check_size, read_depth, read_labels, read_photo_view, read_picture, read_pose, seen_by
 
 if TYPE_CHECKING:
-    from ..fit import PoseFit
+    from ..fit.pose.result import PoseFit
 
 
 def add(commands: Any) -> None:

@@ -30,10 +30,10 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Find how a skinned mesh or a robot is posed from masks, from coarse to fine, beginning at rest. Ctrl-C keeps the best so
     far, and --resume goes on from there."""
-    from .. import load_rig, load_robot
     from ..fit import fit_rig
+    from ..rig.files import load
 
-    rig = load_robot(args.rig) if args.rig.suffix.lower() == ".urdf" else load_rig(args.rig, materials=False)
+    rig = load(args.rig)
     cameras, _, _ = read_views(args)
     masks = [read_coverage(path, args.label) for path in args.images]
     make_folder(args.out)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from .. import Camera, Mesh, Scene
-    from ..fit import Pose
+    from ..fit.placement import Pose
 
 
 def read_scene(args: argparse.Namespace) -> Scene:
@@ -193,7 +193,7 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
     import torch
 
     from .. import load_camera
-    from ..fit import PoseFit
+    from ..fit.pose.result import PoseFit
     from ..preview import framing
 
     described = any(value is not None for value in (args.fov, args.eye, args.target, args.up))

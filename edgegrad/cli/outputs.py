@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..fit import CameraFit, Fit, PoseFit
-    from ..live import Viewer
+    from ..fit.descent.result import Fit
+    from ..fit.pose.fit_camera import CameraFit
+    from ..fit.pose.result import PoseFit
+    from ..live.view import Viewer
 
 
 def make_folder(folder: Path) -> None:

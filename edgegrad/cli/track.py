@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from .. import Camera
-    from ..fit import TrackedPose
+    from ..fit.pose.track import TrackedPose
     from ..scene.scene import Scene
 
 FRAMES_BETWEEN_WRITES = 10  # frames between two writings of poses.json

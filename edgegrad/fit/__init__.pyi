@@ -1,30 +1,19 @@
 from . import losses, priors, regularizers
-from .descent.fit_scene import Progress, fit_scene
+from .descent.fit_scene import fit_scene
 from .descent.fit_shape import fit_shape
 from .descent.fit_texture import fit_texture
-from .descent.result import Fit
-from .ending import Ending
-from .history import Record
 from .hull import visual_hull
-from .measured import Measured
 from .options import Options, Parameter
-from .placement import Pose, PoseParameter
-from .pose.calibrate import Calibration, calibrate
-from .pose.camera_uncertainty import CameraUncertainty
-from .pose.fit_camera import CameraFit, fit_camera
+from .placement import PoseParameter
+from .pose.calibrate import calibrate
+from .pose.fit_camera import fit_camera
 from .pose.fit_pose import fit_pose
 from .pose.fit_poses import fit_poses
-from .pose.result import PoseFit, Step
-from .pose.track import TrackedPose, track
-from .pose.uncertainty import Uncertainty
+from .pose.track import track
 from .rig.fit_rig import fit_rig
-from .rig.result import RigFit
 from .rig.track_rig import track_rig
-from .rig.uncertainty import JointUncertainty
 
 __all__ = [
-    "Calibration", "CameraFit", "CameraUncertainty", "Ending", "Fit", "JointUncertainty", "Measured", "Options", "Parameter",
-    "Pose", "PoseFit", "PoseParameter", "Progress", "Record", "RigFit", "Step", "TrackedPose", "Uncertainty", "calibrate",
-    "fit_camera", "fit_pose", "fit_poses", "fit_rig", "fit_scene", "fit_shape", "fit_texture", "losses", "priors",
-    "regularizers", "track", "track_rig", "visual_hull",
+    "Options", "Parameter", "PoseParameter", "calibrate", "fit_camera", "fit_pose", "fit_poses", "fit_rig", "fit_scene",
+    "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track", "track_rig", "visual_hull",
 ]  # fmt: skip

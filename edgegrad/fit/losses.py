@@ -19,6 +19,8 @@ from torch import Tensor
 
 from ..optional import require
 
+__all__ = ["huber", "iou", "l1", "l2", "multiscale", "robust", "ssim"]
+
 Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 

@@ -57,7 +57,7 @@ class Pose(NamedTuple):
 class PoseParameter:
     """A pose to find, in steps of a rotation vector about the object's centre and a shift in sizes of the object.
 
-    start     initial pose, Pose(R, t) or Pose(R, t, scale); None: the vertices stay where they are
+    start     initial pose, (R, t), (R, t, scale) or a Pose; None: the vertices stay where they are
     of        the object, a Mesh or a Scene: centre and size are those of its bounding box. None: the part of the scene that the
               parameter's name names
     rotation  learning rate, about radians per step
@@ -65,7 +65,7 @@ class PoseParameter:
     scale     learning rate of the logarithm of the scale; None: the scale is fixed
     """
 
-    start: Pose | None = None
+    start: tuple[Tensor, ...] | None = None
     of: Mesh | Scene | None = None
     rotation: float = 0.01
     shift: float = 0.01
@@ -96,9 +96,9 @@ def _checked(name: str, start: object) -> Pose:
     f64 = torch.float64
     if start is None:
         return Pose(torch.eye(3, dtype=f64), torch.zeros(3, dtype=f64))
-    if not isinstance(start, Pose):
-        raise TypeError(f"{name}: start: expected a Pose, got {type(start).__name__}; give Pose(R, t)")
-    R, t, scale = (torch.as_tensor(x).detach().cpu().to(f64, copy=True) for x in start[:3])
+    if not isinstance(start, tuple) or not 2 <= len(start) <= 6:
+        raise TypeError(f"{name}: start: expected a tuple (R, t), got {type(start).__name__}; R is (3, 3), and t (3,)")
+    R, t, scale = (torch.as_tensor(x).detach().cpu().to(f64, copy=True) for x in Pose(*start)[:3])
     for part, value, shape in (("R", R, (3, 3)), ("t", t, (3,)), ("scale", scale, ())):
         check_shape(f"{name}: {part}", value, shape)
         check_finite(f"{name}: {part}", value)

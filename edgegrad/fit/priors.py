@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
+__all__ = ["mirrored", "near", "towards"]
+
 Prior = Callable[[Mapping[str, Tensor]], Tensor]
 PLACE = ("translation", "orientation", "scale")
 

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from ..scene.rows import areas, unit
 
+__all__ = ["area", "edge_length", "laplacian", "normal_consistency", "total_variation"]
+
 
 def edges(faces: Tensor) -> Tensor:
     """Return every edge (E, 2) int64 once, its smaller vertex first."""

@@ -83,7 +83,7 @@ class Lighting(NamedTuple):
             warn(
                 "no light",
                 "scene: no light falls on its materials, so they are black; give it lights=[…], such as "
-                "eg.Environment(torch.ones(3)), or leave the materials out: colours are then radiance",
+                "eg.lights.Environment(torch.ones(3)), or leave the materials out: colours are then radiance",
             )
         if self.bounces > 1:
             check_bounces(scene, camera, request)

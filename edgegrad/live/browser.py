@@ -15,7 +15,7 @@ from ..camera.camera import Camera
 from ..files.formats.gltf_pack import to_glb
 from ..fit.views import displayed
 from ..optional import require
-from ..scene.material import Material, vertex_normals
+from ..scene.material import Material
 from ..scene.mesh import DEFAULT_RADIANCE, Mesh
 from ..scene.tree import named_tensors
 from .snapshot import BONE, CONTRAST, Snapshot, as_bytes
@@ -166,7 +166,7 @@ class Browser:
         if mesh.face_colors is not None:  # colours of corners are written faster
             mesh = mesh.replace(corner_colors=mesh.face_colors[:, None].expand(-1, 3, -1))
         if mesh.material is None:  # a matt and smooth one
-            mesh = mesh.replace(material=Material(), normals=vertex_normals(mesh.verts, mesh.faces), normal_faces=None)
+            mesh = mesh.replace(material=Material(), normals=mesh.vertex_normals(), normal_faces=None)
         if opacity < 1.0 and mesh.alpha is None and mesh.material is not None:
             own = mesh.uvs is not None
             anywhere = {} if own else {"uvs": torch.zeros(1, 2), "uv_faces": torch.zeros_like(mesh.faces)}

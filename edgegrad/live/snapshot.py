@@ -12,11 +12,15 @@ from torch import Tensor
 
 from ..aovs import render_aovs
 from ..camera.camera import Camera
-from ..fit import Calibration, CameraFit, Fit, PoseFit, Progress, RigFit
 from ..fit.contour_colors import draw_contour
+from ..fit.descent.fit_scene import Progress
+from ..fit.descent.result import Fit
+from ..fit.pose.calibrate import Calibration
+from ..fit.pose.fit_camera import CameraFit
 from ..fit.pose.photo.overlay import overlay
-from ..fit.pose.result import Step
+from ..fit.pose.result import PoseFit, Step
 from ..fit.pose.task import PoseTask
+from ..fit.rig.result import RigFit
 from ..fit.views import Images, Observation, area_mean, cameras_of, displayed, views_of
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene

@@ -22,7 +22,11 @@ from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 
 if TYPE_CHECKING:
-    from ..fit import Calibration, CameraFit, Fit, PoseFit, RigFit
+    from ..fit.descent.result import Fit
+    from ..fit.pose.calibrate import Calibration
+    from ..fit.pose.fit_camera import CameraFit
+    from ..fit.pose.result import PoseFit
+    from ..fit.rig.result import RigFit
     from .browser import Browser
     from .figure import NotebookFigure
     from .snapshot import Shown, Snapshot

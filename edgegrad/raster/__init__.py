@@ -6,21 +6,19 @@ scripts run with `import edgegrad.raster as dr`. Row 0 of images and textures is
 on any device; the work is done on the CPU, with the same bits at any number of threads.
 """
 
-from .antialias import TopologyHash, antialias, antialias_construct_topology_hash
+from .antialias import antialias, antialias_construct_topology_hash
 from .interpolate import interpolate
 from .rasterize import (
     DepthPeeler,
-    RasterizeContext,
     RasterizeCudaContext,
     RasterizeGLContext,
     get_log_level,
     rasterize,
     set_log_level,
 )
-from .texture import Mipmaps, texture, texture_construct_mip
+from .texture import texture, texture_construct_mip
 
 __all__ = [
-    "DepthPeeler", "Mipmaps", "RasterizeContext", "RasterizeCudaContext", "RasterizeGLContext", "TopologyHash", "antialias",
-    "antialias_construct_topology_hash", "get_log_level", "interpolate", "rasterize", "set_log_level", "texture",
-    "texture_construct_mip",
+    "DepthPeeler", "RasterizeCudaContext", "RasterizeGLContext", "antialias", "antialias_construct_topology_hash",
+    "get_log_level", "interpolate", "rasterize", "set_log_level", "texture", "texture_construct_mip",
 ]  # fmt: skip

@@ -17,17 +17,7 @@ from .tensors import check_positions, contiguous, ranges_of, to_kernel, triangle
 
 
 class RasterizeContext:
-    """The context that `rasterize` takes, which here holds one choice and no resources. Raises ValueError for another mode.
-
-    Parameters
-    ----------
-    output_db : bool, default True
-        Whether derivatives of barycentrics in the image are returned.
-    mode : "automatic" or "manual"
-        Both do the same here.
-    device
-        Ignored: results are on the device of `pos`.
-    """
+    """Base class of both contexts, which hold one choice and no resources."""
 
     def __init__(self, output_db: bool = True, mode: str = "automatic", device: Any = None) -> None:
         if mode not in ("automatic", "manual"):
@@ -42,11 +32,21 @@ class RasterizeContext:
 
 
 class RasterizeGLContext(RasterizeContext):
-    """`RasterizeContext` under the name that scripts use."""
+    """A context for `rasterize`, which here holds one choice and no resources. Raises ValueError for another mode.
+
+    Parameters
+    ----------
+    output_db : bool, default True
+        Whether derivatives of barycentrics in the image are returned.
+    mode : "automatic" or "manual"
+        Both do the same here.
+    device
+        Ignored: results are on the device of `pos`.
+    """
 
 
 class RasterizeCudaContext(RasterizeContext):
-    """`RasterizeContext` under the name, and with the arguments, that scripts use."""
+    """A context for `rasterize` under the name, and with the arguments, that scripts use. It needs no CUDA."""
 
     def __init__(self, device: Any = None) -> None:
         super().__init__(device=device)
@@ -67,7 +67,7 @@ def get_log_level() -> int:
 
 
 def rasterize(
-    ctx: RasterizeContext,
+    ctx: RasterizeCudaContext | RasterizeGLContext,
     pos: Tensor,
     tri: Tensor,
     resolution: Sequence[int],
@@ -87,7 +87,7 @@ def rasterize(
 
     Parameters
     ----------
-    ctx : RasterizeContext
+    ctx : RasterizeCudaContext or RasterizeGLContext
     pos : (B, V, 4) float, or (V, 4) for all images with `ranges`
         Vertices of each image in clip space: −w ≤ x, y, z ≤ w is seen, the smaller z/w the nearer.
     tri : (F, 3) int
@@ -153,7 +153,7 @@ class _Arguments(NamedTuple):
     @classmethod
     def checked(cls, ctx: Any, pos: Any, tri: Any, resolution: Sequence[int], ranges: Any, grad_db: bool) -> _Arguments:
         if not isinstance(ctx, RasterizeContext):
-            raise TypeError(f"ctx: expected a RasterizeContext, got {type(ctx).__name__}")
+            raise TypeError(f"ctx: expected a RasterizeCudaContext or RasterizeGLContext, got {type(ctx).__name__}")
         (pos,), device = to_kernel(pos=pos)
         if pos.dim() not in (2, 3) or pos.shape[-1] != 4:
             raise ValueError(f"pos: expected shape (B, V, 4), or (V, 4) with ranges, got {tuple(pos.shape)}")

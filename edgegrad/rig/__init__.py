@@ -1,1 +1,5 @@
 """Rigs: functions from few numbers to meshes that bend."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

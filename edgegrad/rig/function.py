@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ..check import check_finite
-from ..scene.material import vertex_normals
 from ..scene.mesh import Mesh
+from ..scene.rows import vertex_normals
 from .control import Control
 from .rotations import roma
 

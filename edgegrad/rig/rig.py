@@ -59,7 +59,7 @@ class Shape(NamedTuple):
 class Rig:
     """Meshes that bend: a differentiable function from few numbers to vertices.
 
-    It is made by load_rig(path), Rig.from_arrays(…), Rig.from_function(…) or load_robot(path).
+    It is made by eg.rig.load(path), Rig.from_arrays(…) or Rig.from_function(…).
 
     Attributes
     ----------
@@ -320,7 +320,7 @@ class Rig:
         names the argument.
 
             model = anny.Anny(skinning_method="lbs")
-            rig = eg.Rig.from_function(body, model.get_triangular_faces(), {"age": torch.tensor(0.5), …})
+            rig = eg.rig.Rig.from_function(body, model.get_triangular_faces(), {"age": torch.tensor(0.5), …})
 
         Parameters
         ----------

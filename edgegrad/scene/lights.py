@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..check import check_fields, check_positive_int, check_shape, values_visible
+from ..check import check_fields, check_shape, values_visible
 from .affine import Affine, check_rotation
-from .material import Material, numbers
-from .mesh import Mesh
+from .material import numbers
 from .rows import unit
 from .spherical_harmonics import harmonics
 
@@ -301,56 +300,3 @@ class SphericalHarmonics(Light):
         """Return the irradiance (N, C) of surfaces with unit normals (N, 3)."""
         n = normal if self.rotation is None else normal @ self.rotation.to(normal)
         return torch.stack(harmonics(n), -1) @ self.coefficients.to(normal)
-
-
-class AreaLight:
-    """Constructors of meshes that emit light. Any mesh whose material has emission is a light. They go among the lights or the
-    meshes of a Scene, and are seen."""
-
-    @staticmethod
-    def of(mesh: Mesh, radiance: Tensor | float, two_sided: bool = True) -> Mesh:
-        """Return the mesh with a material that scatters nothing and emits `radiance`, a number or (C,), W/(sr m²).
-
-        If not two_sided, it emits only to the side from which the vertices of its faces run counter-clockwise. Raises TypeError
-        or ValueError.
-        """
-        if not isinstance(mesh, Mesh):
-            raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}")
-        return mesh.replace(
-            material=Material(base_color=0.0, emission=numbers("radiance", radiance), two_sided=two_sided)
-        )
-
-    @staticmethod
-    def rectangle(center: Tensor, u: Tensor, v: Tensor, radiance: Tensor | float, two_sided: bool = True) -> Mesh:
-        """Return a parallelogram with the corners center ± u ± v, (3,) each, world units; its front is that of u × v. Raises
-        TypeError or ValueError."""
-        center, u, v = _vectors(center=center, u=u, v=v)
-        verts = torch.stack([center - u - v, center + u - v, center + u + v, center - u + v])
-        faces = torch.tensor([[0, 1, 2], [0, 2, 3]], device=verts.device)
-        return AreaLight.of(Mesh(verts, faces), radiance, two_sided)
-
-    @staticmethod
-    def disc(
-        center: Tensor, u: Tensor, v: Tensor, radiance: Tensor | float, segments: int = 64, two_sided: bool = True
-    ) -> Mesh:
-        """Return a polygon of `segments` corners center + u cos φ + v sin φ, (3,) each, world units; its front is that of u ×
-        v. Raises TypeError or ValueError."""
-        center, u, v = _vectors(center=center, u=u, v=v)
-        check_positive_int("segments", segments, most=1 << 20)
-        if segments < 3:
-            raise ValueError(f"segments: expected at least 3, got {segments}")
-        k = torch.arange(segments, device=center.device)
-        angle = (2 * math.pi / segments * k).to(center)[:, None]
-        ring = center + angle.cos() * u + angle.sin() * v
-        faces = torch.stack([torch.full_like(k, segments), k, (k + 1) % segments], 1)
-        return AreaLight.of(Mesh(torch.cat([ring, center[None]]), faces), radiance, two_sided)
-
-
-def _vectors(**given: Tensor) -> list[Tensor]:
-    found = []
-    for name, value in given.items():
-        vector = numbers(name, value)
-        check_shape(name, vector, (3,))
-        found.append(vector)
-    dtype = max((v.dtype for v in found), key=lambda t: torch.finfo(t).bits)
-    return [v.to(dtype) for v in found]

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ..check import as_index, as_real, as_tensor, check_choice, check_fields, check_finite, check_float, check_shape
 from ..library import core
-from .rows import areas, unit
 
 WRAPS: tuple[str, ...] = core.WRAPS  # repeat, clamp, mirror
 LOOKUPS = ("linear", "nearest", "mipmap")
@@ -246,23 +245,3 @@ def numbers(name: str, value: object) -> Tensor:
     check_float(name, tensor)
     check_finite(name, tensor)
     return tensor
-
-
-def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
-    """Return unit normals (V, 3) of vertices, differentiable, for `Mesh(…, normals=eg.vertex_normals(verts, faces))`.
-
-    They are the mean of the incident faces' by area, on the side from which their vertices run counter-clockwise, and zero
-    where there is no direction. Raises TypeError or ValueError that names the argument.
-
-    Parameters
-    ----------
-    verts : (V, 3) float
-    faces : (F, 3) int
-    """
-    verts = as_tensor("verts", verts, floating=True)
-    check_float("verts", verts)
-    check_shape("verts", verts, ("V", 3))
-    faces = as_index("faces", faces, ("F", 3), len(verts), "verts").to(verts.device)
-    area, index = areas(verts[faces.long()]), faces.long().reshape(-1)
-    total = torch.zeros_like(verts, dtype=area.dtype).index_add(0, index, area.repeat_interleave(3, 0))
-    return unit(total).to(verts.dtype)

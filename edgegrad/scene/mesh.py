@@ -24,6 +24,7 @@ from ..check import (
 from ..library import core
 from .affine import Affine
 from .material import LARGEST_UV, LOOKUPS, Material, Texture, checked_wrap
+from .rows import vertex_normals
 from .tree import map_tensors, moved
 
 DEFAULT_RADIANCE = 0.7  # radiance, or base colour, of a mesh without colours, in every channel
@@ -246,6 +247,14 @@ class Mesh:
             gone = appearance | (set() if needs_uvs else {"uvs", "uv_faces"})
             fields = {**dict.fromkeys(gone - set(fields)), **fields}
         return dataclasses.replace(self, **fields)
+
+    def vertex_normals(self) -> Tensor:
+        """Return unit normals (V, 3) of the vertices, differentiable, for `mesh.replace(normals=mesh.vertex_normals())`.
+
+        They are the mean of the incident faces' by area, on the side from which their vertices run counter-clockwise, and zero
+        where there is no direction.
+        """
+        return vertex_normals(self.verts, self.faces)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Mesh:
         """Return the mesh with vertices `scale · R v + t`, differentiable in all four.

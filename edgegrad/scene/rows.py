@@ -34,6 +34,14 @@ def areas(corners: Tensor) -> Tensor:
     return torch.linalg.cross(b - a, c - a)
 
 
+def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
+    """Return Mesh.vertex_normals() of checked verts (V, 3) and faces (F, 3)."""
+    faces = faces.to(verts.device).long()
+    area = areas(verts[faces])
+    total = torch.zeros_like(verts, dtype=area.dtype).index_add(0, faces.reshape(-1), area.repeat_interleave(3, 0))
+    return unit(total).to(verts.dtype)
+
+
 def interpolated(b: Tensor, corners: Tensor) -> Tensor:
     """Return (N, K) of barycentrics (N, 3) and values at corners (N, 3, K). A matrix product would lose digits under
     autocast."""

@@ -117,7 +117,8 @@ class Scene:
                 own.append(light)
             else:
                 raise TypeError(
-                    f"lights[{i}]: expected a light such as eg.PointLight, or a Mesh that emits, got {type(light).__name__}"
+                    f"lights[{i}]: expected a light such as eg.lights.PointLight, or a Mesh that emits, got "
+                    f"{type(light).__name__}"
                 )
         object.__setattr__(self, "lights", tuple(own))
         return meshes

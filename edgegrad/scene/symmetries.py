@@ -9,46 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..check import as_double, check_positive
+from ..check import as_double, check_flag, check_int, check_positive
+from .mesh import Mesh
+from .nearest import SurfaceIndex
+from .scene import Scene, as_scene
+from .symmetry_axis import SymmetryAxis, rigid, skew
+from .symmetry_search import SymmetrySearch
 
 RIGID = 1e-3  # how far R Rᵀ may be from 1: files round to a few digits
 PARALLEL = 1e-3  # sine of the angle between axes that are one
-
-
-@dataclass(frozen=True, eq=False)
-class SymmetryAxis:
-    """The axis of a continuous symmetry: the mesh may be turned about it by any angle.
-
-    Both tensors become float64. Raises TypeError or ValueError.
-
-    Parameters
-    ----------
-    direction : (3,)
-        Of any length; kept with the length 1.
-    offset : (3,), default zeros
-        A point of the axis, in units of the mesh.
-    """
-
-    direction: Tensor
-    offset: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
-
-    def __post_init__(self) -> None:
-        for name in ("direction", "offset"):
-            object.__setattr__(self, name, as_double(name, getattr(self, name), (3,)).cpu())
-        if not float(self.direction.norm()) > 0.0:
-            raise ValueError("direction: expected a length above zero, got zeros; give the direction of the axis")
-        object.__setattr__(self, "direction", self.direction / self.direction.norm())
-
-    def rotations(self, angles: Tensor) -> Tensor:
-        """Return rotations (N, 4, 4) about the axis by angles (N,) in radians, right-handed."""
-        R = about(self.direction, angles)
-        return _rigid(R, self.offset - R @ self.offset)
 
 
 class PoseError(NamedTuple):
@@ -62,18 +37,20 @@ class PoseError(NamedTuple):
 class Symmetries:
     """The symmetries of a mesh: each of the discrete ones, followed by a rotation about each axis.
 
-    find_symmetries(mesh) finds them. Raises TypeError or ValueError that names the argument.
+    Symmetries.find(mesh) finds them. Raises TypeError or ValueError that names the argument.
 
     Parameters
     ----------
     discrete : (N, 4, 4), default the identity alone
         Rigid motions in the mesh's coordinates, for column vectors. The identity is put first where it is missing.
-    continuous : sequence of SymmetryAxis
+    continuous : sequence of Symmetries.Axis
         Two axes that are not parallel make a sphere: it may be turned in any way about their common point.
     """
 
     discrete: Tensor | None = None
     continuous: Sequence[SymmetryAxis] = ()
+
+    Axis: ClassVar[type[SymmetryAxis]] = SymmetryAxis
 
     def __post_init__(self) -> None:
         given = torch.eye(4)[None] if self.discrete is None else self.discrete
@@ -95,9 +72,48 @@ class Symmetries:
         for i, axis in enumerate(axes):
             if not isinstance(axis, SymmetryAxis):
                 raise TypeError(
-                    f"continuous[{i}]: expected a SymmetryAxis, got {type(axis).__name__}; eg.SymmetryAxis(…) makes one"
+                    f"continuous[{i}]: expected a Symmetries.Axis, got {type(axis).__name__}; "
+                    "eg.Symmetries.Axis(direction) makes one"
                 )
         object.__setattr__(self, "continuous", axes)
+
+    @classmethod
+    def find(
+        cls,
+        mesh: Mesh | Scene,
+        tolerance: float = 0.01,
+        *,
+        textured: bool = True,
+        color_tolerance: float = 0.1,
+        max_order: int = 24,
+    ) -> Symmetries:
+        """Return the rotations that map a mesh onto itself. The same mesh gives the same rotations in the same order.
+
+        The distance is that of 600 points of the surface and as many vertices: a detail smaller than their spacing that is
+        nearer than the tolerance breaks no symmetry. A mesh like a sphere has continuous symmetries about three axes. Mirror
+        images are no symmetries, because no motion makes them. Raises TypeError, ValueError that names the argument, or
+        ImportError without SciPy.
+
+        Parameters
+        ----------
+        mesh : Mesh or Scene
+        tolerance : float, default 0.01
+            Largest distance of points of the rotated mesh from the mesh, as a share of its size: twice the largest distance from
+            its centroid. A prism with so many sides that it is a cylinder within it counts as one.
+        textured : bool, default True
+            Whether colours must agree, too; False finds the symmetries of the shape alone. A plain mesh has none.
+        color_tolerance : float, default 0.1
+            Largest difference of the colours of corresponding points, all but one in a hundred of the points, from 0 to 1 of the
+            brightest. Square roots of radiance (or of base colours) are compared, which is about how the eye sees them.
+        max_order : int, default 24
+            Highest order n of a rotation by 360° / n that is looked for.
+        """
+        scene = as_scene(mesh)
+        check_positive("tolerance", tolerance, least=1e-6, most=0.5)
+        check_positive("color_tolerance", color_tolerance, least=0.0, most=1.0)
+        check_int("max_order", max_order, 2, 360)
+        check_flag("textured", textured)
+        return cls(*SymmetrySearch(SurfaceIndex(scene), tolerance, textured, color_tolerance, max_order).run())
 
     @classmethod
     def from_bop(cls, info: Mapping[str, Any]) -> Symmetries:
@@ -179,14 +195,14 @@ class Symmetries:
             A, B = P[:3, :3], Q[:3, :3]
             center = _common_point(self.continuous)
             R = B * (torch.linalg.det(A) / torch.linalg.det(B)) ** (1.0 / 3.0)
-            return _rigid(R[None], (A @ center + P[:3, 3] - R @ center)[None])[0]
+            return rigid(R[None], (A @ center + P[:3, 3] - R @ center)[None])[0]
         motions = self.motions
         M = motions[:, :3, :3] @ Q[:3, :3].T @ P[:3, :3]  # (N, 3, 3): the trace of M C is that of Bᵀ A C D
         value = M.diagonal(dim1=-2, dim2=-1).sum(-1)
         if self.continuous:
             axis = self.continuous[0]
             along = torch.einsum("i,nij,j->n", axis.direction, M, axis.direction)
-            across = torch.einsum("nij,ji->n", M, _skew(axis.direction))
+            across = torch.einsum("nij,ji->n", M, skew(axis.direction))
             angles = torch.atan2(across, value - along)
             motions = axis.rotations(angles) @ motions
             value = along + torch.hypot(across, value - along)
@@ -216,24 +232,6 @@ class Symmetries:
             return "Symmetries(those of a sphere)"
         axes = f", {len(self.continuous)} continuous" if self.continuous else ""
         return f"Symmetries({len(self.motions)} discrete with the identity{axes})"
-
-
-def about(axis: Tensor, angles: Tensor) -> Tensor:
-    """Return rotations (N, 3, 3) float64 about a unit axis (3,) by angles (N,) in radians, by Rodrigues' formula."""
-    X = _skew(axis)
-    s, c = angles.sin()[:, None, None], angles.cos()[:, None, None]
-    return torch.eye(3, dtype=torch.float64) + s * X + (1.0 - c) * (X @ X)
-
-
-def _skew(a: Tensor) -> Tensor:
-    """Return the matrix (3, 3) with `_skew(a) @ v = a × v`."""
-    x, y, z = a.tolist()
-    return a.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def _rigid(R: Tensor, t: Tensor) -> Tensor:
-    last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(R), 1, 4)
-    return torch.cat([torch.cat([R, t[:, :, None]], 2), last], 1)
 
 
 def _common_point(axes: Sequence[SymmetryAxis]) -> Tensor:

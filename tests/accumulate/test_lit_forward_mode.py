@@ -42,19 +42,23 @@ def camera(lens: str, eye: Tensor) -> eg.Camera:
 def light(kind: str, place: Tensor, radiance: Tensor) -> Any:
     """At `place`, or from there, or from an image or coefficients that change with `radiance`."""
     if kind == "point":
-        return eg.PointLight(place, 30.0, color=radiance)
+        return eg.lights.PointLight(place, 30.0, color=radiance)
     if kind == "spot":
-        return eg.SpotLight(place, -place, 40.0, color=radiance, inner_angle=0.3)
+        return eg.lights.SpotLight(place, -place, 40.0, color=radiance, inner_angle=0.3)
     if kind == "sun":
-        return eg.DirectionalLight(-place, 2.0, color=radiance)
+        return eg.lights.DirectionalLight(-place, 2.0, color=radiance)
     if kind == "area":
-        return eg.AreaLight.rectangle(place, vector(0.5, 0, 0), vector(0, 0.5, 0.1), 10 * radiance)
+        return eg.shapes.rectangle(
+            place, vector(0.5, 0, 0), vector(0, 0.5, 0.1), material=eg.Material(base_color=0.0, emission=10 * radiance)
+        )
     if kind == "emitter":
         emitter = ball(0, smooth=False)
         return emitter.replace(verts=place + 0.3 * emitter.verts, material=eg.Material(0.0, emission=9 * radiance))
     if kind == "sky":
-        return eg.Environment(picture() * radiance + 0.1 * place.square().sum())
-    return eg.SphericalHarmonics((torch.linspace(0.8, 0.1, 9, dtype=F64)[:, None] + 0.1 * place.sum()) * radiance)
+        return eg.lights.Environment(picture() * radiance + 0.1 * place.square().sum())
+    return eg.lights.SphericalHarmonics(
+        (torch.linspace(0.8, 0.1, 9, dtype=F64)[:, None] + 0.1 * place.sum()) * radiance
+    )
 
 
 def material(texture: str, alpha: str, values: Tensor) -> dict[str, Any]:

@@ -327,7 +327,7 @@ def test_what_mitsuba_gets_is_the_same_view(open_ball):
 def test_mitsuba_gets_the_same_sky() -> None:
     """The first and the last row are at the poles, as one finds by asking Mitsuba's `envmap`, where it is there."""
     image = torch.rand((5, 8, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    theirs, ours = mitsuba.sky_image(image), eg.Environment(image)
+    theirs, ours = mitsuba.sky_image(image), eg.lights.Environment(image)
     theta = math.pi * (torch.arange(40, dtype=torch.float64) + 0.3) / 40
     phi = 2 * math.pi * (3 + 0.5) / 8 - math.pi  # of the centres of a column
     d = torch.stack([theta.sin() * math.sin(phi), theta.cos(), -theta.sin() * math.cos(phi)], 1)

@@ -10,7 +10,7 @@ import trimesh
 
 import edgegrad as eg
 from edgegrad import bop
-from edgegrad.scene.symmetries import about
+from edgegrad.scene.symmetry_axis import about
 
 SIZE = (72, 96)
 K = torch.tensor([[120.0, 0.0, 47.5], [0.0, 120.0, 35.5], [0.0, 0.0, 1.0]])
@@ -58,16 +58,16 @@ def camera() -> eg.Camera:
 
 def make(folder: Path, scene_id: int = 3) -> Path:
     models = meshes()
-    bop.write_models(folder, models, {5: eg.find_symmetries(models[5])})
-    bop.write_scene(folder, scene_id, [bop.Shot(camera(), objects) for objects in TRUTHS], models, spp=32)
+    bop.files.write_models(folder, models, {5: eg.Symmetries.find(models[5])})
+    bop.files.write_scene(folder, scene_id, [bop.files.Shot(camera(), objects) for objects in TRUTHS], models, spp=32)
     return folder
 
 
-def estimates(moved: torch.Tensor | None = None) -> list[bop.Estimate]:
+def estimates(moved: torch.Tensor | None = None) -> list[bop.files.Estimate]:
     """Return the true poses, each followed by a motion in the camera's axes."""
     moved = torch.eye(4, dtype=torch.float64) if moved is None else moved
     return [
-        bop.Estimate(3, im_id, obj_id, 0.9 - 0.1 * i, moved @ truth, 1.5)
+        bop.files.Estimate(3, im_id, obj_id, 0.9 - 0.1 * i, moved @ truth, 1.5)
         for im_id, objects in enumerate(TRUTHS)
         for i, (obj_id, truth) in enumerate(objects)
     ]

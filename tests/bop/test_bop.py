@@ -16,6 +16,7 @@ from PIL import Image
 
 import edgegrad as eg
 from edgegrad import bop, cli
+from edgegrad.bop.dataset import Target
 
 pytest_plugins = "bop_fixtures"
 
@@ -41,14 +42,14 @@ def test_written_data_sets_are_read_back(made: Path) -> None:
     assert five.points.shape == (8, 3) and five.mesh.channels == 3
     # The picture is the mesh in its pose; depth is its depth, to half a step of 0.1 mm; masks are where it is.
     truth = frame.truths[0].pose
-    depth = bop.depth_image(meshes()[5], truth, frame.camera)
+    depth = bop.errors.depth_image(meshes()[5], truth, frame.camera)
     own = frame.mask(0) > 0.5
     assert torch.equal(own, depth > 0) and torch.equal(frame.mask_visible(0) > 0.5, own)
     assert float((frame.depth() - depth)[own].abs().max()) < 0.051
     again = eg.render(five.mesh.transformed(truth[:3, :3], truth[:3, 3]), frame.camera, spp=32, seed=0)
     inside = torch.nn.functional.max_pool2d(1.0 - own.float()[None, None], 3, 1, 1)[0, 0] == 0
     assert float((frame.picture() - again)[inside].abs().mean()) < 0.004
-    assert data.targets() == [bop.Target(3, 0, 1, 1), bop.Target(3, 0, 5, 1), bop.Target(3, 1, 5, 2)]
+    assert data.targets() == [Target(3, 0, 1, 1), Target(3, 0, 5, 1), Target(3, 1, 5, 2)]
 
 
 def test_pictures_are_read_as_they_are_stored(folder: Path) -> None:
@@ -71,7 +72,7 @@ def test_targets_without_a_file_are_the_visible_instances(folder: Path) -> None:
     content = json.loads(info.read_text())
     content["1"][0]["visib_fract"] = 0.09
     info.write_text(json.dumps(content))
-    assert bop.Dataset(folder).targets() == [bop.Target(3, 0, 1, 1), bop.Target(3, 0, 5, 1), bop.Target(3, 1, 5, 1)]
+    assert bop.Dataset(folder).targets() == [Target(3, 0, 1, 1), Target(3, 0, 5, 1), Target(3, 1, 5, 1)]
 
 
 def test_covered_instances_have_visible_masks_and_shares(tmp_path: Path) -> None:
@@ -80,8 +81,8 @@ def test_covered_instances_have_visible_masks_and_shares(tmp_path: Path) -> None
     plate = {2: eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.full((2, 3), 0.2))}
     far, near = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
     far[2, 3], near[:3, 3] = 400.0, torch.tensor([-50.0, 0.0, 300.0])
-    bop.write_models(tmp_path, plate)
-    bop.write_scene(tmp_path, 1, [bop.Shot(camera(), [(2, far), (2, near)])], plate, split="val", spp=1)
+    bop.files.write_models(tmp_path, plate)
+    bop.files.write_scene(tmp_path, 1, [bop.files.Shot(camera(), [(2, far), (2, near)])], plate, split="val", spp=1)
     frame = bop.Dataset(tmp_path).frame(1, 0)
     # 40 / 400 · 120 = 12 px to each side of the middle, at 48; the near one's right border is at -10 / 300 · 120 = -4 px.
     assert frame.truths[0].visible == pytest.approx(16 / 24) and frame.truths[1].visible == 1.0
@@ -163,7 +164,7 @@ def test_split_is_chosen_or_must_be_named(folder: Path) -> None:
     data = bop.Dataset(folder, "train")
     assert bop.Dataset(folder).split == "test_other" and data.split == "train"
     (folder / "test_targets_bop19.json").write_text("[]")  # says nothing of another split
-    assert data.targets()[-1] == bop.Target(3, 1, 5, 2) and bop.Dataset(folder).targets() == []
+    assert data.targets()[-1] == Target(3, 1, 5, 2) and bop.Dataset(folder).targets() == []
     (folder / "test_other").rename(folder / "val")
     with pytest.raises(ValueError, match="expected the name of a split, got train, val; name one"):
         bop.Dataset(folder)
@@ -174,9 +175,9 @@ def test_split_is_chosen_or_must_be_named(folder: Path) -> None:
 
 def test_results_come_back_to_the_bit(tmp_path: Path) -> None:
     given = estimates(pose((0.1, 0.2, 0.3), (1.0, 2.0, 1 / 3)))
-    bop.write_results(tmp_path / "a.csv", given)
+    bop.files.write_results(tmp_path / "a.csv", given)
     assert (tmp_path / "a.csv").read_text().splitlines()[0] == "scene_id,im_id,obj_id,score,R,t,time"
-    found = bop.read_results(tmp_path / "a.csv")
+    found = bop.files.read_results(tmp_path / "a.csv")
     for ours, theirs in zip(found, given, strict=True):
         assert torch.equal(ours.pose, theirs.pose) and ours.seconds == 1.5
         assert (ours.scene_id, ours.im_id, ours.obj_id, ours.score) == (
@@ -187,7 +188,7 @@ def test_results_come_back_to_the_bit(tmp_path: Path) -> None:
         )
     # By rows; the header and the last newline may be missing.
     (tmp_path / "b.csv").write_text("1, 2,3,0.5,0 -1 0 1 0 0 0 0 1,10 20 30,-1")
-    (one,) = bop.read_results(tmp_path / "b.csv")
+    (one,) = bop.files.read_results(tmp_path / "b.csv")
     assert one.pose.tolist() == [[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]] and one.seconds == -1.0
 
 
@@ -206,7 +207,7 @@ def test_results_come_back_to_the_bit(tmp_path: Path) -> None:
 def test_malformed_result_files_are_named(line: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(f"scene_id,im_id,obj_id,score,R,t,time\n{line}\n")
     with pytest.raises(ValueError, match=words):
-        bop.read_results(tmp_path / "a.csv")
+        bop.files.read_results(tmp_path / "a.csv")
 
 
 # -- refined -------------------------------------------------------------------------------------------------------------------
@@ -228,7 +229,7 @@ def test_command_line_writes_errors_and_refined_poses(folder: Path, capsys: pyte
     # The second in another of the poses that look the same: what comes out is near that one.
     starts = [TRUTHS[0][0][1], TRUTHS[0][1][1] @ data.model(5).symmetries.motions[1]]
     given = [replace(one, pose=pose_off(start)) for one, start in zip(estimates()[:2], starts, strict=True)]
-    bop.write_results(results, given)
+    bop.files.write_results(results, given)
     assert run("bop", "refine", folder, results, "-o", out, "--limit", 1, "--pictures", folder / "seen", *QUICK) == 0
     said = capsys.readouterr().out
     assert "scene 3, image 0, object 1: turned" in said and "1 of 1 rows in" in said
@@ -239,7 +240,7 @@ def test_command_line_writes_errors_and_refined_poses(folder: Path, capsys: pyte
     assert "--resume" in capsys.readouterr().err and out.read_text() == first
     assert run("bop", "refine", folder, results, "-o", out, "--resume", *QUICK) == 0
     assert out.read_text().splitlines()[1].rsplit(",", 1)[0] == first.splitlines()[1].rsplit(",", 1)[0]
-    found = bop.read_results(out)
+    found = bop.files.read_results(out)
     assert found[0].seconds == found[1].seconds > 1.5  # one time for the image
     assert run("bop", "errors", folder, results, "--no-vsd") == 0
     assert run("bop", "errors", folder, out, "--out", report) == 0
@@ -256,14 +257,14 @@ def test_command_line_writes_errors_and_refined_poses(folder: Path, capsys: pyte
 
 def test_refine_keeps_poses_whose_fit_fails(made: Path) -> None:
     data = bop.Dataset(made)
-    off_image = bop.Estimate(3, 0, 1, 1.0, pose((0.1, 0, 0), (5000.0, 0.0, 400.0)))
+    off_image = bop.files.Estimate(3, 0, 1, 1.0, pose((0.1, 0, 0), (5000.0, 0.0, 400.0)))
     found = bop.refine(data, off_image)
     assert found.kept and found.fit is None and "does not show" in found.why and found.estimate is off_image
     start = replace(estimates()[0], pose=pose_off(TRUTHS[0][0][1]))
     early = bop.refine(data, start, size=32, steps=1)
     assert early.kept and early.estimate is start and "steps ran out" in early.why
     with pytest.raises(ValueError, match="expected object 7 in it, got 1, 5"):
-        bop.refine(data, bop.Estimate(3, 0, 7, 1.0, TRUTHS[0][0][1]))
+        bop.refine(data, bop.files.Estimate(3, 0, 7, 1.0, TRUTHS[0][0][1]))
 
 
 @pytest.mark.parametrize(
@@ -282,9 +283,9 @@ def test_command_line_messages(
     arguments: tuple[str, ...], words: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:  # fmt: skip
     monkeypatch.chdir(folder)
-    bop.write_results("results.csv", estimates())
-    bop.write_results("longer.csv", estimates())
-    bop.write_results("other.csv", estimates()[1:])
+    bop.files.write_results("results.csv", estimates())
+    bop.files.write_results("longer.csv", estimates())
+    bop.files.write_results("other.csv", estimates()[1:])
     command, *rest = arguments
     assert run("bop", command, ".", *rest) == 2
     (line,) = capsys.readouterr().err.splitlines()

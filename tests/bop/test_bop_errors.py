@@ -29,7 +29,7 @@ pytest_plugins = "bop_fixtures"
 E, T = pose((0.5, -0.3, 0.9), (10.0, -20.0, 400.0)), pose((0.4, -0.2, 1.0), (14.0, -18.0, 410.0))
 POINTS = torch.from_numpy(np.random.default_rng(0).uniform(-50, 50, (40, 3)))
 TURNS = eg.Symmetries(
-    torch.diag(torch.tensor([1.0, -1, -1, 1]))[None], [eg.SymmetryAxis([0.0, 0, 1], [1.0, 2, 0])]
+    torch.diag(torch.tensor([1.0, -1, -1, 1]))[None], [eg.Symmetries.Axis([0.0, 0, 1], [1.0, 2, 0])]
 )  # fmt: skip
 
 
@@ -40,10 +40,10 @@ def moved(motion: np.ndarray, x: np.ndarray) -> np.ndarray:
 def test_point_errors_equal_plain_formulas() -> None:
     a, b, x = E.numpy(), T.numpy(), POINTS.numpy()
     A, B = moved(a, x), moved(b, x)
-    assert bop.add(E, T, POINTS) == pytest.approx(
+    assert bop.errors.add(E, T, POINTS) == pytest.approx(
         np.mean([np.linalg.norm(p - q) for p, q in zip(A, B, strict=True)]), rel=1e-12
     )
-    assert bop.adi(E, T, POINTS) == pytest.approx(
+    assert bop.errors.adi(E, T, POINTS) == pytest.approx(
         np.mean([min(np.linalg.norm(p - q) for p in A) for q in B]), rel=1e-12
     )
     places = A @ K.double().numpy().T
@@ -55,25 +55,30 @@ def test_point_errors_equal_plain_formulas() -> None:
         worst.append(np.linalg.norm(A - C, axis=1).max())
         other = C @ K.double().numpy().T
         pixels.append(np.linalg.norm(places[:, :2] / places[:, 2:] - other[:, :2] / other[:, 2:], axis=1).max())
-    assert bop.mssd(E, T, POINTS, S) == pytest.approx(min(worst), rel=1e-12)
-    assert bop.mspd(E, T, POINTS, S, CAMERA) == pytest.approx(min(pixels), rel=1e-9)
+    assert bop.errors.mssd(E, T, POINTS, S) == pytest.approx(min(worst), rel=1e-12)
+    assert bop.errors.mspd(E, T, POINTS, S, CAMERA) == pytest.approx(min(pixels), rel=1e-9)
     # A pose that a symmetry makes the same.
-    assert bop.mssd(T @ S[40], T, POINTS, S) < 1e-9 and bop.mspd(T @ S[40], T, POINTS, S, CAMERA) < 1e-9
-    assert bop.add(T @ S[40], T, POINTS) > 10.0
+    assert bop.errors.mssd(T @ S[40], T, POINTS, S) < 1e-9 and bop.errors.mspd(T @ S[40], T, POINTS, S, CAMERA) < 1e-9
+    assert bop.errors.add(T @ S[40], T, POINTS) > 10.0
 
 
 def test_bounds_leave_out_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Continuous symmetries have errors close to each other, and bounds come from one point in ten."""
     S = TURNS.transforms()
-    whole = min(bop.mssd(E, T, POINTS, s[None]) for s in S), min(bop.mspd(E, T, POINTS, s[None], CAMERA) for s in S)
+    whole = (
+        min(bop.errors.mssd(E, T, POINTS, s[None]) for s in S),
+        min(bop.errors.mspd(E, T, POINTS, s[None], CAMERA) for s in S),
+    )
     monkeypatch.setattr("edgegrad.bop.errors.BOUND_POINTS", 4)
-    assert (bop.mssd(E, T, POINTS, S), bop.mspd(E, T, POINTS, S, CAMERA)) == pytest.approx(whole, rel=1e-12)
+    assert (bop.errors.mssd(E, T, POINTS, S), bop.errors.mspd(E, T, POINTS, S, CAMERA)) == pytest.approx(
+        whole, rel=1e-12
+    )
 
 
 def test_depth_is_that_of_the_plane() -> None:
     """At the pixels' centres, in OpenCV's convention of K, n·x = d holds."""
     corners = torch.tensor([[-60.0, -50, 10], [70, -40, -20], [0, 80, 30]])
-    depth = bop.depth_image(eg.Mesh(corners, torch.tensor([[0, 1, 2]])), T, CAMERA)
+    depth = bop.errors.depth_image(eg.Mesh(corners, torch.tensor([[0, 1, 2]])), T, CAMERA)
     a, b, c = (T[:3, :3] @ corners.double().T).T + T[:3, 3]
     n = torch.linalg.cross(b - a, c - a)
     seen = 0
@@ -92,8 +97,8 @@ def test_depth_is_that_of_the_plane() -> None:
 def test_depth_of_what_is_not_in_the_image() -> None:
     mesh = meshes()[1]
     for shift in ((5000.0, 0, 400), (0, 0, -400.0), (0, -900.0, 300)):
-        assert float(bop.depth_image(mesh, pose((0.1, 0, 0), shift), CAMERA).max()) == 0.0
-    assert float(bop.depth_image(mesh, pose((0.1, 0, 0), (0, 0, 5.0)), CAMERA).max()) > 0.0  # the eye is inside
+        assert float(bop.errors.depth_image(mesh, pose((0.1, 0, 0), shift), CAMERA).max()) == 0.0
+    assert float(bop.errors.depth_image(mesh, pose((0.1, 0, 0), (0, 0, 5.0)), CAMERA).max()) > 0.0  # the eye is inside
 
 
 def test_vsd_by_pixels() -> None:
@@ -115,10 +120,10 @@ def test_vsd_by_pixels() -> None:
             seen_e = e > 0 and (m == 0 or e <= m + delta or seen_t)
             union += seen_e or seen_t
             wrong += (seen_e != seen_t) + (seen_e and seen_t) * (abs(e - t) / diameter >= np.array(taus))
-    found = bop.vsd(*map(torch.from_numpy, (estimate, truth, scene)), CAMERA, diameter, taus, delta)
+    found = bop.errors.vsd(*map(torch.from_numpy, (estimate, truth, scene)), CAMERA, diameter, taus, delta)
     assert found == pytest.approx(wrong / union, abs=1e-12) and found[0] > found[1] > found[2] > 0.1
     nothing = torch.zeros(size)
-    assert bop.vsd(nothing, nothing, nothing, CAMERA, diameter, taus) == [1.0, 1.0, 1.0]
+    assert bop.errors.vsd(nothing, nothing, nothing, CAMERA, diameter, taus) == [1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(
@@ -143,7 +148,7 @@ def test_true_poses_are_all_found(made: Path) -> None:
     given = estimates()
     flip = data.model(5).symmetries.motions[2]
     for i in (1, 2):  # in another of the poses that look the same
-        given[i] = bop.Estimate(3, given[i].im_id, 5, given[i].score, given[i].pose @ flip)
+        given[i] = bop.files.Estimate(3, given[i].im_id, 5, given[i].score, given[i].pose @ flip)
     found = bop.evaluate(data, given, progress=False)
     assert found.overall.ar == 1.0
     assert found.overall.add_s == 1.0 and found.overall.instances == found.overall.estimates == 4
@@ -183,8 +188,11 @@ def test_missing_and_surplus_estimates(made: Path) -> None:
     far = pose((0.1, 0, 0), (0.0, 0.0, 900.0))
     # One instance has no estimate; a second one of object 1 with a lower score is ignored, as is an object that is not there.
     found = bop.evaluate(
-        data, [*given[:3], bop.Estimate(3, 0, 1, 0.1, far), bop.Estimate(3, 1, 1, 0.9, far)], with_vsd=False, progress=False
-    )  # fmt: skip
+        data,
+        [*given[:3], bop.files.Estimate(3, 0, 1, 0.1, far), bop.files.Estimate(3, 1, 1, 0.9, far)],
+        with_vsd=False,
+        progress=False,
+    )
     assert (
         found.overall.ar_mssd == 0.75
         and found.overall.ar_vsd is None
@@ -193,7 +201,7 @@ def test_missing_and_surplus_estimates(made: Path) -> None:
     )
     assert found.objects[1].ar_mssd == 1.0 and found.objects[5].ar_mssd == pytest.approx(2 / 3)
     # With a higher score it goes first, and the right one is ignored.
-    found = bop.evaluate(data, [*given, bop.Estimate(3, 0, 1, 0.99, far)], with_vsd=False, progress=False)
+    found = bop.evaluate(data, [*given, bop.files.Estimate(3, 0, 1, 0.99, far)], with_vsd=False, progress=False)
     assert found.objects[1].ar_mssd == 0.0 and found.objects[5].ar_mssd == 1.0
     nothing = bop.evaluate(data, [], progress=False)
     assert nothing.overall.ar == 0.0 and math.isnan(nothing.overall.degrees) and "nan" not in nothing.table()

@@ -334,7 +334,7 @@ def test_shader() -> None:
     scene, view, adjoint = both(PLACES["behind"]), camera(), smooth_adjoint(*SIZE, 3)
     colors = torch.cat([m.colors for m in scene.meshes if m.colors is not None])
 
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         return hits.interpolate(colors, "vertex")
 
     found = []

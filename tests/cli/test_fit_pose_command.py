@@ -13,7 +13,7 @@ import edgegrad as eg
 from edgegrad import cli
 from edgegrad.cli import outputs
 from edgegrad.files.image import linear_to_srgb, read_image, write_image
-from edgegrad.fit import PoseFit
+from edgegrad.fit.pose.result import PoseFit
 
 pytestmark = [pytest.mark.quick, pytest.mark.unsanitized]
 pytest_plugins = "cli_fixtures"

@@ -306,7 +306,7 @@ def test_shaders_have_the_same_discontinuities(move):
     first = tilted(quad(1, alpha=disc(), colors=noise(4, 3).abs()))
     at = case([first], move)
 
-    def own(hits: eg.Hits) -> Tensor:
+    def own(hits: eg.points.Hits) -> Tensor:
         colors = first.colors
         assert colors is not None
         return hits.interpolate(colors)
@@ -364,10 +364,10 @@ def test_plan_says_what_is_looked_for():
 @pytest.mark.parametrize(
     "value, error, message",
     [
-        (0.0, ValueError, "step_spacing: expected a number from 0.015625 to 64, got 0.0"),
-        (float("nan"), ValueError, "step_spacing: expected a number from 0.015625 to 64, got nan"),
-        ("1", TypeError, "step_spacing: expected a number, got str"),
-        (True, TypeError, "step_spacing: expected a number, got bool"),
+        (0.0, ValueError, "sampling.discontinuity_spacing: expected a number from 0.015625 to 64, got 0.0"),
+        (float("nan"), ValueError, "sampling.discontinuity_spacing: expected a number from 0.015625 to 64, got nan"),
+        ("1", TypeError, "sampling.discontinuity_spacing: expected a number, got str"),
+        (True, TypeError, "sampling.discontinuity_spacing: expected a number, got bool"),
     ],
 )
 def test_spacing_that_is_none(value, error, message):

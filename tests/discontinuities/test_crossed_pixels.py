@@ -26,7 +26,7 @@ FLAT = eg.Camera(
 
 
 def images(
-    seeds: int, shader: Callable[[eg.Hits], Tensor], mesh: eg.Mesh | eg.Scene, camera: eg.Camera, spp: int
+    seeds: int, shader: Callable[[eg.points.Hits], Tensor], mesh: eg.Mesh | eg.Scene, camera: eg.Camera, spp: int
 ) -> Tensor:
     with torch.no_grad():
         return torch.stack([eg.render(mesh, camera, spp=spp, seed=seed, shader=shader) for seed in range(seeds)])
@@ -37,7 +37,7 @@ def without_borders(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discontinuous_pixels.DiscontinuousPixels, "found", lambda self: (nowhere, 1))
 
 
-def dots(hits: eg.Hits) -> Tensor:
+def dots(hits: eg.points.Hits) -> Tensor:
     """Paint a dot of 0.6 px in the middle of every third pixel: no other pixel knows of it."""
     x = hits.pixel % 3 - 1.5
     return hits.where(0.3 - x.norm(dim=1), 1.0, 0.0)
@@ -78,7 +78,7 @@ def test_a_bound_of_what_is_shaded():
     """Every pixel is a border, so at most four times the points of the first pass are shaded more."""
     counts = []
 
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         counts.append(len(hits))
         return hits.where(torch.cos(50.0 * hits.position.sum(1)), 1.0, 0.0)
 

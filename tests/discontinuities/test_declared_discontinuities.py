@@ -76,7 +76,7 @@ def test_texels_between_neighbouring_points_all_count():
     def gradient(seed: int) -> Tensor:
         duty = torch.tensor(0.3, dtype=F64, requires_grad=True)
 
-        def stripes(hits: eg.Hits) -> Tensor:
+        def stripes(hits: eg.points.Hits) -> Tensor:
             x = 20.3 * hits.position[:, 0]
             return (hits.floor(x) - hits.floor(x - duty))[:, None]  # 1 in the first `duty` of each stripe
 
@@ -94,7 +94,7 @@ def test_a_discontinuity_declared_twice_counts_once():
     def gradient(twice: bool) -> Tensor:
         a = torch.tensor(0.137, dtype=F64, requires_grad=True)
 
-        def shader(hits: eg.Hits) -> Tensor:
+        def shader(hits: eg.points.Hits) -> Tensor:
             s = hits.position[:, 0] + 0.3 * hits.position[:, 1] - a
             # The product of two jumps at one place, 1 → 4, or the whole at once.
             return hits.where(s, 2.0, 1.0) * hits.where(-2 * s, 1.0, 2.0) if twice else hits.where(s, 4.0, 1.0)
@@ -110,7 +110,7 @@ def test_a_jump_of_the_function_is_not_declared():
     back, front = square(), square(0.4)
     scene = eg.Scene([back, front.replace(verts=0.5 * front.verts - torch.tensor([0.0, 0.0, 1.0], dtype=F64))])
 
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         by_mesh = torch.where(hits.mesh == 1, 1.0, -1.0)
         by_place = torch.where(hits.position[:, 1] > 0.7, 2.0, -1.0)
         return hits.where(by_mesh + a, 1.0, 0.0) + hits.where(by_place + a, 1.0, 0.0)
@@ -152,7 +152,7 @@ def test_forward_mode_and_transforms():
     mesh, camera = ball(), front_camera(SIZE)
 
     def image(a: Tensor, verts: Tensor) -> Tensor:
-        def shader(hits: eg.Hits) -> Tensor:
+        def shader(hits: eg.points.Hits) -> Tensor:
             return hits.where(hits.position[:, 0] * (1 + a) - 0.1, 0.4 + 0.5 * hits.shading_normal, 0.2 + a)
 
         return eg.render(mesh.replace(verts=verts), camera, seed=3, shader=shader)
@@ -203,7 +203,7 @@ def test_a_discontinuity_along_a_strip_of_surface(wide: float, least: float, mos
 
 
 def test_calls_that_are_not_always_made_are_refused():
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         return hits.where(hits.depth - 3, 1.0, 0.0) if len(hits) > 50 else torch.ones(len(hits), 1)
 
     mesh = ball()
@@ -253,7 +253,7 @@ def test_discontinuities_along_edges(kind: str):
     def gradient(seed: int) -> Tensor:
         theta = torch.zeros((), dtype=F64, requires_grad=True)
 
-        def shader(hits: eg.Hits) -> Tensor:
+        def shader(hits: eg.points.Hits) -> Tensor:
             s = hits.position[:, 0] - theta
             if kind == "where":
                 return hits.where(s, 1.0, 0.0)
@@ -275,13 +275,13 @@ def test_discontinuities_of_some_points_are_those_of_all():
         back, front = square(), square(0.4)
         front = front.replace(verts=0.4 * front.verts - torch.tensor([0.0, 0.0, 1.0], dtype=F64))
 
-        def of_back(hits: eg.Hits) -> Tensor:
+        def of_back(hits: eg.points.Hits) -> Tensor:
             return hits.where(hits.position[:, 0] - 0.7 - theta, 1.0, 0.3)
 
-        def of_front(hits: eg.Hits) -> Tensor:
+        def of_front(hits: eg.points.Hits) -> Tensor:
             return 0.1 * hits.floor(7 * hits.position[:, 1] + theta)[:, None]
 
-        def shader(hits: eg.Hits) -> Tensor:
+        def shader(hits: eg.points.Hits) -> Tensor:
             front = hits.mesh == 1
             if not selected:
                 return torch.where(front[:, None], of_front(hits), of_back(hits))
@@ -289,7 +289,7 @@ def test_discontinuities_of_some_points_are_those_of_all():
             color = color.index_put(((~front).nonzero()[:, 0],), of_back(hits.select(~front)))
             return color.index_put((front.nonzero()[:, 0],), of_front(hits.select(front)))
 
-        image = eg.render(eg.Scene([back, front]), flat_camera(32), shader=shader, check_shader=True, seed=0)
+        image = eg.render(eg.Scene([back, front]), flat_camera(32), shader=shader, seed=0)
         return torch.autograd.grad((image * smooth_adjoint(32, 32, 1)).sum(), theta)[0]
 
     one, all = gradient(True), gradient(False)
@@ -300,7 +300,7 @@ def test_discontinuities_of_some_points_are_those_of_all():
 def test_many_directions_in_one_pass():
     mesh, camera = ball(), front_camera(SIZE)
 
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         return hits.where(hits.position[:, 0] - 0.1, 1.0, 0.2) + hits.floor(3 * hits.position[:, 1:2])
 
     directions = torch.stack([0.1 * torch.sin(k * mesh.verts) for k in (1, 2, 3)])

@@ -27,7 +27,10 @@ from torch import Tensor
 import edgegrad
 import edgegrad.bop
 import edgegrad.fit
+import edgegrad.points
 import edgegrad.raster
+import edgegrad.rig
+from edgegrad.fit.pose.result import PoseFit
 
 pytestmark = pytest.mark.unsanitized
 
@@ -93,7 +96,7 @@ def test_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for source in blocks:
         exec(compile(source.replace("range(200)", "range(3)"), "README.md", "exec"), names)
     found, sun = (names[name] for name in ("fit", "sun"))
-    assert isinstance(found, edgegrad.fit.PoseFit) and isinstance(sun, torch.Tensor)
+    assert isinstance(found, PoseFit) and isinstance(sun, torch.Tensor)
     assert found.loss < 1e-3 and sun.grad is not None and sun.grad.abs().max() > 0
 
 
@@ -105,7 +108,21 @@ def test_equations_are_typeset() -> None:
         assert not [found for found in code if re.search("[∫∮∂∇]", found)], page.name
 
 
-@pytest.mark.parametrize("module", [edgegrad, edgegrad.bop, edgegrad.fit, edgegrad.raster])
+@pytest.mark.parametrize(
+    "module",
+    [
+        edgegrad,
+        edgegrad.bop,
+        edgegrad.fit,
+        edgegrad.image,
+        edgegrad.lights,
+        edgegrad.points,
+        edgegrad.raster,
+        edgegrad.rig,
+        edgegrad.shapes,
+        edgegrad.textures,
+    ],
+)
 def test_reference_has_all_that_is_public(module: ModuleType) -> None:
     reference = "".join(page.read_text(encoding="utf-8") for page in (FOLDER / "api").glob("*.md"))
     listed = set(re.findall(r"^\.\. auto\w+:: (\S+)$", reference, re.MULTILINE))
@@ -155,8 +172,8 @@ def textures_of(kind: type) -> list[str]:
 def test_names_of_parameters_are_those_of_the_classes() -> None:
     """The table of docs/fits.md can be copied from the message of a failure."""
     lights = (
-        edgegrad.PointLight, edgegrad.SpotLight, edgegrad.DirectionalLight, edgegrad.Environment,
-        edgegrad.SphericalHarmonics,
+        edgegrad.lights.PointLight, edgegrad.lights.SpotLight, edgegrad.lights.DirectionalLight, edgegrad.lights.Environment,
+        edgegrad.lights.SphericalHarmonics,
     )  # fmt: skip
     rows = [("", edgegrad.Scene), ("meshes.0.", edgegrad.Mesh), ("meshes.0.material.", edgegrad.Material)]
     rows += [(f"meshes.0.material.{name}.", edgegrad.Texture) for name in textures_of(edgegrad.Material)]

@@ -126,7 +126,7 @@ def test_a_camera_from_masks_of_a_robot(tmp_path: Path) -> None:
     pytest.importorskip("pytorch_kinematics")
     robot = example("robot")
     truth, start, found, _, _ = robot.trial(
-        robot.eg.load_robot(robot.arm.write(tmp_path / "arm.urdf")), 4, size=96, seed=2
+        robot.eg.rig.load(robot.arm.write(tmp_path / "arm.urdf")), 4, size=96, seed=2
     )
     before, after = (robot.errors(one, truth) for one in (start, found))
     assert before[0] > 40.0 and before[1] > 2.0 and after[0] < 2.0 and after[1] < 0.1

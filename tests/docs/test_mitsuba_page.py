@@ -89,16 +89,21 @@ def case(mi: Any, page: dict[str, Any], name: str) -> tuple[dict[str, Any], Any,
     point = {"type": "point", "position": [0.8, 0.5, 2.0], "intensity": rgb([9 * c for c in COLOR])}
     color = torch.tensor(COLOR)
     if name == "point":
-        return point, eg.PointLight((0.8, 0.5, 2.0), 9.0, color=color), bsdf, material
+        return point, eg.lights.PointLight((0.8, 0.5, 2.0), 9.0, color=color), bsdf, material
     if name == "directional":
         emitter = {"type": "directional", "direction": [0.6, -0.8, -1.0], "irradiance": rgb([3 * c for c in COLOR])}
-        return emitter, eg.DirectionalLight((0.6, -0.8, -1.0), 3.0, color=color), bsdf, material
+        return emitter, eg.lights.DirectionalLight((0.6, -0.8, -1.0), 3.0, color=color), bsdf, material
     if name == "spot":
         place = T().look_at([0.3, 0.2, 2.0], [0.0, 0.1, 0.0], [0.0, 1.0, 0.0])
         emitter = {"type": "spot", "to_world": place, "intensity": rgb([9 * c for c in COLOR]), "cutoff_angle": 40.0}
         emitter["beam_width"] = 39.0
         angles = {"inner_angle": math.radians(39.0), "outer_angle": math.radians(40.0)}
-        return emitter, eg.SpotLight((0.3, 0.2, 2.0), (-0.3, -0.1, -2.0), 9.0, color=color, **angles), bsdf, material
+        return (
+            emitter,
+            eg.lights.SpotLight((0.3, 0.2, 2.0), (-0.3, -0.1, -2.0), 9.0, color=color, **angles),
+            bsdf,
+            material,
+        )
     if name == "area":
         place = T().translate([0.2, 0.3, 1.5]) @ T().scale([0.4, 0.3, 1.0]) @ T().rotate([1.0, 0.0, 0.0], 180)
         radiance = {"type": "area", "radiance": rgb([5 * c for c in COLOR])}
@@ -107,7 +112,7 @@ def case(mi: Any, page: dict[str, Any], name: str) -> tuple[dict[str, Any], Any,
         light = light.replace(verts=light.verts @ M[:3, :3].T + M[:3, 3])
         return {"type": "rectangle", "to_world": place, "emitter": radiance}, light, bsdf, material
     if name == "constant":
-        return {"type": "constant", "radiance": rgb(COLOR)}, eg.Environment(color), bsdf, material
+        return {"type": "constant", "radiance": rgb(COLOR)}, eg.lights.Environment(color), bsdf, material
     if name == "envmap":
         rows = sky_image(sky().double()).float()
         place = T().rotate([1.0, 0.0, 0.0], 90) @ T().rotate([0.0, 1.0, 0.0], 40)
@@ -115,7 +120,7 @@ def case(mi: Any, page: dict[str, Any], name: str) -> tuple[dict[str, Any], Any,
         return emitter, page["environment"](sky(), np.array(place.matrix)), bsdf, material
     metallic, roughness = 1.0 if name == "metal" else 0.0, 0.5
     bsdf = {"type": "principled", "base_color": rgb(ALBEDO), "metallic": metallic, "roughness": roughness}
-    light = eg.PointLight((0.8, 0.5, 2.0), 9.0, color=color)
+    light = eg.lights.PointLight((0.8, 0.5, 2.0), 9.0, color=color)
     return point, light, bsdf, eg.Material(torch.tensor(ALBEDO), metallic, roughness)
 
 

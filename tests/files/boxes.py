@@ -39,7 +39,7 @@ APPEARANCES = {
     "colours of corners": {"corner_colors": torch.rand(12, 3, 3, generator=random)},
     "texture": {"texture": color(), "wrap": ("mirror", "clamp"), "filter": "nearest"},
     "nothing": {},
-    "normals of corners": {"normals": eg.vertex_normals(VERTS, FACES)[FACES].flatten(0, 1).roll(1, 0),
+    "normals of corners": {"normals": eg.Mesh(VERTS, FACES).vertex_normals()[FACES].flatten(0, 1).roll(1, 0),
                            "normal_faces": torch.arange(36).reshape(12, 3)},
     "name": {"name": "crate"},
 }  # fmt: skip

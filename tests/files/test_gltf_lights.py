@@ -20,7 +20,7 @@ def test_normals_follow_their_nodes(tmp_path, scale):
     node = {"mesh": 0, "scale": scale, "rotation": [0.5, 0.5, 0.5, 0.5], "translation": [1, 2, 3]}
     mesh = loaded(tmp_path, {}, positions=TILTED, nodes=[node], attributes=normals)
     assert mesh.normal_faces is None
-    np.testing.assert_allclose(mesh.normals, eg.vertex_normals(mesh.verts, mesh.faces), atol=1e-6)
+    np.testing.assert_allclose(mesh.normals, mesh.vertex_normals(), atol=1e-6)
 
 
 def test_normals_that_differ_at_a_vertex(tmp_path):
@@ -59,7 +59,11 @@ def test_lights_stand_where_their_nodes_do(tmp_path):
     ]
     scene = eg.load_scene(file(tmp_path, nodes=nodes, roots=[0, 3, 4], lights=lights), lit=True)
     point, sun, spot, second = scene.lights
-    assert isinstance(point, eg.PointLight) and isinstance(sun, eg.DirectionalLight) and isinstance(spot, eg.SpotLight)
+    assert (
+        isinstance(point, eg.lights.PointLight)
+        and isinstance(sun, eg.lights.DirectionalLight)
+        and isinstance(spot, eg.lights.SpotLight)
+    )
     np.testing.assert_allclose(point.position, [9, 0, 0], atol=1e-6)
     assert float(point.intensity) == 5.0 and point.color.tolist() == [1.0, 0.5, 0.25]
     np.testing.assert_allclose(sun.direction, [0, 0, 1], atol=1e-6)

@@ -12,7 +12,7 @@ from edgegrad.files.formats import gltf
 
 
 def seen(mesh, **options):
-    lights = [eg.PointLight((2.0, 3.0, 4.0), 20.0), eg.Environment(torch.tensor([0.3, 0.4, 0.5]))]
+    lights = [eg.lights.PointLight((2.0, 3.0, 4.0), 20.0), eg.lights.Environment(torch.tensor([0.3, 0.4, 0.5]))]
     camera = eg.Camera.look_at((3, 2, 4), (0, 0, 0), size=(48, 48))
     return eg.render(eg.Scene([mesh], torch.tensor([0.1, 0.2, 0.3]), lights=lights), camera, spp=8, seed=1, **options)
 
@@ -62,7 +62,7 @@ MATERIALS = {
 
 @pytest.mark.parametrize("name", MATERIALS)
 def test_materials_come_back(name, tmp_path):
-    mesh = box(MATERIALS[name], normals=eg.vertex_normals(VERTS, FACES))
+    mesh = box(MATERIALS[name], normals=eg.Mesh(VERTS, FACES).vertex_normals())
     found = saved(tmp_path, mesh)
     assert found.material.two_sided == mesh.material.two_sided
     for field in ("base_color", "metallic", "roughness", "emission", "normal_map", "normal_scale"):

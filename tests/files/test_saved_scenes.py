@@ -14,9 +14,9 @@ import edgegrad as eg
 from edgegrad.files.formats import gltf
 
 random = torch.Generator().manual_seed(1)
-POINT = eg.PointLight((2.0, 3.0, 4.0), 20.0, torch.tensor([1.0, 0.5, 0.25]))
-SPOT = eg.SpotLight((0.5, 4.0, 1.0), (0.1, -2.0, -0.3), 30.0, None, 0.2, 0.7)
-SUN = eg.DirectionalLight((-3.0, -2.0, -4.0), 1.5, torch.tensor([2.0, 1.0, 0.5]))  # a colour beyond 1
+POINT = eg.lights.PointLight((2.0, 3.0, 4.0), 20.0, torch.tensor([1.0, 0.5, 0.25]))
+SPOT = eg.lights.SpotLight((0.5, 4.0, 1.0), (0.1, -2.0, -0.3), 30.0, None, 0.2, 0.7)
+SUN = eg.lights.DirectionalLight((-3.0, -2.0, -4.0), 1.5, torch.tensor([2.0, 1.0, 0.5]))  # a colour beyond 1
 CAMERA = eg.Camera.look_at((3, 2, 4), (0, 0, 0), size=(40, 56))
 
 
@@ -30,6 +30,7 @@ def ground(**look):
     return eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), **look)
 
 
+EMITTING = eg.Material(base_color=0.0, emission=torch.tensor([9.0, 5.0, 2.0]))
 WOOD = eg.Material(eg.Texture(color(), filter="mipmap"), roughness=eg.Texture(data(1, least=60)), metallic=0.2)
 SCENES = {
     "plain": eg.Scene([eg.Mesh(VERTS, FACES)]),
@@ -48,12 +49,12 @@ SCENES = {
     ),
     "a light": eg.Scene(
         [ground(material=eg.Material(0.7))],
-        lights=[eg.AreaLight.rectangle((0.0, 3.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 0.5), torch.tensor([9.0, 5.0, 2.0]))],
+        lights=[eg.shapes.rectangle((0.0, 3.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 0.5), material=EMITTING)],
     ),
     "normals and alpha-tested faces": eg.Scene(
         [
             box(eg.Material(0.6, 0.3, 0.5, normal_map=eg.Texture(data(least=128), **OWN)),
-                normals=eg.vertex_normals(VERTS, FACES)),
+                normals=eg.Mesh(VERTS, FACES).vertex_normals()),
             box(eg.Material(eg.Texture(color())), alpha=data(1)[..., 0]).transformed(t=(0.0, 0.0, -3.0)),
             box(eg.Material(0.3, alpha_mode="BLEND"), alpha=torch.full((1, 1), 0.4)).transformed(t=(1.0, 0.5, 2.0), scale=0.3),
         ],
@@ -104,7 +105,7 @@ def test_lights_are_the_same(tmp_path):
 @pytest.mark.parametrize("direction", [(0.0, 0.0, -1.0), (0.0, 0.0, 5.0), (0.0, -1e-30, 0.0), (1e20, -2e20, 0.5e20)])
 def test_suns_from_any_direction(direction, tmp_path):
     given = torch.tensor(direction, dtype=torch.float64)
-    (sun,) = saved(tmp_path / "a.glb", eg.Scene([ball()], lights=[eg.DirectionalLight(given)])).lights
+    (sun,) = saved(tmp_path / "a.glb", eg.Scene([ball()], lights=[eg.lights.DirectionalLight(given)])).lights
     unit = given / given.abs().max()
     torch.testing.assert_close(sun.direction.double(), unit / unit.norm(), rtol=0, atol=1e-7)
 
@@ -169,8 +170,12 @@ K = CAMERA.K
 @pytest.mark.parametrize(
     ("scene", "cameras", "message"),
     [
-        (eg.Scene([ball()], lights=[SUN, eg.Environment(torch.ones(3))]), None, r"no Environment \(lights\[1\]\)"),
-        (eg.Scene([ball()], lights=[eg.SphericalHarmonics(torch.ones(9, 3))]), None, r"no SphericalHarmonics \(lights\[0\]\)"),
+        (eg.Scene([ball()], lights=[SUN, eg.lights.Environment(torch.ones(3))]), None, r"no Environment \(lights\[1\]\)"),
+        (
+            eg.Scene([ball()], lights=[eg.lights.SphericalHarmonics(torch.ones(9, 3))]),
+            None,
+            r"no SphericalHarmonics \(lights\[0\]\)",
+        ),
         (eg.Scene([ball()], torch.ones(3)), None, "no background"),
         (eg.Scene([ball()], lights=[SUN.replace(intensity=-1.0)]), None, r"no what takes light away of DirectionalLight"),
         (eg.Scene([ball(), ball(colors=torch.full((42, 3), 2.0))]), None, r"no colors beyond 0 … 1 of meshes\[1\]"),

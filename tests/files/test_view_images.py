@@ -12,6 +12,7 @@ from PIL import Image
 
 import edgegrad as eg
 from edgegrad.cli.inputs import seen_by
+from edgegrad.files.formats.views import View
 from edgegrad.files.image import linear_to_srgb
 
 TRIANGLE = eg.Mesh(
@@ -54,7 +55,7 @@ def write_transforms(folder: Path, camera: eg.Camera, **sizes: int) -> None:
     (folder / "transforms.json").write_text(json.dumps(fields))
 
 
-def check(view: eg.io.View) -> None:
+def check(view: View) -> None:
     """Check that the image is a render by the camera, to the rounding of its 8 bits and the noise of its samples."""
     assert view.image is not None
     seen, again = eg.read_image(view.image, channels=3), eg.render(TRIANGLE, view.camera, 64, seed=0)
@@ -150,10 +151,10 @@ def test_commands_read_pictures_as_their_camera_speaks_of_them(tmp_path, capsys)
     camera = camera_of(36, 48)
     eg.save_camera(tmp_path / "c.json", camera)
     write(tmp_path / "a.png", picture_of(camera), 6)
-    check(eg.io.View(camera, seen_by(tmp_path / "c.json", tmp_path / "a.png")))
+    check(View(camera, seen_by(tmp_path / "c.json", tmp_path / "a.png")))
     write(tmp_path / "b.png", np.rot90(picture_of(camera)), 6)
-    check(eg.io.View(camera, seen_by(tmp_path / "c.json", tmp_path / "b.png")))
+    check(View(camera, seen_by(tmp_path / "c.json", tmp_path / "b.png")))
     assert capsys.readouterr().err == ""
     write(tmp_path / "b.png", np.rot90(picture_of(camera), 2), 3)
-    check(eg.io.View(camera, seen_by(tmp_path / "c.json", tmp_path / "b.png")))
+    check(View(camera, seen_by(tmp_path / "c.json", tmp_path / "b.png")))
     assert "b.png: read upright, as its EXIF orientation 3 says" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import torch
 import edgegrad as eg
 
 
-def arm(bones: int = 2, colored: bool = False) -> eg.Rig:
+def arm(bones: int = 2, colored: bool = False) -> eg.rig.Rig:
     """Return a flat bar along y with some bones of length 1."""
     n = 4 * bones
     y = torch.linspace(0.0, float(bones), n + 1, dtype=torch.float64)
@@ -25,12 +25,12 @@ def arm(bones: int = 2, colored: bool = False) -> eg.Rig:
         up = (verts[:, 1] - k + 0.25).mul(2.0).clamp(0.0, 1.0) if k else torch.ones(len(verts))
         weights[:, : k or None] *= (1.0 - up)[:, None] if k else 1.0
         weights[:, k] = up
-    joints = eg.Joints(
+    joints = eg.rig.Joints(
         [f"bone {k}" for k in range(bones)], list(range(-1, bones - 1)),
         torch.tensor([[0.0, float(k > 0), 0.0] for k in range(bones)]), torch.zeros(bones, 3),
     )  # fmt: skip
     colors = 0.3 + 0.5 * torch.rand(len(verts), 3, generator=torch.Generator().manual_seed(0)) if colored else None
-    return eg.Rig.from_arrays(eg.Mesh(verts.float(), torch.tensor(faces), colors=colors), joints, weights)
+    return eg.rig.Rig.from_arrays(eg.Mesh(verts.float(), torch.tensor(faces), colors=colors), joints, weights)
 
 
 def views(size: int = 48, count: int = 3) -> list[eg.Camera]:

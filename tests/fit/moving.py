@@ -93,10 +93,10 @@ class Film:
         else:
             M = self.poses[k].float()
             mesh = self.mesh.transformed(M[:3, :3], M[:3, 3])
-            mesh = mesh.replace(material=eg.Material(), normals=eg.vertex_normals(mesh.verts, mesh.faces))
+            mesh = mesh.replace(material=eg.Material(), normals=mesh.vertex_normals())
             lights = [
-                eg.DirectionalLight(torch.tensor([0.6, -0.8, 0.7]), 2.4),
-                eg.Environment(torch.tensor([0.5, 0.45, 0.4]), visible=False),
+                eg.lights.DirectionalLight(torch.tensor([0.6, -0.8, 0.7]), 2.4),
+                eg.lights.Environment(torch.tensor([0.5, 0.45, 0.4]), visible=False),
             ]
             scene = eg.Scene([mesh], background=srgb_to_linear(self.background), lights=lights)
             with torch.no_grad():

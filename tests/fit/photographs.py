@@ -26,8 +26,8 @@ def photograph(view, *meshes, seed=0, gain=(1.3, 1.0, 0.8), sampling=None):
     """Return meshes, by default the bracket, in the light of a sun and a sky, blurred as a lens does, noisy and compressed."""
     lit = [mesh.replace(material=eg.Material()) for mesh in meshes or [bracket()]]
     lights = [
-        eg.DirectionalLight(torch.tensor([-0.5, -1.0, -0.8]).double(), 2.0),
-        eg.Environment(torch.full((3,), 0.35), visible=False),
+        eg.lights.DirectionalLight(torch.tensor([-0.5, -1.0, -0.8]).double(), 2.0),
+        eg.lights.Environment(torch.full((3,), 0.35), visible=False),
     ]
     scene = eg.Scene(lit, clutter(view.size[0], seed), lights)
     with torch.no_grad():

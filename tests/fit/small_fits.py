@@ -13,7 +13,9 @@ from brackets import CENTER, SIZE, bracket, rotation
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Fit, Parameter, Pose, PoseParameter, fit_scene
+from edgegrad.fit import Parameter, PoseParameter, fit_scene
+from edgegrad.fit.descent.result import Fit
+from edgegrad.fit.placement import Pose
 
 SKY = torch.tensor([0.1, 0.2, 0.3])
 
@@ -28,12 +30,12 @@ def lit_bracket(**material: Any) -> eg.Mesh:
     return bracket().to(torch.float32).replace(material=eg.Material(**material))
 
 
-def sun(direction: Any = (-0.5, -0.8, -1.0), strength: Any = 2.0) -> eg.DirectionalLight:
-    return eg.DirectionalLight(torch.as_tensor(direction), strength)
+def sun(direction: Any = (-0.5, -0.8, -1.0), strength: Any = 2.0) -> eg.lights.DirectionalLight:
+    return eg.lights.DirectionalLight(torch.as_tensor(direction), strength)
 
 
-def sky(strength: float = 0.6) -> eg.SphericalHarmonics:
-    return eg.SphericalHarmonics(torch.zeros(9, 3).index_fill(0, torch.tensor(0), strength))
+def sky(strength: float = 0.6) -> eg.lights.SphericalHarmonics:
+    return eg.lights.SphericalHarmonics(torch.zeros(9, 3).index_fill(0, torch.tensor(0), strength))
 
 
 def lit(mesh: eg.Mesh, *lights: Any) -> eg.Scene:
@@ -117,8 +119,8 @@ def sunlight() -> Problem:
 def emitter() -> Problem:
     views, truth = cameras(), torch.tensor([2.4, 2.0, 2.6])
 
-    def light(position: Tensor, colour: Tensor) -> eg.PointLight:
-        return eg.PointLight(position, 6.0, colour)
+    def light(position: Tensor, colour: Tensor) -> eg.lights.PointLight:
+        return eg.lights.PointLight(position, 6.0, colour)
 
     targets = pictures(lit(lit_bracket(), light(truth, torch.tensor([1.0, 0.9, 0.7])), sky(0.3)), views)
     start = lit(lit_bracket(), light(torch.tensor([1.8, 2.4, 2.9]), torch.ones(3)), sky(0.3))
@@ -137,7 +139,7 @@ def patched_ball(colours: Tensor) -> eg.Mesh:
     verts, faces = torch.tensor(shape.vertices).float(), torch.tensor(shape.faces)
     octant = ((verts[faces].mean(1) > 0).long() * torch.tensor([1, 2, 4])).sum(1)
     placed = verts + CENTER.float()
-    normals = eg.vertex_normals(placed, faces)
+    normals = eg.Mesh(placed, faces).vertex_normals()
     return eg.Mesh(placed, faces, face_colors=colours[octant], normals=normals, material=eg.Material())
 
 

@@ -12,8 +12,9 @@ from brackets import BACKGROUND, about_center, bracket, camera, picture, rotatio
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Calibration, calibrate, fit_camera
+from edgegrad.fit import calibrate, fit_camera
 from edgegrad.fit.ending import Ending
+from edgegrad.fit.pose.calibrate import Calibration
 from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
 from edgegrad.fit.pose.loss_model import ColorLoss, score_covariance
 from edgegrad.fit.pose.pose import Pose

@@ -7,8 +7,8 @@ import torch
 from brackets import BACKGROUND, CENTER, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, fit_pose
-from edgegrad.fit.pose.result import pose_from_json
+from edgegrad.fit import fit_pose
+from edgegrad.fit.pose.result import PoseFit, pose_from_json
 
 pytestmark = pytest.mark.unsanitized
 

@@ -16,7 +16,7 @@ from bracket_files import write_bracket
 
 import edgegrad.fit
 from edgegrad import cli
-from edgegrad.fit import PoseFit
+from edgegrad.fit.pose.result import PoseFit
 
 pytestmark = pytest.mark.unsanitized
 

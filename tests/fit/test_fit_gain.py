@@ -11,9 +11,10 @@ from photographs import clutter
 
 import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
-from edgegrad.fit import PoseFit, PoseParameter, fit_pose, fit_scene
+from edgegrad.fit import PoseParameter, fit_pose, fit_scene
 from edgegrad.fit.edge_support import edge_support
 from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.robust_loss import Comparison
 from edgegrad.fit.views import has_levels, white_level
 

@@ -9,14 +9,14 @@ import torch
 from brackets import BACKGROUND, bracket, camera, rotation
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses
+from edgegrad.fit import Parameter, PoseParameter, fit_scene, losses
 from edgegrad.fit.descent import gauss_newton
 from edgegrad.fit.descent.curvature import curvature, weights_of
 from edgegrad.fit.descent.gauss_newton import GaussNewtonOptimizer
 from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.descent.scene_builder import builder
 from edgegrad.fit.options import Options
-from edgegrad.fit.placement import Coordinates
+from edgegrad.fit.placement import Coordinates, Pose
 from edgegrad.fit.views import views_of
 
 F64 = torch.float64

@@ -59,7 +59,7 @@ def test_other_channels_are_refused():
     motion = about(CENTER)
     with pytest.raises(ValueError, match=r"aovs: expected a channel that has derivatives .*'face_id'"):
         derivatives(eg.Scene([smooth()]), camera(8), ["face_id"], motion)
-    lit = eg.Scene([smooth()], lights=[eg.PointLight((0.0, 0.0, 9.0), 100.0)])
+    lit = eg.Scene([smooth()], lights=[eg.lights.PointLight((0.0, 0.0, 9.0), 100.0)])
     with pytest.raises(ValueError, match=r"aovs: expected a channel of a scene that is lit .*'image'"):
         derivatives(lit, camera(8), ["image"], motion)
     assert derivatives(lit, camera(8), ["alpha"], motion)[1]["alpha"].shape == (6, 8, 8, 1)

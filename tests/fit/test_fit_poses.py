@@ -16,7 +16,7 @@ import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.cli import main
 from edgegrad.files.image import linear_to_srgb
-from edgegrad.fit import PoseFit, fit_pose, fit_poses
+from edgegrad.fit import fit_pose, fit_poses
 from edgegrad.fit.pose.jacobian import Motions, Rendered
 from edgegrad.fit.pose.photo.level import photo_levels
 from edgegrad.fit.pose.photo.light import FittedLight
@@ -25,6 +25,7 @@ from edgegrad.fit.pose.photo.picture import Picture
 from edgegrad.fit.pose.photo.region_term import regions_term
 from edgegrad.fit.pose.photo.surface_interior import AOVS, SurfaceInterior
 from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.region import OUTLIERS, smoothed
 
 ASIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which covers a part of the bracket

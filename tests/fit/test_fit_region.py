@@ -13,9 +13,10 @@ from vases import AROUND, RADII, VIEW, vase
 
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
-from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, fit_shape, fit_texture, losses
+from edgegrad.fit import Parameter, PoseParameter, fit_scene, fit_shape, fit_texture, losses
 from edgegrad.fit.contour_colors import CONTOUR_BLURS, ContourColors
 from edgegrad.fit.descent.region_loss import RENEWAL_STEPS, RegionLoss
+from edgegrad.fit.placement import Pose
 from edgegrad.fit.region import OUTLIERS, Palette, smoothed
 from edgegrad.fit.views import region_views, views_of
 

@@ -44,7 +44,7 @@ def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
     assert torch.equal(found.values["translation"], torch.zeros(3, dtype=torch.float64))
 
 
-def photographs(rig: eg.Rig, cameras: list[eg.Camera], seed: int) -> tuple[eg.Mesh, list[torch.Tensor]]:
+def photographs(rig: eg.rig.Rig, cameras: list[eg.Camera], seed: int) -> tuple[eg.Mesh, list[torch.Tensor]]:
     """Return the true pose, and pictures of it before clutter, in colours that the rig does not know."""
     g = torch.Generator().manual_seed(seed)
     posed = rig.posed(TRUTH, translation=[0.05, 0.0, -0.1])
@@ -143,7 +143,7 @@ def test_what_a_frame_misses_is_searched_once(monkeypatch, loss: float, angles: 
     """A result is kept where it is better. A limb that is still missed is not searched again in the next frame."""
     calls: list[tuple[int | None, float]] = []
 
-    def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **options: Any) -> Any:
+    def fit(rig: eg.rig.Rig, cameras: object, *, start: dict[str, torch.Tensor], **options: Any) -> Any:
         angle = float(start["rotations"][0, 0]) + (1.0 if calls else 0.0)
         calls.append((options.get("tries"), angle))
         assert options["resume"] == (options["checkpoint"] is not None)
@@ -211,7 +211,7 @@ def test_the_command_line(tmp_path, capsys) -> None:
 
     from edgegrad import cli
 
-    rig = eg.load_rig(simple_skin().write(tmp_path))
+    rig = eg.rig.load(simple_skin().write(tmp_path))
     camera = eg.Camera.look_at((0.5, 1.0, 4.0), (0.5, 1.0, 0.0), up=(0, 1, 0), fov_y=40, size=(24, 24))
     eg.save_camera(tmp_path / "camera.json", camera)
     (mask,) = shown(rig.posed({"upper": [0.0, 0.0, 0.4]}), [camera])

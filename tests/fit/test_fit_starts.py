@@ -45,8 +45,8 @@ def pictured(R: Tensor, t: Tensor) -> tuple[eg.Mesh, Tensor, Tensor]:
     coarse = 0.15 + 0.5 * torch.rand(1, 3, 9, 9, generator=generator)
     clutter = torch.nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bilinear")[0].movedim(0, -1)
     light = [
-        eg.DirectionalLight(torch.tensor([-0.5, -0.8, -1.0]), 2.0),
-        eg.Environment(torch.tensor([0.5, 0.5, 0.6]), visible=False),
+        eg.lights.DirectionalLight(torch.tensor([-0.5, -0.8, -1.0]), 2.0),
+        eg.lights.Environment(torch.tensor([0.5, 0.5, 0.6]), visible=False),
     ]
     lit = moved.replace(material=eg.Material())
     with torch.no_grad():

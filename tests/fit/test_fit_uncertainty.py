@@ -11,10 +11,12 @@ from brackets import task_of
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, Uncertainty, fit_pose
+from edgegrad.fit import fit_pose
 from edgegrad.fit.pose.pose import Pose
+from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask
-from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
+from edgegrad.fit.pose.uncertainty import Uncertainty
+from edgegrad.scene.symmetries import Symmetries
 
 pytestmark = pytest.mark.quick
 
@@ -42,7 +44,7 @@ def picture(mesh: eg.Mesh) -> Tensor:
     coarse = 0.05 + 0.3 * torch.rand(1, 3, 9, 9, generator=torch.Generator().manual_seed(3))
     clutter = torch.nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bilinear")[0].movedim(0, -1)
     lit = mesh.replace(colors=torch.full((len(mesh.verts), 3), 0.8), material=eg.Material())
-    lights = [eg.Environment(torch.tensor([0.9, 0.9, 1.0]), visible=False)]
+    lights = [eg.lights.Environment(torch.tensor([0.9, 0.9, 1.0]), visible=False)]
     with torch.no_grad():
         return eg.render(eg.Scene([lit], background=clutter, lights=lights), camera(), spp=32, seed=0)
 
@@ -83,10 +85,10 @@ def test_a_continuous_symmetry_makes_its_axis_known() -> None:
     information[3:, 3:] = 1e6 * torch.eye(3)
     known = Uncertainty.from_information(given, standing(), information, list(range(6)), None)
     assert known.degrees > 45.0 and abs(float(known.axis[1])) > 0.999
-    spun = Symmetries(continuous=[SymmetryAxis(torch.tensor([0.0, 1.0, 0.0]))])
+    spun = Symmetries(continuous=[Symmetries.Axis(torch.tensor([0.0, 1.0, 0.0]))])
     free = Uncertainty.from_information(given, standing(), information, list(range(6)), spun)
     assert free.degrees < 1.0 and free.unknown == ""
-    other = Symmetries(continuous=[SymmetryAxis(torch.tensor([1.0, 0.0, 0.0]))])
+    other = Symmetries(continuous=[Symmetries.Axis(torch.tensor([1.0, 0.0, 0.0]))])
     assert Uncertainty.from_information(given, standing(), information, list(range(6)), other).unknown != ""
 
 
@@ -111,7 +113,7 @@ def test_a_vase_is_not_converged_about_its_axis_unless_that_is_a_symmetry() -> N
     shot = picture(vase())
     start = torch.eye(4, dtype=torch.float64)
     start[0, 3] = 0.05
-    spun = Symmetries(continuous=[SymmetryAxis(torch.tensor([0.0, 1.0, 0.0]))])
+    spun = Symmetries(continuous=[Symmetries.Axis(torch.tensor([0.0, 1.0, 0.0]))])
 
     def fitted(symmetries: Symmetries | None) -> PoseFit:
         return fit_pose(vase(), shot, camera(), init=start, search=False, symmetries=symmetries, progress=False)

@@ -131,7 +131,7 @@ def test_area_regularizer_shrinks_a_sphere():
 def test_unwrapped_faces_lie_apart_and_keep_their_shape():
     pytest.importorskip("xatlas")
     ring = torus()
-    found = eg.unwrap(ring, 256)
+    found = eg.textures.unwrap(ring, 256)
     assert torch.equal(found.faces, ring.faces) and torch.equal(found.verts, ring.verts)
     assert float(found.uvs.min()) >= 0.0 and float(found.uvs.max()) <= 1.0
 
@@ -158,7 +158,7 @@ def test_a_texture_on_an_unwrapped_mesh():
     colors = 0.5 + 0.4 * torch.sin(3.0 * egg.verts)
     cameras = around(egg, 6, 32)
     pictures = [eg.render(egg.replace(colors=colors), camera, spp=32, seed=0) for camera in cameras]
-    fit = fit_texture(eg.unwrap(egg, 64), cameras, pictures, 64, steps=40, **QUIET)
+    fit = fit_texture(eg.textures.unwrap(egg, 64), cameras, pictures, 64, steps=40, **QUIET)
     view = eg.Camera.look_at((2.0, 2.5, 5.0), (0.0, 0.0, 0.0), size=(32, 32))
     apart = eg.render(fit.mesh, view, spp=32, seed=0) - eg.render(egg.replace(colors=colors), view, spp=32, seed=0)
     assert -10.0 * math.log10(float(apart.square().mean())) > 28.0
@@ -167,16 +167,16 @@ def test_a_texture_on_an_unwrapped_mesh():
 def test_unwrapping_errors_name_the_argument():
     pytest.importorskip("xatlas")
     with pytest.raises(TypeError, match="mesh: expected a Mesh, got int"):
-        eg.unwrap(3)
+        eg.textures.unwrap(3)
     with pytest.raises(ValueError, match="size: expected an int from 16"):
-        eg.unwrap(ball(1), 2)
+        eg.textures.unwrap(ball(1), 2)
     with pytest.raises(ValueError, match="mesh: expected faces with an area"):
-        eg.unwrap(ball(1).replace(verts=torch.zeros_like(ball(1).verts)))
+        eg.textures.unwrap(ball(1).replace(verts=torch.zeros_like(ball(1).verts)))
 
 
 @pytest.mark.parametrize("scale", [2.0**-66, 2.0**66])
 def test_units_do_not_matter_to_unwrapping(scale: float) -> None:
     mesh = ball(1)
-    same, other = eg.unwrap(mesh, 64), eg.unwrap(mesh.replace(verts=mesh.verts * scale), 64)
+    same, other = eg.textures.unwrap(mesh, 64), eg.textures.unwrap(mesh.replace(verts=mesh.verts * scale), 64)
     assert same.uvs is not None and other.uvs is not None and same.uvs.shape == other.uvs.shape
     assert torch.equal(same.uvs, other.uvs)

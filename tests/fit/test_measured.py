@@ -7,8 +7,8 @@ import torch
 from small_scenes import QUIET, ball, egg_views
 
 import edgegrad as eg
-from edgegrad.fit import Measured, fit_shape
-from edgegrad.fit.measured import measured_loss, measurements
+from edgegrad.fit import fit_shape
+from edgegrad.fit.measured import Measured, measured_loss, measurements
 from edgegrad.fit.views import views_of
 
 CAMERA = eg.Camera.look_at((0.0, 0.0, 4.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(4, 6))

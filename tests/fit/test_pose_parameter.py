@@ -11,8 +11,8 @@ from brackets import BACKGROUND, CENTER, bracket, camera, rotation
 from brackets import START as START_MATRIX
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene
-from edgegrad.fit.placement import Coordinates
+from edgegrad.fit import Parameter, PoseParameter, fit_scene
+from edgegrad.fit.placement import Coordinates, Pose
 
 F64 = torch.float64
 QUIET = {"progress": False, "spp": 4}
@@ -191,7 +191,7 @@ def test_coordinates_without_poses_are_the_values():
         (
             {"meshes.0.pose": PoseParameter(torch.eye(4))},
             TypeError,
-            "meshes.0.pose: start: expected a Pose, got Tensor",
+            "meshes.0.pose: start: expected a tuple",
         ),
         (
             {"meshes.0.pose": PoseParameter(Pose(2.0 * torch.eye(3), torch.zeros(3)))},

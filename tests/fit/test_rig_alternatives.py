@@ -25,13 +25,13 @@ ARM = ["left arm", "left elbow", "left hand"]
 F64 = torch.float64
 
 
-def legs(apart: float) -> eg.Joints:
+def legs(apart: float) -> eg.rig.Joints:
     """Return two legs of three joints, whose own axes at rest are not alike."""
     one = torch.tensor([[0.5 * apart, 0.0, 0.0], [0.0, -0.4, 0.0], [0.0, -0.3, 0.1]], dtype=F64)
     turns = torch.tensor([[0.3, 0.0, 0.2], [0.0, 0.5, 0.0], [0.1, 0.0, 0.0]], dtype=F64)
     mirror = torch.tensor([-1.0, 1.0, 1.0], dtype=F64)
     places = torch.cat([torch.zeros(1, 3, dtype=F64), one, one * mirror])
-    return eg.Joints(
+    return eg.rig.Joints(
         ["hips", *LEGS], [-1, 0, 1, 2, 0, 4, 5], places, torch.cat([torch.zeros(1, 3), turns, -turns * mirror])
     )
 
@@ -86,7 +86,7 @@ def test_axial_rotations_are_found(seed: int) -> None:
     assert fit.converged and float(body.Errors.of(fit.rig, fit.values["rotations"], truth).rotation.quantile(0.9)) < 3.0
 
 
-def arm_of(rig: eg.Rig) -> tuple[FreeParameters, Alternatives]:
+def arm_of(rig: eg.rig.Rig) -> tuple[FreeParameters, Alternatives]:
     """Return the rotations of one arm of a figure as free parameters, and their alternatives."""
     free = FreeParameters.from_arguments(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
     return free, Alternatives(rig, free, "rotations")

@@ -20,7 +20,7 @@ F64 = torch.float64
 TRUTH = torch.tensor([[0.0, 0.0, 0.2], [0.2, 0.0, 0.4], [0.0, 0.0, 0.3]], dtype=F64)
 
 
-def objective(rig: eg.Rig, cameras: list[eg.Camera], **pictures: list[torch.Tensor]) -> Objective:
+def objective(rig: eg.rig.Rig, cameras: list[eg.Camera], **pictures: list[torch.Tensor]) -> Objective:
     def build(values: dict[str, torch.Tensor]) -> tuple[eg.Scene, list[eg.Camera]]:
         return eg.Scene([rig.posed(values["rotations"])]), cameras
 
@@ -109,9 +109,9 @@ def test_light_is_found_with_the_pose() -> None:
     rig, cameras = arm(2, colored=True), views(32, 2)
 
     def lit(posed: eg.Mesh, light: torch.Tensor) -> eg.Scene:
-        normals = eg.vertex_normals(posed.verts, posed.faces)
+        normals = posed.vertex_normals()
         mesh = posed.replace(colors=None, normals=normals, material=eg.Material(base_color=posed.colors))
-        return eg.Scene(mesh, lights=[eg.SphericalHarmonics(light.to(posed.verts))])
+        return eg.Scene(mesh, lights=[eg.lights.SphericalHarmonics(light.to(posed.verts))])
 
     light = torch.zeros(9, 1, dtype=F64)
     light[:4, 0] = torch.tensor([4.0, 0.8, -0.5, 0.6])

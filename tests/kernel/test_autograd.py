@@ -126,7 +126,9 @@ def test_the_loop_in_the_readme(monkeypatch):
 def test_the_light_in_the_readme():
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
     (lit,) = (
-        block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "eg.DirectionalLight(sun" in block
+        block
+        for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+        if "eg.lights.DirectionalLight(sun" in block
     )
     corners = torch.tensor([[-3.0, -3.0, -0.8], [3.0, -3.0, -0.8], [3.0, 3.0, -0.8], [-3.0, 3.0, -0.8]])
     ground = eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), colors=torch.ones((4, 3)))

@@ -116,7 +116,7 @@ SQUARE = torch.tensor([[0, 1, 2], [0, 2, 3]])
 def test_compile_lit_scene(compiled):
     def function(verts, place, roughness, seed):
         mesh = eg.Mesh(verts, MESH.faces, material=eg.Material(roughness=roughness))
-        return eg.render(eg.Scene(mesh, lights=[eg.PointLight(place, 9.0)]), CAMERA, 1, seed)
+        return eg.render(eg.Scene(mesh, lights=[eg.lights.PointLight(place, 9.0)]), CAMERA, 1, seed)
 
     values = (MESH.verts, torch.tensor([1.0, 1.5, 4.0], dtype=F64), torch.tensor(0.4, dtype=F64))
     call = [*map(leaf, values), 3]
@@ -138,12 +138,14 @@ def test_compile_all_that_lights_a_scene(compiled):
             eg.Mesh(QUAD, SQUARE, uvs=uvs, uv_faces=SQUARE, material=painted, wrap=["repeat", "clamp"]),
         ]
         lights = [
-            eg.PointLight(place, power, color=sky[0, 0]),
-            eg.SpotLight(place + 1, -place, power, inner_angle=0.2),
-            eg.DirectionalLight(-place, 0.5),
-            eg.Environment(sky, torch.eye(3, dtype=F64), visible=False),
-            eg.SphericalHarmonics(sky[:1, :1].expand(9, 1, 3)[:, 0] * 0.1),
-            eg.AreaLight.rectangle(place, sky[0, 0] / 4, sky[1, 0] / 4, power),
+            eg.lights.PointLight(place, power, color=sky[0, 0]),
+            eg.lights.SpotLight(place + 1, -place, power, inner_angle=0.2),
+            eg.lights.DirectionalLight(-place, 0.5),
+            eg.lights.Environment(sky, torch.eye(3, dtype=F64), visible=False),
+            eg.lights.SphericalHarmonics(sky[:1, :1].expand(9, 1, 3)[:, 0] * 0.1),
+            eg.shapes.rectangle(
+                place, sky[0, 0] / 4, sky[1, 0] / 4, material=eg.Material(base_color=0.0, emission=power)
+            ),
         ]
         camera = eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=40.0, size=(10, 8))
         return eg.render(

@@ -33,7 +33,7 @@ def shaded(verts: Tensor) -> Tensor:
 
 def lit(verts: Tensor) -> Tensor:
     mesh = MESH.replace(verts=verts, material=eg.Material())
-    scene = eg.Scene(mesh, BACKGROUND, lights=[eg.PointLight(torch.tensor([1.0, 2.0, 3.0]), 20.0)])
+    scene = eg.Scene(mesh, BACKGROUND, lights=[eg.lights.PointLight(torch.tensor([1.0, 2.0, 3.0]), 20.0)])
     return (eg.render(scene, CAMERA, 4, seed=0) * ADJOINT).sum()
 
 

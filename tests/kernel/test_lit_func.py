@@ -30,7 +30,7 @@ def lit(
     camera: eg.Camera = CAMERA,
 ) -> Tensor:
     shiny = eg.Material(eg.Texture(image, UVS, BALL.faces, filter="linear"), roughness=0.4)
-    lights = [eg.PointLight(place, 20.0), eg.Environment(RADIANCE)]
+    lights = [eg.lights.PointLight(place, 20.0), eg.lights.Environment(RADIANCE)]
     return eg.render(eg.Scene([eg.Mesh(verts, BALL.faces, material=shiny), FLOOR], lights=lights), camera, 1, seed=0)
 
 
@@ -42,7 +42,12 @@ def mipmapped(image: Tensor) -> Tensor:
 
 
 def emitter(radiance: Tensor) -> Tensor:
-    meshes = [FLOOR, eg.AreaLight.rectangle(PLACE, vector(0.5, 0, 0), vector(0, 0.5, 0), radiance)]
+    meshes = [
+        FLOOR,
+        eg.shapes.rectangle(
+            PLACE, vector(0.5, 0, 0), vector(0, 0.5, 0), material=eg.Material(base_color=0.0, emission=radiance)
+        ),
+    ]
     return eg.render(eg.Scene(meshes), CAMERA, 1, seed=0)
 
 
@@ -98,7 +103,7 @@ def test_a_batch_of_scenes_and_cameras() -> None:
     cameras = CAMERA.replace(K=torch.stack([CAMERA.K, CAMERA.K * torch.tensor([[1.2], [1.2], [1]], dtype=F64)]))
 
     def image(place: Tensor) -> Tensor:
-        scene = eg.Scene([BALL.replace(material=eg.Material())], lights=[eg.PointLight(place, 20.0)])
+        scene = eg.Scene([BALL.replace(material=eg.Material())], lights=[eg.lights.PointLight(place, 20.0)])
         return eg.render_aovs(scene, cameras, ["image", "alpha"], 1, seed=0)["image"]
 
     batch = PLACE * TWO[:, None]
@@ -123,7 +128,7 @@ def test_what_was_made_in_inference_mode(shader) -> None:
         return torch.autograd.grad((eg.render(moved, camera, 1, shader=shader, seed=0) * ADJOINT).sum(), t)[0]
 
     shiny = BALL.replace(material=eg.Material(0.5, roughness=0.4))
-    scene = eg.Scene([shiny, FLOOR], lights=[eg.PointLight(PLACE, 20.0), eg.Environment(RADIANCE)])
+    scene = eg.Scene([shiny, FLOOR], lights=[eg.lights.PointLight(PLACE, 20.0), eg.lights.Environment(RADIANCE)])
     with torch.inference_mode():
         copy, camera = scene.to(F64, copy=True), CAMERA.to(F64, copy=True)
         image = eg.render(copy, camera, 1, seed=0)

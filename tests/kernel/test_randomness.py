@@ -12,7 +12,7 @@ from torch_scenes import CAMERA, MESH, leaf
 
 import edgegrad as eg
 
-SUN = eg.DirectionalLight(torch.tensor([0.2, -0.3, -1.0]), 2.0)
+SUN = eg.lights.DirectionalLight(torch.tensor([0.2, -0.3, -1.0]), 2.0)
 LIT = eg.Scene(MESH.replace(material=eg.Material()), lights=[SUN])
 
 
@@ -37,7 +37,7 @@ CALLS: dict[str, Callable[..., object]] = {
     "render_batch": lambda **given: eg.render_batch([(MESH, CAMERA), (LIT, CAMERA)], 4, **given)[0],
     "jvp": lambda **given: eg.jvp(MESH, CAMERA, {MESH.verts: torch.ones_like(MESH.verts)[None]}, 4, **given)[1],
     "screen_gradient": lambda **given: eg.screen_gradient(MESH, CAMERA, torch.ones(*CAMERA.size, 3), 4, **given),
-    "primary_hits": lambda **given: eg.primary_hits(MESH, CAMERA, 4, **given).hits.pixel,
+    "primary_hits": lambda **given: eg.points.primary_hits(MESH, CAMERA, 4, **given).hits.pixel,
 }
 
 

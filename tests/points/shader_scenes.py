@@ -35,7 +35,7 @@ def cameras() -> dict[str, eg.Camera]:
     }
 
 
-def by_hand(scene: eg.Scene) -> Callable[[eg.Hits], Tensor]:
+def by_hand(scene: eg.Scene) -> Callable[[eg.points.Hits], Tensor]:
     mesh = scene.meshes[0]
     if mesh.texture is not None:
         texture = mesh.texture

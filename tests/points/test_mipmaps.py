@@ -29,7 +29,7 @@ def facing(texture: Tensor, pixels_a_texel: float) -> tuple[eg.Mesh, eg.Camera]:
 def test_mipmaps_show_means_of_texels(levels: int):
     texture = torch.rand((32, 64, 3), generator=torch.Generator().manual_seed(0), dtype=F64)
     mesh, camera = facing(texture, 0.5**levels)
-    hits = eg.primary_hits(mesh, camera, spp=1, seed=0).hits
+    hits = eg.points.primary_hits(mesh, camera, spp=1, seed=0).hits
     mean = torch.nn.functional.avg_pool2d(texture.movedim(-1, 0), 2**levels).movedim(0, -1)
     expected = hits.sample(mean, uv=hits.uv)
     assert torch.allclose(hits.sample(texture, mipmap=True), expected, atol=1e-9)
@@ -38,7 +38,7 @@ def test_mipmaps_show_means_of_texels(levels: int):
 def test_between_two_levels_mipmaps_are_linear():
     texture = torch.rand((32, 32, 2), generator=torch.Generator().manual_seed(0), dtype=F64)
     mesh, camera = facing(texture, 2**-1.25)
-    hits = eg.primary_hits(mesh, camera, spp=1, seed=0).hits
+    hits = eg.points.primary_hits(mesh, camera, spp=1, seed=0).hits
     levels = [torch.nn.functional.avg_pool2d(texture.movedim(-1, 0), 2**k).movedim(0, -1) for k in (1, 2)]
     low, high = (hits.sample(level, uv=hits.uv) for level in levels)
     assert torch.allclose(hits.sample(texture, mipmap=True), 0.75 * low + 0.25 * high, atol=1e-6)
@@ -49,7 +49,7 @@ def test_texels_get_gradients_through_mipmaps():
     mesh, camera = facing(texture, 0.5)
 
     def value(texture: Tensor) -> Tensor:
-        return eg.primary_hits(mesh, camera, spp=1, seed=0).hits.sample(texture, mipmap=True)
+        return eg.points.primary_hits(mesh, camera, spp=1, seed=0).hits.sample(texture, mipmap=True)
 
     assert torch.autograd.gradcheck(value, texture.requires_grad_())
 
@@ -74,7 +74,7 @@ def test_levels_of_mipmaps_have_derivatives(view: str):
         W, K = camera.world_to_camera, camera.K
         W = torch.cat([torch.cat([W[:3, :3], W[:3, 3:] + t[:, None]], 1), W[3:]])
         K = torch.cat([torch.cat([focal * K[:2, :2], K[:2, 2:]], 1), K[2:]])
-        return eg.primary_hits(moved, camera.replace(world_to_camera=W, K=K), spp=1, seed=0).hits.sample(
+        return eg.points.primary_hits(moved, camera.replace(world_to_camera=W, K=K), spp=1, seed=0).hits.sample(
             texture, mipmap=True
         )
 
@@ -88,10 +88,10 @@ def test_levels_of_mipmaps_have_derivatives(view: str):
 def test_mipmaps_need_neighbours():
     texture = torch.rand((8, 8, 1), dtype=F64)
     mesh, camera = facing(texture, 0.5)
-    hits = eg.primary_hits(mesh, camera, spp=1, seed=0).hits
+    hits = eg.points.primary_hits(mesh, camera, spp=1, seed=0).hits
     with pytest.raises(ValueError, match="mipmap: expected the surface's own texture coordinates"):
         hits.sample(texture, uv=hits.uv, mipmap=True)
-    rays = eg.trace(mesh, torch.zeros(3), torch.tensor([1.0, 1.0, 1.0]))
+    rays = eg.points.trace(mesh, torch.zeros(3), torch.tensor([1.0, 1.0, 1.0]))
     with pytest.raises(ValueError, match="mipmap: expected hits of a camera"):
         rays.sample(texture, mipmap=True)
     with pytest.raises(ValueError, match=r"mipmap: expected filter="):
@@ -105,7 +105,7 @@ def test_mipmaps_need_neighbours():
 def test_beyond_the_border(wrap: str, expected: list[int]):
     texture = torch.arange(3.0, dtype=F64).reshape(1, 3, 1)
     mesh, camera = facing(texture, 1.0)
-    hits = eg.primary_hits(mesh, camera, spp=1, seed=0).hits
+    hits = eg.points.primary_hits(mesh, camera, spp=1, seed=0).hits
     for k, value in zip((-1, 0, 1, 2, 3), expected, strict=True):
         uv = torch.tensor([(k + 0.5) / 3, 0.5], dtype=F64).expand(len(hits), 2)
         for filter in ("nearest", "linear"):

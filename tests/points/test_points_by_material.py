@@ -25,11 +25,16 @@ CAMERA = eg.Camera.look_at((0.4, 0.9, 4.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(2
 
 def scene(base: Tensor, power: Tensor, texels: Tensor) -> eg.Scene:
     gold = eg.Material(base, metallic=0.9, roughness=0.3)
-    emitter = eg.AreaLight.rectangle(vector(-0.5, 2.0, 1.5), vector(1, 0, 0), vector(0, 0.4, -0.6), power)
+    emitter = eg.shapes.rectangle(
+        vector(-0.5, 2.0, 1.5),
+        vector(1, 0, 0),
+        vector(0, 0.4, -0.6),
+        material=eg.Material(base_color=0.0, emission=power),
+    )
     floor = plane(2.0, material=eg.Material(vector(0.4, 0.5, 0.6)))
     bare = plane(0.2).replace(verts=plane(0.2).verts + vector(1.0, 1.0, 0.3))
     floor = floor.replace(verts=floor.verts - vector(0, 0, 1.2))
-    sky = eg.Environment(texels, rotation=torch.linalg.qr(vector(1, 2, 3, 0, 1, 5, 2, 1, 0).reshape(3, 3))[0])
+    sky = eg.lights.Environment(texels, rotation=torch.linalg.qr(vector(1, 2, 3, 0, 1, 5, 2, 1, 0).reshape(3, 3))[0])
     return eg.Scene([ball(2, material=gold), floor, bare, emitter], lights=[sky.replace(visible=False)])
 
 
@@ -63,7 +68,7 @@ def test_a_shader_of_its_own_gives_what_render_gives():
     def shader(own: dict[str, Tensor]) -> Any:
         material = [(own["base"], vector(0.9), vector(0.3)), (vector(0.4, 0.5, 0.6), None, None)]
 
-        def shade(hits: eg.Hits) -> Tensor:
+        def shade(hits: eg.points.Hits) -> Tensor:
             total = torch.zeros((len(hits), 3), dtype=F64)
             for number, (base, metallic, roughness) in enumerate(material):
                 rows = (hits.mesh == number).nonzero()[:, 0]
@@ -107,7 +112,7 @@ def test_a_shader_of_its_own_gives_what_render_gives():
 
 
 def test_arguments():
-    hits = eg.trace(scene(**leaves()), vector(0, 0, 3)[None], vector(0, 0, -1))
+    hits = eg.points.trace(scene(**leaves()), vector(0, 0, 3)[None], vector(0, 0, -1))
     with pytest.raises(TypeError, match=r"by: expected a function such as eg\.lights\.points_by_material"):
         hits.light_points(hits.lights[0], by="lobe")
     with pytest.raises(ValueError, match="sample: expected an int from 0 to 1"):

@@ -36,7 +36,7 @@ def test_rays_meet_a_sphere_where_its_faces_are():
     origins = torch.tensor([0.1, -0.2, 4.0], dtype=F64)
     directions = torch.randn((500, 3), generator=generator, dtype=F64) * 0.2 + torch.tensor([0.0, 0.0, -2.0], dtype=F64)
     mesh = ball()
-    hits = eg.trace(mesh, origins, directions)
+    hits = eg.points.trace(mesh, origins, directions)
     # Möller and Trumbore's test of all rays against all faces, in double.
     q = mesh.verts[mesh.faces]
     e1, e2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
@@ -65,7 +65,7 @@ def test_hits_of_rays_are_differentiable():
     assert colors is not None
 
     def value(verts: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
-        hits = eg.trace(mesh.replace(verts=verts), origins, directions)
+        hits = eg.points.trace(mesh.replace(verts=verts), origins, directions)
         return torch.cat([hits.position, hits.depth[:, None], hits.interpolate(colors), hits.view, hits.normal], 1)
 
     origins = torch.tensor([[0.0, 0.05, 3.0], [0.2, 0.0, 3.0]], dtype=F64)
@@ -84,12 +84,12 @@ def test_hits_of_rays_are_differentiable():
 )
 def test_rays_that_cannot_be(origins: Tensor, directions: Tensor, message: str):
     with pytest.raises(ValueError, match=message):
-        eg.trace(ball(), origins, directions)
+        eg.points.trace(ball(), origins, directions)
 
 
 def test_no_rays_and_no_hits():
-    assert len(eg.trace(ball(), torch.zeros(0, 3), torch.zeros(0, 3))) == 0
-    assert len(eg.trace(ball(), torch.tensor([0.0, 0, 5]), torch.tensor([0.0, 0, 1]))) == 0
+    assert len(eg.points.trace(ball(), torch.zeros(0, 3), torch.zeros(0, 3))) == 0
+    assert len(eg.points.trace(ball(), torch.tensor([0.0, 0, 5]), torch.tensor([0.0, 0, 1]))) == 0
 
 
 # -- shadow rays ------------------------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ def test_no_rays_and_no_hits():
 
 def test_a_convex_body_sees_what_its_faces_look_at():
     mesh = ball(3)
-    hits = eg.primary_hits(mesh, front_camera(SIZE), seed=0).hits
+    hits = eg.points.primary_hits(mesh, front_camera(SIZE), seed=0).hits
     light = torch.tensor([3.0, 2.0, 1.5], dtype=F64)
     facing = (hits.normal * (light - hits.position)).sum(1)
     visible = hits.visible(light)
@@ -119,7 +119,7 @@ def test_what_joins_at_an_edge_hides_what_lies_beyond_and_no_more(dtype: torch.d
         fov_y=40.0,
         size=(48, 48),
     )
-    hits = eg.primary_hits(mesh, camera, spp=4, seed=0).hits
+    hits = eg.points.primary_hits(mesh, camera, spp=4, seed=0).hits
     z = hits.position[:, 2].double() - far
     floor = hits.face < 2
     behind = torch.tensor([far, far + 3.0, far - 1.0], dtype=dtype)
@@ -146,7 +146,7 @@ def test_rays_pass_through_what_is_masked():
     scene = eg.Scene([screen, floor])
     x = torch.linspace(-0.95, 0.95, 20, dtype=F64)
     origins = torch.stack([x, torch.full_like(x, 0.3), torch.full_like(x, -2.0)], 1)
-    hits = eg.trace(scene, origins, torch.tensor([0.0, 0.0, 1.0], dtype=F64))
+    hits = eg.points.trace(scene, origins, torch.tensor([0.0, 0.0, 1.0], dtype=F64))
     assert torch.equal(hits.mesh, (x < 0).long())
     below = hits.select(hits.mesh == 1)
     # From the floor straight back: through the hole; and a light far to the right is behind what is left of the screen.
@@ -156,7 +156,7 @@ def test_rays_pass_through_what_is_masked():
 
 
 def test_points_to_see_are_checked():
-    hits = eg.primary_hits(ball(), front_camera(SIZE), seed=0).hits
+    hits = eg.points.primary_hits(ball(), front_camera(SIZE), seed=0).hits
     with pytest.raises(ValueError, match=r"points: expected shape"):
         hits.visible(torch.zeros(2, 3))
 
@@ -179,7 +179,7 @@ def views() -> dict[str, eg.Camera]:
 @pytest.mark.parametrize("view", views())
 def test_places_show_what_pixels_do(view: str):
     """Compare what is seen at a place, the ray that goes there and its derivative by the place with the hits of an image."""
-    primary = eg.primary_hits(ball(1), views()[view], spp=4, seed=0)
+    primary = eg.points.primary_hits(ball(1), views()[view], spp=4, seed=0)
     hits, frame = primary.hits, primary.context
     x = hits.pixel
     places = frame.sampler.hits_at(x)
@@ -209,22 +209,22 @@ def pipeline(verts: Tensor, camera: eg.Camera, seed: int, own_interior: bool) ->
     colors = mesh.colors
     assert colors is not None
 
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         return hits.interpolate(colors) * (1 + 0.5 * hits.position)
 
-    primary = eg.primary_hits(mesh.replace(verts=verts), camera, spp=256 if own_interior else 16, seed=seed)
+    primary = eg.points.primary_hits(mesh.replace(verts=verts), camera, spp=256 if own_interior else 16, seed=seed)
     if own_interior:
         image = primary.image(shader(primary.hits), background)
     else:
         with torch.no_grad():
             image = primary.image(shader(primary.hits), background)
-        inside = eg.surface_samples(primary, 20000)
+        inside = eg.points.surface_samples(primary, 20000)
         shaded = inside.image(shader(inside.hits))
         image = image + (shaded - shaded.detach())
-    edges = eg.edge_samples(primary, 20000, creases=False)
+    edges = eg.points.edge_samples(primary, 20000, creases=False)
     with torch.no_grad():
         jump = edges.jump(shader(edges.hits))
-    return eg.attach_boundary(image, edges, jump, background)
+    return eg.points.attach_boundary(image, edges, jump, background)
 
 
 @pytest.mark.parametrize("own_interior", [True, False])
@@ -270,37 +270,41 @@ def test_jumps_at_edges_alone_move_a_silhouette():
     mesh = eg.Mesh(size * corner, torch.tensor([[0, 1, 2], [0, 2, 3]]))
     K = torch.tensor([[10.0, 0, 12], [0, 10.0, 12], [0, 0, 1]], dtype=F64)
     camera = eg.Camera(torch.eye(4, dtype=F64), K, (SIZE, SIZE), "orthographic")
-    primary = eg.primary_hits(mesh, camera, seed=0)
-    edges = eg.edge_samples(primary, 400, creases=False)
+    primary = eg.points.primary_hits(mesh, camera, seed=0)
+    edges = eg.points.edge_samples(primary, 400, creases=False)
     image = torch.zeros((SIZE, SIZE, 1), dtype=F64)
-    attached = eg.attach_boundary(image, edges, edges.jump(torch.ones((len(edges.hits), 1), dtype=F64)))
+    attached = eg.points.attach_boundary(image, edges, edges.jump(torch.ones((len(edges.hits), 1), dtype=F64)))
     assert torch.equal(attached, image)
     (grad,) = torch.autograd.grad(attached.sum(), size)
     assert torch.allclose(grad, torch.tensor(8 * 0.5 * 100.0, dtype=F64), rtol=1e-6)
     with pytest.raises(RuntimeError, match="second derivatives"):
         verts = (size * corner).detach().requires_grad_()
-        edges = eg.edge_samples(eg.primary_hits(mesh.replace(verts=verts), camera, seed=0), 400)
+        edges = eg.points.edge_samples(eg.points.primary_hits(mesh.replace(verts=verts), camera, seed=0), 400)
         jump = edges.jump(torch.ones((len(edges.hits), 1), dtype=F64))
-        (first,) = torch.autograd.grad(eg.attach_boundary(image, edges, jump).square().sum(), verts, create_graph=True)
+        (first,) = torch.autograd.grad(
+            eg.points.attach_boundary(image, edges, jump).square().sum(), verts, create_graph=True
+        )
         torch.autograd.grad(first.sum(), verts)
 
 
 def test_attached_edges_keep_the_type_and_have_no_second_derivatives():
     """The image's own graph does not have how coverage moves, so second derivatives by it are refused, too."""
     verts, color = ball().verts.clone().requires_grad_(), torch.rand(3, dtype=F64, requires_grad=True)
-    primary = eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE), seed=0)
-    edges = eg.edge_samples(primary, 200)
+    primary = eg.points.primary_hits(ball().replace(verts=verts), front_camera(SIZE), seed=0)
+    edges = eg.points.edge_samples(primary, 200)
     jump = edges.jump(torch.ones((len(edges.hits), 3), dtype=F64))
     image = primary.image(torch.ones((len(primary.hits), 3), dtype=F64), color)
     (by_verts,) = torch.autograd.grad(
-        eg.attach_boundary(image, edges, jump, color).pow(2).sum(), verts, create_graph=True
+        eg.points.attach_boundary(image, edges, jump, color).pow(2).sum(), verts, create_graph=True
     )
     with pytest.raises(RuntimeError, match="second derivatives"):
         torch.autograd.grad(by_verts.sum(), color)
 
     def single(verts: Tensor) -> Tensor:
-        edges = eg.edge_samples(eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE), seed=0), 200)
-        return eg.attach_boundary(
+        edges = eg.points.edge_samples(
+            eg.points.primary_hits(ball().replace(verts=verts), front_camera(SIZE), seed=0), 200
+        )
+        return eg.points.attach_boundary(
             torch.zeros(SIZE, SIZE, 3), edges, edges.jump(torch.ones((len(edges.hits), 3), dtype=F64))
         )
 
@@ -309,25 +313,25 @@ def test_attached_edges_keep_the_type_and_have_no_second_derivatives():
 
 
 def test_what_parts_are_given_is_checked():
-    primary = eg.primary_hits(ball(), front_camera(SIZE), seed=0)
-    edges = eg.edge_samples(primary, 100)
+    primary = eg.points.primary_hits(ball(), front_camera(SIZE), seed=0)
+    edges = eg.points.edge_samples(primary, 100)
     with pytest.raises(ValueError, match=r"radiance: expected shape"):
         primary.image(torch.zeros(3, 3))
     with pytest.raises(TypeError, match=r"primary: expected what primary_hits\(\) returned, got Mesh"):
-        eg.surface_samples(ball())  # type: ignore[arg-type]
+        eg.points.surface_samples(ball())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"count: expected"):
-        eg.edge_samples(primary, 0)
+        eg.points.edge_samples(primary, 0)
     with pytest.raises(TypeError, match=r"creases: expected True, False or a tensor"):
-        eg.edge_samples(primary, creases="auto")  # type: ignore[arg-type]
+        eg.points.edge_samples(primary, creases="auto")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"image: expected shape"):
-        eg.attach_boundary(torch.zeros(3, 3, 3), edges, torch.zeros(len(edges), 3))
-    for call in (eg.surface_samples, eg.edge_samples):
+        eg.points.attach_boundary(torch.zeros(3, 3, 3), edges, torch.zeros(len(edges), 3))
+    for call in (eg.points.surface_samples, eg.points.edge_samples):
         with pytest.raises(MemoryError, match=r"got about .* TB \(samples"), torch.no_grad():
             call(primary, 10**12)
     with pytest.raises(TypeError, match=r"samples: expected what edge_samples\(\) returned, got PrimaryHits"):
-        eg.attach_boundary(torch.zeros(SIZE, SIZE, 3), primary, torch.zeros(len(edges), 3))  # type: ignore[arg-type]
+        eg.points.attach_boundary(torch.zeros(SIZE, SIZE, 3), primary, torch.zeros(len(edges), 3))  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"image: expected a tensor, array or nested sequence of numbers, got NoneType"):
-        eg.attach_boundary(None, edges, torch.zeros(len(edges), 3))  # type: ignore[arg-type]
+        eg.points.attach_boundary(None, edges, torch.zeros(len(edges), 3))  # type: ignore[arg-type]
     w = torch.eye(4).expand(2, 4, 4)
     with pytest.raises(ValueError, match=r"camera: expected one camera, got a batch of 2"):
-        eg.primary_hits(ball(), front_camera(SIZE).replace(world_to_camera=w), seed=0)
+        eg.points.primary_hits(ball(), front_camera(SIZE).replace(world_to_camera=w), seed=0)

@@ -166,7 +166,7 @@ def test_cameras_of_a_batch():
     moved[0, 3] += 0.2
     batch = camera.replace(world_to_camera=torch.stack([camera.world_to_camera, moved]))
 
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         return hits.interpolate(colors)
 
     mesh = icosphere(2).replace(verts=verts)
@@ -243,7 +243,7 @@ def test_noise_of_shading_falls_with_samples(lit):
     scene = textured()
     texture = torch.rand((32, 32, 1), generator=torch.Generator().manual_seed(1), dtype=F64)
     mesh = scene.meshes[0].replace(texture=texture)
-    emitter = eg.PointLight(torch.tensor([2.0, 3.0, 2.5], dtype=F64), 20.0)
+    emitter = eg.lights.PointLight(torch.tensor([2.0, 3.0, 2.5], dtype=F64), 20.0)
     scene = eg.Scene([mesh.replace(material=eg.Material())], lights=[emitter]) if lit else eg.Scene([mesh])
     more = {} if lit else {"shader": by_hand(scene)}
 
@@ -286,7 +286,7 @@ def test_in_parts_of_bounded_size(monkeypatch: pytest.MonkeyPatch):
     net = network(6)
     sizes = []
 
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         sizes.append(len(hits))
         return hits.where(hits.position[:, 0] - 0.1, net(torch.cat([hits.position, hits.normal], 1)), 0.3)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 import edgegrad as eg
 
 F64 = torch.float64
-Case = Callable[[Tensor], tuple[eg.Scene, eg.Camera, Callable[[eg.Hits], Tensor]]]
+Case = Callable[[Tensor], tuple[eg.Scene, eg.Camera, Callable[[eg.points.Hits], Tensor]]]
 
 
 def turned(scene: eg.Scene, theta: Tensor) -> eg.Scene:
@@ -29,50 +29,50 @@ TEXTURE = torch.rand((8, 8, 4), generator=torch.Generator().manual_seed(5), dtyp
 HARMONICS = torch.rand((4, 3), generator=torch.Generator().manual_seed(6), dtype=F64)
 
 
-def of_position_and_view(hits: eg.Hits, theta: Tensor) -> Tensor:
+def of_position_and_view(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     return NET(torch.cat([2 * hits.position, hits.view], 1))
 
 
-def harmonics(hits: eg.Hits, theta: Tensor) -> Tensor:
+def harmonics(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     n = hits.shading_normal
     return torch.cat([torch.ones_like(n[:, :1]), n], 1) @ HARMONICS
 
 
-def neural_texture(hits: eg.Hits, theta: Tensor) -> Tensor:
+def neural_texture(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     return FEATURES(hits.sample(TEXTURE, uv=0.4 * hits.position[:, :2] + 0.5))
 
 
-def flat_normals(hits: eg.Hits, theta: Tensor) -> Tensor:
+def flat_normals(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     return 0.5 + 0.5 * hits.normal
 
 
-def by_mesh(hits: eg.Hits, theta: Tensor) -> Tensor:
+def by_mesh(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     red = torch.stack([0.9 + 0 * hits.depth, 0.2 * hits.depth, 0.1 + 0 * hits.depth], 1)
     return torch.where((hits.mesh == 0)[:, None], red, 0.5 + 0.4 * hits.shading_normal)
 
 
-def checkerboard(hits: eg.Hits, theta: Tensor) -> Tensor:
+def checkerboard(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     """Paint a checkerboard in world space."""
     cells = hits.floor(1.7 * hits.position[:, :2] + 0.6 * hits.position[:, 2:] + 0.4).sum(1, keepdim=True)
     return 0.2 + 0.6 * (cells % 2) * torch.tensor([1.0, 0.7, 0.4], dtype=F64) + 0.1 * hits.position
 
 
-def disc(hits: eg.Hits, theta: Tensor) -> Tensor:
+def disc(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     """Painted on, along the view, and a ring of the same border that must not count twice."""
     s = 0.4 - (hits.position[:, :2] - 0.1).norm(dim=1)
     inside = hits.where(s, torch.tensor([0.9, 0.8, 0.7], dtype=F64), 0.3 + 0.2 * hits.position)
     return inside + hits.where(-3 * s, 0.0, 0.2)
 
 
-def nearest(hits: eg.Hits, theta: Tensor) -> Tensor:
+def nearest(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     return hits.sample(TEXTURE[..., :3], uv=0.4 * hits.position[:, :2] + 0.5, filter="nearest")
 
 
-def step_of_itself(hits: eg.Hits, theta: Tensor) -> Tensor:
+def step_of_itself(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     return hits.where(hits.position[:, 1] - 0.4 * hits.position[:, 0] - theta, 0.8 * torch.ones(3, dtype=F64), 0.2)
 
 
-def of_itself(hits: eg.Hits, theta: Tensor) -> Tensor:
+def of_itself(hits: eg.points.Hits, theta: Tensor) -> Tensor:
     return torch.sigmoid((2 + theta) * hits.position + theta)
 
 
@@ -101,8 +101,8 @@ def case(name: str, of: str) -> Case:
     )
     camera = front_camera(SIZE)
 
-    def at(theta: Tensor) -> tuple[eg.Scene, eg.Camera, Callable[[eg.Hits], Tensor]]:
-        def shader(hits: eg.Hits) -> Tensor:
+    def at(theta: Tensor) -> tuple[eg.Scene, eg.Camera, Callable[[eg.points.Hits], Tensor]]:
+        def shader(hits: eg.points.Hits) -> Tensor:
             return SHADERS[name](hits, theta)
 
         if name.startswith("its own"):
@@ -193,11 +193,11 @@ def test_creases_are_found_where_the_shader_jumps():
     at = case("flat normals", "pose")
     full = derivative(at, 2)
 
-    def own(theta: Tensor) -> tuple[eg.Scene, eg.Camera, Callable[[eg.Hits], Tensor]]:
+    def own(theta: Tensor) -> tuple[eg.Scene, eg.Camera, Callable[[eg.points.Hits], Tensor]]:
         scene, camera, _ = at(theta)
         faces = scene.meshes[0].faces
 
-        def shader(hits: eg.Hits) -> Tensor:
+        def shader(hits: eg.points.Hits) -> Tensor:
             corner = scene.meshes[0].verts[faces][hits._face]
             normal = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
             return 0.5 + 0.5 * torch.nn.functional.normalize(normal, dim=-1)

@@ -279,7 +279,7 @@ def test_shader(lens: str) -> None:
     view, adjoint = camera(lens), smooth_adjoint(*SIZE, 1)
     expected = found(view, lambda image: (image * adjoint).sum(), scene, sampling=eg.Sampling(edges=20_000))
 
-    def plain(hits: eg.Hits) -> Tensor:
+    def plain(hits: eg.points.Hits) -> Tensor:
         return torch.ones((len(hits), 1), dtype=F64)
 
     for gradient, truth in zip(
@@ -288,8 +288,8 @@ def test_shader(lens: str) -> None:
         strict=True,
     ):
         check(gradient, truth, 5e-3)
-    primary = eg.primary_hits(scene, view.replace(K=view.K.clone().requires_grad_()), seed=0)
-    samples = eg.edge_samples(primary, creases=False)
+    primary = eg.points.primary_hits(scene, view.replace(K=view.K.clone().requires_grad_()), seed=0)
+    samples = eg.points.edge_samples(primary, creases=False)
     assert len(samples) > 500 and len(samples.hits) == len(samples)
     assert bool(primary.context.sampler.rays_at(samples.x).along.isfinite().all())
 

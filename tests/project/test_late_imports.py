@@ -32,19 +32,22 @@ LAZY = """
 import pickle, sys
 import edgegrad as eg
 assert not {"torch", "numpy", "edgegrad._core"} & set(sys.modules)
-assert {"render", "Mesh", "fit", "io"} <= set(dir(eg)) and set(eg.__all__) == set(dir(eg))
+assert {"render", "Mesh", "fit", "points"} <= set(dir(eg)) and set(eg.__all__) == set(dir(eg))
 for wrong in ("rendr", "fit.fit_pos"):
     try: eval(f"eg.{wrong}")
     except AttributeError as error: assert wrong.split(".")[-1] in str(error) and error.obj is not None
 assert "torch" not in sys.modules
 import edgegrad.render
-assert callable(eg.render) and callable(eg.plan) and callable(eg.profile) and callable(eg.bake)
+assert callable(eg.render) and callable(eg.plan) and callable(eg.profile) and callable(eg.textures.bake)
 assert "edgegrad.fit.rig" not in sys.modules and callable(eg.fit.fit_pose)
 assert pickle.loads(pickle.dumps(eg.Camera)) is eg.Camera
 from edgegrad import *
 from edgegrad.fit import *
 assert render is eg.render and fit_rig is eg.fit.fit_rig
-assert all(hasattr(eg, name) for name in eg.__all__) and all(hasattr(eg.fit, name) for name in eg.fit.__all__)
+import edgegrad.bop
+for part in (eg, eg.bop, eg.fit, eg.points, eg.rig):
+    assert set(part.__all__) == set(dir(part)) and all(hasattr(part, name) for name in part.__all__), part
+assert callable(eg.points.trace) and callable(eg.rig.load) and callable(eg.shapes.box) and callable(eg.bop.evaluate)
 """
 
 

@@ -39,7 +39,7 @@ def test_rasterize_equal_the_twin(seed: int, spread: float) -> None:
     pos, tri = random_triangles(seed, spread=spread)
     behind = (pos[tri][..., 3] < 0).any(1).sum()
     assert (behind > 0) == (spread > 2), behind
-    rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (9, 14))
+    rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos[None], tri, (9, 14))
     expected = torch.from_numpy(twin.rasterize(pos.numpy(), tri.numpy(), (9, 14)))
     assert (expected[..., 3] > 0).sum() > 20
     torch.testing.assert_close(rast[0], expected, rtol=1e-9, atol=1e-10)
@@ -60,15 +60,15 @@ def test_rasterize_equal_the_twin(seed: int, spread: float) -> None:
 def test_float32_is_rounded_once() -> None:
     pos, tri = random_triangles(4)
     single = pos.float()
-    rast, rast_db = dr.rasterize(dr.RasterizeContext(), single[None], tri, (20, 20))
-    exact, exact_db = dr.rasterize(dr.RasterizeContext(), single.double()[None], tri, (20, 20))
+    rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), single[None], tri, (20, 20))
+    exact, exact_db = dr.rasterize(dr.RasterizeCudaContext(), single.double()[None], tri, (20, 20))
     assert rast.dtype == torch.float32 and torch.equal(rast, exact.float()) and torch.equal(rast_db, exact_db.float())
 
 
 def coverage(pos: Tensor, tri: Tensor, size: tuple[int, int]) -> Tensor:
     """(F, H, W): what each triangle covers alone."""
     one_each = torch.stack([torch.arange(len(tri)), torch.ones(len(tri), dtype=torch.long)], 1)
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, size, ranges=one_each)
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, size, ranges=one_each)
     return rast[..., 3] > 0
 
 
@@ -136,7 +136,7 @@ def test_planes_cut_at_each_pixel() -> None:
     """A floor from behind the eye to beyond the far plane."""
     corners = torch.tensor([[-50.0, -1, 40], [50, -1, 40], [0, -1, -400]], dtype=torch.float64)
     pos = clip(corners, 0.0)
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos[None], torch.tensor([[0, 1, 2]]), (64, 64))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos[None], torch.tensor([[0, 1, 2]]), (64, 64))
     rows = rast[0, :, 32, 3] > 0
     _, y = twin.centers(64, 64)
     distance = np.divide(2.0, -y, where=y < 0, out=np.full(64, np.inf))  # where row y meets the floor one below the eye
@@ -150,22 +150,22 @@ def test_what_shows_nothing() -> None:
         [[0.0, 0, 0, 1], [0.5, 0, 0, 1], [1, 0, 0, 1], [0, 0.5, 0, -1], [0.5, 0.5, 0, -1], [0, 1, 0, -2]]
     )
     for tri in ([[0, 1, 2]], [[0, 0, 1]], [[3, 4, 5]]):  # in a line, of two corners, behind the eye
-        rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos[None], torch.tensor(tri), (8, 8))
+        rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos[None], torch.tensor(tri), (8, 8))
         assert not rast.any() and not rast_db.any()
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos[None], torch.zeros(0, 3, dtype=torch.int32), (8, 8))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos[None], torch.zeros(0, 3, dtype=torch.int32), (8, 8))
     assert not rast.any() and rast.shape == (1, 8, 8, 4)
 
 
 def test_nearer_is_smaller_and_the_first_of_equals() -> None:
     square = torch.tensor([[-1.0, -1, 0, 1], [3, -1, 0, 1], [-1, 3, 0, 1]])
     pos = torch.cat([square + square.new_tensor([0, 0, z, 0]) for z in (0.5, -0.5, -0.5)])
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos[None], torch.arange(9).reshape(3, 3), (4, 4))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos[None], torch.arange(9).reshape(3, 3), (4, 4))
     assert (rast[..., 3] == 2).all() and (rast[..., 2] == -0.5).all()
 
 
 def test_ranges_are_images_of_their_own() -> None:
     (a, tri_a), (b, tri_b) = random_triangles(5, 8), random_triangles(6, 11)
-    ctx = dr.RasterizeContext()
+    ctx = dr.RasterizeCudaContext()
     pos, tri = torch.cat([a, b]), torch.cat([tri_a, tri_b + len(a)])
     ranges = torch.tensor([[8, 11], [0, 8], [3, 2], [0, 0]], dtype=torch.int32)
     rast, rast_db = dr.rasterize(ctx, pos, tri, (10, 12), ranges=ranges)
@@ -183,8 +183,8 @@ def test_ranges_are_images_of_their_own() -> None:
 def test_layers_behind_one_another() -> None:
     pos, tri = random_triangles(7, 10)
     behind = None
-    with dr.DepthPeeler(dr.RasterizeContext(), pos[None], tri, (8, 8)) as peeler:
-        first, _ = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (8, 8))
+    with dr.DepthPeeler(dr.RasterizeCudaContext(), pos[None], tri, (8, 8)) as peeler:
+        first, _ = dr.rasterize(dr.RasterizeCudaContext(), pos[None], tri, (8, 8))
         for layer in range(4):
             rast, _ = peeler.rasterize_next_layer()
             assert layer > 0 or torch.equal(rast, first)
@@ -198,7 +198,7 @@ def test_layers_behind_one_another() -> None:
 
 def test_interpolate_equals_its_definition() -> None:
     pos, tri = random_triangles(8)
-    rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (9, 9))
+    rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos[None], tri, (9, 9))
     attr = torch.rand(1, len(pos), 4, dtype=torch.float64)
     values, da = dr.interpolate(attr, rast, tri, rast_db, [2, 0])
     everything, all_da = dr.interpolate(attr, rast, tri, rast_db, "all")
@@ -229,7 +229,7 @@ def test_derivatives_of_rasterize_and_interpolate(mode: str) -> None:
     attr = torch.rand(*pos.shape[:-1], 2, dtype=torch.float64, requires_grad=True)
 
     def f(pos: Tensor, attr: Tensor) -> tuple[Tensor, ...]:
-        rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos, tri, (5, 6), ranges=ranges)
+        rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (5, 6), ranges=ranges)
         values, da = dr.interpolate(attr, rast, tri, rast_db, "all")
         return rast[..., :2], rast_db, values, da
 
@@ -241,7 +241,7 @@ def test_attributes_of_all_images() -> None:
     """(1, V, A) gets the sum of what images say."""
     pos, tri = random_triangles(10, 6)
     pos = torch.stack([pos, pos.flip(0), pos.roll(6, 0)])
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (7, 7))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (7, 7))
     attr = torch.rand(1, pos.shape[1], 3, dtype=torch.float64, requires_grad=True)
     weight = torch.rand(3, 7, 7, 3, dtype=torch.float64)
     (dr.interpolate(attr, rast, tri)[0] * weight).sum().backward()
@@ -253,9 +253,9 @@ def test_attributes_of_all_images() -> None:
 def test_gradients_of_derivatives_can_stay_out() -> None:
     pos, tri = random_triangles(11, 4)
     pos = pos[None].requires_grad_()
-    rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos, tri, (6, 6), grad_db=False)
+    rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (6, 6), grad_db=False)
     (grad,) = torch.autograd.grad(rast_db.sum() + rast[..., 0].sum(), pos)
-    rast, rast_db = dr.rasterize(dr.RasterizeContext(output_db=False), pos, tri, (6, 6))
+    rast, rast_db = dr.rasterize(dr.RasterizeGLContext(output_db=False), pos, tri, (6, 6))
     assert rast_db.shape == (1, 6, 6, 0)
     assert torch.equal(grad, torch.autograd.grad(rast[..., 0].sum(), pos)[0])
     assert not grad[..., 2].any() and grad.any()
@@ -268,7 +268,7 @@ def test_same_bits_at_any_number_of_threads() -> None:
         given.requires_grad_()
 
         def compute(given: Tensor = given) -> list[Tensor]:
-            rast, rast_db = dr.rasterize(dr.RasterizeContext(), given, tri, (33, 40))
+            rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), given, tri, (33, 40))
             values, da = dr.interpolate(attr, rast, tri, rast_db, [1])
             image = dr.antialias(torch.cat([values, da], 3), rast, given, tri)
             loss = (image * torch.linspace(0, 1, image.numel()).view_as(image)).sum()
@@ -280,7 +280,7 @@ def test_same_bits_at_any_number_of_threads() -> None:
 @pytest.mark.parametrize(
     "change, error, words",
     [
-        ({"ctx": None}, TypeError, "ctx: expected a RasterizeContext"),
+        ({"ctx": None}, TypeError, "ctx: expected a RasterizeCudaContext or RasterizeGLContext"),
         ({"pos": torch.zeros(3, 4)}, ValueError, "ranges: expected .* use pos\\[None\\]"),
         ({"pos": torch.zeros(1, 3, 3)}, ValueError, "pos: expected shape"),
         ({"pos": torch.full((1, 3, 4), torch.nan)}, ValueError, "pos: expected finite"),
@@ -302,7 +302,7 @@ def test_same_bits_at_any_number_of_threads() -> None:
 )
 def test_wrong_arguments(change: dict[str, object], error: type[Exception], words: str) -> None:
     given = {
-        "ctx": dr.RasterizeContext(),
+        "ctx": dr.RasterizeCudaContext(),
         "pos": torch.ones(1, 3, 4),
         "tri": torch.tensor([[0, 1, 2]]),
         "resolution": (8, 8),
@@ -320,7 +320,7 @@ def test_levels_of_a_log_that_is_empty() -> None:
 
 def test_wrong_attributes() -> None:
     pos, tri = random_triangles(13, 2)
-    rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (4, 4))
+    rast, rast_db = dr.rasterize(dr.RasterizeCudaContext(), pos[None], tri, (4, 4))
     for attr, more, words in (
         (torch.ones(2, 6, 3), {}, "attr: expected shape"),
         (torch.ones(5, 3), {}, "tri: expected indices from 0 to 4"),

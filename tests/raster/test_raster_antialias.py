@@ -28,7 +28,7 @@ def scene(seed: int) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("seed", range(3))
 def test_values_beside_the_twin(seed: int) -> None:
     pos, tri = scene(seed)
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (22, 18))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos[None], tri, (22, 18))
     color = torch.rand(1, 22, 18, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     found = dr.antialias(color, rast, pos[None], tri)
     expected = twin.antialias(color[0].numpy(), rast[0].numpy(), pos.numpy(), tri.numpy())
@@ -39,7 +39,7 @@ def test_values_beside_the_twin(seed: int) -> None:
 
 def test_edges_up_and_along_give_exact_means() -> None:
     """A half-plane whose edge is straight up, or along: each pixel gets the share that it covers."""
-    ctx, tri = dr.RasterizeContext(), torch.tensor([[0, 1, 2]])
+    ctx, tri = dr.RasterizeCudaContext(), torch.tensor([[0, 1, 2]])
     for at in np.linspace(-0.4, 0.4, 9):
         corners = torch.tensor([[at, -9.0], [at, 9.0], [-30.0, 0.0]], dtype=torch.float64)
         covered = (4 + 4 * at - torch.arange(8, dtype=torch.float64)).clamp(0, 1)
@@ -57,7 +57,7 @@ def test_derivatives(mode: str) -> None:
     pos, tri = scene(4)
     ranges = torch.tensor([[0, len(tri)], [80, 5]])
     pos = pos if mode == "ranges" else torch.stack([pos, pos * pos.new_tensor([1.2, 0.9, 1, 1])])
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (12, 10), ranges=ranges)
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (12, 10), ranges=ranges)
     color = torch.rand(2, 12, 10, 2, dtype=torch.float64, requires_grad=True)
     image = dr.antialias(color, rast, pos, tri)
     assert ((image - color).abs().amax((1, 2, 3)) > 0).all()
@@ -79,7 +79,7 @@ def test_the_area_of_an_outline_grows_with_the_square_of_its_size() -> None:
     scale = torch.tensor(0.6, dtype=torch.float64, requires_grad=True)
     turn = torch.linalg.matrix_exp(torch.tensor([[0, 0.3, -0.8], [-0.3, 0, 0.5], [0.8, -0.5, 0]], dtype=torch.float64))
     verts = torch.nn.functional.pad(mesh.verts.double() @ turn * scale, (0, 1), value=1.0)
-    rast, _ = dr.rasterize(dr.RasterizeContext(), verts[None], mesh.faces, (128, 128))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), verts[None], mesh.faces, (128, 128))
     image = dr.antialias((rast[..., 3:] > 0).double(), rast, verts[None], mesh.faces)
     image.sum().backward()
     area = float(image.detach().sum())
@@ -91,7 +91,7 @@ def test_interior_edges_are_left_alone() -> None:
     corners = torch.tensor([[-0.7, -0.7], [0.7, -0.7], [0.7, 0.7], [-0.7, 0.7]], dtype=torch.float64)
     pos = torch.cat([corners, torch.zeros(4, 1), torch.ones(4, 1)], 1)[None].double()
     tri = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (16, 16))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (16, 16))
     color = rast[..., 3:].clone()
     image = dr.antialias(color, rast, pos, tri)
     inside = slice(4, 12)
@@ -103,7 +103,7 @@ def test_interior_edges_are_left_alone() -> None:
 
 def test_wrong_arguments() -> None:
     pos, tri = random_triangles(5, 3)
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (4, 4))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos[None], tri, (4, 4))
     color = torch.ones(1, 4, 4, 3)
     topology = dr.antialias_construct_topology_hash(tri)
     copied = pickle.loads(pickle.dumps(topology))

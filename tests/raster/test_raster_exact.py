@@ -87,7 +87,7 @@ def test_means_and_derivatives(name: str) -> None:
     verts = torch.tensor(SCENES[name], dtype=torch.float64).reshape(6, 3)
     pos = clip(verts).requires_grad_()
     tri, colors = torch.tensor([[0, 1, 2], [3, 4, 5]]), np.array([1.0, 0.4])
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos[None], tri, SIZE)
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos[None], tri, SIZE)
     assert {1, 2} <= set(rast[..., 3].flatten().tolist())
     color = torch.tensor([0, *colors], dtype=torch.float64)[rast[..., 3:].detach().long()]
     image = dr.antialias(color, rast, pos[None], tri, exact=True, spp=4096, seed=0)
@@ -113,7 +113,7 @@ def grown(subdivisions: int, size: int, exact: bool) -> float:
     scale = torch.tensor(0.6, dtype=torch.float64, requires_grad=True)
     turn = torch.linalg.matrix_exp(torch.tensor([[0, 0.3, -0.8], [-0.3, 0, 0.5], [0.8, -0.5, 0]], dtype=torch.float64))
     verts = torch.nn.functional.pad(mesh.verts.double() @ turn * scale, (0, 1), value=1.0)[None]
-    rast, _ = dr.rasterize(dr.RasterizeContext(), verts, mesh.faces, (size, size))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), verts, mesh.faces, (size, size))
     image = dr.antialias((rast[..., 3:] > 0).double(), rast, verts, mesh.faces, exact=exact)
     (grad,) = torch.autograd.grad(image.sum(), scale)
     return float(grad) / (2 * float(image.detach().sum()) / 0.6)
@@ -128,7 +128,7 @@ def test_small_triangles_count_too() -> None:
 def test_colors_get_the_shares_of_samples() -> None:
     verts = torch.tensor(SCENES["before the eye"], dtype=torch.float64).reshape(6, 3)
     pos, tri = clip(verts)[None], torch.tensor([[0, 1, 2], [3, 4, 5]])
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, SIZE)
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, SIZE)
     color = torch.rand(1, *SIZE, 2, dtype=torch.float64, requires_grad=True)
     weight, along = torch.rand(2, 1, *SIZE, 2, dtype=torch.float64)
     image = dr.antialias(color, rast, pos, tri, exact=True, spp=4, seed=0)
@@ -142,7 +142,7 @@ def test_colors_get_the_shares_of_samples() -> None:
 def test_batches_ranges_and_boost() -> None:
     a, b = (clip(torch.tensor(points, dtype=torch.float64).reshape(-1, 3)) for points in SCENES["before the eye"])
     tri = torch.tensor([[0, 1, 2]])
-    rast, _ = dr.rasterize(dr.RasterizeContext(), torch.stack([a, b]), tri, SIZE)
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), torch.stack([a, b]), tri, SIZE)
     color = (rast[..., 3:] > 0).double()
     instanced = torch.stack([a, b]).requires_grad_()
     image = dr.antialias(color, rast, instanced, tri, exact=True, seed=0)
@@ -150,7 +150,7 @@ def test_batches_ranges_and_boost() -> None:
 
     both, tris = torch.cat([a, b]).requires_grad_(), torch.tensor([[0, 1, 2], [3, 4, 5]])
     ranges = torch.tensor([[0, 1], [1, 1]])
-    rast, _ = dr.rasterize(dr.RasterizeContext(), both, tris, SIZE, ranges=ranges)
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), both, tris, SIZE, ranges=ranges)
     again = dr.antialias(color, rast, both, tris, exact=True, ranges=ranges, pos_gradient_boost=2.0, seed=0)
     assert torch.equal(image, again)
     torch.testing.assert_close(torch.autograd.grad(again.sum(), both)[0].view(2, 3, 4), 2 * grad)
@@ -170,7 +170,7 @@ def test_batches_ranges_and_boost() -> None:
 def test_nothing_to_see() -> None:
     pos = torch.tensor([[[0.0, 0, 0, -1], [1, 0, 0, -1], [0, 1, 0, -1]]], requires_grad=True)
     tri, color = torch.tensor([[0, 1, 2]]), torch.rand(1, 4, 4, 3)
-    rast, _ = dr.rasterize(dr.RasterizeContext(), pos, tri, (4, 4))
+    rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, tri, (4, 4))
     assert torch.equal(dr.antialias(color, rast, pos, tri, exact=True, seed=0), color)
 
 
@@ -179,7 +179,7 @@ def test_same_bits_at_any_number_of_threads() -> None:
     pos = clip(mesh.verts.double()).float()[None].requires_grad_()
 
     def compute() -> list[torch.Tensor]:
-        rast, _ = dr.rasterize(dr.RasterizeContext(), pos, mesh.faces, (24, 24))
+        rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, mesh.faces, (24, 24))
         image = dr.antialias((rast[..., 3:] > 0).float(), rast, pos, mesh.faces, exact=True, seed=0)
         return [image, *torch.autograd.grad(image.square().sum(), pos)]
 

@@ -82,21 +82,21 @@ def test_products_of_extremes(world: float, radiance: float, adjoint: float):
     check_close(found, expected, {**factors, "world_to_camera": both, "K": both}, 2e-3)
 
 
-def shaded(world: float, shader: Callable[[eg.Hits], Tensor] | None) -> tuple[Tensor, Tensor]:
+def shaded(world: float, shader: Callable[[eg.points.Hits], Tensor] | None) -> tuple[Tensor, Tensor]:
     """The image of two metal faces under a light in other units of length, and its gradient by their vertices in these units."""
     corners = torch.tensor([[-1.0, -0.9, 0.1], [1.0, -0.8, 0.0], [0.9, 1.0, 0.5], [-1.0, 0.8, 0.3]])
     verts, faces = (world * corners).requires_grad_(), torch.tensor([[0, 1, 2], [0, 2, 3]])
     above = world * (0.4 * corners + torch.tensor([1.0, 0.5, 2.0]))
     emitter = eg.Mesh(above, faces, material=eg.Material(emission=torch.tensor([5.0, 4.0, 3.0])))
     metal = eg.Mesh(verts, faces, material=eg.Material(metallic=1.0, roughness=0.5))
-    scene = eg.Scene([metal, emitter], lights=[eg.DirectionalLight(torch.tensor([0.2, -0.3, -1.0]), 3.0)])
+    scene = eg.Scene([metal, emitter], lights=[eg.lights.DirectionalLight(torch.tensor([0.2, -0.3, -1.0]), 3.0)])
     image = eg.render(scene, eg.Camera.look_at((0, 0, 4 * world), (0, 0, 0), size=(12, 12)), shader=shader, seed=0)
     image.backward(ADJOINT.to(image.dtype))
     assert verts.grad is not None
     return image.detach(), world * verts.grad
 
 
-def irradiance(hits: eg.Hits) -> Tensor:
+def irradiance(hits: eg.points.Hits) -> Tensor:
     emitter = hits.lights[1]
     points = hits.light_points(emitter)
     return emitter.arriving(points, hits.position) * emitter.incident(points, hits.position)
@@ -108,7 +108,7 @@ def irradiance(hits: eg.Hits) -> Tensor:
     ids=["materials", "normal", "shading normal", "view", "irradiance"],
 )
 @pytest.mark.parametrize("power", [-17, -7, 11, 17])
-def test_units_of_length_of_what_is_shaded(shader: Callable[[eg.Hits], Tensor] | None, power: int):
+def test_units_of_length_of_what_is_shaded(shader: Callable[[eg.points.Hits], Tensor] | None, power: int):
     """Areas are squares of lengths, and the lengths of normals squares of areas, which floats soon cannot hold. Where within a
     pixel a shader is asked is a matter of rounding: up to 0.6 %."""
     for found, expected in zip(shaded(10.0**power, shader), shaded(1.0, shader), strict=True):
@@ -118,7 +118,9 @@ def test_units_of_length_of_what_is_shaded(shader: Callable[[eg.Hits], Tensor] |
 @pytest.mark.parametrize("world", [1e-17, 1e17])
 def test_units_of_length_of_vertex_normals(world: float):
     verts, faces = cube().verts.float(), cube().faces
-    assert torch.allclose(eg.vertex_normals(world * verts, faces), eg.vertex_normals(verts, faces), atol=1e-6)
+    assert torch.allclose(
+        eg.Mesh(world * verts, faces).vertex_normals(), eg.Mesh(verts, faces).vertex_normals(), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("power", [-37, 37])
@@ -225,7 +227,7 @@ def test_skies_of_any_brightness(brightness: float):
     radiance = torch.full((2, 4, 1), brightness, requires_grad=True)
     ball = cube().replace(colors=None, material=eg.Material(metallic=1.0, roughness=0.5))
     camera = eg.Camera.look_at((1.0, 1.5, 3.0), (0.0, 0.0, 0.0), size=(12, 12))
-    image = eg.render(eg.Scene([ball], lights=[eg.Environment(radiance)]), camera, seed=0)
+    image = eg.render(eg.Scene([ball], lights=[eg.lights.Environment(radiance)]), camera, seed=0)
     image.mean().backward()
     assert radiance.grad is not None
     # The image is linear in the sky.

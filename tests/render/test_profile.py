@@ -54,7 +54,7 @@ def test_profile_rebuilds_for_every_repeat(monkeypatch):
 
 
 def test_profile_of_a_lit_scene():
-    light = eg.PointLight(torch.tensor([1.0, 2.0, 4.0]))
+    light = eg.lights.PointLight(torch.tensor([1.0, 2.0, 4.0]))
     mesh = cube(0.5).replace(material=eg.Material(), face_colors=None)
     scene = eg.Scene([mesh, mesh.transformed(t=torch.tensor([0.5, 1.0, 2.0]), scale=0.2)], lights=[light])
     found = eg.profile(scene, CAMERA, spp=4, repeats=2)
@@ -83,7 +83,8 @@ def test_profile_of_a_lit_scene():
 def test_profile_of_bounces_has_the_rows_of_indirect_light():
     mesh = cube(0.5).replace(material=eg.Material(), face_colors=None)
     scene = eg.Scene(
-        [mesh, mesh.transformed(t=torch.tensor([0.5, 1.0, 2.0]), scale=0.2)], lights=[eg.Environment(torch.ones(3))]
+        [mesh, mesh.transformed(t=torch.tensor([0.5, 1.0, 2.0]), scale=0.2)],
+        lights=[eg.lights.Environment(torch.ones(3))],
     )
     found = eg.profile(scene, CAMERA, spp=1, repeats=1, bounces=2)
     assert list(found)[-4:] == ["indirect shadows", "secondary edges", "backward", "python"]

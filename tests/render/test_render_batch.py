@@ -65,7 +65,7 @@ def test_lit_scenes_and_lenses_come_one_by_one() -> None:
     mesh = icosphere(1)
     lit = eg.Scene(
         [eg.Mesh(mesh.verts.float(), mesh.faces, material=eg.Material())],
-        lights=[eg.PointLight((0, 3, 3), intensity=9.0)],
+        lights=[eg.lights.PointLight((0, 3, 3), intensity=9.0)],
     )
     distorted = camera(1).replace(distortion=torch.tensor([0.05, 0.0, 0.0, 0.0]))
     given = [(lit, camera(0)), (eg.Mesh(mesh.verts.float(), mesh.faces, colors=mesh.verts.float().abs()), distorted)]
@@ -77,7 +77,9 @@ def test_lit_scenes_and_lenses_come_one_by_one() -> None:
 
 def test_errors_of_lit_scenes_name_the_pair() -> None:
     mesh = icosphere(0)
-    lit = eg.Scene([mesh.replace(material=eg.Material())], lights=[eg.DirectionalLight(torch.tensor([0.0, 0, -1]))])
+    lit = eg.Scene(
+        [mesh.replace(material=eg.Material())], lights=[eg.lights.DirectionalLight(torch.tensor([0.0, 0, -1]))]
+    )
     camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (4, 4))
     with pytest.raises(ValueError, match=r"pairs\[0\]: bounces: expected"):
         eg.render_batch([(lit, camera)], bounces=0, seed=0)

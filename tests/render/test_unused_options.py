@@ -14,10 +14,10 @@ import edgegrad as eg
 CAMERA = from_above(4)
 UNLIT = eg.Scene(plane(colors=torch.full((4, 3), 0.5, dtype=F64)))
 MIPMAPS = eg.Scene(plane(texture=torch.full((2, 2, 3), 0.5, dtype=F64), filter="mipmap"))
-LIT = eg.Scene(plane(material=eg.Material(0.5)), lights=[eg.PointLight((0.0, 0.0, 2.0), 3.0)])
+LIT = eg.Scene(plane(material=eg.Material(0.5)), lights=[eg.lights.PointLight((0.0, 0.0, 2.0), 3.0)])
 
 
-def shader(hits: eg.Hits) -> torch.Tensor:
+def shader(hits: eg.points.Hits) -> torch.Tensor:
     return hits.position
 
 

@@ -15,7 +15,7 @@ def meshes_of(posed: Any) -> list[eg.Mesh]:
     return [posed] if isinstance(posed, eg.Mesh) else list(posed.meshes)
 
 
-def check(sample: Sample, rig: eg.Rig, posed: Any, animation: int | None, t: float) -> None:
+def check(sample: Sample, rig: eg.rig.Rig, posed: Any, animation: int | None, t: float) -> None:
     """Check vertices to 1e-6 of the size of what is shown."""
     expected = places(sample, animation, t)
     found = meshes_of(posed)

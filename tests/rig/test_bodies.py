@@ -18,9 +18,9 @@ def body(lengths: torch.Tensor, lean: torch.Tensor) -> dict[str, torch.Tensor]:
     return {"verts": verts, "joints": torch.stack([verts[0], verts[3]])}
 
 
-def rig() -> eg.Rig:
-    controls = {"lengths": torch.ones(3), "lean": eg.Control(torch.tensor(0.0), low=-1.0, high=1.0)}
-    return eg.Rig.from_function(body, FACES, controls, joints=[("foot", -1), ("head", 0)])
+def rig() -> eg.rig.Rig:
+    controls = {"lengths": torch.ones(3), "lean": eg.rig.Control(torch.tensor(0.0), low=-1.0, high=1.0)}
+    return eg.rig.Rig.from_function(body, FACES, controls, joints=[("foot", -1), ("head", 0)])
 
 
 def test_a_function_is_a_rig() -> None:
@@ -49,7 +49,7 @@ def test_a_function_of_a_batch() -> None:
         assert lengths.shape[0] == lean.shape[0]
         return torch.stack([body(a, b)["verts"] for a, b in zip(lengths, lean, strict=True)])
 
-    found = eg.Rig.from_function(batched, FACES, {"lengths": torch.ones(3), "lean": torch.zeros(())}, batched=True)
+    found = eg.rig.Rig.from_function(batched, FACES, {"lengths": torch.ones(3), "lean": torch.zeros(())}, batched=True)
     other = rig()
     assert torch.allclose(found.posed(lean=0.3).verts, other.posed(lean=0.3).verts.to(found.meshes[0].verts))
     _, b = found.posed(lean=torch.tensor([0.3, 0.4]), lengths=[1.0, 2.0, 1.0])
@@ -58,17 +58,17 @@ def test_a_function_of_a_batch() -> None:
 
 def test_bad_functions() -> None:
     for error, message, call in (
-        (TypeError, "function: expected a function", lambda: eg.Rig.from_function(3, FACES, {"a": torch.zeros(1)})),
-        (TypeError, "controls: expected a mapping", lambda: eg.Rig.from_function(body, FACES, {})),
+        (TypeError, "function: expected a function", lambda: eg.rig.Rig.from_function(3, FACES, {"a": torch.zeros(1)})),
+        (TypeError, "controls: expected a mapping", lambda: eg.rig.Rig.from_function(body, FACES, {})),
         (
             TypeError,
             "function: expected vertices",
-            lambda: eg.Rig.from_function(lambda a: 1.0, FACES, {"a": torch.zeros(1)}),
+            lambda: eg.rig.Rig.from_function(lambda a: 1.0, FACES, {"a": torch.zeros(1)}),
         ),
         (
             ValueError,
             r"function: expected vertices \(4, 3\) of mesh 0, got \(3, 3\)",
-            lambda: eg.Rig.from_function(lambda a: VERTS[:3] * a, eg.Mesh(VERTS, FACES), {"a": torch.ones(())}),
+            lambda: eg.rig.Rig.from_function(lambda a: VERTS[:3] * a, eg.Mesh(VERTS, FACES), {"a": torch.ones(())}),
         ),
         (ValueError, "lean: expected finite", lambda: rig().posed(lean=torch.tensor(float("inf")))),
         (ValueError, r"lean: expected shape \(\)", lambda: rig().posed(lean=torch.zeros(2, 2))),
@@ -95,9 +95,9 @@ def test_anny() -> None:
         )
         return model(poses, phenotype)["vertices"]
 
-    controls = {"rotations": eg.Control(torch.zeros(bones, 3), names=tuple(model.bone_labels), rotates=True)}
-    controls |= {name: eg.Control(torch.tensor(0.5), 0.0, 1.0) for name in model.phenotype_labels}
-    found = eg.Rig.from_function(function, model.get_triangular_faces(), controls, batched=True)
+    controls = {"rotations": eg.rig.Control(torch.zeros(bones, 3), names=tuple(model.bone_labels), rotates=True)}
+    controls |= {name: eg.rig.Control(torch.tensor(0.5), 0.0, 1.0) for name in model.phenotype_labels}
+    found = eg.rig.Rig.from_function(function, model.get_triangular_faces(), controls, batched=True)
     rest = torch.eye(4, dtype=model.dtype).repeat(1, bones, 1, 1)
     plain = model(rest, {n: torch.tensor([0.5]) for n in model.phenotype_labels})
     assert torch.allclose(found.posed().verts.to(plain["vertices"]), plain["vertices"][0], atol=1e-6)

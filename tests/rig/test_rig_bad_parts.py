@@ -15,11 +15,12 @@ from rig_files import Sample, quaternion_matrix, simple_morph, simple_skin
 from scipy.spatial.transform import Rotation, Slerp
 
 import edgegrad as eg
+from edgegrad.rig.animation import Channel
 
 
-def load(sample: Sample, folder: Path, message: str) -> eg.Rig:
+def load(sample: Sample, folder: Path, message: str) -> eg.rig.Rig:
     with pytest.warns(UserWarning, match=message):
-        return eg.load_rig(sample.write(folder))
+        return eg.rig.load(sample.write(folder))
 
 
 # -- rotations --------------------------------------------------------------------------------------------------------
@@ -46,7 +47,7 @@ def turning(rows: np.ndarray, interpolation: str, dtype: str) -> Sample:
     return sample
 
 
-def matrix_at(rig: eg.Rig, t: float) -> np.ndarray:
+def matrix_at(rig: eg.rig.Rig, t: float) -> np.ndarray:
     return rig.posed(**rig.animation("A").at(t)).verts.double().numpy().T
 
 
@@ -59,17 +60,17 @@ def degrees(A: np.ndarray, B: np.ndarray) -> float:
 def test_rotations_in_bytes_and_shorts_are_slerps_of_unit_quaternions(dtype: str, tmp_path) -> None:
     sample = turning(KEYS, "LINEAR", dtype)
     stored = sample.numbers[2]
-    rig = eg.load_rig(sample.write(tmp_path))
+    rig = eg.rig.load(sample.write(tmp_path))
     slerp = Slerp([0.0, 1.0, 2.0], Rotation.from_quat(stored))
     for t in (0.0, 0.3, 1.0, 1.5, 2.0):
         assert degrees(matrix_at(rig, t), slerp(t).as_matrix()) < 1e-4
-    rig = eg.load_rig(turning(KEYS, "STEP", dtype).write(tmp_path))
+    rig = eg.rig.load(turning(KEYS, "STEP", dtype).write(tmp_path))
     assert degrees(matrix_at(rig, 0.9), quaternion_matrix(stored[0])) < 1e-4
     # Of a spline the keys, and the speed at which it leaves them.
     tangents = 0.3 * np.random.default_rng(0).standard_normal((3, 2, 4)).clip(-1, 1)
     sample = turning(np.stack([tangents[:, 0], KEYS, tangents[:, 1]], 1).reshape(-1, 4), "CUBICSPLINE", dtype)
     rows, h = sample.numbers[2].reshape(3, 3, 4), 1e-4
-    rig = eg.load_rig(sample.write(tmp_path), dtype=torch.float64)
+    rig = eg.rig.load(sample.write(tmp_path), dtype=torch.float64)
     assert degrees(matrix_at(rig, 1.0), quaternion_matrix(rows[1, 1])) < 1e-4
     ahead = quaternion_matrix(rows[0, 1] + h * rows[0, 2])
     assert degrees(matrix_at(rig, h), ahead) < 0.01 * degrees(matrix_at(rig, 0.0), ahead)
@@ -93,9 +94,9 @@ def test_rotations_of_other_lengths_are_named(tmp_path) -> None:
 def test_channels_take_unit_quaternions_alone() -> None:
     times, keys = torch.tensor([0.0, 1.0]), torch.tensor(KEYS[:2])
     with pytest.raises(ValueError, match=r"values: expected unit quaternions x, y, z, w, got one of length 2 at key 1"):
-        eg.Channel("rotation", 0, times, keys * torch.tensor([[1.0], [2.0]]))
-    assert torch.allclose(eg.Channel("rotation", 0, times, 1.009 * keys).values, keys)
-    assert torch.allclose(eg.Channel("scale", 0, times, 2.0 * keys[:, :3]).values, 2.0 * keys[:, :3])
+        Channel("rotation", 0, times, keys * torch.tensor([[1.0], [2.0]]))
+    assert torch.allclose(Channel("rotation", 0, times, 1.009 * keys).values, keys)
+    assert torch.allclose(Channel("scale", 0, times, 2.0 * keys[:, :3]).values, 2.0 * keys[:, :3])
 
 
 # -- skins ------------------------------------------------------------------------------------------------------------
@@ -183,17 +184,17 @@ def test_names_differ(tmp_path) -> None:
     sample.tree["scenes"][0]["nodes"] = [0, 1, 2, 3]
     for name in ("morph (2)", "morph"):
         sample.animation(name, (0, "weights", [0, 1], [[0, 0], [0, 1]], "LINEAR"))
-    rig = eg.load_rig(sample.write(tmp_path))
+    rig = eg.rig.load(sample.write(tmp_path))
     assert rig.controls["morphs"].names == ("smile", "a: smile")
     assert rig.controls["rotations"].names == ("a", "a (2)", "a (2) (2)", "node 3")
     assert list(rig.animations) == ["morph", "morph (2)", "morph (2) (2)"]
     for given, names in ((["", ""], ("target 0", "target 1")), ([], ("target 0", "target 1"))):
         sample.tree["meshes"][0]["extras"]["targetNames"] = given
-        assert eg.load_rig(sample.write(tmp_path)).controls["morphs"].names == names
+        assert eg.rig.load(sample.write(tmp_path)).controls["morphs"].names == names
     sample.tree["meshes"].append({**sample.tree["meshes"][0], "extras": {"targetNames": ["x", "x"]}})
     sample.tree["nodes"] += [{"mesh": 1, "name": "x"}, {"mesh": 1, "name": "x"}]
     sample.tree["scenes"][0]["nodes"] += [4, 5]
-    names = eg.load_rig(sample.write(tmp_path)).controls["morphs"].names
+    names = eg.rig.load(sample.write(tmp_path)).controls["morphs"].names
     assert len(set(names)) == len(names) == 6
 
 
@@ -210,7 +211,7 @@ def test_morphs_that_do_not_fit(tmp_path) -> None:
     # A primitive with fewer targets than another is not moved by those that it lacks.
     sample = simple_morph()
     sample.tree["meshes"][0]["primitives"].append({k: v for k, v in primitive(sample).items() if k != "targets"})
-    first, second = eg.load_rig(sample.write(tmp_path)).posed(morphs=[0.0, 1.0]).meshes
+    first, second = eg.rig.load(sample.write(tmp_path)).posed(morphs=[0.0, 1.0]).meshes
     assert not torch.allclose(first.verts, second.verts) and second.verts.amax(0).tolist() == [1.0, 0.5, 0.0]
 
 

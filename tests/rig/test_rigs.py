@@ -20,7 +20,7 @@ def test_samples_agree_with_a_reference(name: str, tmp_path) -> None:
     sample = SAMPLES[name]()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        rig = eg.load_rig(sample.write(tmp_path), lit=True)
+        rig = eg.rig.load(sample.write(tmp_path), lit=True)
     check(sample, rig, rig.posed(), None, 0.0)
     for number, animation in enumerate(rig.animations.values()):
         times = np.linspace(-0.1, animation.duration + 0.1, 10)
@@ -33,7 +33,7 @@ def test_samples_agree_with_a_reference(name: str, tmp_path) -> None:
 
 def test_the_check_rejects_what_is_off(tmp_path) -> None:
     sample = simple_skin()
-    rig = eg.load_rig(sample.write(tmp_path))
+    rig = eg.rig.load(sample.write(tmp_path))
     with pytest.raises(AssertionError):
         check(sample, rig, rig.posed(**rig.animation("bend").at(0.7001)), 0, 0.7)
     with pytest.raises(AssertionError):
@@ -41,29 +41,31 @@ def test_the_check_rejects_what_is_off(tmp_path) -> None:
 
 
 def test_plain_loaders_name_load_rig(tmp_path) -> None:
-    with pytest.warns(UserWarning, match=r"animations \(shown at rest; load_rig\(\) has them\).*skins .*load_rig"):
+    with pytest.warns(
+        UserWarning, match=r"animations \(shown at rest; eg.rig.load\(\) has them\).*skins .*eg.rig.load"
+    ):
         eg.load_scene(simple_skin().write(tmp_path))
-    with pytest.warns(UserWarning, match=r"morph targets \(shown without; load_rig"):
+    with pytest.warns(UserWarning, match=r"morph targets \(shown without; eg.rig.load"):
         eg.load_scene(simple_morph().write(tmp_path, "b.gltf"))
 
 
 # -- gradients --------------------------------------------------------------------------------------------------------
 
 
-def small(dtype: torch.dtype = torch.float64) -> eg.Rig:
+def small(dtype: torch.dtype = torch.float64) -> eg.rig.Rig:
     """Return three joints in a chain, one morph target, and normals."""
     g = torch.Generator().manual_seed(0)
     verts = torch.rand(7, 3, generator=g, dtype=dtype) * 3.0
     faces = torch.tensor([[0, 1, 2], [2, 3, 4], [4, 5, 6]])
     normals = torch.randn(7, 3, generator=g, dtype=dtype)
-    joints = eg.Joints(
+    joints = eg.rig.Joints(
         ["a", "b", "c"], [-1, 0, 1], torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]), torch.zeros(3, 3)
     )
-    skin = eg.Skin(
+    skin = eg.rig.Skin(
         torch.arange(3), torch.linalg.inv(joints.world()), torch.rand(7, 3, generator=g) + 0.1, 0,
         torch.randn(2, 7, 3, generator=g), torch.randn(2, 7, 3, generator=g),
     )  # fmt: skip
-    return eg.Rig.from_arrays(eg.Mesh(verts, faces, normals=normals), joints, skin, morphs=("wide", "long"))
+    return eg.rig.Rig.from_arrays(eg.Mesh(verts, faces, normals=normals), joints, skin, morphs=("wide", "long"))
 
 
 @pytest.mark.parametrize("skinning", ["linear", "dual quaternion"])
@@ -94,7 +96,7 @@ def test_gradients_at_rest_are_finite() -> None:
 
 
 def test_gradients_by_time(tmp_path) -> None:
-    rig = eg.load_rig(rigged_simple().write(tmp_path), dtype=torch.float64)
+    rig = eg.rig.load(rigged_simple().write(tmp_path), dtype=torch.float64)
     t = torch.tensor(0.6, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda t: rig.posed(**rig.animation().at(t)).verts, (t,))
 
@@ -154,8 +156,8 @@ def test_the_whole_is_placed_about_its_middle() -> None:
 def test_dual_quaternions_keep_the_volume_of_a_twist() -> None:
     """A vertex half on a joint that twists by 170° turns by 85° and keeps its distance; linear blending takes it to cos 85°."""
     verts = torch.tensor([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-    joints = eg.Joints(["a", "b"], [-1, 0], torch.zeros(2, 3), torch.zeros(2, 3))
-    rig = eg.Rig.from_arrays(eg.Mesh(verts, torch.tensor([[0, 1, 2]])), joints, torch.full((3, 2), 0.5))
+    joints = eg.rig.Joints(["a", "b"], [-1, 0], torch.zeros(2, 3), torch.zeros(2, 3))
+    rig = eg.rig.Rig.from_arrays(eg.Mesh(verts, torch.tensor([[0, 1, 2]])), joints, torch.full((3, 2), 0.5))
     angle = math.radians(170)
     kept = rig.posed({"b": [angle, 0.0, 0.0]}, skinning="dual quaternion").verts[0]
     lost = rig.posed({"b": [angle, 0.0, 0.0]}).verts[0]
@@ -179,7 +181,7 @@ def test_limits() -> None:
 
 
 def test_a_posed_mesh_is_saved(tmp_path) -> None:
-    rig = eg.load_rig(walk().write(tmp_path))
+    rig = eg.rig.load(walk().write(tmp_path))
     posed = rig.posed(**rig.animation("Walk").at(0.7))
     eg.save_scene(tmp_path / "posed.glb", posed)
     again = eg.load_scene(tmp_path / "posed.glb")
@@ -192,13 +194,13 @@ def test_what_a_rig_hides_and_welds(tmp_path) -> None:
     """Equal positions with other weights stay apart; a mirrored node keeps the fronts of its faces."""
     sample = simple_skin()
     sample.tree["nodes"][1]["scale"] = [-1, 1, 1]
-    mesh = eg.load_rig(sample.write(tmp_path)).posed()
+    mesh = eg.rig.load(sample.write(tmp_path)).posed()
     a, b, c = mesh.verts[mesh.faces].unbind(1)
     assert bool((torch.linalg.cross(b - a, c - a)[:, 2] > 0).all())
     sample.tree["nodes"][0]["extensions"] = {"KHR_node_visibility": {"visible": False}}
     sample.tree["extensionsUsed"] = ["KHR_node_visibility"]
     with pytest.raises(ValueError, match="expected triangles, got none"):
-        eg.load_rig(sample.write(tmp_path))
+        eg.rig.load(sample.write(tmp_path))
 
 
 # -- bad input --------------------------------------------------------------------------------------------------------
@@ -227,7 +229,7 @@ BAD: dict[str, tuple[Sample, str]] = {
 def test_bad_files(case: str, tmp_path) -> None:
     sample, message = BAD[case]
     with pytest.raises(ValueError, match=message) as caught:
-        eg.load_rig(sample.write(tmp_path))
+        eg.rig.load(sample.write(tmp_path))
     assert "a.gltf" in str(caught.value)
 
 
@@ -237,13 +239,13 @@ def test_weights_are_normalised_with_a_warning(tmp_path) -> None:
         3.0 * sample.numbers[primitive(sample)["attributes"]["WEIGHTS_0"]]
     )
     with pytest.warns(UserWarning, match="weights of 'mesh 0' that add up to 1 only within 2"):
-        rig = eg.load_rig(sample.write(tmp_path))
+        rig = eg.rig.load(sample.write(tmp_path))
     check(sample, rig, rig.posed(**rig.animation().at(0.8)), 0, 0.8)
 
 
 def test_bad_arguments() -> None:
     rig = small()
-    skin = eg.Skin(torch.tensor([0]), torch.eye(4)[None], torch.ones(7, 1), 0, torch.zeros(1, 6, 3))
+    skin = eg.rig.Skin(torch.tensor([0]), torch.eye(4)[None], torch.ones(7, 1), 0, torch.zeros(1, 6, 3))
     for error, message, call in (
         (ValueError, "rotations: expected shape", lambda: rig.posed(torch.zeros(4, 3))),
         (ValueError, "rotations: expected rotations, got matrices", lambda: rig.posed(torch.ones(3, 3, 3))),
@@ -257,16 +259,16 @@ def test_bad_arguments() -> None:
         (ValueError, r"orientation: expected shape \(3,\)", lambda: rig.posed(orientation=[0.0, 0.0])),
         (ValueError, "low: expected numbers, .*got nan", lambda: rig.with_limits(rotations=(math.nan, 1.0))),
         (TypeError, "clamped: expected values of rotations", lambda: rig.clamped(translation=torch.zeros(3))),
-        (ValueError, "controls: expected names other than .*got 'scale'", lambda: eg.Rig.from_function(
+        (ValueError, "controls: expected names other than .*got 'scale'", lambda: eg.rig.Rig.from_function(
             lambda scale: rig.scene.verts * scale, rig.scene.faces, {"scale": torch.ones(())})),
         (ValueError, "skinning: expected one of", lambda: rig.posed(skinning="smooth")),
         (ValueError, "expected an animation among none", lambda: rig.animation("Walk")),
-        (ValueError, "cycle: a → b → a", lambda: eg.Joints(["a", "b"], [1, 0], torch.zeros(2, 3), torch.zeros(2, 3))),
-        (ValueError, "each joint once", lambda: eg.Joints(["a", "a"], [-1, 0], torch.zeros(2, 3), torch.zeros(2, 3))),
+        (ValueError, "cycle: a → b → a", lambda: eg.rig.Joints(["a", "b"], [1, 0], torch.zeros(2, 3), torch.zeros(2, 3))),
+        (ValueError, "each joint once", lambda: eg.rig.Joints(["a", "a"], [-1, 0], torch.zeros(2, 3), torch.zeros(2, 3))),
         (
             ValueError,
             r"targets: expected shape \(M, 7, 3\)",
-            lambda: eg.Rig.from_arrays(rig.scene, rig.joints, skin),
+            lambda: eg.rig.Rig.from_arrays(rig.scene, rig.joints, skin),
         ),
     ):  # fmt: skip
         with pytest.raises(error, match=message):
@@ -276,7 +278,7 @@ def test_bad_arguments() -> None:
 # -- several bodies ---------------------------------------------------------------------------------------------------
 
 
-def two_bars() -> eg.Rig:
+def two_bars() -> eg.rig.Rig:
     """Return one rig of two coloured bars on joints of their own, the second across the first."""
     from arms import arm
 
@@ -285,14 +287,14 @@ def two_bars() -> eg.Rig:
         one.scene.replace(colors=torch.tensor(c).expand(len(one.scene.verts), 3))
         for c in ([0.9, 0.2, 0.1], [0.1, 0.6, 0.9])
     ]
-    joints = eg.Joints(
+    joints = eg.rig.Joints(
         ["a0", "a1", "b0", "b1"], [-1, 0, -1, 2],
         torch.tensor([[0.0, 0, 0], [0, 1, 0], [0.75, 0.3, 0.35], [0, 1, 0]]),
         torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0.9], [0, 0, 0]]),
     )  # fmt: skip
     inverse = torch.linalg.inv(one.joints.world())
-    skins = [eg.Skin(torch.tensor(rows), inverse, skin.weights) for rows in ([0, 1], [2, 3])]
-    return eg.Rig.from_arrays(eg.Scene(meshes), joints, skins)
+    skins = [eg.rig.Skin(torch.tensor(rows), inverse, skin.weights) for rows in ([0, 1], [2, 3])]
+    return eg.rig.Rig.from_arrays(eg.Scene(meshes), joints, skins)
 
 
 @pytest.mark.parametrize("depth", [0.0, -0.35], ids=["in front", "through"])
@@ -323,3 +325,12 @@ def test_gradients_of_bodies_that_occlude_each_other(depth: float) -> None:
         expected = torch.stack([(loss(angles + s, 2048, 2) - loss(angles - s, 2048, 2)) / (2 * h) for s in steps])
     assert (found - expected).norm() < 0.02 * expected.norm()
     assert not (1.05 * found - expected).norm() < 0.02 * expected.norm()
+
+
+def test_options_for_files_of_the_other_kind_are_refused() -> None:
+    with pytest.raises(ValueError, match="package_dirs: expected none with a glTF file"):
+        eg.rig.load("a.glb", package_dirs=["."])
+    with pytest.raises(ValueError, match="lit: expected the default with a URDF file"):
+        eg.rig.load("a.urdf", lit=True)
+    with pytest.raises(TypeError, match="path: expected a str or Path, got int"):
+        eg.rig.load(3)  # type: ignore[arg-type]

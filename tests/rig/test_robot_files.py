@@ -68,7 +68,7 @@ def write_obj(path: Path, materials: tuple[str, ...] = ()) -> None:
 @pytest.mark.parametrize("scale", ["1 -1 1", "-1 -1 -1", "-2 0.5 1", "-1 -1 1"])
 def test_a_mirrored_mesh_keeps_its_outside(scale: str, tmp_path) -> None:
     write_obj(tmp_path / "uv.obj")
-    mesh = eg.load_robot(robot(tmp_path, mesh_link("a", "uv.obj", f' scale="{scale}"'))).posed()
+    mesh = eg.rig.load(robot(tmp_path, mesh_link("a", "uv.obj", f' scale="{scale}"'))).posed()
     assert volume(mesh) == pytest.approx(8.0)
     # Each corner keeps its texture coordinates.
     factor = torch.tensor([float(x) for x in scale.split()])
@@ -143,7 +143,7 @@ def test_a_dae_is_read_in_its_unit_with_its_materials(tmp_path) -> None:
     texels = np.random.default_rng(0).integers(0, 256, (3, 2, 3), dtype=np.uint8)
     Image.fromarray(texels).save(tmp_path / "t.png")
     (tmp_path / "a.dae").write_text(DAE.replace("IMAGE", "t.png"))
-    plain, textured = eg.load_robot(robot(tmp_path, mesh_link("a", "a.dae"))).posed().meshes
+    plain, textured = eg.rig.load(robot(tmp_path, mesh_link("a", "a.dae"))).posed().meshes
     for mesh in (plain, textured):
         assert torch.allclose(mesh.verts.amin(0), torch.tensor([0.0, 0.0, 0.5]))
         assert torch.allclose(mesh.verts.amax(0), torch.tensor([1.0, 1.0, 1.5]))
@@ -152,7 +152,7 @@ def test_a_dae_is_read_in_its_unit_with_its_materials(tmp_path) -> None:
     assert textured.uvs[textured.uv_faces].amax((0, 1)).tolist() == [1.0, 1.0]
     (tmp_path / "a.dae").write_text(DAE.replace("IMAGE", "gone.png"))
     with pytest.warns(UserWarning, match=r"a\.dae: not rendered as the file asks: '.*gone\.png' \(no such file"):
-        eg.load_robot(tmp_path / "r.urdf")
+        eg.rig.load(tmp_path / "r.urdf")
 
 
 def test_materials_of_trimesh_have_their_colours() -> None:
@@ -160,12 +160,12 @@ def test_materials_of_trimesh_have_their_colours() -> None:
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[204, 51, 102, 255])
     given = trimesh.creation.box()
     given.visual = trimesh.visual.TextureVisuals(material=material)
-    assert torch.allclose(eg.io.from_trimesh(given).face_colors, torch.tensor([0.8, 0.2, 0.4]))
+    assert torch.allclose(eg.shapes.from_trimesh(given).face_colors, torch.tensor([0.8, 0.2, 0.4]))
 
 
 def test_an_obj_of_two_textures_shows_both(tmp_path) -> None:
     write_obj(tmp_path / "two.obj", ("m", "n"))
-    first, second = eg.load_robot(robot(tmp_path, mesh_link("a", "two.obj"))).posed().meshes
+    first, second = eg.rig.load(robot(tmp_path, mesh_link("a", "two.obj"))).posed().meshes
     for mesh, code in ((first, 60), (second, 150)):
         assert len(mesh.faces) == 6
         assert torch.allclose(mesh.texture, srgb_to_linear(torch.tensor(code / 255.0)).expand(2, 2, 3))
@@ -175,7 +175,7 @@ def test_an_obj_of_two_textures_shows_both(tmp_path) -> None:
     with pytest.warns(
         UserWarning, match=r"r\.urdf: .*materials of two\.obj \(left out: .*'n\.png', and there is no such file"
     ):
-        mesh = eg.load_robot(tmp_path / "r.urdf").posed()
+        mesh = eg.rig.load(tmp_path / "r.urdf").posed()
     assert mesh.texture is None and volume(mesh) == pytest.approx(8.0)
 
 
@@ -191,12 +191,12 @@ def test_textures_and_alpha_of_a_urdf(tmp_path) -> None:
         UserWarning,
         match=r"r\.urdf: not .*alpha 0\.5 of material 'm' \(opaque\); the texture of 'b' .*no texture coordinates",
     ):
-        textured, box = eg.load_robot(path).posed().meshes
+        textured, box = eg.rig.load(path).posed().meshes
     assert torch.allclose(textured.texture, srgb_to_linear(torch.tensor(150 / 255.0)).expand(2, 2, 3))
     assert box.face_colors[0].tolist() == [1.0, 0.0, 0.0]
     (tmp_path / "t.png").unlink()
     with pytest.warns(UserWarning, match=r"the texture 't\.png' of link 'a' \(left out, for there is no such file"):
-        assert eg.load_robot(path).meshes[0].face_colors[0].tolist() == [1.0, 0.0, 0.0]
+        assert eg.rig.load(path).meshes[0].face_colors[0].tolist() == [1.0, 0.0, 0.0]
 
 
 def test_meshes_of_packages(tmp_path) -> None:
@@ -205,30 +205,30 @@ def test_meshes_of_packages(tmp_path) -> None:
     write_obj(tmp_path / "other" / "arm_meshes" / "visual" / "a.obj")
     path = robot(tmp_path / "robots", mesh_link("a", "package://arm_meshes/visual/a.obj"))
     for folders in (tmp_path / "other", [str(tmp_path), tmp_path / "other"], tmp_path / "other" / "arm_meshes"):
-        assert volume(eg.load_robot(path, package_dirs=folders).posed()) == pytest.approx(8.0)
+        assert volume(eg.rig.load(path, package_dirs=folders).posed()) == pytest.approx(8.0)
     with pytest.raises(
         FileNotFoundError, match=r"r\.urdf: link 'a': names the mesh .*pass the folder .* by package_dirs="
     ):
-        eg.load_robot(path, package_dirs=tmp_path)
+        eg.rig.load(path, package_dirs=tmp_path)
     with pytest.raises(FileNotFoundError, match=r"package_dirs: expected folders, got .*nowhere"):
-        eg.load_robot(path, package_dirs=tmp_path / "nowhere")
+        eg.rig.load(path, package_dirs=tmp_path / "nowhere")
     with pytest.raises(TypeError, match="package_dirs: expected folders, got int"):
-        eg.load_robot(path, package_dirs=[3])  # type: ignore[list-item]
+        eg.rig.load(path, package_dirs=[3])  # type: ignore[list-item]
     # Next to the robot's own folder, without an argument.
     shutil.move(tmp_path / "other" / "arm_meshes", tmp_path / "arm_meshes")
-    assert volume(eg.load_robot(path).posed()) == pytest.approx(8.0)
+    assert volume(eg.rig.load(path).posed()) == pytest.approx(8.0)
 
 
 # -- links and joints -------------------------------------------------------------------------------------------------
 
 
 def test_a_robot_of_one_link(tmp_path) -> None:
-    found = eg.load_robot(robot(tmp_path, f'<link name="a"><visual>{SHAPE}</visual></link>'))
+    found = eg.rig.load(robot(tmp_path, f'<link name="a"><visual>{SHAPE}</visual></link>'))
     assert volume(found.posed()) == pytest.approx(8.0) and found.controls["angles"].rest.shape == (0,)
     assert found.shape({}).joints.tolist() == [[0.0, 0.0, 0.0]]
     assert len(found.posed(angles=torch.zeros(3, 0))) == 3
     path = robot(tmp_path, f'<link name="a"><visual>{SHAPE}</visual></link><link name="b"/>', joint("j", "a", "b"))
-    assert volume(eg.load_robot(path).posed()) == pytest.approx(8.0)
+    assert volume(eg.rig.load(path).posed()) == pytest.approx(8.0)
 
 
 LINKS = f'<link name="a"><visual>{SHAPE}</visual></link><link name="b"/><link name="c"/>'
@@ -257,7 +257,7 @@ def test_what_is_no_robot_is_named(case: str, tmp_path) -> None:
     parts, message = REFUSED[case]
     write_obj(tmp_path / "uv.obj")
     with pytest.raises(ValueError, match=rf"r\.urdf: {message}"):
-        eg.load_robot(robot(tmp_path, *parts))
+        eg.rig.load(robot(tmp_path, *parts))
 
 
 def test_missing_limits_are_zero(tmp_path) -> None:
@@ -269,5 +269,5 @@ def test_missing_limits_are_zero(tmp_path) -> None:
     with pytest.warns(
         UserWarning, match=r"limit of joint 'j' without lower \(0, as the format says.*'k' without lower"
     ):
-        control = eg.load_robot(path).controls["angles"]
+        control = eg.rig.load(path).controls["angles"]
     assert control.low.tolist() == [0.0, 0.0] and control.high.tolist() == [0.0, 2.0]

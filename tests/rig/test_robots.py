@@ -45,7 +45,7 @@ def gripper(folder: Path, text: str = GRIPPER) -> Path:
     return path
 
 
-def check_links(path: Path, robot: eg.Rig, seed: int) -> None:
+def check_links(path: Path, robot: eg.rig.Rig, seed: int) -> None:
     """Check links against yourdfpy's own kinematics."""
     control = robot.controls["angles"]
     random = torch.rand(len(control.rest), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -64,7 +64,7 @@ def check_links(path: Path, robot: eg.Rig, seed: int) -> None:
 
 def test_links_are_where_another_library_has_them(tmp_path) -> None:
     for path in (arm.write(tmp_path / "arm.urdf"), gripper(tmp_path)):
-        robot = eg.load_robot(path)
+        robot = eg.rig.load(path)
         for seed in range(3):
             check_links(path, robot, seed)
 
@@ -73,13 +73,13 @@ def test_a_robot_of_a_package() -> None:
     """The robot has joints that mimic others, colours, and meshes of OBJ files."""
     models = pytest.importorskip("airo_models")
     path = Path(models.get_urdf_path("robotiq_2f_85"))
-    robot = eg.load_robot(path)
+    robot = eg.rig.load(path)
     assert robot.controls["angles"].names == ("finger_joint",) and len(robot.meshes) == 11
     check_links(path, robot, 0)
 
 
 def test_parts_limits_and_colours(tmp_path) -> None:
-    robot = eg.load_robot(gripper(tmp_path))
+    robot = eg.rig.load(gripper(tmp_path))
     control = robot.controls["angles"]
     assert control.names == ("slide", "turn")
     assert control.rest.tolist() == [0.01, 0.0] and control.low.tolist() == [0.01, -math.inf]
@@ -93,14 +93,14 @@ def test_parts_limits_and_colours(tmp_path) -> None:
 
 
 def test_gradients_by_angles(tmp_path) -> None:
-    robot = eg.load_robot(arm.write(tmp_path / "arm.urdf"))
+    robot = eg.rig.load(arm.write(tmp_path / "arm.urdf"))
     angles = (0.3 * torch.arange(7, dtype=torch.float64)).requires_grad_()
     where = lambda a: robot.shape({"angles": a}).joints  # noqa: E731
     assert torch.autograd.gradcheck(where, (angles,), check_forward_ad=True)
 
 
 def test_only_the_joints_that_are_named_turn(tmp_path) -> None:
-    robot = eg.load_robot(arm.write(tmp_path / "arm.urdf"))
+    robot = eg.rig.load(arm.write(tmp_path / "arm.urdf"))
     names = robot.controls["angles"].names
     middle, size = robot.center.tolist(), 2.0 * robot.size
     camera = eg.Camera.look_at((middle[0], middle[1] - size, middle[2]), middle, up=(0, 0, 1), fov_y=40, size=(24, 24))
@@ -141,5 +141,5 @@ def test_bad_files(case: str, tmp_path) -> None:
     (tmp_path / "broken.stl").write_text("no mesh")
     path = gripper(tmp_path, text)
     with pytest.raises(error, match=message) as caught:
-        eg.load_robot(path)
+        eg.rig.load(path)
     assert "gripper.urdf" in str(caught.value)

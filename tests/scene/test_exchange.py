@@ -58,22 +58,22 @@ def close(a: eg.Mesh, b: eg.Mesh, linear: bool = False) -> None:
 @pytest.mark.parametrize("appearance", APPEARANCES)
 def test_to_trimesh_and_back(appearance: str) -> None:
     mesh = eg.Mesh(VERTS, FACES, **APPEARANCES[appearance])
-    close(eg.io.from_trimesh(eg.io.to_trimesh(mesh)), mesh)
+    close(eg.shapes.from_trimesh(eg.shapes.to_trimesh(mesh)), mesh)
 
 
 def test_trimesh_itself() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=2)
-    mesh = eg.io.from_trimesh(sphere)
+    mesh = eg.shapes.from_trimesh(sphere)
     assert mesh.verts.shape == sphere.vertices.shape and mesh.channels is None
-    assert eg.io.to_trimesh(mesh).volume == pytest.approx(sphere.volume, rel=1e-5)
+    assert eg.shapes.to_trimesh(mesh).volume == pytest.approx(sphere.volume, rel=1e-5)
     sphere.visual.face_colors = [255, 0, 0, 255]
-    assert eg.io.from_trimesh(sphere).face_colors[5].tolist() == [1.0, 0.0, 0.0]
+    assert eg.shapes.from_trimesh(sphere).face_colors[5].tolist() == [1.0, 0.0, 0.0]
     with pytest.raises(TypeError, match=r"expected a trimesh\.Trimesh, got a Scene; take scene\.to_mesh"):
-        eg.io.from_trimesh(trimesh.Scene([sphere]))
+        eg.shapes.from_trimesh(trimesh.Scene([sphere]))
     with pytest.raises(TypeError, match="got Mesh"):
-        eg.io.from_trimesh(mesh)
+        eg.shapes.from_trimesh(mesh)
     with pytest.raises(ValueError, match="expected 1 or 3 channels, got 5"):
-        eg.io.to_trimesh(eg.Mesh(VERTS, FACES, colors=torch.rand(8, 5)))
+        eg.shapes.to_trimesh(eg.Mesh(VERTS, FACES, colors=torch.rand(8, 5)))
 
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "glb"])
@@ -155,9 +155,9 @@ def test_a_state_dict_holds_all_of_a_scene(tmp_path: Path) -> None:
                    uvs=COLORS[:, :2], uv_faces=FACES)  # fmt: skip
     camera = eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(8, 8))
     lights = [
-        eg.DirectionalLight((0, 0, -1)), eg.PointLight((0, 0, 4)), eg.SpotLight((0, 0, 4), (0, 0, -1)),
-        eg.Environment(torch.ones(3)), eg.SphericalHarmonics(torch.ones(9, 3)),
-        eg.AreaLight.disc((0, 3, 0), (1, 0, 0), (0, 0, 1), 2.0),
+        eg.lights.DirectionalLight((0, 0, -1)), eg.lights.PointLight((0, 0, 4)), eg.lights.SpotLight((0, 0, 4), (0, 0, -1)),
+        eg.lights.Environment(torch.ones(3)), eg.lights.SphericalHarmonics(torch.ones(9, 3)),
+        eg.shapes.disc((0, 3, 0), (1, 0, 0), (0, 0, 1), material=eg.Material(base_color=0.0, emission=2.0)),
     ]  # fmt: skip
     scene = eg.Scene([mesh], (0.1, 0.2, 0.3), lights)
     torch.save({"scene": scene.state_dict(), "camera": camera.state_dict()}, tmp_path / "a.pt")
@@ -243,13 +243,13 @@ def test_a_headlight_shines_only_where_nothing_says_a_look() -> None:
     assert len(sides.unique()) >= 4 and 0.2 < float(seen.max()) <= 0.7 and float(seen.std()) > 0.05
     dark = eg.Scene([eg.Mesh(VERTS, FACES, material=eg.Material())])
     assert float(eg.render(under_headlight(dark, camera), camera, spp=1, seed=0).max()) > 0.2
-    sunny = dark.replace(lights=[eg.PointLight((0, 0, 9))])
+    sunny = dark.replace(lights=[eg.lights.PointLight((0, 0, 9))])
     assert under_headlight(sunny, camera) is sunny
 
 
 def test_a_trimesh_without_faces_is_named() -> None:
     with pytest.raises(ValueError, match=r"mesh: expected a trimesh\.Trimesh with faces"):
-        eg.io.from_trimesh(trimesh.Trimesh())
+        eg.shapes.from_trimesh(trimesh.Trimesh())
 
 
 def test_two_textured_objs_in_one_folder(tmp_path):

@@ -98,9 +98,9 @@ def test_a_mirrored_image() -> None:
     uvs = torch.stack([verts[:, 0].abs(), verts[:, 1]], 1)
     mesh = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, normals=normals, material=eg.Material(1.0, normal_map=image))
     towards = normalize(vector(0.3, 0.1, 1.0), dim=0)
-    scene = eg.Scene([mesh], lights=[eg.DirectionalLight(-towards)])
+    scene = eg.Scene([mesh], lights=[eg.lights.DirectionalLight(-towards)])
     x = torch.tensor([-0.7, -0.31, -0.01, 0.01, 0.31, 0.7], dtype=F64)
-    hits = eg.trace(scene, torch.stack([x, 0.12 + 0 * x, 2 + 0 * x], 1), vector(0, 0, -1))
+    hits = eg.points.trace(scene, torch.stack([x, 0.12 + 0 * x, 2 + 0 * x], 1), vector(0, 0, -1))
     n, side = normalize(torch.stack([x, 0 * x, 1 + 0 * x], 1), dim=1), x.sign()[:, None]
     along = side * torch.stack([n[:, 2], 0 * x, -n[:, 0]], 1)
     expected = (tilted[0] * along + tilted[1] * vector(0, 1, 0) + tilted[2] * n) @ towards / torch.pi
@@ -132,11 +132,13 @@ def test_gradients_under_transforms() -> None:
 
     def loss(verts: Tensor) -> Tensor:
         mesh = eg.Mesh(
-            verts, ball.faces, uvs=verts[:, :2], uv_faces=ball.faces, normals=eg.vertex_normals(verts, ball.faces),
+            verts, ball.faces, uvs=verts[:, :2], uv_faces=ball.faces, normals=eg.Mesh(verts, ball.faces).vertex_normals(),
             material=eg.Material(normal_map=eg.Texture(map_)),
         )  # fmt: skip
         return (
-            eg.render(eg.Scene([mesh], lights=[eg.PointLight(vector(1, 2, 3), 20.0)]), camera, 1, seed=0).square().sum()
+            eg.render(eg.Scene([mesh], lights=[eg.lights.PointLight(vector(1, 2, 3), 20.0)]), camera, 1, seed=0)
+            .square()
+            .sum()
         )
 
     leaf = ball.verts.clone().requires_grad_()

@@ -10,7 +10,8 @@ import torch
 import trimesh
 
 import edgegrad as eg
-from edgegrad.scene.symmetries import about
+from edgegrad.fit.pose.result import PoseFit
+from edgegrad.scene.symmetry_axis import about
 
 DISPLACED = trimesh.transformations.random_rotation_matrix(np.array([0.2, 0.5, 0.9]))
 DISPLACED[:3, 3] = 3.0, -2.0, 5.0
@@ -57,7 +58,7 @@ TETRAHEDRON = trimesh.Trimesh(
 )  # fmt: skip
 def test_of_solids(solid: trimesh.Trimesh, order: int) -> None:
     mesh = mesh_of(solid)
-    found = eg.find_symmetries(mesh)
+    found = eg.Symmetries.find(mesh)
     motions = found.motions
     assert len(motions) == order and not found.continuous and found.trivial == (order == 1)
     assert torch.equal(motions[0], torch.eye(4, dtype=torch.float64))
@@ -82,7 +83,7 @@ def test_of_solids(solid: trimesh.Trimesh, order: int) -> None:
     ids=["cylinder", "cone", "torus", "prism of 40", "cylinder of equal moments"],
 )  # fmt: skip
 def test_continuous(solid: trimesh.Trimesh, discrete: int) -> None:
-    found = eg.find_symmetries(mesh_of(solid))
+    found = eg.Symmetries.find(mesh_of(solid))
     assert len(found.continuous) == 1 and len(found.motions) == discrete and not found.spherical
     axis = found.continuous[0]
     z = torch.tensor(DISPLACED[:3, 2])
@@ -95,7 +96,7 @@ def test_continuous(solid: trimesh.Trimesh, discrete: int) -> None:
 
 
 def test_sphere() -> None:
-    found = eg.find_symmetries(mesh_of(trimesh.creation.icosphere(4)))
+    found = eg.Symmetries.find(mesh_of(trimesh.creation.icosphere(4)))
     assert found.spherical and len(found.continuous) == 3
     pose, reference = rigid((0.3, 1.0, -0.2), (1.0, 2.0, 3.0)), rigid((2.0, 0.1, 0.4), (0.0, -1.0, 2.0))
     closest = found.closest(pose, reference)
@@ -107,14 +108,14 @@ def test_sphere() -> None:
 
 @pytest.mark.parametrize("scale", [1e-12, 1e12])
 def test_units_of_length(scale: float) -> None:
-    found = eg.find_symmetries(mesh_of(trimesh.creation.box((scale, 2 * scale, 3 * scale)), displaced=False))
+    found = eg.Symmetries.find(mesh_of(trimesh.creation.box((scale, 2 * scale, 3 * scale)), displaced=False))
     assert len(found.motions) == 4
 
 
 def test_tolerance() -> None:
     """The corners of a prism of 8 sides stand out by 1 - cos(π/8) of the radius, 0.028 of the size."""
-    wide = eg.find_symmetries(mesh_of(prism(8)), 0.04)
-    assert len(wide.continuous) == 1 and len(eg.find_symmetries(mesh_of(prism(8)), 0.02).motions) == 16
+    wide = eg.Symmetries.find(mesh_of(prism(8)), 0.04)
+    assert len(wide.continuous) == 1 and len(eg.Symmetries.find(mesh_of(prism(8)), 0.02).motions) == 16
 
 
 def test_a_propeller() -> None:
@@ -126,15 +127,15 @@ def test_a_propeller() -> None:
     ]  # fmt: skip
     solid = trimesh.util.concatenate([*blades, trimesh.creation.cylinder(0.3, 0.5, sections=60)])
     solid.vertices[:, 2] += 0.3 * np.hypot(solid.vertices[:, 0], solid.vertices[:, 1])
-    found = eg.find_symmetries(mesh_of(solid))
+    found = eg.Symmetries.find(mesh_of(solid))
     assert len(found.motions) == 5 and not found.continuous
-    assert eg.find_symmetries(mesh_of(solid), max_order=4).trivial
+    assert eg.Symmetries.find(mesh_of(solid), max_order=4).trivial
 
 
 def test_noise_below_the_tolerance() -> None:
     solid = prism(6, 3.0).subdivide().subdivide()
     solid.vertices += np.random.default_rng(0).normal(0, 0.004, solid.vertices.shape)
-    found = eg.find_symmetries(mesh_of(solid), 0.02)
+    found = eg.Symmetries.find(mesh_of(solid), 0.02)
     assert len(found.motions) == 12
     angles = [eg.Symmetries().error(m, torch.eye(4)).degrees for m in found.motions]
     assert np.allclose(sorted(angles)[:3], [0, 60, 60], atol=0.5)
@@ -150,10 +151,10 @@ def test_colors_break_them() -> None:
 
     x, _, z = solid.face_normals.T
     top = painted(z > 0.5)
-    assert len(eg.find_symmetries(top).motions) == 4
-    assert len(eg.find_symmetries(painted(x > 0.5)).motions) == 2
-    assert len(eg.find_symmetries(top, textured=False).motions) == 8
-    assert len(eg.find_symmetries(top, color_tolerance=1.0).motions) == 8
+    assert len(eg.Symmetries.find(top).motions) == 4
+    assert len(eg.Symmetries.find(painted(x > 0.5)).motions) == 2
+    assert len(eg.Symmetries.find(top, textured=False).motions) == 8
+    assert len(eg.Symmetries.find(top, color_tolerance=1.0).motions) == 8
 
 
 @pytest.mark.slow
@@ -168,19 +169,19 @@ def test_a_texture_breaks_them() -> None:
     flat = torch.tensor(np.concatenate(uvs))
     image = torch.full((32, 32, 3), 0.7)
     mesh = mesh_of(faces, texture=image, uvs=flat, uv_faces=torch.arange(36).reshape(12, 3))
-    assert len(eg.find_symmetries(mesh).motions) == 24
+    assert len(eg.Symmetries.find(mesh).motions) == 24
     letter = image.clone()
     letter[6:26, 8:12] = letter[22:26, 8:22] = 0.05
-    assert eg.find_symmetries(mesh.replace(texture=letter, uvs=mesh.uvs, uv_faces=mesh.uv_faces)).trivial
+    assert eg.Symmetries.find(mesh.replace(texture=letter, uvs=mesh.uvs, uv_faces=mesh.uv_faces)).trivial
     ring = image.clone()
     ring[12:20, 12:20] = 0.05
-    assert len(eg.find_symmetries(mesh.replace(texture=ring, uvs=mesh.uvs, uv_faces=mesh.uv_faces)).motions) == 24
+    assert len(eg.Symmetries.find(mesh.replace(texture=ring, uvs=mesh.uvs, uv_faces=mesh.uv_faces)).motions) == 24
 
 
 def test_of_a_scene_and_again() -> None:
     """Two halves of a box; the same numbers each time."""
     left, right = (mesh_of(trimesh.creation.box(bounds=[[a, 0, 0], [a + 1, 1.2, 3.0]])) for a in (0.0, 1.0))
-    first, again = (eg.find_symmetries(eg.Scene([left, right])) for _ in range(2))
+    first, again = (eg.Symmetries.find(eg.Scene([left, right])) for _ in range(2))
     assert len(first.motions) == 4 and torch.equal(first.motions, again.motions)
 
 
@@ -196,7 +197,7 @@ def rigid(turn: tuple[float, ...], shift: tuple[float, ...]) -> torch.Tensor:
 
 
 def test_closest_of_discrete() -> None:
-    found = eg.find_symmetries(mesh_of(trimesh.creation.box((1, 1, 1))))
+    found = eg.Symmetries.find(mesh_of(trimesh.creation.box((1, 1, 1))))
     reference = rigid((0.3, 1.0, -0.2), (1.0, 2.0, 3.0))
     off = reference @ rigid((0.05, 0.0, 0.0), (0.0, 0.1, 0.0))
     for motion in found.motions:
@@ -207,7 +208,7 @@ def test_closest_of_discrete() -> None:
 
 
 def test_closest_is_exact_about_an_axis() -> None:
-    axis = eg.SymmetryAxis([0.0, 0.6, 0.8], [1.0, 0.0, 2.0])
+    axis = eg.Symmetries.Axis([0.0, 0.6, 0.8], [1.0, 0.0, 2.0])
     flip = 2.0 * np.outer([1.0, 0, 0], [1.0, 0, 0]) - np.eye(3)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = flip, np.array([1.0, 0.0, 2.0]) - flip @ [1.0, 0.0, 2.0]
@@ -233,12 +234,12 @@ def test_fit_pose_reports_the_nearest() -> None:
     shown = eg.render_aovs(cylinder.transformed(truth[:3, :3], truth[:3, 3]), camera, ["image", "alpha"], seed=0)
     start = truth @ rigid((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)) @ rigid((0.1, 0.05, 0.0), (0.05, 0.0, 0.0))
 
-    def fitted(symmetries: eg.Symmetries | None, mesh: eg.Mesh = cylinder) -> eg.fit.PoseFit:
+    def fitted(symmetries: eg.Symmetries | None, mesh: eg.Mesh = cylinder) -> PoseFit:
         return eg.fit.fit_pose(
             mesh, shown["image"], camera, shown["alpha"][..., 0], start, steps=2, progress=False, symmetries=symmetries
         )  # fmt: skip
 
-    free, found = fitted(None), eg.find_symmetries(cylinder)
+    free, found = fitted(None), eg.Symmetries.find(cylinder)
     nearest = found.closest(free, start)
     assert float((nearest - free.matrix).abs().max()) > 1e-5
     fit = fitted(found)
@@ -281,18 +282,18 @@ def test_transforms_are_those_of_bop() -> None:
         (lambda: eg.Symmetries(torch.eye(3)[None]), ValueError, r"discrete: expected shape \(N, 4, 4\)"),
         (lambda: eg.Symmetries(torch.diag(torch.tensor([1.0, 1, -1, 1]))[None]), ValueError, r"discrete\[0\]: .*mirror"),
         (lambda: eg.Symmetries(torch.ones(1, 4, 4)), ValueError, r"discrete\[0\]: expected the last row"),
-        (lambda: eg.Symmetries(continuous=[torch.eye(3)]), TypeError, r"continuous\[0\]: expected a SymmetryAxis"),
-        (lambda: eg.SymmetryAxis([0.0, 0, 0]), ValueError, "direction: expected a length above zero"),
+        (lambda: eg.Symmetries(continuous=[torch.eye(3)]), TypeError, r"continuous\[0\]: expected a Symmetries.Axis"),
+        (lambda: eg.Symmetries.Axis([0.0, 0, 0]), ValueError, "direction: expected a length above zero"),
         (lambda: eg.Symmetries.from_bop({"symmetries_discrete": [[1, 2]]}), ValueError, "symmetries_discrete: .*16"),
         (lambda: eg.Symmetries.from_bop({"symmetries_continuous": [{"axis": [0, 0, 1]}]}), ValueError, "axis and offset"),
         (lambda: eg.Symmetries().closest(torch.eye(3), torch.eye(4)), ValueError, r"pose: expected shape \(4, 4\)"),
         (lambda: eg.Symmetries().error(torch.eye(4), -torch.eye(4)), ValueError, "reference: expected the last row"),
         (lambda: eg.Symmetries().transforms(0.0), ValueError, "step: expected"),
-        (lambda: eg.find_symmetries(mesh_of(prism(3)), 0.0), ValueError, "tolerance: expected"),
-        (lambda: eg.find_symmetries(mesh_of(prism(3)), max_order=1), ValueError, "max_order: expected"),
-        (lambda: eg.find_symmetries(mesh_of(prism(3)), textured=1), TypeError, "textured: expected True or False"),
-        (lambda: eg.find_symmetries(torch.eye(3)), TypeError, "expected a"),
-        (lambda: eg.find_symmetries(eg.Mesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]))), ValueError, "area"),
+        (lambda: eg.Symmetries.find(mesh_of(prism(3)), 0.0), ValueError, "tolerance: expected"),
+        (lambda: eg.Symmetries.find(mesh_of(prism(3)), max_order=1), ValueError, "max_order: expected"),
+        (lambda: eg.Symmetries.find(mesh_of(prism(3)), textured=1), TypeError, "textured: expected True or False"),
+        (lambda: eg.Symmetries.find(torch.eye(3)), TypeError, "expected a"),
+        (lambda: eg.Symmetries.find(eg.Mesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]))), ValueError, "area"),
     ],
 )  # fmt: skip
 def test_messages(make, error, words) -> None:

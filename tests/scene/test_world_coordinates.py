@@ -174,9 +174,9 @@ def test_another_dtype_is_refused(tmp_path):
 def test_from_trimesh():
     verts, faces = sphere()
     texture = trimesh.visual.TextureVisuals(uv=np.zeros((len(verts), 2)), image=Image.new("RGB", (2, 2)))
-    far = eg.io.from_trimesh(trimesh.Trimesh(verts, faces, visual=texture, process=False))
+    far = eg.shapes.from_trimesh(trimesh.Trimesh(verts, faces, visual=texture, process=False))
     assert {far.verts.dtype, far.uvs.dtype, far.texture.dtype} == {torch.float64}
     assert np.array_equal(far.verts[far.faces].numpy(), verts[faces])
-    near = eg.io.from_trimesh(trimesh.Trimesh(verts - UTM, faces, process=False))
+    near = eg.shapes.from_trimesh(trimesh.Trimesh(verts - UTM, faces, process=False))
     assert near.verts.dtype is torch.float32
     assert len(near.verts) == len(far.verts) == 162

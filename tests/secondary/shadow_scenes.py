@@ -34,7 +34,7 @@ Parts = Callable[[Moved], list[eg.Mesh]]
 
 
 def lit(mesh: eg.Mesh, smooth: bool = False, base: float = 0.25) -> eg.Mesh:
-    normals = eg.vertex_normals(mesh.verts, mesh.faces) if smooth else None
+    normals = mesh.vertex_normals() if smooth else None
     return mesh.replace(
         material=eg.Material(base_color=base), normals=normals, colors=torch.ones((len(mesh.verts), 1), dtype=F64)
     )
@@ -98,33 +98,40 @@ EMITTER = vector(1.1, -0.7, 2.4)
 
 
 def point(m: Moved, at: Tensor = EMITTER) -> object:
-    return eg.PointLight(at + m.by(LIGHT), 10.0)
+    return eg.lights.PointLight(at + m.by(LIGHT), 10.0)
 
 
 def sun(m: Moved, at: Tensor = EMITTER) -> object:
-    return eg.DirectionalLight(-(at + m.by(LIGHT)), 1.5)
+    return eg.lights.DirectionalLight(-(at + m.by(LIGHT)), 1.5)
 
 
 def spot(m: Moved) -> object:
     at = EMITTER + m.by(LIGHT)
-    return eg.SpotLight(at, vector(-1.1, 0.7, -2.0), 10.0, inner_angle=0.2, outer_angle=0.6)
+    return eg.lights.SpotLight(at, vector(-1.1, 0.7, -2.0), 10.0, inner_angle=0.2, outer_angle=0.6)
 
 
 def panel(m: Moved) -> object:
-    return eg.AreaLight.rectangle(vector(0.9, -0.6, 2.4) + m.by(LIGHT), vector(0.4, 0, 0.1), vector(0, 0.3, 0), 8.0)
+    return eg.shapes.rectangle(
+        vector(0.9, -0.6, 2.4) + m.by(LIGHT),
+        vector(0.4, 0, 0.1),
+        vector(0, 0.3, 0),
+        material=eg.Material(base_color=0.0, emission=8.0),
+    )
 
 
 def bulb(m: Moved) -> object:
-    return eg.AreaLight.of(sphere(2, 0.25, vector(0.9, -0.6, 2.4) + m.by(LIGHT)), 12.0)
+    return sphere(2, 0.25, vector(0.9, -0.6, 2.4) + m.by(LIGHT)).replace(
+        material=eg.Material(base_color=0.0, emission=12.0)
+    )
 
 
 def sky(m: Moved) -> object:
-    return eg.Environment(vector(1.0))
+    return eg.lights.Environment(vector(1.0))
 
 
 def image_sky(m: Moved) -> object:
     y, x = torch.meshgrid(torch.arange(8.0), torch.arange(16.0), indexing="ij")
-    return eg.Environment((0.3 + 2.0 * torch.exp(-((y - 2.5) ** 2 + (x - 5) ** 2) / 2)).double()[:, :, None])
+    return eg.lights.Environment((0.3 + 2.0 * torch.exp(-((y - 2.5) ** 2 + (x - 5) ** 2) / 2)).double()[:, :, None])
 
 
 # -- surfaces -----------------------------------------------------------------------------------------------------------
@@ -284,7 +291,7 @@ CASES = {
     # It moves along the plane: across it, the border of the shadow has another speed on either side.
     "light nearly in a face's plane": Case(
         above(box(vector(0.1, 0, 1.0), 0.6, 0.6, 0.5)),
-        lambda m: eg.PointLight(vector(0.4 + 1e-7, -0.1, 2.4) + m.by(LIGHT, vector(0, 1.0, 0.2)), 10.0),
+        lambda m: eg.lights.PointLight(vector(0.4 + 1e-7, -0.1, 2.4) + m.by(LIGHT, vector(0, 1.0, 0.2)), 10.0),
         LIGHT,
     ),
     **{

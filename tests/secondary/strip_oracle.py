@@ -51,7 +51,7 @@ class Strip(NamedTuple):
             eg.Mesh(self.reflector, one, material=eg.Material(**reflector)),
             eg.Mesh(self.strip, two, material=eg.Material(torch.zeros(3, dtype=F64))),
         ]
-        return eg.Scene(meshes, lights=[eg.PointLight(self.light, 4.0)])
+        return eg.Scene(meshes, lights=[eg.lights.PointLight(self.light, 4.0)])
 
     @property
     def tensors(self) -> dict[str, Tensor]:

@@ -246,9 +246,9 @@ def test_texel_edges_are_declared_as_shading_looks_them_up() -> None:
     material = eg.Material(nearest(3), nearest(1), nearest(1), emission=nearest(3), normal_map=nearest(3))
     painted = plane(1.0, texture=TEXELS, filter="nearest", material=material)
     smooth = plane(3.0, texture=TEXELS, material=eg.Material(nearest(3))).transformed(t=vector(0, 0, -1))
-    lit = eg.Scene([painted, smooth], lights=[eg.PointLight(vector(0, 0, 2), 5.0)])
+    lit = eg.Scene([painted, smooth], lights=[eg.lights.PointLight(vector(0, 0, 2), 5.0)])
     place = torch.rand((60, 3), dtype=F64, generator=draw) * vector(4, 4, 0) - vector(2, 2, -1)
-    whole, alone = (eg.trace(lit, place, vector(0, 0, -1)) for _ in range(2))
+    whole, alone = (eg.points.trace(lit, place, vector(0, 0, -1)) for _ in range(2))
     reference(whole)
     declare_texel_edges(alone)
     assert whole._discontinuities.kinds == alone._discontinuities.kinds == ["floor"] * 14

@@ -36,12 +36,12 @@ def lights_of(kind: str, theta: Tensor) -> tuple[list[eg.Mesh], list[Any]]:
         corners = torch.stack([place + half + up, place - half + up, place - half - up, place + half - up])
         return [mesh(corners, [[0, 2, 1], [0, 3, 2]], 0.0, 30.0)], []
     if kind == "point":
-        return [], [eg.PointLight(place, 9.0)]
+        return [], [eg.lights.PointLight(place, 9.0)]
     if kind == "spot":
-        return [], [eg.SpotLight(place, vector(3.0, -1.2, 0.0), 9.0, inner_angle=0.3, outer_angle=0.6)]
+        return [], [eg.lights.SpotLight(place, vector(3.0, -1.2, 0.0), 9.0, inner_angle=0.3, outer_angle=0.6)]
     if kind == "directional":
-        return [], [eg.DirectionalLight(-towards, 3.0)]
-    return [], [eg.Environment(bright_spot(), rotation((0.0, 0.6, 0.8), 0.3 * theta), visible=False)]
+        return [], [eg.lights.DirectionalLight(-towards, 3.0)]
+    return [], [eg.lights.Environment(bright_spot(), rotation((0.0, 0.6, 0.8), 0.3 * theta), visible=False)]
 
 
 def case_of(kind: str, moved: str, **of_floor: Any) -> Case:

@@ -85,11 +85,11 @@ class Case:
         away = away + self._moved("light", theta)
         meshes, lights = [mesh, wall], []
         if self.light == "point":
-            lights = [eg.PointLight(still.eye + away, 20.0)]
+            lights = [eg.lights.PointLight(still.eye + away, 20.0)]
         elif self.light == "spot":
-            lights = [eg.SpotLight(still.eye + away, -eye, 20.0, inner_angle=0.3, outer_angle=0.6)]
+            lights = [eg.lights.SpotLight(still.eye + away, -eye, 20.0, inner_angle=0.3, outer_angle=0.6)]
         elif self.light == "sun":
-            lights = [eg.DirectionalLight(still.world_to_camera[2, :3] + away, 3.0)]
+            lights = [eg.lights.DirectionalLight(still.world_to_camera[2, :3] + away, 3.0)]
         else:  # a light of 1e-4, a little behind the eye, so that the camera does not see it
             right, down, forward = still.world_to_camera[:3, :3]
             corners = 1e-4 * torch.stack([-right - down, right - down, down])

@@ -210,7 +210,7 @@ def block_on_reflector(theta: Tensor, dtype: torch.dtype) -> tuple[eg.Scene, eg.
     block = torch.tensor(ends, dtype=F64) @ turn.T + theta * torch.tensor([0.0, 1.0, 0.3], dtype=F64)
     materials = (strip.receiver, QUAD[:1], gray), (reflector, QUAD[:1], gray), (block, BOX, torch.zeros(3, dtype=F64))
     meshes = [eg.Mesh(v.to(dtype), torch.tensor(f), material=eg.Material(color)) for v, f, color in materials]
-    lights = [eg.PointLight(torch.tensor([0.0, 0.5, 0.2], dtype=F64), 4.0)]
+    lights = [eg.lights.PointLight(torch.tensor([0.0, 0.5, 0.2], dtype=F64), 4.0)]
     return eg.Scene(meshes, lights=lights), strip.camera
 
 

@@ -81,7 +81,7 @@ def seen(leaves: Leaves, corners: Tensor, camera: eg.Camera) -> Strip:
 
 
 def lit(meshes: list[eg.Mesh]) -> eg.Scene:
-    return eg.Scene(meshes, lights=[eg.PointLight(Strip.standard().light, 4.0)])
+    return eg.Scene(meshes, lights=[eg.lights.PointLight(Strip.standard().light, 4.0)])
 
 
 def masked_sheet(materials: tuple[str, str]) -> Border:

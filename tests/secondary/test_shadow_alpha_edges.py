@@ -163,8 +163,8 @@ def case(what: str, light: str, mode: str = "MASK", filter: str = "linear", came
     def at(t: Tensor) -> tuple[eg.Scene, eg.Camera]:
         place = vector(0.3, -0.2, 2.6) + (t * vector(0.6, 0.2, 0.3) if what == "light" else 0)
         lights = {
-            "point": lambda: eg.PointLight(place, 10.0),
-            "sun": lambda: eg.DirectionalLight(-place, 2.0),
+            "point": lambda: eg.lights.PointLight(place, 10.0),
+            "sun": lambda: eg.lights.DirectionalLight(-place, 2.0),
         }
         floor = plane(2.0, material=eg.Material(0.8))
         return eg.Scene([moved.get(what, lambda t: leaf)(t), floor], lights=[lights[light]()]), camera
@@ -205,7 +205,7 @@ def seen(alpha: Tensor) -> Tensor:
     """A leaf's shadow alone."""
     floor, leaf = plane(2.0, material=eg.Material(0.8)), quad(alpha=alpha, material=eg.Material(0.3))
     leaf = leaf.replace(verts=0.6 * leaf.verts + vector(0, 0, 1))
-    scene = eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0.3, -0.2, 2.6), 10.0)])
+    scene = eg.Scene([floor, leaf], lights=[eg.lights.PointLight(vector(0.3, -0.2, 2.6), 10.0)])
     return eg.render(scene, ASIDE, spp=4, seed=0) * torch.linspace(0, 1, 32, dtype=torch.float64)[:, None]
 
 
@@ -228,7 +228,7 @@ def test_forward_mode_is_reverse_mode() -> None:
 
 def test_plan_says_that_alpha_edges_move() -> None:
     floor, leaf = plane(material=eg.Material()), quad(alpha=disc(9), material=eg.Material())
-    scene = eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0, 0, 3))])
+    scene = eg.Scene([floor, leaf], lights=[eg.lights.PointLight(vector(0, 0, 3))])
     assert not eg.plan(scene, ABOVE)["shadow boundaries"].on
     moving = leaf.replace(alpha=disc(9).requires_grad_())
     assert eg.plan(scene.replace(meshes=[floor, moving]), ABOVE)["shadow boundaries"].on

@@ -80,21 +80,21 @@ def adjoint() -> Tensor:
     return (1 + x / 40).expand(SIZE, SIZE)[:, :, None]
 
 
-def visibility(hits: eg.Hits) -> Tensor:
+def visibility(hits: eg.points.Hits) -> Tensor:
     (light,) = hits.lights
     return hits.visible_from(light, hits.light_points(light))[:, None]
 
 
 def point(s: Setting) -> object:
-    return eg.PointLight(s.light)
+    return eg.lights.PointLight(s.light)
 
 
 def sun(s: Setting) -> object:
-    return eg.DirectionalLight(-s.light)
+    return eg.lights.DirectionalLight(-s.light)
 
 
 def spot(s: Setting) -> object:
-    return eg.SpotLight(s.light, vector(0, 0, -1), outer_angle=1.0)
+    return eg.lights.SpotLight(s.light, vector(0, 0, -1), outer_angle=1.0)
 
 
 LIGHTS = {"point": point, "sun": sun, "spot": spot}
@@ -161,7 +161,7 @@ U, V = vector(0.5, 0.0, 0.1), vector(0.0, 0.4, 0.0)  # half the sides of an emis
 
 
 def panel(s: Setting) -> object:
-    return eg.AreaLight.rectangle(s.light, U, V, 1.0)
+    return eg.shapes.rectangle(s.light, U, V, material=eg.Material(base_color=0.0, emission=1.0))
 
 
 def of_panel(motion: str, kind: type[Setting] = Setting) -> float:
@@ -189,7 +189,7 @@ def test_penumbra_of_a_rectangle(motion: str) -> None:
 
 
 def sky(s: Setting) -> object:
-    return eg.Environment(vector(1.0), visible=False)
+    return eg.lights.Environment(vector(1.0), visible=False)
 
 
 def of_sky(motion: str, kind: type[Setting] = Setting) -> float:
@@ -269,7 +269,7 @@ def test_masked_faces_cast_no_shadow(mode, alpha):
         verts = square.clone().requires_grad_()
         appearance = {"alpha": torch.full((2, 2), alpha), "material": eg.Material(0.5, alpha_mode=mode)}
         sheet = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, **appearance)
-        scene = eg.Scene([sheet, floor], lights=[eg.PointLight(torch.tensor([1.2, 2.5, 2.5]), 15.0)])
+        scene = eg.Scene([sheet, floor], lights=[eg.lights.PointLight(torch.tensor([1.2, 2.5, 2.5]), 15.0)])
         image = eg.render(scene, camera, spp=16, shadows=shadows, seed=0)
         (image * torch.linspace(-1, 1, 32)[:, None, None]).sum().backward()
         found.append(verts.grad)
@@ -305,7 +305,7 @@ def test_shadows_fall_on_each_of_two_transparent_sheets():
             }
         meshes = [eg.Mesh(sheet, faces, uvs=uvs, uv_faces=faces, **appearance) for sheet in sheets]
         scene = eg.Scene(
-            [*meshes, eg.Mesh(caster, faces, material=eg.Material(0.3))], lights=[eg.PointLight(light, 30.0)]
+            [*meshes, eg.Mesh(caster, faces, material=eg.Material(0.3))], lights=[eg.lights.PointLight(light, 30.0)]
         )
         image = eg.render(scene, camera, spp=16, sampling=eg.Sampling(edges=1 << 14), seed=0)
         (image * weights).sum().backward()

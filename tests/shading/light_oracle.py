@@ -45,10 +45,10 @@ class Oracle:
         self._balls, self._draws = balls, draws
         self._generator = torch.Generator().manual_seed(seed)
 
-    def __call__(self, hits: eg.Hits) -> Tensor:
+    def __call__(self, hits: eg.points.Hits) -> Tensor:
         return of_each_mesh(hits, self._of_mesh)
 
-    def _of_mesh(self, hits: eg.Hits, index: int) -> Tensor:
+    def _of_mesh(self, hits: eg.points.Hits, index: int) -> Tensor:
         scene, at = hits._surfaces.scene, on_mesh(hits, index)
         material = at.mesh.material
         assert material is not None
@@ -59,7 +59,7 @@ class Oracle:
             meshes=[m for m in scene.meshes if m.material is None or m.material.alpha_mode != "BLEND"]
         )
         for light in scene.lights:
-            if isinstance(light, eg.PointLight):
+            if isinstance(light, eg.lights.PointLight):
                 d = light.position - surface.position
                 far = d.norm(dim=1, keepdim=True)
                 there = _nearest(casters, surface.position, d / far) >= far.detach()[:, 0] * (1 - 1e-6)
@@ -131,20 +131,20 @@ def _nearest(casters: eg.Scene, place: Tensor, l: Tensor) -> Tensor:
     """(N,) how far rays go."""
     with torch.no_grad():
         l = l.detach().double()
-        hits = eg.trace(casters, place.detach().double() + AWAY * l, l)
+        hits = eg.points.trace(casters, place.detach().double() + AWAY * l, l)
         return torch.full((len(l),), math.inf, dtype=F64).index_copy(0, hits.ray, hits.depth.double())
 
 
 def _seen(scene: eg.Scene, casters: eg.Scene, place: Tensor, l: Tensor) -> Tensor:
     """(N, C) what shines at the ends of rays: differentiable by radiance alone."""
-    hits = eg.trace(casters, place.detach().double() + AWAY * l, l)
+    hits = eg.points.trace(casters, place.detach().double() + AWAY * l, l)
     found = torch.zeros((len(l), scene.channels), dtype=F64)
     free = torch.ones(len(l), dtype=torch.bool).index_fill(0, hits.ray, False)
     for light in scene.lights:
-        if isinstance(light, eg.Environment):
+        if isinstance(light, eg.lights.Environment):
             found = found + torch.where(free[:, None], light.towards(l), 0.0)
 
-    def emitted(own: eg.Hits, index: int) -> Tensor:
+    def emitted(own: eg.points.Hits, index: int) -> Tensor:
         at = on_mesh(own, index)
         material = at.mesh.material
         emission = None if material is None else emission_of(at, material)

@@ -116,27 +116,34 @@ def scene_of(words: str, n: Leaves) -> eg.Scene:
     ground = eg.Mesh(n["ground"], torch.tensor([[0, 2, 1], [0, 3, 2]]), material=eg.Material(n["ground_color"]))
     lights: list[Any] = []
     if "point" in n:
-        lights.append(eg.PointLight(n["point"], n["point_power"], n["point_color"]))
+        lights.append(eg.lights.PointLight(n["point"], n["point_power"], n["point_color"]))
     if "sun" in n:
-        lights.append(eg.DirectionalLight(n["sun"], n["sun_power"]))
+        lights.append(eg.lights.DirectionalLight(n["sun"], n["sun_power"]))
     if "spot" in n:
         angles = n["spot_inner"], n["spot_outer"]
-        lights.append(eg.SpotLight(n["spot"], n["spot_axis"], n["spot_power"], None, *angles))
+        lights.append(eg.lights.SpotLight(n["spot"], n["spot_axis"], n["spot_power"], None, *angles))
     if "harmonics" in n:
-        lights.append(eg.SphericalHarmonics(n["harmonics"], n["harmonics_turn"]))
+        lights.append(eg.lights.SphericalHarmonics(n["harmonics"], n["harmonics_turn"]))
     if "environment" in n:
-        lights.append(eg.Environment(n["environment"], n["environment_turn"]))
+        lights.append(eg.lights.Environment(n["environment"], n["environment_turn"]))
     if "sky" in n:
-        lights.append(eg.Environment(n["sky"]))
+        lights.append(eg.lights.Environment(n["sky"]))
     if "emitter" in n:
         if "bulb" in words:
             bulb = icosphere(1)
             bulb = eg.Mesh(0.7 * bulb.verts.double() + n["emitter"], bulb.faces)
-            lights.append(eg.AreaLight.of(bulb, n["emitter_radiance"]))
+            lights.append(bulb.replace(material=eg.Material(base_color=0.0, emission=n["emitter_radiance"])))
         else:
             u, v = number([0.5, 0.0, 0.0]), number([0.0, 0.1, 0.5])
             sides = "one_sided" not in words
-            lights.append(eg.AreaLight.rectangle(n["emitter"], u, v, n["emitter_radiance"], two_sided=sides))
+            lights.append(
+                eg.shapes.rectangle(
+                    n["emitter"],
+                    u,
+                    v,
+                    material=eg.Material(base_color=0.0, emission=n["emitter_radiance"], two_sided=sides),
+                )
+            )
     return eg.Scene([mesh, ground], lights=lights)
 
 

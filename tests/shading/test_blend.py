@@ -50,7 +50,7 @@ def test_what_lies_before_something_opaque_and_an_environment() -> None:
     floor = plane().replace(verts=plane().verts - vector(0, 0, 2), material=eg.Material(0.0, emission=0.3))
     image = eg.render(eg.Scene([sheet(0, 0.9, 0.25), floor]), from_above(8), spp=4, seed=0)
     assert torch.allclose(image, torch.full_like(image, over([0.9], [0.25], 0.3)), atol=1e-9)
-    sky = eg.Environment(torch.tensor([0.6, 0.6, 0.6], dtype=F64))
+    sky = eg.lights.Environment(torch.tensor([0.6, 0.6, 0.6], dtype=F64))
     image = eg.render(eg.Scene([sheet(0, 0.9, 0.25)], lights=[sky]), from_above(8), spp=4, seed=0)
     assert torch.allclose(image, torch.full_like(image, over([0.9], [0.25], 0.6)), atol=1e-9)
 
@@ -59,7 +59,7 @@ def test_what_lies_before_something_opaque_and_an_environment() -> None:
 def test_gradient_by_an_environment_that_is_seen_through(image_of_directions: bool) -> None:
     """The image is linear in what shows behind the sheet."""
     radiance = torch.full((3,), 0.6, dtype=F64, requires_grad=True)
-    sky = eg.Environment(radiance.expand(2, 4, 3) if image_of_directions else radiance)
+    sky = eg.lights.Environment(radiance.expand(2, 4, 3) if image_of_directions else radiance)
     image = eg.render(eg.Scene([sheet(0, 0.9, 0.25, size=0.5)], lights=[sky]), from_above(8), spp=4, seed=0)
     (found,) = torch.autograd.grad(image.sum(), radiance)
     seen_through = 64 * (1 - 0.25 * 0.25)  # a quarter of the image is covered, of which a quarter is the sheet's own
@@ -84,7 +84,7 @@ def test_a_shader_is_composed_with_what_it_gives_behind() -> None:
     """Values, and gradients by alpha and by what moves, are those of materials."""
     scene = eg.Scene([sheet(0, 0.9, 0.25), sheet(-1, 0.5, 0.6, size=0.6)], torch.full((3,), 0.4, dtype=F64))
 
-    def shader(hits: eg.Hits) -> Tensor:
+    def shader(hits: eg.points.Hits) -> Tensor:
         return torch.where(hits.position[:, 2:] > -0.5, 0.9, 0.5).expand(-1, 3)
 
     adjoint = torch.rand(8, 8, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
@@ -140,7 +140,7 @@ def test_a_texture_behind_moves_inside_and_the_border_of_the_first_sheet() -> No
 
 
 def test_shadows_of_thin_and_thick_sheets() -> None:
-    light = eg.DirectionalLight(vector(0, 0, -1))
+    light = eg.lights.DirectionalLight(vector(0, 0, -1))
     floor = plane().replace(verts=plane().verts - vector(0, 0, 1), material=eg.Material(1.0))
     dark, bright = (
         eg.render(eg.Scene([sheet(0, 0.0, alpha), floor], lights=[light]), from_above(4), spp=1, seed=0).mean()
@@ -197,7 +197,7 @@ def test_silhouette_of_a_square_behind_transparent_sheets() -> None:
 def behind_glass(kind: str, t: Tensor, covered: bool) -> tuple[eg.Scene, eg.Camera]:
     """A black transparent sheet of alpha 0.4, or none, before something that moves."""
     camera = eg.Camera.look_at((0.3, -0.4, 5.0), (0, 0, 0), up=(0.1, 1, 0), fov_y=40, size=(32, 32)).to(F64)
-    material, lights = eg.Material(), [eg.PointLight(vector(1.2, 0.9, 2.6) + t * vector(0.5, 0.1, 0), 9.0)]
+    material, lights = eg.Material(), [eg.lights.PointLight(vector(1.2, 0.9, 2.6) + t * vector(0.5, 0.1, 0), 9.0)]
     floor = plane(1.6, material=material).transformed(t=vector(0, 0, -0.6))
     first = cube(0.6).transformed(R=rotation((0.0, 0.6, 0.8), torch.tensor(0.7, dtype=F64)))
     moved = 0.2 * t * vector(1, 0.4, 0.3)
@@ -251,7 +251,7 @@ def test_borders_of_nearest_texels_are_searched_where_they_move(
     image = torch.linspace(0.2, 0.8, 12, dtype=F64).reshape(2, 2, 3)
     material = eg.Material(eg.Texture(image, filter="nearest"), alpha_mode="BLEND")
     mesh = start.replace(verts=values["verts"], uvs=values["uvs"], alpha=values["alpha"], material=material)
-    scene = eg.Scene(mesh, lights=[eg.PointLight((0.3, 0.2, 2.0), values["light"])])
+    scene = eg.Scene(mesh, lights=[eg.lights.PointLight((0.3, 0.2, 2.0), values["light"])])
     loss = eg.render(scene, from_above(4), spp=1, seed=0).sum()
     torch.autograd.grad(loss, values[moving])
     assert bool(searches) == searched

@@ -92,16 +92,16 @@ def test_antithetic_sets_have_their_density(roughness: float):
     assert float(((observed - expected) ** 2 / expected).sum()) < chi2.ppf(1 - 1e-4, rings * sectors)
 
 
-def sky(emitters: bool) -> eg.Environment:
+def sky(emitters: bool) -> eg.lights.Environment:
     """A smooth one, or with lights, of which one lies where the point mirrors."""
     image = torch.linspace(0.4, 1.2, 16, dtype=F64)[:, None, None].expand(16, 32, 3).clone()
     turn = torch.linalg.qr(uniform(3, 3))[0]
     if emitters:
-        light = eg.Environment(image, rotation=turn)
+        light = eg.lights.Environment(image, rotation=turn)
         mirror = light.points_at(2 * dot(V[None], N[None]) * N - V)
         image.reshape(-1, 3)[mirror.index] = 40.0
         image[3:5, 20:22] = 20.0
-    return eg.Environment(image, rotation=turn)
+    return eg.lights.Environment(image, rotation=turn)
 
 
 PARAMETERS = ["normal", "normal across", "roughness", "metallic", "base color", "texel"]
@@ -121,7 +121,7 @@ def derivatives(l: Tensor, arriving: Tensor, roughness: float) -> Tensor:
     return torch.stack([*((value(step) - value(-step)) / 2e-5 for step in steps), value(torch.zeros(5, dtype=F64))], 1)
 
 
-def estimates(light: eg.Environment, roughness: float, seeds: int, antithetic: bool) -> Tensor:
+def estimates(light: eg.lights.Environment, roughness: float, seeds: int, antithetic: bool) -> Tensor:
     """(seeds, 6) of the derivatives from four directions, or from one."""
     material = Scattering(vector(0.8)[None], vector(0.8)[None], vector(roughness)[None])
     one = Glossy.of(V[None], N[None], N[None], material, torch.zeros(1, dtype=torch.int64))
@@ -191,10 +191,13 @@ def test_kernel_and_twin_draw_the_same_points():
         material = eg.Material(of["base"], metallic=of["metallic"][0], roughness=of["roughness"])
         mesh = ball(2).replace(verts=of["verts"], normals=of["normals"], material=material)
         ground = plane(material=eg.Material()).transformed(t=vector(0, 0, -1.2))
-        lights = [eg.Environment(of["sky"], rotation=of["turn"]), eg.PointLight(vector(2.0, 1.0, 3.0), 9.0)]
+        lights = [
+            eg.lights.Environment(of["sky"], rotation=of["turn"]),
+            eg.lights.PointLight(vector(2.0, 1.0, 3.0), 9.0),
+        ]
         scene = eg.Scene([mesh, ground], lights=lights)
         camera = eg.Camera.look_at((0.0, -2.0, 2.5), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 50.0, (16, 16))
-        hits = eg.surface_samples(eg.primary_hits(scene, camera, seed=0)).hits
+        hits = eg.points.surface_samples(eg.points.primary_hits(scene, camera, seed=0)).hits
         hits._needs_values = False
         bar = torch.randn((len(hits), 3), dtype=F64, generator=torch.Generator().manual_seed(1))
         L = shade(hits, True, 2)  # type: ignore[operator]
@@ -211,5 +214,5 @@ def test_values_take_no_antithetic_sets():
     """Shaders see the points that images do."""
     scene = eg.Scene([ball(2, material=eg.Material(metallic=1.0, roughness=0.2))], lights=[sky(True)])
     camera = eg.Camera.look_at((0.0, -2.0, 2.5), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 50.0, (16, 16))
-    hits: Hits = eg.primary_hits(scene, camera, seed=0).hits
+    hits: Hits = eg.points.primary_hits(scene, camera, seed=0).hits
     assert torch.allclose(shading.reference(hits, True, 2), in_kernel.radiance(hits, True, 2), rtol=1e-10)

@@ -42,7 +42,7 @@ def test_a_tree_finds_what_rays_cross():
     verts = torch.randn((90, 3), dtype=F64, generator=draw)
     verts[::3, 2] = 0.25
     faces = torch.randint(0, 90, (150, 3), generator=draw)
-    light = MeshLight(eg.AreaLight.of(eg.Mesh(verts, faces), 1.0))
+    light = MeshLight(eg.Mesh(verts, faces).replace(material=eg.Material(base_color=0.0, emission=1.0)))
     origins = 2 * torch.randn((400, 3), dtype=F64, generator=draw)
     directions = normalize(-origins + torch.randn((400, 3), dtype=F64, generator=draw), dim=1)
     directions[:3] = torch.eye(3, dtype=F64)
@@ -83,7 +83,7 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_the_shape_of_an_emitter(name: str):
     mesh, flat, convex = SHAPES[name]
-    tree = tree_of(MeshLight(eg.AreaLight.of(mesh, 1.0)))
+    tree = tree_of(MeshLight(mesh.replace(material=eg.Material(base_color=0.0, emission=1.0))))
     assert (tree.is_flat, tree.is_convex) == (flat, convex)
 
 
@@ -124,7 +124,7 @@ def test_directions_to_a_ball_have_their_density(distance: float):
     """How often faces are met, against their solid angles; and densities by area against those by solid angle."""
     mesh, n = icosphere(1), 40_000
     mesh = eg.Mesh(mesh.verts.double() + distance * normalize(vector(0.3, -0.5, 0.8), dim=0), mesh.faces)
-    light = MeshLight(eg.AreaLight.of(mesh, 1.0))
+    light = MeshLight(mesh.replace(material=eg.Material(base_color=0.0, emission=1.0)))
     meets = EmissiveMeshSampler.of(light, torch.zeros((n, 3), dtype=F64), torch.full((n,), -1))
     ray, points = meets.towards(meets.draw_by_ball(sobol_parts(torch.arange(n), 5, 1)))
     assert len(ray.unique()) == len(ray)  # of a convex light only what lies in front
@@ -149,7 +149,9 @@ def test_directions_to_a_ball_have_their_density(distance: float):
 
 def test_all_directions_may_miss_an_emitter():
     """There is nothing then; one surface at a time, for what others meet would hide it."""
-    emitter = MeshLight(eg.AreaLight.of(together(moved(block(1, 1, 1), 1.0, 0, 0, 3)), 1.0))
+    emitter = MeshLight(
+        together(moved(block(1, 1, 1), 1.0, 0, 0, 3)).replace(material=eg.Material(base_color=0.0, emission=1.0))
+    )
     n, y = vector(0, 0, 1)[None], vector(0.1, 0.2, 0)[None]
     rough = Scattering(vector(0.5)[None], vector(1.0)[None], vector(0.9)[None])
     drawn = []
@@ -164,7 +166,9 @@ def test_the_kernel_draws_what_pytorch_draws():
     """A ball emits, for surfaces where the lobe is asked and where it is not."""
     metal = eg.Material(torch.ones(3, dtype=F64), metallic=1.0, roughness=0.3)
     rough = eg.Material(torch.ones(3, dtype=F64), metallic=1.0, roughness=0.9)
-    emitter = eg.AreaLight.of(eg.Mesh(icosphere(1).verts * 0.6 + vector(1.7, 0.1, 0.8), icosphere(1).faces), 3.0)
+    emitter = eg.Mesh(icosphere(1).verts * 0.6 + vector(1.7, 0.1, 0.8), icosphere(1).faces).replace(
+        material=eg.Material(base_color=0.0, emission=3.0)
+    )
     floor = plane(2.0, material=rough).replace(verts=plane(2.0).verts - vector(0, 0, 1.2))
     scene = eg.Scene([ball(2, material=metal), floor, emitter])
     hits = hits_of(scene, from_above(20))
@@ -225,11 +229,11 @@ def seen_from_origin(corner: Tensor, there: Tensor) -> Tensor:
 def test_points_are_unbiased(name: str):
     """The mean over draws against quadrature over the light's faces, of what reaches the origin past the light itself."""
     mesh, two_sided = EMITTERS[name]
-    light = MeshLight(eg.AreaLight.of(mesh, 1.0, two_sided))
+    light = MeshLight(mesh.replace(material=eg.Material(base_color=0.0, emission=1.0, two_sided=two_sided)))
     n, v, y = vector(0, 0, 1), normalize(vector(0.5, -0.2, 0.9), dim=0), vector(0, 0, 0)
     corner = mesh.verts.double()[mesh.faces]
 
-    def arriving(points: eg.LightPoints) -> tuple[Tensor, Tensor]:
+    def arriving(points: eg.lights.LightPoints) -> tuple[Tensor, Tensor]:
         """(M, 3) the direction l, and max(0, n·l) V cos θ / r²."""
         there = light.place(points)
         l = normalize(there, dim=1)
@@ -244,7 +248,7 @@ def test_points_are_unbiased(name: str):
     lower, upper = i + j < fine, i + j < fine - 1
     uv = torch.cat([torch.stack([i, j], 1)[lower] + 1 / 3, torch.stack([i, j], 1)[upper] + 2 / 3]).double() / fine
     F = len(mesh.faces)
-    every = eg.LightPoints(
+    every = eg.lights.LightPoints(
         torch.arange(F).repeat_interleave(len(uv)), uv.repeat(F, 1), torch.ones(F * len(uv), dtype=F64)
     )
     l, all_arriving = arriving(every)
@@ -278,7 +282,9 @@ def test_lobes_draw_only_where_they_gain():
 
     def asked(size: float, roughness: float, x: float) -> bool:
         verts, faces = quad(2.0, size)
-        light = MeshLight(eg.AreaLight.of(eg.Mesh(verts + vector(x, 0, 0), faces), 1.0))
+        light = MeshLight(
+            eg.Mesh(verts + vector(x, 0, 0), faces).replace(material=eg.Material(base_color=0.0, emission=1.0))
+        )
         meets = EmissiveMeshSampler.of(light, torch.zeros((1, 3), dtype=F64), torch.tensor([-1]))
         return bool(meets.is_drawn_by(Lobes.of(v[None], n[None], vector(roughness)[None])))
 
@@ -292,9 +298,11 @@ def studio(kind: str, roughness: float) -> tuple[eg.Scene, eg.Camera]:
     metal = eg.Material(torch.ones(3), metallic=1.0, roughness=roughness)
     if kind == "softbox":
         corners = vector(0, 2.5, -3), vector(2.5, 0, 0), vector(0, 1.6, 0.8)
-        emitter = eg.AreaLight.rectangle(*corners, 2.0, two_sided=False)
+        emitter = eg.shapes.rectangle(*corners, material=eg.Material(base_color=0.0, emission=2.0, two_sided=False))
     else:
-        emitter = eg.AreaLight.of(eg.Mesh(icosphere(2).verts * 0.5 + vector(-1.2, 2.0, 1.5), icosphere(2).faces), 10.0)
+        emitter = eg.Mesh(icosphere(2).verts * 0.5 + vector(-1.2, 2.0, 1.5), icosphere(2).faces).replace(
+            material=eg.Material(base_color=0.0, emission=10.0)
+        )
     camera = eg.Camera.look_at((0.0, 1.6, 3.6), (0.0, 0.2, 0.0), (0.0, 1.0, 0.0), 36.0, (32, 32))
     return eg.Scene([ball(3, material=metal), emitter]), camera
 
@@ -318,9 +326,12 @@ def test_the_plan_says_how_light_is_drawn():
         mesh = ball(1, material=eg.Material(**material))
         return eg.plan(eg.Scene([mesh], lights=list(lights)), studio("ball", 0.3)[1])["lights"].why
 
-    emitter, sky = eg.AreaLight.of(plane(), 1.0), eg.Environment(torch.ones(3))
+    emitter, sky = (
+        plane().replace(material=eg.Material(base_color=0.0, emission=1.0)),
+        eg.lights.Environment(torch.ones(3)),
+    )
     assert "drawn by the light, for no surface is glossy" in said(emitter, sky)
     glossy = said(emitter, sky, metallic=1.0, roughness=0.3)
     assert "8 candidates" in glossy and "(skies, meshes that emit)" in glossy and "by the light alone" in glossy
     assert "by the light alone" not in said(sky, metallic=1.0, roughness=0.3)
-    assert "candidates" not in said(eg.PointLight(vector(0, 0, 1)), metallic=1.0, roughness=0.3)
+    assert "candidates" not in said(eg.lights.PointLight(vector(0, 0, 1)), metallic=1.0, roughness=0.3)

@@ -69,10 +69,10 @@ def test_directions_have_the_density_that_is_said(roughness: float, angle: float
     assert int(many.sum()) > 20 and statistic < chi2.ppf(1 - 1e-4, int(many.sum()))
 
 
-def sky(dark: float) -> eg.Environment:
+def sky(dark: float) -> eg.lights.Environment:
     image = torch.full((16, 32, 3), 0.2, dtype=F64)
     image[3:5, 20:22], image[7:12], image[14, 4:9] = 30.0, 0.0, dark
-    return eg.Environment(image, rotation=torch.linalg.qr(uniform(3, 3))[0])
+    return eg.lights.Environment(image, rotation=torch.linalg.qr(uniform(3, 3))[0])
 
 
 MATERIALS = {
@@ -123,15 +123,15 @@ def test_points_are_unbiased(name: str, roughness: float):
 
 def test_nothing_arrives_from_a_black_sky_of_one_texel_but_derivatives():
     radiance = torch.zeros(3, requires_grad=True)
-    scene, camera = metal(eg.Environment(radiance), 0.3), from_front(16)
+    scene, camera = metal(eg.lights.Environment(radiance), 0.3), from_front(16)
     image = eg.render(scene, camera, spp=16, seed=0)
     assert float(image.detach().abs().max()) == 0
     image.sum().backward()
-    white = float(eg.render(metal(eg.Environment(torch.ones(3)), 0.3), camera, spp=64, seed=0).sum())
+    white = float(eg.render(metal(eg.lights.Environment(torch.ones(3)), 0.3), camera, spp=64, seed=0).sum())
     assert radiance.grad is not None and float(radiance.grad.sum()) == pytest.approx(white, rel=0.03)
 
 
-def metal(light: eg.Environment, roughness: float) -> eg.Scene:
+def metal(light: eg.lights.Environment, roughness: float) -> eg.Scene:
     material = eg.Material(torch.ones(3), metallic=1.0, roughness=roughness)
     return eg.Scene([ball(3, material=material)], lights=[light])
 
@@ -142,7 +142,7 @@ def from_front(size: int) -> eg.Camera:
 
 @pytest.mark.parametrize(("roughness", "most"), [(0.5, 0.05), (0.2, 0.03), (0.05, 0.02)])
 def test_noise_under_an_even_sky(roughness: float, most: float):
-    scene, camera = metal(eg.Environment(torch.ones(32, 64, 3)), roughness), from_front(32)
+    scene, camera = metal(eg.lights.Environment(torch.ones(32, 64, 3)), roughness), from_front(32)
     images = torch.stack(
         [eg.render(scene, camera, spp=16, sampling=eg.Sampling(lights=4), seed=seed) for seed in range(8)]
     )

@@ -56,7 +56,7 @@ def sky_emitters() -> list[Ball]:
 
 def by_oracle(scene: eg.Scene, camera: eg.Camera, seed: int) -> Tensor:
     shining = [m for m in scene.meshes if m.material is not None and m.material.emission is not None]
-    skies = any(isinstance(light, eg.Environment) for light in scene.lights)
+    skies = any(isinstance(light, eg.lights.Environment) for light in scene.lights)
     oracle = Oracle([around(mesh) for mesh in shining] + sky_emitters() * skies, seed)
     traits = ShadingTraits(points=16, blended=scene.blends, glossy=True)
     return render_shaded(scene, camera, oracle, make_request(scene, camera, seed=seed, **MANY), "auto", False, traits)

@@ -44,7 +44,7 @@ def room(floor: dict[str, Any] | None = None) -> eg.Scene:
     ball = icosphere(1)
     verts = 0.45 * ball.verts.to(F64) + vector(-0.2, 0.1, 0.6)
     white = eg.Material(vector(0.75, 0.75, 0.75), **GLOSSY)
-    round_ = eg.Mesh(verts, ball.faces, material=white, normals=eg.vertex_normals(verts, ball.faces))
+    round_ = eg.Mesh(verts, ball.faces, material=white, normals=eg.Mesh(verts, ball.faces).vertex_normals())
     return scene.replace(meshes=[*scene.meshes[:4], round_, *scene.meshes[5:]])
 
 
@@ -69,7 +69,7 @@ def from_light(scene: eg.Scene, seen_from: eg.Camera, count: int, seed: int, bou
     """Points spread over all surfaces take the light of the scene's point light on."""
     frame = ImageContext(scene, make_request(scene, seen_from, 1, seed))
     (light,) = scene.lights
-    assert isinstance(light, eg.PointLight)
+    assert isinstance(light, eg.lights.PointLight)
     corner = frame.fixed.verts[frame.fixed.faces.long()]
     area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).norm(dim=1) / 2
     random = torch.rand(count, 3, dtype=F64, generator=torch.Generator().manual_seed(seed))

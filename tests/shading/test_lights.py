@@ -45,10 +45,10 @@ def emitter(verts: Tensor, emission: Tensor, two_sided: bool = True) -> Any:
 
 
 LIGHTS: dict[str, tuple[Callable[..., Any], list[Tensor]]] = {
-    "directional": (eg.DirectionalLight, [vector(0.3, -0.2, -1), vector(2).sum(), vector(1, 0.5, 0.2)]),
-    "point": (eg.PointLight, [vector(0.3, 0.2, 1), vector(2).sum(), vector(1, 0.5, 0.2)]),
+    "directional": (eg.lights.DirectionalLight, [vector(0.3, -0.2, -1), vector(2).sum(), vector(1, 0.5, 0.2)]),
+    "point": (eg.lights.PointLight, [vector(0.3, 0.2, 1), vector(2).sum(), vector(1, 0.5, 0.2)]),
     "spot": (
-        eg.SpotLight,
+        eg.lights.SpotLight,
         [
             vector(0.3, 0.2, 1),
             vector(-0.2, 0.1, -1),
@@ -59,7 +59,7 @@ LIGHTS: dict[str, tuple[Callable[..., Any], list[Tensor]]] = {
         ],
     ),
     "area": (emitter, [QUAD, picture(1, 4)[0]]),
-    "environment": (eg.Environment, [picture(), rotation((0.0, 1.0, 0.0), vector(0.5).sum())]),
+    "environment": (eg.lights.Environment, [picture(), rotation((0.0, 1.0, 0.0), vector(0.5).sum())]),
 }
 
 
@@ -85,7 +85,7 @@ def test_what_arrives_has_right_derivatives(kind: str):
 
 
 def test_points_of_an_environment_have_their_density():
-    light = eg.Environment(picture(5, 7), rotation((1.0, 0.0, 0.0), vector(0.7).sum()))
+    light = eg.lights.Environment(picture(5, 7), rotation((1.0, 0.0, 0.0), vector(0.7).sum()))
     points = light.draw(uniform(200_000))
     assert math.isclose(float((1 / points.density).mean()), 4 * math.pi, rel_tol=0.005)
     d = light.place(points)
@@ -99,7 +99,7 @@ def test_points_of_an_environment_have_their_density():
     # A texel is where its row and column say: +Y on top, −Z in the middle, +X to the right.
     image = torch.zeros(8, 16, 1, dtype=F64)
     image[0], image[3:5, 7:9], image[3:5, 11:13] = 1, 2, 3
-    seen = eg.Environment(image).towards(torch.tensor([[0, 1, 0], [0, 0, -1], [1, 0, 0], [-1, 0, 0]], dtype=F64))
+    seen = eg.lights.Environment(image).towards(torch.tensor([[0, 1, 0], [0, 0, -1], [1, 0, 0], [-1, 0, 0]], dtype=F64))
     torch.testing.assert_close(seen[:, 0], vector(1, 2, 3, 0))
 
 
@@ -109,7 +109,7 @@ def test_directions_above_a_surface_give_the_same_irradiance(image: bool) -> Non
     seeded = torch.Generator().manual_seed(3)
     radiance = torch.rand((9, 16, 1), dtype=F64, generator=seeded) ** 3 if image else vector(1.0)
     turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.3, 0.5], [0.3, 0, -0.2], [-0.5, 0.2, 0]], dtype=F64))
-    sky = eg.Environment(radiance, rotation=turn)
+    sky = eg.lights.Environment(radiance, rotation=turn)
     points = sky.draw(torch.rand((200_000, 3), dtype=F64, generator=seeded))
     direction = sky.place(points)
     again = sky.points_at(direction)
@@ -130,14 +130,17 @@ def test_negative_light_takes_away_what_it_would_give(kind: str):
     """An optimisation may pass there: images are linear in radiance and intensity, also below zero."""
     rows = picture() - (0.7 if kind == "image of both signs" else 0.0)
     make: dict[str, Callable[[Tensor], Any]] = {
-        "constant": lambda scale: eg.Environment(scale * rows[0, 0]),
-        "point": lambda scale: eg.PointLight(vector(1, 2, 3), 5 * scale),
-        "directional": lambda scale: eg.DirectionalLight(vector(0, -1, -1), 5 * scale),
-        "emission": lambda scale: eg.AreaLight.rectangle(
-            vector(0, 0, 3), vector(1, 0, 0), vector(0, 1, 0), scale * rows[0, 0]
+        "constant": lambda scale: eg.lights.Environment(scale * rows[0, 0]),
+        "point": lambda scale: eg.lights.PointLight(vector(1, 2, 3), 5 * scale),
+        "directional": lambda scale: eg.lights.DirectionalLight(vector(0, -1, -1), 5 * scale),
+        "emission": lambda scale: eg.shapes.rectangle(
+            vector(0, 0, 3),
+            vector(1, 0, 0),
+            vector(0, 1, 0),
+            material=eg.Material(base_color=0.0, emission=scale * rows[0, 0]),
         ),
     }
-    light = make.get(kind, lambda scale: eg.Environment(scale * rows))
+    light = make.get(kind, lambda scale: eg.lights.Environment(scale * rows))
 
     def image(sign: float) -> tuple[Tensor, Tensor]:
         scale = torch.tensor(sign, dtype=F64, requires_grad=True)
@@ -154,8 +157,8 @@ def test_negative_light_takes_away_what_it_would_give(kind: str):
 def test_dark_texels_and_dark_faces_are_drawn_too():
     image = torch.zeros(2, 4, 1, dtype=F64)
     image[0, 0] = 1e6
-    assert eg.Environment(image).draw(uniform(2000)).index.bincount(minlength=8).min() > 0
-    assert eg.Environment(0 * image).draw(uniform(2000)).index.bincount(minlength=8).min() > 50
+    assert eg.lights.Environment(image).draw(uniform(2000)).index.bincount(minlength=8).min() > 0
+    assert eg.lights.Environment(0 * image).draw(uniform(2000)).index.bincount(minlength=8).min() > 50
     assert emitter(QUAD, vector(0.0)).draw(uniform(2000)).index.bincount(minlength=2).min() > 500
 
 
@@ -192,7 +195,7 @@ def image_of(light: Any, material: eg.Material = WHITE, **options: Any) -> Tenso
 
 
 def test_directional_light_on_a_plane():
-    image = image_of(eg.DirectionalLight([3.0, 0.0, -4.0], 2.0, [1.0, 0.5, 0.25]), eg.Material(base_color=0.5))
+    image = image_of(eg.lights.DirectionalLight([3.0, 0.0, -4.0], 2.0, [1.0, 0.5, 0.25]), eg.Material(base_color=0.5))
     torch.testing.assert_close(image, (vector(1, 0.5, 0.25) * 0.5 * 2 * 0.8 / math.pi).expand(16, 16, 3))
 
 
@@ -201,7 +204,9 @@ def test_directions_of_any_length() -> None:
     scene = plane(material=eg.Material(base_color=0.5))
     images = [
         eg.render(
-            eg.Scene([scene], lights=[eg.DirectionalLight(length * vector(0.3, 0.2, -1.0))]), from_above(), seed=0
+            eg.Scene([scene], lights=[eg.lights.DirectionalLight(length * vector(0.3, 0.2, -1.0))]),
+            from_above(),
+            seed=0,
         )
         for length in (1.0, 1e-14, 1e-30, 1e30)
     ]
@@ -212,7 +217,7 @@ def test_directions_of_any_length() -> None:
 
 def test_point_light_on_a_plane_in_closed_form():
     position = vector(0.3, -0.2, 1.0)
-    image = torch.stack([image_of(eg.PointLight(position, 3.0), seed=seed) for seed in range(8)]).mean(0)
+    image = torch.stack([image_of(eg.lights.PointLight(position, 3.0), seed=seed) for seed in range(8)]).mean(0)
     r = (position - grid()).norm(dim=-1)
     exact = (3.0 * position[2] / r**3 / math.pi).mean(-1)
     torch.testing.assert_close(image[..., 0], exact, rtol=0.1, atol=0)  # a pixel's point is drawn at random within it
@@ -220,8 +225,8 @@ def test_point_light_on_a_plane_in_closed_form():
 
 
 def test_spot_light_has_the_cone_of_gltf():
-    spot = eg.SpotLight([0.0, 0, 1], [0.0, 0, -2], 3.0, inner_angle=0.3, outer_angle=0.7)
-    point = eg.PointLight([0.0, 0, 1], 3.0)
+    spot = eg.lights.SpotLight([0.0, 0, 1], [0.0, 0, -2], 3.0, inner_angle=0.3, outer_angle=0.7)
+    point = eg.lights.PointLight([0.0, 0, 1], 3.0)
     angle = vector(0.0, 0.29, 0.5, 0.71)
     there = torch.stack([angle.tan(), 0 * angle, 0 * angle], 1)
     points = spot.draw(uniform(4))
@@ -238,9 +243,11 @@ def test_spherical_harmonics_are_orthonormal_and_give_irradiance():
     coefficients[0], coefficients[2] = 2.0, 1.0
     turn = rotation((1.0, 0.0, 0.0), vector(math.pi / 2).sum())
     n = torch.eye(3, dtype=F64)
-    own = eg.SphericalHarmonics(coefficients)
+    own = eg.lights.SphericalHarmonics(coefficients)
     assert own.irradiance(n)[2, 0] > own.irradiance(n)[0, 0]
-    torch.testing.assert_close(eg.SphericalHarmonics(coefficients, turn).irradiance(n @ turn.T), own.irradiance(n))
+    torch.testing.assert_close(
+        eg.lights.SphericalHarmonics(coefficients, turn).irradiance(n @ turn.T), own.irradiance(n)
+    )
     image = image_of(own, eg.Material(base_color=0.5))
     torch.testing.assert_close(image, (own.irradiance(n)[2] * 0.5 / math.pi).expand(16, 16, 3))
 
@@ -252,9 +259,16 @@ def by_light(name: str) -> Case:
     def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
         move = theta * vector(0.3, 0.5, 0.8)
         light = {
-            "cone": lambda: eg.SpotLight(vector(0.4, 0.3, 2.0), vector(-0.1, 0, -1), 4.0, None, 0.1, 0.5 + 0.3 * theta),
-            "emitter": lambda: eg.AreaLight.rectangle(vector(1.6, 0.7, 1.5) + move, [0.3, 0, 0], [0, 0.3, 0], 4.0),
-            "radiance": lambda: eg.Environment(picture() * (1 + theta), visible=False),
+            "cone": lambda: eg.lights.SpotLight(
+                vector(0.4, 0.3, 2.0), vector(-0.1, 0, -1), 4.0, None, 0.1, 0.5 + 0.3 * theta
+            ),
+            "emitter": lambda: eg.shapes.rectangle(
+                vector(1.6, 0.7, 1.5) + move,
+                [0.3, 0, 0],
+                [0, 0.3, 0],
+                material=eg.Material(base_color=0.0, emission=4.0),
+            ),
+            "radiance": lambda: eg.lights.Environment(picture() * (1 + theta), visible=False),
         }[name]()
         floor = plane(1.0, material=eg.Material([0.5, 0.6, 0.7], metallic=0.2, roughness=0.5))
         return eg.Scene([floor], lights=[light]), from_above(16, 1.9)
@@ -283,27 +297,22 @@ def test_gradients_by_lights_are_finite_differences(name: str):
 MESH = plane(material=WHITE)
 
 REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
-    (lambda: eg.DirectionalLight([0.0, 0, 0]), ValueError, "direction: expected a direction, got zeros"),
-    (lambda: eg.DirectionalLight([0.0, 1]), ValueError, r"direction: expected shape \(3,\)"),
-    (lambda: eg.PointLight("here"), TypeError, "position: expected"),
-    (lambda: eg.PointLight([0.0, 0, float("nan")]), ValueError, "position: expected finite"),
-    (lambda: eg.PointLight([0.0, 0, 1], [1.0, 2.0]), ValueError, "intensity: expected one number.*color="),
-    (lambda: eg.SpotLight([0.0, 0, 1], [0, 0, -1.0], torch.ones(1, 3)), ValueError, "give the colour as color="),
-    (lambda: eg.DirectionalLight([0.0, 0, 1], (1, 2, 3)), ValueError, "give the colour as color="),
-    (lambda: eg.PointLight([0.0, 0, 1], 1.0, 3.0), ValueError, "color: expected shape.*is intensity="),
-    (lambda: eg.SpotLight([0.0, 0, 1], [0, 0, -1.0], inner_angle=1.0), ValueError, "inner_angle: expected 0 ≤"),
-    (lambda: eg.SpotLight([0.0, 0, 1], [0, 0, -1.0], outer_angle=2.0), ValueError, "outer_angle"),
-    (lambda: eg.Environment(torch.ones(4, 3)), ValueError, "radiance: expected shape.*one channel is"),
-    (lambda: eg.Environment([1.0], 2 * torch.eye(3)), ValueError, "rotation: expected a rotation"),
-    (lambda: eg.Environment([1.0], visible=1), TypeError, "visible: expected True or False"),
-    (lambda: eg.SphericalHarmonics(torch.ones(4, 3)), ValueError, r"coefficients: expected shape \(9, C\)"),
-    (lambda: eg.SphericalHarmonics(torch.ones(9)), ValueError, r"of one, coefficients\[:, None\]"),
-    (
-        lambda: eg.AreaLight.disc([0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], 1.0, 2),
-        ValueError,
-        "segments: expected at least 3",
-    ),
-    (lambda: eg.AreaLight.of(3, 1.0), TypeError, "mesh: expected a Mesh"),
+    (lambda: eg.lights.DirectionalLight([0.0, 0, 0]), ValueError, "direction: expected a direction, got zeros"),
+    (lambda: eg.lights.DirectionalLight([0.0, 1]), ValueError, r"direction: expected shape \(3,\)"),
+    (lambda: eg.lights.PointLight("here"), TypeError, "position: expected"),
+    (lambda: eg.lights.PointLight([0.0, 0, float("nan")]), ValueError, "position: expected finite"),
+    (lambda: eg.lights.PointLight([0.0, 0, 1], [1.0, 2.0]), ValueError, "intensity: expected one number.*color="),
+    (lambda: eg.lights.SpotLight([0.0, 0, 1], [0, 0, -1.0], torch.ones(1, 3)), ValueError, "give the colour as color="),
+    (lambda: eg.lights.DirectionalLight([0.0, 0, 1], (1, 2, 3)), ValueError, "give the colour as color="),
+    (lambda: eg.lights.PointLight([0.0, 0, 1], 1.0, 3.0), ValueError, "color: expected shape.*is intensity="),
+    (lambda: eg.lights.SpotLight([0.0, 0, 1], [0, 0, -1.0], inner_angle=1.0), ValueError, "inner_angle: expected 0 ≤"),
+    (lambda: eg.lights.SpotLight([0.0, 0, 1], [0, 0, -1.0], outer_angle=2.0), ValueError, "outer_angle"),
+    (lambda: eg.lights.Environment(torch.ones(4, 3)), ValueError, "radiance: expected shape.*one channel is"),
+    (lambda: eg.lights.Environment([1.0], 2 * torch.eye(3)), ValueError, "rotation: expected a rotation"),
+    (lambda: eg.lights.Environment([1.0], visible=1), TypeError, "visible: expected True or False"),
+    (lambda: eg.lights.SphericalHarmonics(torch.ones(4, 3)), ValueError, r"coefficients: expected shape \(9, C\)"),
+    (lambda: eg.lights.SphericalHarmonics(torch.ones(9)), ValueError, r"of one, coefficients\[:, None\]"),
+    (lambda: eg.shapes.disc(segments=2), ValueError, "segments: expected an int from 3"),
     (lambda: eg.Scene([MESH], lights=3), TypeError, "lights: expected a sequence"),
     (lambda: eg.Scene([MESH], lights=[3]), TypeError, r"lights\[0\]: expected a light"),
     (
@@ -312,7 +321,9 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
         r"lights\[0\]: expected a light, got a Mesh without emission",
     ),
     (
-        lambda: eg.Scene([MESH], lights=[eg.PointLight([0.0, 0, 1], 1.0, [1.0, 2]), eg.Environment([1.0, 2, 3])]),
+        lambda: eg.Scene(
+            [MESH], lights=[eg.lights.PointLight([0.0, 0, 1], 1.0, [1.0, 2]), eg.lights.Environment([1.0, 2, 3])]
+        ),
         ValueError,
         r"lights\[1\]: expected 2 channels",
     ),

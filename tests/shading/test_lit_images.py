@@ -106,7 +106,7 @@ def test_the_same_whole_image_on_any_number_of_threads() -> None:
 
 
 def test_radiance_that_is_not_finite_is_named() -> None:
-    light = eg.PointLight(torch.tensor([0.0, 0.0, 3.0]), 1e25, torch.full((3,), 1e25))
+    light = eg.lights.PointLight(torch.tensor([0.0, 0.0, 3.0]), 1e25, torch.full((3,), 1e25))
     ball = icosphere(2)
     scene = eg.Scene([eg.Mesh(ball.verts.float(), ball.faces, material=eg.Material())], lights=[light])
     with pytest.raises(ValueError, match=r"expected finite numbers, got .*inf"):
@@ -117,14 +117,16 @@ def test_all_tensors_get_gradients_though_the_image_depends_on_few() -> None:
     """Zeros of those that it does not depend on: alpha that cuts nothing out, a light that is behind, the lens."""
     ball = icosphere(1)
     alpha = torch.ones(2, 2, requires_grad=True)
-    emitter = eg.SpotLight(*(torch.tensor(v, requires_grad=True) for v in ([0.0, 0.0, 9.0], [0.0, 0.0, 1.0])), 3.0)
+    emitter = eg.lights.SpotLight(
+        *(torch.tensor(v, requires_grad=True) for v in ([0.0, 0.0, 9.0], [0.0, 0.0, 1.0])), 3.0
+    )
     distortion = torch.zeros(8, requires_grad=True)
     mesh = eg.Mesh(
         ball.verts.float().requires_grad_(), ball.faces, uvs=torch.rand(len(ball.verts), 2), uv_faces=ball.faces,
         material=eg.Material(), alpha=alpha,
     )  # fmt: skip
     camera = CAMERAS["perspective"].replace(distortion=distortion)
-    sun = eg.DirectionalLight(torch.tensor([-0.2, -0.5, -1.0]), 2.0)
+    sun = eg.lights.DirectionalLight(torch.tensor([-0.2, -0.5, -1.0]), 2.0)
     image = eg.render(eg.Scene([mesh], lights=[sun, emitter]), camera, 4, seed=0)
     leaves = [mesh.verts, alpha, emitter.position, emitter.direction, distortion]
     found = torch.autograd.grad(image.sum(), leaves)
@@ -143,7 +145,8 @@ def test_extremes_are_finite(dtype: torch.dtype) -> None:
         position = torch.tensor(place, dtype=dtype, requires_grad=True)
         mesh = eg.Mesh(verts, faces, normals=normals, material=eg.Material(0.5, metallic=1.0, roughness=roughness))
         scene = eg.Scene(
-            [mesh], lights=[eg.PointLight(position), eg.SpotLight(position, torch.tensor([0.0, 0.0, -1.0]))]
+            [mesh],
+            lights=[eg.lights.PointLight(position), eg.lights.SpotLight(position, torch.tensor([0.0, 0.0, -1.0]))],
         )
         image = eg.render(scene, eg.Camera.look_at((0.3, 0.2, 3.0), (0.0, 0.0, 0.0), size=(16, 16)), spp=4, seed=0)
         grads = torch.autograd.grad(image.sum(), [verts, roughness, position])
@@ -155,7 +158,7 @@ def pyramid(texture: Tensor) -> eg.Scene:
     verts = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 0.8]])
     faces = torch.tensor([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     uvs = (verts[:, :2] + 1) / 2
-    lights = [eg.PointLight(torch.tensor([0.5, -0.4, z]), power) for z, power in ((3.0, 30.0), (-3.0, 5.0))]
+    lights = [eg.lights.PointLight(torch.tensor([0.5, -0.4, z]), power) for z, power in ((3.0, 30.0), (-3.0, 5.0))]
     return eg.Scene(
         [eg.Mesh(verts, faces, texture=texture, uvs=uvs, uv_faces=faces, material=eg.Material())], lights=lights
     )

@@ -220,10 +220,15 @@ def many_channels(leaves: Leaves, **material: Any) -> eg.Scene:
     mesh, C = icosphere(2), len(leaves["base"])
     mesh = eg.Mesh(mesh.verts.double(), mesh.faces, material=eg.Material(leaves["base"], **material))
     corner, across = torch.tensor([-0.5, 1.5, 1.0]).double(), torch.eye(3).double()
-    emitter = eg.AreaLight.rectangle(corner, across[0], across[2], torch.linspace(3.0, 1.0, C, dtype=F64))
+    emitter = eg.shapes.rectangle(
+        corner,
+        across[0],
+        across[2],
+        material=eg.Material(base_color=0.0, emission=torch.linspace(3.0, 1.0, C, dtype=F64)),
+    )
     lights = [
-        eg.PointLight(torch.tensor([1.0, 2.0, 3.0]).double(), 9.0, leaves["color"]),
-        eg.Environment(leaves["sky"]),
+        eg.lights.PointLight(torch.tensor([1.0, 2.0, 3.0]).double(), 9.0, leaves["color"]),
+        eg.lights.Environment(leaves["sky"]),
     ]
     return eg.Scene([mesh, emitter], lights=lights)
 
@@ -252,8 +257,10 @@ def test_glossy_surfaces_of_many_channels_are_those_of_few() -> None:
         leaves = {name: value.clone().requires_grad_() for name, value in leaves.items()}
         scene = many_channels(leaves, metallic=0.8, roughness=0.15)
         if few:  # the area light's colour is that of the first channels
-            emitter = eg.AreaLight.of(
-                scene.meshes[1].replace(material=None), torch.linspace(3.0, 1.0, 20, dtype=F64)[:3]
+            emitter = (
+                scene.meshes[1]
+                .replace(material=None)
+                .replace(material=eg.Material(base_color=0.0, emission=torch.linspace(3.0, 1.0, 20, dtype=F64)[:3]))
             )
             scene = scene.replace(meshes=[scene.meshes[0], emitter])
         image = eg.render(scene, CAMERAS["perspective"], spp=64, sampling=eg.Sampling(lights=4), seed=0)[..., :3]

@@ -27,6 +27,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.points.shadow_rays import Forced
 
+EMITTING = eg.Material(base_color=0.0, emission=[3.0, 2.0, 1.0])
 WHITE = eg.Material(base_color=1.0)
 
 
@@ -46,11 +47,15 @@ def test_a_rectangle_casts_its_shadow(kind: str):
     """The share of points of the plane that is dark."""
     scene = eg.Scene(
         [plane(1.0, material=WHITE), eg.Mesh(plane(0.25).verts + vector(0, 0, 0.5), plane().faces)],
-        lights=[eg.DirectionalLight([0.0, 0.2, -1.0]) if kind == "directional" else eg.PointLight([0.1, 0, 1.0])],
+        lights=[
+            eg.lights.DirectionalLight([0.0, 0.2, -1.0])
+            if kind == "directional"
+            else eg.lights.PointLight([0.1, 0, 1.0])
+        ],
     )
     g = torch.Generator().manual_seed(0)
     xy = 2 * torch.rand((20_000, 2), dtype=F64, generator=g) - 1
-    hits = eg.trace(scene, torch.cat([xy, torch.full((len(xy), 1), -1.0, dtype=F64)], 1), vector(0, 0, 1))
+    hits = eg.points.trace(scene, torch.cat([xy, torch.full((len(xy), 1), -1.0, dtype=F64)], 1), vector(0, 0, 1))
     (light,) = hits.lights
     lit = hits.visible_from(light, hits.light_points(light)) > 0
     low, high = (-0.25, 0.25) if kind == "directional" else (-0.6, 0.4)
@@ -62,18 +67,23 @@ def test_a_rectangle_casts_its_shadow(kind: str):
 
 def test_an_emitter_does_not_hide_itself():
     """Its faces are thin triangles in one plane, seen at an angle."""
-    emitter = eg.AreaLight.disc([1.6, 0.0, 1.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.1], 5.0)
+    emitter = eg.shapes.disc(
+        [1.6, 0.0, 1.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.1], material=eg.Material(base_color=0.0, emission=5.0)
+    )
     scene = eg.Scene([plane(1.0, material=WHITE), emitter])
     xy = 2 * uniform(20_000)[:, :2] - 1
-    hits = eg.trace(scene, torch.cat([xy, torch.full((len(xy), 1), -1.0, dtype=F64)], 1), vector(0, 0, 1))
+    hits = eg.points.trace(scene, torch.cat([xy, torch.full((len(xy), 1), -1.0, dtype=F64)], 1), vector(0, 0, 1))
     (light,) = hits.lights
     assert bool((hits.visible_from(light, hits.light_points(light)) == 1).all())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_an_emitter_in_floats_does_not_hide_itself_in_a_scene_of_doubles(dtype: torch.dtype) -> None:
-    emitter = eg.AreaLight.rectangle(
-        vector(0.9, -0.6, 2.4), vector(0, 0.3, 0), vector(0.4, 0, 0.1), 8.0, two_sided=False
+    emitter = eg.shapes.rectangle(
+        vector(0.9, -0.6, 2.4),
+        vector(0, 0.3, 0),
+        vector(0.4, 0, 0.1),
+        material=eg.Material(base_color=0.0, emission=8.0, two_sided=False),
     )
     ground = plane(material=eg.Material(base_color=0.7), colors=torch.ones((4, 1), dtype=F64))
     images = [
@@ -84,7 +94,7 @@ def test_an_emitter_in_floats_does_not_hide_itself_in_a_scene_of_doubles(dtype: 
 
 
 def test_options_of_shadows():
-    light = eg.DirectionalLight([0.0, 0.2, -1.0])
+    light = eg.lights.DirectionalLight([0.0, 0.2, -1.0])
     with_, without = shadowed(light), shadowed(light, shadows=False)
     assert float(with_.sum()) < 0.99 * float(without.sum())
     for kwargs, error in (
@@ -93,7 +103,7 @@ def test_options_of_shadows():
     ):
         with pytest.raises(error, match=next(iter(kwargs))):
             shadowed(light, **kwargs)
-    light = eg.Environment([1.0])
+    light = eg.lights.Environment([1.0])
     noise = [
         torch.stack([shadowed(light, sampling=eg.Sampling(lights=n), seed=seed) for seed in range(6)])
         .var(0)
@@ -105,7 +115,7 @@ def test_options_of_shadows():
 
 
 def test_forced_shadows():
-    scene = eg.Scene([plane(material=WHITE)], lights=[eg.PointLight([0.0, 0, 1]), eg.Environment([1.0])])
+    scene = eg.Scene([plane(material=WHITE)], lights=[eg.lights.PointLight([0.0, 0, 1]), eg.lights.Environment([1.0])])
     hits = hits_of(scene, 4)
     light = hits.lights[1]
     drawn = hits.light_points(light)
@@ -118,7 +128,7 @@ def test_forced_shadows():
     assert torch.equal(lit, vector(1, 1, 0))
     assert bool((part.visible_from(hits.lights[0], hits.lights[0].draw(uniform(3))) == 1).all())
     with pytest.raises(ValueError, match=r"light: expected one of hits\.lights"):
-        hits.light_points(eg.PointLight([0.0, 0, 1]))
+        hits.light_points(eg.lights.PointLight([0.0, 0, 1]))
 
 
 # -- random numbers ---------------------------------------------------------------------------------------------------------
@@ -137,7 +147,7 @@ def test_random_numbers_of_points():
 
 def test_random_numbers_of_a_pixel_are_its_own():
     """A change in one corner leaves the noise of all other pixels as it is, with a constant seed."""
-    emitter = eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0])
+    emitter = eg.shapes.rectangle((0.0, -0.5, 1.5), (0.2, 0.0, 0.1), (0.0, -0.2, 0.0), material=EMITTING, dtype=F64)
     floor, dot = plane(1.0, material=WHITE), ball(0, material=WHITE).transformed(scale=0.1, t=vector(-0.8, 0.8, 0.1))
     images = [
         eg.render(eg.Scene(m, lights=[emitter]), from_above(), shadows=False, seed=0) for m in ([floor], [floor, dot])
@@ -149,7 +159,7 @@ def test_random_numbers_of_a_pixel_are_its_own():
 def test_points_of_lights_are_well_spread_between_pixels():
     """A pixel's neighbours find the light that it misses: blocks of 2 × 2 have less than half of the noise that independent
     points would leave."""
-    scene = eg.Scene([plane(material=WHITE)], lights=[eg.Environment(torch.ones(16, 32, 1, dtype=F64))])
+    scene = eg.Scene([plane(material=WHITE)], lights=[eg.lights.Environment(torch.ones(16, 32, 1, dtype=F64))])
     images = torch.stack([eg.render(scene, from_above(32), spp=1, seed=seed) for seed in range(4)])[..., 0]
     of_pixels, of_blocks = (float(torch.nn.functional.avg_pool2d(images - images.mean(), k).std()) for k in (1, 2))
     assert of_pixels > 0.1 and of_blocks < 0.45 * of_pixels
@@ -160,10 +170,10 @@ def test_points_of_lights_are_well_spread_between_pixels():
 
 def all_lights() -> list[Any]:
     return [
-        eg.DirectionalLight([0.3, 0.2, -1.0]), eg.PointLight([0.5, 0.5, 1.5], 2.0),
-        eg.SpotLight([-0.5, 0.5, 1.5], [0.2, -0.2, -1.0], 2.0), eg.Environment(picture()),
-        eg.SphericalHarmonics(0.1 * picture(3, 3).reshape(9, 3)),
-        eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0]),
+        eg.lights.DirectionalLight([0.3, 0.2, -1.0]), eg.lights.PointLight([0.5, 0.5, 1.5], 2.0),
+        eg.lights.SpotLight([-0.5, 0.5, 1.5], [0.2, -0.2, -1.0], 2.0), eg.lights.Environment(picture()),
+        eg.lights.SphericalHarmonics(0.1 * picture(3, 3).reshape(9, 3)),
+        eg.shapes.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], material=EMITTING, dtype=F64),
     ]  # fmt: skip
 
 
@@ -185,13 +195,13 @@ def test_moved_scenes_look_the_same():
     # A ray may meet another face than before: compared in the mean of 4 × 4 pixels.
     small = [torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 4) for image in images]
     torch.testing.assert_close(*small, rtol=0.03, atol=0.01)
-    for light in (eg.Environment([1.0]), eg.SphericalHarmonics(torch.ones(9, 1))):
+    for light in (eg.lights.Environment([1.0]), eg.lights.SphericalHarmonics(torch.ones(9, 1))):
         with pytest.raises(ValueError, match="R: expected a rotation"):
             light.transformed(2 * torch.eye(3))
 
 
 def test_a_light_moved_by_a_matrix_that_enlarges():
-    light = eg.PointLight(vector(0, 0, 1), 3.0)
+    light = eg.lights.PointLight(vector(0, 0, 1), 3.0)
     twice = light.transformed(2 * rotation((0.0, 0.0, 1.0), vector(0.3).sum()))
     assert float(twice.intensity) == pytest.approx(float(light.transformed(scale=2.0).intensity)) == pytest.approx(12.0)
 
@@ -205,7 +215,7 @@ def test_a_scene_of_materials_without_a_light_says_so():
 def test_to_and_detach_take_everything_along():
     scene, _ = everything()
     leaf = vector(1.0).sum().requires_grad_()
-    scene = scene.replace(lights=[eg.PointLight([0.0, 0, 1], leaf), *scene.lights])
+    scene = scene.replace(lights=[eg.lights.PointLight([0.0, 0, 1], leaf), *scene.lights])
     assert not any(
         t.requires_grad for light in scene.detach().lights for t in vars(light).values() if isinstance(t, Tensor)
     )
@@ -237,7 +247,9 @@ def test_renders_in_every_way():
     with pytest.raises(ValueError, match="reference: expected a scene without materials"):
         reference.render(scene, camera)
     with pytest.raises(ValueError, match="intensity: expected numbers, got a meta tensor"):
-        eg.render(scene.replace(lights=[eg.PointLight([0.0, 0, 1], torch.ones((), device="meta"))]), camera, seed=0)
+        eg.render(
+            scene.replace(lights=[eg.lights.PointLight([0.0, 0, 1], torch.ones((), device="meta"))]), camera, seed=0
+        )
 
 
 def test_forward_mode_is_reverse_mode():
@@ -248,7 +260,7 @@ def test_forward_mode_is_reverse_mode():
         floor, thing, *rest = scene.meshes
         floor = floor.replace(material=eg.Material(0.6, metallic=0.3, roughness=roughness))
         return eg.Scene(
-            [floor, thing.replace(verts=verts), *rest], lights=[eg.PointLight(position, 2.0), *scene.lights]
+            [floor, thing.replace(verts=verts), *rest], lights=[eg.lights.PointLight(position, 2.0), *scene.lights]
         )
 
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
@@ -270,10 +282,14 @@ def test_forward_mode_is_reverse_mode():
 def test_one_number_for_all_channels():
     """One number counts for each channel of lights of every kind."""
     make: list[Callable[[Any], Any]] = [
-        lambda c: eg.PointLight([1.0, 0, 1], c) if isinstance(c, float) else eg.PointLight([1.0, 0, 1], color=c),
-        eg.Environment,
-        lambda c: eg.SphericalHarmonics(torch.ones(9, 1) * torch.as_tensor(c)),
-        lambda c: eg.AreaLight.rectangle([1.0, 0, 1], [0.2, 0, 0], [0, 0.2, 0], c),
+        lambda c: (
+            eg.lights.PointLight([1.0, 0, 1], c) if isinstance(c, float) else eg.lights.PointLight([1.0, 0, 1], color=c)
+        ),
+        eg.lights.Environment,
+        lambda c: eg.lights.SphericalHarmonics(torch.ones(9, 1) * torch.as_tensor(c)),
+        lambda c: eg.shapes.rectangle(
+            [1.0, 0, 1], [0.2, 0, 0], [0, 0.2, 0], material=eg.Material(base_color=0.0, emission=c)
+        ),
     ]
     for light in make:
         images = [
@@ -299,7 +315,7 @@ def test_a_visible_environment_is_the_background():
             ]
         )
         camera = eg.Camera(w2c, torch.tensor([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]], dtype=F64), (16, 16))
-        return eg.render(eg.Scene([far], lights=[eg.Environment(radiance)]), camera, seed=0)
+        return eg.render(eg.Scene([far], lights=[eg.lights.Environment(radiance)]), camera, seed=0)
 
     found = image(radiance, turned)
     pixels = torch.arange(16, dtype=F64)
@@ -308,7 +324,7 @@ def test_a_visible_environment_is_the_background():
     for dx in (0.25, 0.75):
         for dy in (0.25, 0.75):
             d = torch.stack([(x + dx - 8) / 8, -(y + dy - 8) / 8, -torch.ones_like(x)], -1).reshape(-1, 3)
-            exact = exact + eg.Environment(radiance).towards(d).reshape(16, 16, 3) / 4
+            exact = exact + eg.lights.Environment(radiance).towards(d).reshape(16, 16, 3) / 4
     torch.testing.assert_close(found[:, :3], exact[:, :3])
     weight = picture(16, 16, 9)
     weight[4:12] = 0  # away from the thing, whose silhouette moves too
@@ -318,9 +334,9 @@ def test_a_visible_environment_is_the_background():
     with torch.no_grad():
         high, low = ((image(radiance, vector(k * h).sum()) * weight).sum() for k in (1, -1))
     torch.testing.assert_close(by[1], (high - low) / (2 * h), rtol=1e-4, atol=0)
-    hidden = eg.Environment(radiance, visible=False)
+    hidden = eg.lights.Environment(radiance, visible=False)
     assert float(eg.render(eg.Scene([far], lights=[hidden]), from_above(), seed=0).detach().abs().sum()) == 0
-    shown = eg.render(eg.Scene([far], vector(1, 2, 3), lights=[eg.Environment(radiance)]), from_above(), seed=0)
+    shown = eg.render(eg.Scene([far], vector(1, 2, 3), lights=[eg.lights.Environment(radiance)]), from_above(), seed=0)
     torch.testing.assert_close(shown[0, 0], vector(1, 2, 3))
 
 
@@ -338,7 +354,7 @@ def test_second_derivatives_raise_before_a_background(kind: str) -> None:
         verts, faces, texture=texture, uvs=uvs, uv_faces=faces, filter="mipmap" if kind == "mipmap" else "linear"
     )
     mesh = mesh.replace(material=WHITE) if kind == "lit" else mesh
-    lights = [eg.PointLight(torch.zeros(3, dtype=F64), 3.0)] if kind == "lit" else []
+    lights = [eg.lights.PointLight(torch.zeros(3, dtype=F64), 3.0)] if kind == "lit" else []
     camera = eg.Camera.look_at((0.0, 0, -2), (0.0, 0, 1), size=(16, 16))
     shader = (lambda hits: hits.sample(texture)) if kind == "shader" else None
     image = eg.render(eg.Scene([mesh], background, lights), camera, spp=4, shader=shader, seed=0)
@@ -353,7 +369,9 @@ def test_a_gradient_of_the_image_that_is_not_finite_is_named(bad: float) -> None
     verts = QUAD.clone().requires_grad_()
     mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=WHITE)
     camera = eg.Camera.look_at((0.0, 0, -2), (0.0, 0, 1), size=(16, 16))
-    image = eg.render(eg.Scene([mesh], lights=[eg.PointLight(torch.zeros(3, dtype=F64), 3.0)]), camera, spp=4, seed=0)
+    image = eg.render(
+        eg.Scene([mesh], lights=[eg.lights.PointLight(torch.zeros(3, dtype=F64), 3.0)]), camera, spp=4, seed=0
+    )
     adjoint = torch.zeros_like(image)
     adjoint[1, 14, 2] = bad
     with pytest.raises(ValueError, match=r"the gradient of the image: expected finite numbers, got .* at \[1, 14, 2\]"):
@@ -362,16 +380,18 @@ def test_a_gradient_of_the_image_that_is_not_finite_is_named(bad: float) -> None
 
 def test_leaves_of_lights_stay_leaves() -> None:
     power = torch.tensor(3.0, dtype=F64, requires_grad=True)
-    assert eg.PointLight(torch.zeros(3, dtype=F64), power).intensity is power
+    assert eg.lights.PointLight(torch.zeros(3, dtype=F64), power).intensity is power
 
 
 @pytest.mark.parametrize("filter", ["linear", "mipmap"])
 def test_nothing_in_view_has_gradients_of_zero(filter: str):
     """A loop goes on where the mesh has left the image, or no light falls on it, as without lights."""
-    for place, light in ((100, eg.PointLight), (100, eg.SphericalHarmonics), (0, eg.PointLight)):
+    for place, light in ((100, eg.lights.PointLight), (100, eg.lights.SphericalHarmonics), (0, eg.lights.PointLight)):
         verts, texels = ball(1).verts.clone().requires_grad_(), picture().requires_grad_()
         uvs, faces = torch.rand(3, 2), torch.arange(3).expand(len(ball(1).faces), 3)
-        emitter = torch.tensor([0, 0, -5], dtype=F64) if light is eg.PointLight else torch.ones((9, 3), dtype=F64)
+        emitter = (
+            torch.tensor([0, 0, -5], dtype=F64) if light is eg.lights.PointLight else torch.ones((9, 3), dtype=F64)
+        )
         material = eg.Material(eg.Texture(texels, uvs, faces, filter=filter))
         mesh = ball(1).replace(verts=verts, material=material).transformed(t=vector(place, 0, 0))
         image = eg.render(eg.Scene([mesh], lights=[light(emitter.requires_grad_())]), from_above(8), spp=4, seed=0)
@@ -389,4 +409,4 @@ def test_emitters_that_are_masked_are_said_to_lack_a_gradient() -> None:
         warnings.simplefilter("error")
         eg.render(eg.Scene([floor, emitter]), from_above(), seed=0)
         leaf = moving.replace(material=eg.Material())
-        eg.render(eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0.3, 0.2, 3))]), from_above(), seed=0)
+        eg.render(eg.Scene([floor, leaf], lights=[eg.lights.PointLight(vector(0.3, 0.2, 3))]), from_above(), seed=0)

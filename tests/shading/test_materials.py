@@ -126,21 +126,21 @@ def at_origin(material: eg.Material, lights: list[Any], count: int = 4096, angle
 def test_lambert_under_a_constant_environment():
     """Radiance base · E, for the irradiance is π E: also of a ball, whose points all see half of it."""
     base, E = vector(0.8, 0.5, 0.2), vector(1.0, 2.0, 3.0)
-    torch.testing.assert_close(at_origin(eg.Material(base), [eg.Environment(E)]), base * E, rtol=0.005, atol=0)
-    scene = eg.Scene([ball(3, smooth=False, material=eg.Material(base))], lights=[eg.Environment(E)])
+    torch.testing.assert_close(at_origin(eg.Material(base), [eg.lights.Environment(E)]), base * E, rtol=0.005, atol=0)
+    scene = eg.Scene([ball(3, smooth=False, material=eg.Material(base))], lights=[eg.lights.Environment(E)])
     image = eg.render(scene, from_above(16, 1.2), sampling=eg.Sampling(lights=64), seed=0)
     torch.testing.assert_close(image.mean((0, 1)), base * E, rtol=0.005, atol=0)
 
 
 @pytest.mark.parametrize(("metallic", "roughness", "angle"), [(1.0, 0.5, 0.3), (0.0, 0.4, 1.2), (0.5, 1.0, 0.8)])
 def test_energy_of_glossy_surfaces(metallic: float, roughness: float, angle: float):
-    found = at_origin(eg.Material(0.9, metallic, roughness), [eg.Environment([1.0])], 1 << 13, angle)
+    found = at_origin(eg.Material(0.9, metallic, roughness), [eg.lights.Environment([1.0])], 1 << 13, angle)
     exact = albedo(scattering(0.9, metallic, roughness), angle)
     assert math.isclose(float(found[0]), exact, rel_tol=0.01)
 
 
 def test_parameters_of_every_kind_agree():
-    lights = [eg.PointLight([0.5, 0.5, 1.0]), eg.SphericalHarmonics(0.1 + torch.rand(9, 3, dtype=F64))]
+    lights = [eg.lights.PointLight([0.5, 0.5, 1.0]), eg.lights.SphericalHarmonics(0.1 + torch.rand(9, 3, dtype=F64))]
     values = {
         "base_color": vector(0.8, 0.5, 0.2),
         "metallic": vector(0.3),
@@ -167,7 +167,7 @@ def test_parameters_of_every_kind_agree():
     ):  # fmt: skip
         found = at_origin(eg.Material(**{**values, "base_color": image}), lights, 1, **fields)
         torch.testing.assert_close(found, constant)
-    plain = at_origin(eg.Material(), [eg.DirectionalLight([0.0, 0, -1], math.pi)], 1)
+    plain = at_origin(eg.Material(), [eg.lights.DirectionalLight([0.0, 0, -1], math.pi)], 1)
     torch.testing.assert_close(plain, vector(0.7, 0.7, 0.7))
 
 
@@ -186,7 +186,7 @@ def test_emission_alone_is_the_unlit_image():
 
 
 def test_back_sides():
-    lights = [eg.DirectionalLight([0.0, 0, 1.0], math.pi)]
+    lights = [eg.lights.DirectionalLight([0.0, 0, 1.0], math.pi)]
     for two_sided, seen in ((True, 0.5), (False, 0.0)):
         scene = eg.Scene([plane(material=eg.Material(0.5, emission=0.25, two_sided=two_sided))], lights=lights)
         below = radiance(hits_of(scene, 1, view=vector(0, 0, -1)))
@@ -202,16 +202,16 @@ def test_vertex_normals():
     mesh = ball(3)
     assert mesh.normals is not None
     assert float((mesh.normals * normalize(mesh.verts, dim=1)).sum(1).min()) > 0.999
-    alone = eg.vertex_normals(torch.cat([mesh.verts, vector(9, 9, 9)[None]]), mesh.faces)
+    alone = eg.Mesh(torch.cat([mesh.verts, vector(9, 9, 9)[None]]), mesh.faces).vertex_normals()
     assert torch.equal(alone[-1], vector(0, 0, 0))
     few = ball(0, smooth=False)
-    assert gradcheck(lambda verts: eg.vertex_normals(verts, few.faces), few.verts.clone().requires_grad_())
+    assert gradcheck(lambda verts: eg.Mesh(verts, few.faces).vertex_normals(), few.verts.clone().requires_grad_())
 
 
 def test_normal_maps():
     tilted = normalize(vector(0.3, 0.2, 1), dim=0)
     image = ((tilted + 1) / 2).expand(2, 2, 3)
-    light = [eg.DirectionalLight([-0.2, -0.4, -1.0])]
+    light = [eg.lights.DirectionalLight([-0.2, -0.4, -1.0])]
     # The uvs of the plane run along x and y, so the tangent frame is the world's.
     mapped = at_origin(eg.Material(1.0, normal_map=eg.Texture(image)), light, 1)
     given = at_origin(eg.Material(1.0), light, 1, normals=tilted.expand(4, 3))
@@ -239,7 +239,7 @@ def test_light_ends_where_the_face_turns_away():
     seen = []
     for sine in (-0.01, 0.001, 0.01, 0.1):
         l = vector(math.sqrt(1 - sine**2), 0, sine)
-        seen.append(float(at_origin(eg.Material(1.0), [eg.DirectionalLight(-l)], 1, normals=n.expand(4, 3))[0]))
+        seen.append(float(at_origin(eg.Material(1.0), [eg.lights.DirectionalLight(-l)], 1, normals=n.expand(4, 3))[0]))
     assert seen[0] == 0 and 0 < seen[1] < 0.002 < seen[2] < 0.02 < seen[3]
 
 
@@ -262,13 +262,13 @@ def test_edges_where_lit_surfaces_jump():
             spread.append(start.index_reduce(0, index, rows, "amax"))
         return (spread[0] + spread[1]).amax(1)
 
-    sun = eg.DirectionalLight([0.0, 0, -1.0])
+    sun = eg.lights.DirectionalLight([0.0, 0, -1.0])
     flat, smooth = ball(3, smooth=False, material=eg.Material()), ball(3, material=eg.Material())
     assert float(jumping(creases(flat, sun), flat).min()) > 1e-3
     z = smooth.verts[:, 2]
     by_light = jumping(creases(smooth, sun), smooth)
     assert float(by_light[z.abs() > 0.8].max()) < 0.1 * float(by_light[z.abs() < 0.1].max())
-    wide = jumping(creases(smooth, eg.Environment([1.0])), smooth)
+    wide = jumping(creases(smooth, eg.lights.Environment([1.0])), smooth)
     assert float(wide.min()) > 1e-3
 
 
@@ -279,12 +279,12 @@ def test_edges_where_no_light_jumps(specular: bool):
     material = eg.Material(roughness=0.5) if specular else eg.Material()
     ball_ = ball(3, smooth=False, material=material)
     lights = [
-        eg.DirectionalLight([1.0, 0.3, -0.2]),
-        eg.PointLight([0.0, 3, 1.5], 20.0),
-        eg.SpotLight([0.0, 0.5, -4.0], [0.0, 0, 1.0], 9.0, outer_angle=0.05),
+        eg.lights.DirectionalLight([1.0, 0.3, -0.2]),
+        eg.lights.PointLight([0.0, 3, 1.5], 20.0),
+        eg.lights.SpotLight([0.0, 0.5, -4.0], [0.0, 0, 1.0], 9.0, outer_angle=0.05),
     ]
     for emitters in (lights[:1], lights[1:]):
-        hits = eg.primary_hits(eg.Scene([ball_], lights=emitters), from_above(), seed=0).hits
+        hits = eg.points.primary_hits(eg.Scene([ball_], lights=emitters), from_above(), seed=0).hits
         radiance(hits)
         noted = hits._surfaces.crease_attributes().double()
         edges: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
@@ -320,10 +320,12 @@ def by_material(name: str) -> Case:
             mesh = mesh.replace(normals=mesh.normals + theta * vector(0.5, 0.3, 0))
         if name == "verts":
             wave = 1 + theta * (1 + mesh.verts[:, :1])
-            mesh = mesh.replace(verts=mesh.verts * wave, normals=eg.vertex_normals(mesh.verts * wave, mesh.faces))
+            mesh = mesh.replace(
+                verts=mesh.verts * wave, normals=eg.Mesh(mesh.verts * wave, mesh.faces).vertex_normals()
+            )
         if name == "flat":
             mesh = mesh.replace(verts=mesh.verts * (1 + theta * (1 + mesh.verts[:, :1])), normals=None)
-        return eg.Scene([mesh], lights=[eg.PointLight([1.5, 2.0, 3.0], 20.0)]), from_above(16, 2.4)
+        return eg.Scene([mesh], lights=[eg.lights.PointLight([1.5, 2.0, 3.0], 20.0)]), from_above(16, 2.4)
 
     return case
 
@@ -355,7 +357,7 @@ def test_gradients_by_texture_coordinates(filter: str):
         image = torch.rand((5, 5, 3), dtype=F64, generator=torch.Generator().manual_seed(1))
         uvs = mesh.uvs @ turn + theta * vector(0.05, 0.03)
         mesh = mesh.replace(uvs=uvs, material=eg.Material(eg.Texture(image, filter=filter)))
-        return eg.Scene([mesh], lights=[eg.PointLight([1.0, 1.0, 3.0], 50.0)]), from_above(16, 1.9)
+        return eg.Scene([mesh], lights=[eg.lights.PointLight([1.0, 1.0, 3.0], 50.0)]), from_above(16, 1.9)
 
     exact = by_quadrature(case, 0.1, 56)
     check(
@@ -410,7 +412,11 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
         ValueError,
         "normal_faces: expected indices",
     ),
-    (lambda: eg.vertex_normals(torch.ones(3, 3), torch.tensor([[0, 1, 3]])), ValueError, "faces: expected indices"),
+    (
+        lambda: eg.Mesh(torch.ones(3, 3), torch.tensor([[0, 1, 3]])).vertex_normals(),
+        ValueError,
+        "faces: expected indices",
+    ),
     (
         lambda: eg.Mesh(torch.rand(3, 3), torch.tensor([[0, 1, 2]]), material=eg.Material(eg.Texture(IMAGE))),
         ValueError,

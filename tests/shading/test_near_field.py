@@ -26,7 +26,7 @@ def corner() -> BounceScene:
     """A floor and a wall, seen from near, in the light of a point."""
     floor = mesh([[-2, 0, 0], [-2, 0, 2], [2, 0, 2], [2, 0, 0]], QUAD, 0.7)
     wall = mesh([[-2, 0, 0], [2, 0, 0], [2, 2, 0], [-2, 2, 0]], QUAD, 0.8)
-    light = eg.PointLight(torch.tensor([0.3, 1.6, 1.7], dtype=F64), torch.tensor([9.0], dtype=F64))
+    light = eg.lights.PointLight(torch.tensor([0.3, 1.6, 1.7], dtype=F64), torch.tensor([9.0], dtype=F64))
     camera = eg.Camera.look_at((0.4, 1.1, 2.3), (0.0, 0.25, 0.1), (0.4, 1.0, 0.01), 48.5, (32, 32)).to(F64)
     return BounceScene({"floor": floor, "wall": wall}, camera, (light,))
 

@@ -66,7 +66,7 @@ class Case:
             verts = (self.corners + theta * self.motion).reshape(-1, 3)
             mesh = _matt(verts, [[0, 1, 2], [3, 4, 5]], ALBEDO).replace(normals=self.normals.repeat_interleave(3, 0))
             ground = _matt(self.ground, [[0, 1, 2], [0, 2, 3]], GROUND_ALBEDO)
-            sky = eg.Environment(torch.tensor([RADIANCE], dtype=F64), visible=False)
+            sky = eg.lights.Environment(torch.tensor([RADIANCE], dtype=F64), visible=False)
             scene = eg.Scene([mesh, ground], lights=[sky])
             image = eg.render(
                 scene, self.camera, spp=256, seed=seed, sampling=eg.Sampling(lights=4, edges=samples, surface=samples)

@@ -143,7 +143,7 @@ def under_sky() -> BounceScene:
     ground = [[-2.2, -0.6, -2.2], [-2.2, -0.6, 2.2], [2.2, -0.6, 2.2], [2.2, -0.6, -2.2]]
     floating = block((0.1, 0.25, 0), (0.5, 0.4, 0.45), 0.5, 0.2, albedo=0.7)
     camera = seen_from((0.6, 1.6, 4.0), (0.0, 0.0, 0.0), 0.4)
-    sky = eg.Environment(torch.ones(1, dtype=F64), visible=False)
+    sky = eg.lights.Environment(torch.ones(1, dtype=F64), visible=False)
     return BounceScene({"block": floating, "ground": mesh(ground, QUAD, 0.6)}, camera, (sky,))
 
 

@@ -41,7 +41,7 @@ def plane(size: float = 4.0, **fields: Any) -> eg.Mesh:
 def ball(level: int = 2, smooth: bool = True, **fields: Any) -> eg.Mesh:
     mesh = icosphere(level)
     mesh = eg.Mesh(mesh.verts, mesh.faces, **fields)
-    return mesh.replace(normals=eg.vertex_normals(mesh.verts, mesh.faces)) if smooth else mesh
+    return mesh.replace(normals=mesh.vertex_normals()) if smooth else mesh
 
 
 def from_above(size: int = 16, width: float = 2.0) -> eg.Camera:
@@ -60,12 +60,12 @@ def grid(size: int = 16, width: float = 2.0, fine: int = 8) -> Tensor:
     return points.permute(0, 2, 1, 3, 4).reshape(size, size, fine * fine, 3)
 
 
-def hits_of(scene: eg.Scene, count: int = 1, place: Tensor | None = None, view: Tensor | None = None) -> eg.Hits:
+def hits_of(scene: eg.Scene, count: int = 1, place: Tensor | None = None, view: Tensor | None = None) -> eg.points.Hits:
     """`count` times the point of the scene that a ray from `view` to `place` meets."""
     target = vector(0, 0, 0) if place is None else place
     view = vector(0, 0, 1) if view is None else view
     origins = (target + 3 * view).expand(count, 3)
-    return eg.trace(scene, origins, (-view).expand(count, 3))
+    return eg.points.trace(scene, origins, (-view).expand(count, 3))
 
 
 def directions(n: int) -> tuple[Tensor, float]:
@@ -93,7 +93,7 @@ def by_quadrature(case: Case, step: float, fine: int = 8, **options: Any) -> flo
         scene, camera = case(torch.tensor(theta, dtype=F64))
         size = camera.size[0]
         places = grid(size, size / float(camera.K[0, 0]), fine).reshape(-1, 3) + vector(0, 0, 5)
-        hits = eg.trace(scene, places, vector(0, 0, -1))
+        hits = eg.points.trace(scene, places, vector(0, 0, -1))
         values = torch.zeros((len(places), 3), dtype=F64).index_copy(0, hits.ray, radiance(hits, **options))
         image = values.reshape(size, size, fine * fine, 3).mean(2)
         return (image * smooth_adjoint(size, size, 3)).sum()

@@ -88,16 +88,16 @@ class MitsubaRoom:
 
     def _light(self, light: Any) -> Any:
         mi = self._mi
-        if isinstance(light, eg.Environment):
+        if isinstance(light, eg.lights.Environment):
             if light.radiance.dim() == 1:
                 return {"type": "constant", "radiance": self._rgb(light.radiance)}
             return mitsuba.sky(mi, light.radiance)
         power = torch.as_tensor(light.intensity) * (1.0 if light.color is None else light.color)
-        if isinstance(light, eg.PointLight):
+        if isinstance(light, eg.lights.PointLight):
             return {"type": "point", "position": light.position.tolist(), "intensity": self._rgb(power)}
-        if isinstance(light, eg.DirectionalLight):
+        if isinstance(light, eg.lights.DirectionalLight):
             return {"type": "directional", "direction": light.direction.tolist(), "irradiance": self._rgb(power)}
-        assert isinstance(light, eg.SpotLight)
+        assert isinstance(light, eg.lights.SpotLight)
         axis = torch.nn.functional.normalize(light.direction.double(), dim=0)
         given = {"position": light.position, "direction": axis, "intensity": power.double().expand(3)}
         props = {f"{name}{c}": float(x) for name, value in given.items() for c, x in enumerate(value)}

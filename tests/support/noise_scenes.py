@@ -12,6 +12,7 @@ from scenes import smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad.scene.lights import Light
 
 
 class NoiseScene(NamedTuple):
@@ -36,7 +37,7 @@ def camera(size: int = 32) -> eg.Camera:
     return eg.Camera.look_at((1.2, 1.4, 3.4), (0, 0, 0), (0.0, 1.0, 0.01), 35.0, (size, size)).to(F64)
 
 
-def moving(own: eg.Mesh, others: list[eg.Mesh], lights: tuple[eg.lights.Light, ...] = (), **options: Any) -> NoiseScene:
+def moving(own: eg.Mesh, others: list[eg.Mesh], lights: tuple[Light, ...] = (), **options: Any) -> NoiseScene:
     """Return a scene of which the vertices of the first mesh require a gradient."""
     verts = own.verts.clone().requires_grad_()
     scene = eg.Scene([own.replace(verts=verts), *others], lights=list(lights))
@@ -52,20 +53,20 @@ def ground() -> eg.Mesh:
     return mesh([[-3, -0.9, -3], [-3, -0.9, 3], [3, -0.9, 3], [3, -0.9, -3]], QUAD, 0.7)
 
 
-def point_light() -> eg.lights.Light:
-    return eg.PointLight(torch.tensor([1.5, 3.0, 1.0], dtype=F64), torch.tensor([30.0], dtype=F64))
+def point_light() -> Light:
+    return eg.lights.PointLight(torch.tensor([1.5, 3.0, 1.0], dtype=F64), torch.tensor([30.0], dtype=F64))
 
 
 def panel() -> eg.Mesh:
     return mesh([[1, 2.5, 0.5], [2, 2.5, 0.5], [2, 2.5, 1.5], [1, 2.5, 1.5]], QUAD, 0.0, 20.0)
 
 
-def smooth_shader(hits: eg.Hits) -> Tensor:
+def smooth_shader(hits: eg.points.Hits) -> Tensor:
     x = hits.position
     return (torch.sin(3 * x[:, :1]) * torch.cos(2 * x[:, 1:2]) + 1.5) * (0.3 + hits.normal[:, 2:3].abs())
 
 
-def stripes(hits: eg.Hits) -> Tensor:
+def stripes(hits: eg.points.Hits) -> Tensor:
     x = hits.position
     return hits.where(torch.sin(5 * x[:, :1] + 2 * x[:, 1:2]), x.new_tensor([[1.0]]), x.new_tensor([[0.2]]))
 

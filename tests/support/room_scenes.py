@@ -52,9 +52,9 @@ def box_room(lights: str = "emitter", floor: dict[str, Any] | None = None, **of_
     if lights == "emitter":
         meshes.append(emitter())
     elif lights == "point":
-        given.append(eg.PointLight(vector(0.5, -0.3, 1.7), 4.0))
+        given.append(eg.lights.PointLight(vector(0.5, -0.3, 1.7), 4.0))
     else:
-        given.append(eg.Environment(vector(0.9, 1.0, 1.2)))
+        given.append(eg.lights.Environment(vector(0.9, 1.0, 1.2)))
     return eg.Scene(meshes, lights=given)
 
 
@@ -160,12 +160,14 @@ ROOMS: dict[str, Callable[[], eg.Scene]] = {
     "emitter": box_room,
     "glossy block": lambda: box_room(roughness=0.3),
     "sky": lambda: box_room("sky"),
-    "sky through an opening": lambda: box_room("point").replace(lights=[eg.Environment(sky())]),
+    "sky through an opening": lambda: box_room("point").replace(lights=[eg.lights.Environment(sky())]),
     "point": lambda: box_room("point"),
     "spot": lambda: box_room("point").replace(
-        lights=[eg.SpotLight(vector(0.5, -0.3, 1.9), vector(-0.4, 0.3, -1.0), 8.0, inner_angle=0.3, outer_angle=0.7)]
+        lights=[
+            eg.lights.SpotLight(vector(0.5, -0.3, 1.9), vector(-0.4, 0.3, -1.0), 8.0, inner_angle=0.3, outer_angle=0.7)
+        ]
     ),
-    "sun": lambda: box_room("sky").replace(lights=[eg.DirectionalLight(vector(0.3, 0.5, -1.0), 3.0)]),
+    "sun": lambda: box_room("sky").replace(lights=[eg.lights.DirectionalLight(vector(0.3, 0.5, -1.0), 3.0)]),
     "textured walls": textured_room,
     "normal map": bumpy_room,
     "small light": lambda: room_lit_by(_ball(0.05, (0.3, -0.2, 1.6), 1, base_color=0.0, emission=120.0)),

@@ -14,7 +14,7 @@ from torch import Tensor
 from edgegrad.sampling import Sampling
 from edgegrad.scene.environment import Environment
 from edgegrad.scene.lights import PointLight
-from edgegrad.scene.material import Material, Texture, vertex_normals
+from edgegrad.scene.material import Material, Texture
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
 
@@ -83,7 +83,7 @@ def staged(make_light: MakeLight, roughness: float, metallic: float, **fields: A
 def ball(make_light: MakeLight, roughness: float, metallic: float) -> Problem:
     """Return a ball over a plane; its normals are a part, too."""
     shape = icosphere(2).transformed(scale=0.5).transformed(t=vector(0.0, 0.0, 0.8))
-    shape = Mesh(shape.verts, shape.faces, normals=vertex_normals(shape.verts, shape.faces))
+    shape = Mesh(shape.verts, shape.faces, normals=shape.vertex_normals())
     problem = staged(make_light, roughness, metallic, caster=shape)
     made = problem.make
 

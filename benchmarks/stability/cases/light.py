@@ -14,10 +14,11 @@ from edgegrad.camera.camera import Camera
 from edgegrad.camera.poses import rotation
 from edgegrad.sampling import Sampling
 from edgegrad.scene.environment import Environment
-from edgegrad.scene.lights import AreaLight, DirectionalLight, Light, PointLight, SpotLight
-from edgegrad.scene.material import Material, vertex_normals
+from edgegrad.scene.lights import DirectionalLight, Light, PointLight, SpotLight
+from edgegrad.scene.material import Material
 from edgegrad.scene.mesh import Mesh
 from edgegrad.scene.scene import Scene
+from edgegrad.shapes import rectangle
 
 from ...scenes import cube, icosphere
 from .camera import ORIGIN, vector
@@ -46,9 +47,11 @@ def point(power: float = 10.0) -> MakeLight:
     return lambda at, level: PointLight(at, power * level)
 
 
-def panel(power: float = 8.0, **fields: Any) -> MakeLight:
+def panel(power: float = 8.0, two_sided: bool = True) -> MakeLight:
     u, v = vector(0.4, 0.0, 0.1), vector(0.0, 0.3, 0.0)
-    return lambda at, level: AreaLight.rectangle(at, u, v, power * level, **fields)
+    return lambda at, level: rectangle(
+        at, u, v, material=Material(base_color=0.0, emission=power * level, two_sided=two_sided)
+    )
 
 
 def ground(size: float = 4.0) -> Mesh:
@@ -252,7 +255,7 @@ def rough(roughness: float, metallic: float) -> Problem:
 def opposed() -> Problem:
     ball = icosphere(2).transformed(scale=0.4).transformed(t=vector(0.0, 0.0, 0.8))
     ball = Mesh(ball.verts, ball.faces)
-    return stage(point(), caster=ball.replace(normals=-vertex_normals(ball.verts, ball.faces)))
+    return stage(point(), caster=ball.replace(normals=-ball.vertex_normals()))
 
 
 @group.add("million", "a caster of 3.1 M faces", slow=True)
@@ -291,7 +294,7 @@ def touching() -> Problem:
 @group.add("panel-1e-3", "a panel of 1e-3 of the scene's size")
 def small_panel() -> Problem:
     u, v = vector(4e-4, 0.0, 1e-4), vector(0.0, 3e-4, 0.0)
-    return stage(lambda at, level: AreaLight.rectangle(at, u, v, 8e6 * level))
+    return stage(lambda at, level: rectangle(at, u, v, material=Material(base_color=0.0, emission=8e6 * level)))
 
 
 @group.add("sky-bright", "an environment with a texel 1e6 times as bright as the others")
@@ -323,7 +326,7 @@ def torus(major: float = 0.55, minor: float = 0.22, around: int = 32, across: in
     a, b, c, d = index(0, 0), index(1, 0), index(1, 1), index(0, 1)
     faces = torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])
     verts = verts @ rotation(vector(0.9, 0.3, 0.0)).mT + vector(0.0, 0.0, 0.75)
-    return Mesh(verts, faces, normals=vertex_normals(verts, faces))
+    return Mesh(verts, faces, normals=Mesh(verts, faces).vertex_normals())
 
 
 def _sun(at: Tensor, level: Tensor) -> DirectionalLight:

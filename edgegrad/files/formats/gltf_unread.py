@@ -35,7 +35,7 @@ def note_unread(tree: dict[str, Any], context: LoadContext) -> None:
             context.unread.note(f"{name!r} of {kind}")
     for name, instead in {"animations": "shown at rest", "skins": "shown in the pose of their binding"}.items():
         if tree.get(name) and not context.options.rigged:
-            context.unread.note(name, f"{instead}; load_rig() has them")
+            context.unread.note(name, f"{instead}; eg.rig.load() has them")
     note_rotations(tree, context.unread)
     used = {f"TEXCOORD_{number}" for number in _values(tree.get("materials", []), "texCoord")}
     primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
@@ -43,7 +43,7 @@ def note_unread(tree: dict[str, Any], context: LoadContext) -> None:
     for name in sorted(name for name in attributes - used if not ATTRIBUTES.fullmatch(name)):
         context.unread.note(f"attribute {name}")
     if any("targets" in primitive for primitive in primitives) and not context.options.rigged:
-        context.unread.note("morph targets", "shown without; load_rig() has them")
+        context.unread.note("morph targets", "shown without; eg.rig.load() has them")
     if any(primitive.get("mode", 4) in (0, 1, 2, 3) for primitive in primitives):
         context.unread.note("points and lines")
 

@@ -21,7 +21,6 @@ from tqdm import tqdm
 from ...camera.camera import Camera
 from ...check import as_tensor, check_flag, check_float, check_int, check_shape
 from ...files.paths import PathLike
-from ...scene.find_symmetries import find_symmetries
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
@@ -116,7 +115,7 @@ def fit_pose(
     resume      continue from the checkpoint, if there is one: the fit ends as if it had never stopped. A checkpoint of a fit
                 with other arguments is refused
     symmetries  of the mesh: of the equivalent poses, the one nearest to the start is reported, by its rotation. "find" computes
-                them with find_symmetries(). They do not change the search itself
+                them with Symmetries.find(). They do not change the search itself
 
     Something unknown may cover about a quarter of the object; fit_poses() is for meshes that cover one another. The picture may
     be blurred by up to 1.4 pixels, and compressed: renders get the same blur. The start is refined first. The fit is
@@ -330,11 +329,11 @@ def _check_starts(starts: object, init: object, camera: object, name: str) -> No
 
 
 def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -> Symmetries | None:
-    """Return the given or found symmetries. Raises TypeError or ValueError, or what find_symmetries() raises."""
+    """Return the given or found symmetries. Raises TypeError or ValueError, or what Symmetries.find() raises."""
     if given is None or isinstance(given, Symmetries):
         return given
     if given == "find":
-        return find_symmetries(mesh)
+        return Symmetries.find(mesh)
     if isinstance(given, str):
         raise ValueError(f'{name}: expected Symmetries, "find" or None, got {given!r}')
     raise TypeError(f'{name}: expected Symmetries, "find" or None, got {type(given).__name__}')

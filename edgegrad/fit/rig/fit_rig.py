@@ -71,7 +71,7 @@ def fit_rig(
     The other arguments are those of fit_scene(). Raises TypeError or ValueError that names the argument.
     """
     if not isinstance(rig, Rig):
-        raise TypeError(f"rig: expected a Rig, got {type(rig).__name__}; load one with load_rig(path)")
+        raise TypeError(f"rig: expected a Rig, got {type(rig).__name__}; load one with eg.rig.load(path)")
     check_int("coarsest", coarsest, 4, 65536)
     check_int("tries", tries, 0, 10**6)
     check_positive("keypoint_weight", keypoint_weight, least=0.0, most=1e9)

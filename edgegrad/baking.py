@@ -216,7 +216,7 @@ class _Texels(NamedTuple):
         depth = ((2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1).view(-1, 1, 1).expand(-1, 3, 1)
         pos = torch.cat([2 * used - 1, depth, torch.ones_like(depth)], 2).view(1, 3 * count, 4)
         corners = torch.arange(3 * count).view(count, 3)
-        with raster.DepthPeeler(raster.RasterizeContext(output_db=False), pos, corners, shape) as layers:
+        with raster.DepthPeeler(raster.RasterizeGLContext(output_db=False), pos, corners, shape) as layers:
             rast, beneath = (layers.rasterize_next_layer()[0][0].flip(0).reshape(-1, 4) for _ in range(2))
         _warn_of_overlaps(rast[:, 3].long(), beneath[:, 3].long())
         place = (rast[:, 3] > 0).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""find_symmetries(): the rotations after which a mesh is where it was, from its surface.
+"""The search of Symmetries.find(): the rotations after which a mesh is where it was, from its surface.
 
 A symmetry keeps the centroid of the surface's area and commutes with its covariance. Where the three variances differ, only half
 turns about the principal axes are left; where two are equal, the third axis may be of any order, and others lie across it. Where
@@ -16,11 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..check import check_flag, check_int, check_positive
-from .mesh import Mesh
 from .nearest import NEIGHBOURS, NearestPoints, SurfaceIndex
-from .scene import Scene, as_scene
-from .symmetries import Symmetries, SymmetryAxis, about
+from .symmetry_axis import SymmetryAxis, about
 
 DECIDING_SAMPLES = 600  # of the surface, and as many vertices, whose distances decide
 RANKING_SAMPLES = 120  # of these for what only ranks candidates
@@ -36,47 +33,13 @@ SMALLEST_POLYHEDRAL, LARGEST_POLYHEDRAL = 12, 60  # rotations of the tetrahedron
 LARGEST_GROUP = 144
 ODD_COLORS = 0.01  # share of the points whose colours may differ: at the borders of texels
 
-
-def find_symmetries(
-    mesh: Mesh | Scene,
-    tolerance: float = 0.01,
-    *,
-    textured: bool = True,
-    color_tolerance: float = 0.1,
-    max_order: int = 24,
-) -> Symmetries:
-    """Return the rotations that map a mesh onto itself. The same mesh gives the same rotations in the same order.
-
-    The distance is that of 600 points of the surface and as many vertices: a detail smaller than their spacing that is nearer
-    than the tolerance breaks no symmetry. A mesh like a sphere has continuous symmetries about three axes. Mirror images are no
-    symmetries, because no motion makes them. Raises TypeError, ValueError that names the argument, or ImportError without
-    SciPy.
-
-    Parameters
-    ----------
-    mesh : Mesh or Scene
-    tolerance : float, default 0.01
-        Largest distance of points of the rotated mesh from the mesh, as a share of its size: twice the largest distance from
-        its centroid. A prism with so many sides that it is a cylinder within it counts as one.
-    textured : bool, default True
-        Whether colours must agree, too; False finds the symmetries of the shape alone. A plain mesh has none.
-    color_tolerance : float, default 0.1
-        Largest difference of the colours of corresponding points, all but one in a hundred of the points, from 0 to 1 of the
-        brightest. Square roots of radiance (or of base colours) are compared, which is about how the eye sees them.
-    max_order : int, default 24
-        Highest order n of a rotation by 360° / n that is looked for.
-    """
-    scene = as_scene(mesh)
-    check_positive("tolerance", tolerance, least=1e-6, most=0.5)
-    check_positive("color_tolerance", color_tolerance, least=0.0, most=1.0)
-    check_int("max_order", max_order, 2, 360)
-    return _SymmetrySearch(
-        SurfaceIndex(scene), tolerance, check_flag("textured", textured), color_tolerance, max_order
-    ).run()
+Group = tuple[Tensor, list[SymmetryAxis]]  # discrete motions (N, 4, 4), the identity first, and continuous ones
 
 
 @dataclass
-class _SymmetrySearch:
+class SymmetrySearch:
+    """The rotations of a surface onto itself, looked for by the arguments of Symmetries.find()."""
+
     surface: SurfaceIndex
     tolerance: float
     textured: bool
@@ -99,7 +62,7 @@ class _SymmetrySearch:
         self.brightest = 1.0 if colors is None else max(float(colors.max()), 1e-30)
         self.colors = None if colors is None else self._seen(colors)
 
-    def run(self) -> Symmetries:
+    def run(self) -> Group:
         radius = np.linalg.norm(self.points, axis=1)
         if radius.max() - radius.min() <= self.limit and all(self._maps(self._any(k)) for k in range(TURNS)):
             return self._with([], list(np.eye(3)))
@@ -123,13 +86,13 @@ class _SymmetrySearch:
                     group = self._with_one_more(group, flip)
         return self._with(group[1:], [])
 
-    def _with(self, rotations: list[np.ndarray], axes: list[np.ndarray]) -> Symmetries:
-        """Return the symmetries with the identity, about the centroid."""
+    def _with(self, rotations: list[np.ndarray], axes: list[np.ndarray]) -> Group:
+        """Return what rotations and axes make, with the identity, about the centroid."""
         R = torch.from_numpy(np.stack([np.eye(3), *rotations]))
         center = torch.from_numpy(self.center)
         motions = torch.eye(4, dtype=torch.float64).repeat(len(R), 1, 1)
         motions[:, :3, :3], motions[1:, :3, 3] = R, (center - R @ center)[1:]
-        return Symmetries(motions, [SymmetryAxis(torch.from_numpy(axis.copy()), center) for axis in axes])
+        return motions, [SymmetryAxis(torch.from_numpy(axis.copy()), center) for axis in axes]
 
     # -- what a symmetry is ----------------------------------------------------------------------------------------------
 

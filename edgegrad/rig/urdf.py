@@ -25,11 +25,11 @@ EXTRA = "edgegrad[robots]", "reading a robot"
 MOVING = ("revolute", "continuous", "prismatic")
 
 
-def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ()) -> Rig:
+def load_urdf(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ()) -> Rig:
     """Return a Rig from a URDF file. Its control `angles` (m,) has the positions of its joints in the file's order: radians, or
     metres of prismatic ones.
 
-        robot = eg.load_robot("arm.urdf")
+        robot = eg.rig.load("arm.urdf")
         scene = robot.posed(angles=[0.0, 0.4, -1.2, 0.0, 0.7, 0.0, 0.0])
 
     Joints that mimic others follow them and have no angle. There is one Mesh for each visual, or for each part of it where

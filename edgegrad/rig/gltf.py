@@ -19,7 +19,7 @@ from .rotations import roma
 from .skin import Skin
 
 
-def load_rig(path: PathLike, materials: bool = True, lit: bool = False, dtype: torch.dtype | None = None) -> Rig:
+def load_gltf(path: PathLike, materials: bool = True, lit: bool = False, dtype: torch.dtype | None = None) -> Rig:
     """Return a Rig from a glTF or GLB file: what its skins, morph targets and nodes move, and its animations.
 
     Each node of the scene is a joint, by its name, and each primitive of a visible node a mesh, in their order; a node without
