@@ -47,7 +47,7 @@ class Term:
 
 
 # What noise costs: csrc/estimator/default_samples.h.
-_NOISE = "from spp=16 on, four times spp at least halve the noise of image and gradient; eg.noise() estimates it"
+_NOISE = "4 × spp halve the noise; see eg.noise()"
 
 
 class Plan(Mapping[str, Term]):

@@ -36,6 +36,17 @@ def test_four_times_spp_halve_the_noise_of_a_gradient(name):
     assert many < 0.6**2 * few, (few, many)
 
 
+def test_plan_counts_samples_by_spp():
+    """In proportion from 16 on, in each row that casts rays for the gradient."""
+    scene = NOISE_SCENES["bounces"]()
+    few, many = (eg.plan(scene.scene, scene.camera, spp, **scene.options) for spp in (16, 64))
+    for row in ("image", "interior", "boundary", "secondary edges", "indirect shadow boundaries", "shadow boundaries"):
+        assert many[row].samples == pytest.approx(4 * few[row].samples, abs=4) and few[row].samples, row
+    assert "4 × spp halve the noise; see eg.noise()" in str(few)
+    lit = NOISE_SCENES["point light"]()
+    assert "96 samples a pixel of boundary" in eg.plan(lit.scene, lit.camera, 64)["shadow boundaries"].why
+
+
 def before_cameras(scene: NoiseScene) -> NoiseScene:
     """Return the scene before a batch of two cameras."""
     other = eg.Camera.look_at((-1.5, 1.0, 3.2), (0, 0, 0), (0.0, 1.0, 0.01), 35.0, scene.camera.size).to(torch.float64)
