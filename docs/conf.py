@@ -51,7 +51,7 @@ nitpick_ignore_regex = [
     ("py:.*", OTHERS),
     (
         "py:class",
-        r"edgegrad\.(fit\.views\.Observation|fit\.placement\.Placement|camera\.fields\.CameraT|points\.discontinuities\.Discontinuities|rig\.rig\.Deformer)|PoseTask",
+        r"edgegrad\.(fit\.views\.Observation|fit\.placement\.Placement|camera\.fields\.CameraT|points\.discontinuities\.Discontinuities|rig\.rig\.Deformer|raster\.rasterize\.RasterizeContext)|PoseTask|RenderOptions",
     ),
 ]
 # Nobody calls these: functions return them.

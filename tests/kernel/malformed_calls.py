@@ -71,11 +71,11 @@ def good_case(draw: st.DrawFn) -> Case:
     values["projection"] = draw(st.sampled_from(["perspective", "orthographic", "panorama"]))
     values |= {"spp": draw(st.integers(1, 3)), "seed": draw(st.integers(0, 2**63 - 1))}
     for name, choices in (
-        ("surface_samples", st.sampled_from([None, 1, 30])),
-        ("edge_samples", st.sampled_from([None, 1, 30])),
+        ("sampling.surface", st.sampled_from([None, 1, 30])),
+        ("sampling.edges", st.sampled_from([None, 1, 30])),
         ("visibility", st.booleans()),
         ("filter", st.sampled_from(["box", "tent", "gaussian"])),
-        ("grad_seed", st.sampled_from([None, 0, 7])),
+        ("sampling.seed", st.sampled_from([None, 0, 7])),
     ):
         values[name] = draw(choices)
     return Case(values)
@@ -89,6 +89,8 @@ def call(values: dict[str, Any], entry: str = "render") -> list[Tensor]:
     camera = values.get("camera", eg.Camera)(*(values[name] for name in CAMERA))
     done = (*MESH, *CAMERA, "background", "meshes", "scene", "camera", ADJOINT, "leaves")
     options = {name: value for name, value in values.items() if name not in done}
+    own = [name for name in options if name.startswith("sampling.")]
+    options["sampling"] = eg.Sampling(**{name.removeprefix("sampling."): options.pop(name) for name in own})
     if entry == "plan":
         return [torch.tensor(eg.plan(scene, camera, **options).samples)]
     if entry == "profile":
@@ -215,8 +217,10 @@ def corrupt_camera(draw: st.DrawFn, case: Case) -> None:
 BAD_INTS = [-1, -(2**63), 2**63, 10**30, 1.5, 2.0, NAN, "4", True, [4], torch.tensor([1, 2]), 1j]
 BAD_OPTIONS: dict[str, list[object]] = {
     "spp": [*BAD_INTS, 0, None, 2**20 + 1],
-    "seed": [*BAD_INTS, None],
-    "sampling": eg.Sampling(seed=BAD_INTS, surface=[*BAD_INTS, 0, 2**41], edges=[*BAD_INTS, 0, 2**41]),
+    "seed": BAD_INTS,
+    "sampling.seed": BAD_INTS,
+    "sampling.surface": [*BAD_INTS, 0, 2**41],
+    "sampling.edges": [*BAD_INTS, 0, 2**41],
     "visibility": [0, 1, "yes", None, torch.tensor(True)],
     "filter": ["sinc", "", None, 3, b"box", [], ("box",)],
     "size": [(0, 4), (-1, 4), (4, 0), (4,), (4, 4, 4), 4, None, "ab", (4.0, 4), (4, 2**17), (2**70, 4), (True, 4), (None, 4)],

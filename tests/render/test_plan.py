@@ -27,7 +27,7 @@ SCENES = {
     "triangles": occluded_triangle,
     "plain": lambda: cube().replace(colors=None),
     "one colour": one_colour,
-    "sampling": eg.Sampling(creases=creased),
+    "creases": creased,
     "texture": textured,
     "inside": inside,
     "nowhere": nowhere,
@@ -241,6 +241,7 @@ def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
     flat = [t for t in flatten(scene) if isinstance(t, torch.Tensor)] + [camera.world_to_camera[None], camera.K[None]]
     flat.append(torch.zeros(1, 8))  # distortion
     flat += [torch.zeros(1, 8, 0), torch.zeros(12, 0)]  # attributes of vertices and of faces: none
+    flat += [torch.zeros(()), torch.zeros(())]  # the seeds of the image and of the gradient
     assert [tuple(t.shape) for t in inputs] == [tuple(t.shape) for t in flat]
     assert eg.render(cube(), CAMERA, spp=4, seed=0).grad_fn is None
     assert eg.plan(cube(), CAMERA)["kept for backward"].bytes == 0
