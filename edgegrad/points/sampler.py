@@ -61,7 +61,12 @@ def shaded_memory(
         surface = options.surface_samples if options.surface_samples >= 0 else default
         edge = options.edge_samples if options.edge_samples >= 0 else int(growth * pixels) // 8
         needs["samples"] = request.cameras * (SURFACE_BYTES * surface + CURVE_BYTES * edge)
-    return memory.room("render with a shader", needs, lambda: lower(request) + ", or what the shader keeps of a point")
+    return memory.room("render with a shader", needs, lambda: _lower(request))
+
+
+def _lower(request: Request) -> str:
+    samples = f"the samples per pixel ({request.image.spp}), with which those of the gradient grow"
+    return f"{lower(request)}, {samples}, or what the shader keeps of a point"
 
 
 def size_of_values(request: Request) -> Any:
