@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import calibrate, fit_camera
+from edgegrad.fit import FitOptions, calibrate, fit_camera
 from edgegrad.fit.pose.fit_camera import CameraFit
 
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])
@@ -89,7 +89,7 @@ def main() -> None:
     ratios: list[float] = []
     for seed, (true, start, shot) in enumerate(cases):
         began = time.process_time()
-        fit = calibrate(eg.Scene([mesh], BACKGROUND), shot, start, seed=seed, progress=False)
+        fit = calibrate(eg.Scene([mesh], BACKGROUND), shot, start, options=FitOptions(seed=seed, progress=False))
         ratios += row(fit.fits[0], true[0], time.process_time() - began, fit.reason)
         if args.plot and seed == 0:
             fit.plot().savefig(args.plot)
@@ -98,7 +98,12 @@ def main() -> None:
     for seed, (true, start, shot) in enumerate(cases):
         began = time.process_time()
         found = fit_camera(
-            mesh, shot[0], start[0], background=BACKGROUND, principal=True, distortion=4, seed=seed, progress=False
+            eg.Scene([mesh], BACKGROUND),
+            shot[0],
+            start[0],
+            principal=True,
+            distortion=4,
+            options=FitOptions(seed=seed, progress=False),
         )
         ratios += row(found, true[0], time.process_time() - began, found.reason)
     print(f"median of |error| / σ: {float(torch.tensor(ratios).abs().median()):.2f}")

@@ -12,7 +12,7 @@ import trimesh
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_scene
+from edgegrad.fit import FitOptions, Parameter, fit_scene
 
 TRUTH, START = 0.3, 0.6
 CASES = [("l2", 8, 1), ("l1", 8, 1), ("huber", 8, 1), ("robust", 8, 1), ("l2", 64, 16), ("robust", 64, 16)]
@@ -39,9 +39,9 @@ def main() -> None:
     print("loss    spp  lights  roughness")
     for loss, spp, lights in CASES:
         fit = fit_scene(
-            lambda values: scene(values["roughness"]), camera, target,
+            lambda values: scene(values["roughness"]), target, camera,
             {"roughness": Parameter(0.02, torch.tensor(START), low=0.05, high=1.0)},
-            loss=loss, spp=spp, steps=150, progress=False, render={"sampling": eg.Sampling(lights=lights)},
+            options=FitOptions(loss=loss, spp=spp, steps=150, seed=0, progress=False, sampling=eg.Sampling(lights=lights)),
         )  # fmt: skip
         print(f"{loss:7} {spp:3} {lights:6} {float(fit.values['roughness']):15.2f}   {fit.reason}", flush=True)
 

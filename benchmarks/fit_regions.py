@@ -17,7 +17,7 @@ from photographs import photograph
 from vases import RADII, VIEW, vase
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, PoseParameter, fit_scene, losses
+from edgegrad.fit import FitOptions, Parameter, PoseParameter, fit_scene, losses
 from edgegrad.fit.descent.result import Fit
 from edgegrad.fit.placement import Pose
 
@@ -28,7 +28,8 @@ def of_bracket(method: str, seed: int) -> tuple[Fit, str]:
     view = camera(128)
     image = photograph(view, seed=seed, sampling=eg.Sampling(lights=16))
     sought = {"pose": PoseParameter(Pose(START[:3, :3], START[:3, 3]))}
-    fit = fit_scene(bracket(plain=True), view, image, sought, loss="region", method=method, spp=8, progress=False)
+    options = FitOptions(seed=0, loss="region", method=method, spp=8, progress=False)
+    fit = fit_scene(bracket(plain=True), image, view, sought, options=options)
     degrees, percent = errors(fit.poses["pose"])
     return fit, f"{degrees:5.2f}° {percent:5.2f} %"
 
@@ -45,7 +46,9 @@ def of_vase(method: str, seed: int) -> tuple[Fit, str]:
     def scene(values):
         return vase(values["radii"]).transformed(values["pose"].R, values["pose"].t)
 
-    fit = fit_scene(scene, VIEW, image, sought, loss="region", method=method, spp=8, progress=False)
+    fit = fit_scene(
+        scene, image, VIEW, sought, options=FitOptions(seed=0, loss="region", method=method, spp=8, progress=False)
+    )
     shown = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=64)["alpha"]
     return fit, f"IoU {1.0 - float(losses.iou(fit.render(), shown)):.3f}"
 

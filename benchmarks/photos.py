@@ -45,7 +45,7 @@ from objects import pebble
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera, fit_pose, fit_poses
+from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses
 from edgegrad.fit.pose.result import PoseFit
 
 from . import photo_edges, photo_folder
@@ -180,8 +180,8 @@ class Run:
         """Fit a pose from a start, or without one by a global search."""
         began = Work.now()
         fit = fit_pose(
-            case.mesh, case.picture, case.camera, mask, None if start is None else start.matrix, depth=case.depth,
-            search=search, starts="global" if start is None else 1, progress=False,
+            case.mesh, case.picture, case.camera, mask, None if start is None else start.matrix, depths=case.depth,
+            search="global" if start is None else search, options=FitOptions(seed=0, progress=False),
         )  # fmt: skip
         found = Placed(fit.R, fit.t)
         trial = self.noted(part, case, start, found, truth, fit, Work.since(began))
@@ -193,7 +193,8 @@ class Run:
         first = cases[0]
         init = [start.matrix for start in starts]
         began = Work.now()
-        fits = fit_poses([case.mesh for case in cases], first.picture, first.camera, init=init, progress=False)
+        options = FitOptions(seed=0, progress=False)
+        fits = fit_poses([case.mesh for case in cases], first.picture, first.camera, init=init, options=options)
         work = Work.since(began)
         image = first.picture
         for case, start, fit in zip(cases, starts, fits, strict=True):
@@ -289,7 +290,7 @@ def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
             given = case.camera.replace(world_to_camera=(W @ moved).float(), K=K)
             still = case.mesh.transformed(case.truth.R.float(), case.truth.t.float())
             began = Work.now()
-            fit = fit_camera(still, case.picture, given, focal=focal, progress=False)
+            fit = fit_camera(still, case.picture, given, focal=focal, options=FitOptions(seed=0, progress=False))
             work = Work.since(began)
             # As a pose of the object before the case's camera.
             back = torch.linalg.inv(W) @ fit.camera.world_to_camera.double() @ case.truth.matrix

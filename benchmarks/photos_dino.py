@@ -27,7 +27,7 @@ from scipy import ndimage
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import fit_shape, fit_texture, regularizers, visual_hull
+from edgegrad.fit import FitOptions, Refinement, fit_shape, fit_texture, regularizers, visual_hull
 from edgegrad.fit.descent.result import Fit
 from edgegrad.image import linear_to_srgb, srgb_to_linear
 
@@ -87,13 +87,13 @@ def _largest(mask: np.ndarray) -> np.ndarray:
 def shape(photos: list[Photo], steps: int = 150) -> Fit:
     """Fit the smallest surface that has the silhouettes, from the visual hull."""
     masks = [torch.maximum(p.mask, 1.0 - p.known) for p in photos]
-    start = visual_hull([p.camera for p in photos], masks, resolution=64, faces=4000)
+    start = visual_hull(masks, [p.camera for p in photos], resolution=64, faces=4000)
 
-    def fit(mesh: eg.Mesh, photos: list[Photo], small: float, **options: Any) -> Fit:
+    def fit(mesh: eg.Mesh, photos: list[Photo], small: float, **how: Any) -> Fit:
         return fit_shape(
-            mesh, [p.camera for p in photos], masks=[p.mask for p in photos], weights=[p.known for p in photos],
+            mesh, None, [p.camera for p in photos], masks=[p.mask for p in photos], weights=[p.known for p in photos],
             regularizer=lambda scene: small * regularizers.area(scene.meshes[0].verts, scene.meshes[0].faces),
-            levels=2, lr=0.002, steps=steps, spp=4, views_per_step=4, **options,
+            refinement=Refinement(2, lr=0.002, **how), options=FitOptions(seed=0, steps=steps, spp=4, views_per_step=4),
         )  # fmt: skip
 
     # First what no view needs is taken away, then contours are followed to the pixel.
@@ -112,7 +112,14 @@ def refined(mesh: eg.Mesh, photos: list[Photo], rounds: int = 3) -> Iterator[eg.
 
     def textured(mesh: eg.Mesh, steps: int) -> eg.Mesh:
         return fit_texture(
-            mesh, cameras, images, TEXELS, masks=masks, weights=weights, lr=0.05, steps=steps, spp=4, views_per_step=4
+            mesh,
+            images,
+            cameras,
+            TEXELS,
+            masks=masks,
+            weights=weights,
+            lr=0.05,
+            options=FitOptions(seed=0, steps=steps, spp=4, views_per_step=4),
         ).mesh
 
     found = textured(eg.textures.unwrap(mesh, TEXELS), 60)
@@ -124,9 +131,9 @@ def refined(mesh: eg.Mesh, photos: list[Photo], rounds: int = 3) -> Iterator[eg.
             return known.replace(verts=bare.verts)
 
         moved = fit_shape(
-            known, cameras, images, masks=masks, weights=weights, look=look, levels=1, lr=0.004, steps=130, spp=2,
-            views_per_step=3,
+            known, images, cameras, masks=masks, weights=weights, appearance=look,
             regularizer=lambda scene: 0.02 * regularizers.area(scene.meshes[0].verts, scene.meshes[0].faces),
+            refinement=Refinement(levels=1, lr=0.004), options=FitOptions(seed=0, steps=130, spp=2, views_per_step=3),
         )  # fmt: skip
         found = textured(known.replace(verts=moved.mesh.verts), 40)
         yield found

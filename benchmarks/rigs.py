@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_rig, track_rig
+from edgegrad.fit import FitOptions, Parameter, fit_rig, track_rig
 
 F64 = torch.float64
 SEEN = 30  # pixels of a limb's own surface in a picture, from which its joint is visible
@@ -129,15 +129,20 @@ def picture(count: int, first: int, size: int) -> None:
         truth, began = figure.pose(seed, 40.0), time.process_time()
         target = eg.render(in_light(rig.posed(truth), sun_and_sky(seed)), camera, 64, 5)
         seen = visible(rig, rig.posed(truth), camera)
-        told = {"loss": "huber", "seed": seed, "progress": False}
+        told: dict[str, Any] = {"loss": "huber", "seed": seed, "progress": False}
         smooth = fit_rig(
-            rig, camera, target, look=harmonic, parameters={"light": Parameter(0.2, light)}, tries=TRIES, **told
+            rig,
+            target,
+            camera,
+            appearance=(harmonic, {"light": Parameter(0.2, light)}),
+            search=TRIES,
+            options=FitOptions(**told),
         )
         before = body.Errors.of(rig, smooth.values["rotations"], truth).rotation[seen]
         # With a light that is known better, from there: shadows that no smooth light has turn limbs aside.
         fit = fit_rig(
-            rig, camera, target, look=sunny, parameters=sun_of(smooth.fit.values["light"]), start=smooth.values,
-            tries=0, coarsest=size // 2, **told,
+            rig, target, camera, appearance=(sunny, sun_of(smooth.fit.values["light"])), init=smooth.values, search=0,
+            options=FitOptions(coarsest=size // 2, **told),
         )  # fmt: skip
         seconds.append(time.process_time() - began)
         errors = body.Errors.of(rig, fit.values["rotations"], truth)
@@ -205,7 +210,7 @@ def model_bodies(count: int, first: int, size: int, degrees: float = 20.0) -> No
         assert isinstance(posed, eg.Mesh)
         tall = float(posed.verts[:, 2].max() - posed.verts[:, 2].min())
         began = time.process_time()
-        fit = fit_rig(rig, cameras, masks=masks_of(posed, cameras), seed=seed, progress=False)
+        fit = fit_rig(rig, None, cameras, masks=masks_of(posed, cameras), options=FitOptions(seed=seed, progress=False))
         seconds.append(time.process_time() - began)
         found = fit.posed()
         assert isinstance(found, eg.Mesh)
@@ -263,7 +268,8 @@ def walk(count: int, first: int, size: int) -> None:
     ]
     start = {"rotations": truths[0], "translation": shifts[0]}
     began, rotation, direction = time.process_time(), [], []
-    for k, fit in enumerate(track_rig(rig, cameras, frames, start=start, tries=0, progress=False)):
+    options = FitOptions(seed=0, progress=False)
+    for k, fit in enumerate(track_rig(rig, frames, cameras, init=start, search=0, options=options)):
         errors = body.Errors.of(rig, fit.values["rotations"], truths[k])
         rotation.append(errors.rotation)
         direction.append(errors.direction)

@@ -18,7 +18,7 @@ from selenium import webdriver
 
 import edgegrad as eg
 from edgegrad.demo import airliner
-from edgegrad.fit import fit_pose
+from edgegrad.fit import FitOptions, fit_pose
 from edgegrad.fit.pose.result import PoseFit
 
 FLAGS = ("headless=new", "no-sandbox", "use-gl=angle", "use-angle=swiftshader", "enable-unsafe-swiftshader",
@@ -63,7 +63,8 @@ def main() -> None:
                 shot.quantize(COLORS).save(folder / "viewer.png", optimize=True)
                 raise KeyboardInterrupt
 
-        fit_pose(mesh, pictures, cameras, init=turn, background=BACKGROUND, callback=callback, progress=False)
+        options = FitOptions(seed=0, callback=callback, progress=False)
+        fit_pose(eg.Scene([mesh], BACKGROUND), pictures, cameras, init=turn, options=options)
     browser.quit()
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from .camera.camera import Camera
 from .camera.poses import rotation
 from .files.image import read_image
-from .fit import fit_pose
+from .fit import FitOptions, fit_pose
 from .fit.pose.result import PoseFit
 from .optional import require
 from .render import render
@@ -97,7 +97,8 @@ def run(mesh: Mesh, background: Tensor, seed: int, progress: bool = True) -> Run
     start = torch.eye(4, dtype=torch.float64)
     start[:3, :3], start[:3, 3] = R_start, center_start - R_start @ center
 
-    fit = fit_pose(mesh, target, camera, init=start, background=background, seed=seed, progress=progress)
+    options = FitOptions(seed=seed, progress=progress)
+    fit = fit_pose(Scene([mesh], background), target, camera, init=start, options=options)
 
     def errors(R: Tensor, t: Tensor) -> Errors:
         # The arc cosine alone loses half the digits of a small angle.

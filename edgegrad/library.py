@@ -7,28 +7,31 @@ import importlib
 import importlib.metadata
 import importlib.util
 import os
+import sys
 from typing import Any
 
 import torch  # noqa: F401  first, so that the kernel shares torch's OpenMP runtime
 
 HOW_TO_GET_EMBREE = (
     "edgegrad needs the Embree 4 library that comes with the embreex package; install it with "
-    "`pip install 'embreex>=4.4,<5'` (wheels exist for x86-64 Linux, Windows and macOS)"
+    "`pip install 'embreex>=4.4,<5'` (wheels exist for x86-64 Linux, Windows and macOS), or with conda the package embree"
 )
 
 
 def embree_path() -> str:
-    """Return the path of libembree4 among the files of the installed embreex distribution. Raises ImportError."""
+    """Return the path of libembree4: of the embreex distribution, or of conda's package embree. Raises ImportError."""
     try:
-        files = importlib.metadata.distribution("embreex").files or []
+        embreex = importlib.metadata.distribution("embreex")
+        missing = f"the installed embreex {embreex.version} carries no libembree4"
+        for file in embreex.files or []:
+            if "embree4" in file.name and (".so" in file.name or file.suffix in (".dll", ".dylib")):
+                return str(file.locate())
     except importlib.metadata.PackageNotFoundError:
-        raise ImportError(f"{HOW_TO_GET_EMBREE}; embreex is not installed") from None
-    for file in files:
-        if "embree4" in file.name and (".so" in file.name or file.suffix in (".dll", ".dylib")):
-            return str(file.locate())
-    raise ImportError(
-        f"{HOW_TO_GET_EMBREE}; the installed embreex {importlib.metadata.version('embreex')} carries no libembree4"
-    )
+        missing = "embreex is not installed"
+    for place in ("lib/libembree4.so", "lib/libembree4.dylib", "Library/bin/embree4.dll"):
+        if os.path.exists(path := os.path.join(sys.prefix, place)):
+            return path
+    raise ImportError(f"{HOW_TO_GET_EMBREE}; {missing}")
 
 
 def load(name: str = "_core") -> Any:

@@ -255,7 +255,7 @@ def jvp(
     TypeError, ValueError
         What render() raises.
     """
-    check_options("jvp", options)
+    check_options("jvp", options, without=() if aovs is None else ("shader",))
     seed = int(drawn_seed(seed, options.pop("generator", None)))
     make_request(scene, camera, spp, seed, **without_shading(options))  # checks them
     scene = as_scene(scene)
@@ -287,7 +287,7 @@ def jvp(
     if len(counts) > 1:
         raise ValueError(f"tangents: expected as many directions of all, got {counts}")
 
-    of_channels: dict[str, Any] = dict(options)  # render_aovs() has no shader, and says so
+    of_channels: dict[str, Any] = dict(options)
 
     def image(*values: Tensor) -> Any:
         moved = dict(zip(map(id, leaves), values, strict=True))

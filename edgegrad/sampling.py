@@ -59,7 +59,7 @@ class Sampling:
         check_positive(
             "sampling.discontinuity_spacing", self.discontinuity_spacing, least=LEAST_SPACING, most=MOST_SPACING
         )
-        if self.creases not in (True, False, "auto"):
+        if not isinstance(self.creases, (bool, str)) or self.creases not in (True, False, "auto"):
             raise ValueError(f'sampling.creases: expected "auto", True or False, got {self.creases!r}')
         if self.seed is not None:
             check_seed("sampling.seed", self.seed)

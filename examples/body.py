@@ -1,6 +1,6 @@
 """Find the pose of a body of twenty joints from four masks.
 
-    python examples/body.py [--degrees 40] [--size 192] [--seed 0] [--tries 40] [--view] [--out body.png]
+    python examples/body.py [--degrees 40] [--size 192] [--seed 0] [--search 40] [--view] [--out body.png]
 
 It starts at rest. Errors are those of rotations, and of the directions in which limbs point: a rotation of a limb about its own
 axis hardly changes its outline.
@@ -12,7 +12,7 @@ import argparse
 import contextlib
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import figure
 import roma
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import fit_rig
+from edgegrad.fit import FitOptions, fit_rig
 from edgegrad.fit.rig.result import RigFit
 
 SIZE = 192
@@ -48,13 +48,14 @@ class Errors(NamedTuple):
 
 
 def trial(
-    seed: int, degrees: float = 40.0, size: int = SIZE, **options: object
+    seed: int, degrees: float = 40.0, size: int = SIZE, search: int = 40, **options: Any
 ) -> tuple[eg.rig.Rig, Tensor, list[Tensor], RigFit]:
     """Return the rig, its true pose, its masks, and what is found."""
     rig = figure.figure(colored=True).with_limits(rotations=(-LIMIT, LIMIT))
     cameras, truth = figure.cameras(size), figure.pose(seed, degrees)
     masks = [eg.render_aovs(rig.posed(truth), camera, ["alpha"], spp=64, seed=5)["alpha"] for camera in cameras]
-    return rig, truth, masks, fit_rig(rig, cameras, masks=masks, seed=seed, **options)
+    given = FitOptions(seed=seed, **options)
+    return rig, truth, masks, fit_rig(rig, None, cameras, masks=masks, search=search, options=given)
 
 
 def pictures(rig: eg.rig.Rig, truth: Tensor, fit: RigFit, size: int) -> list[dict[str, Tensor]]:
@@ -72,7 +73,7 @@ def main() -> None:
     parser.add_argument("--degrees", type=float, default=40.0, help="of each joint, at most")
     parser.add_argument("--size", type=int, default=SIZE)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--tries", type=int, default=40)
+    parser.add_argument("--search", type=int, default=40)
     parser.add_argument("--view", action="store_true", help="in a browser")
     parser.add_argument("--out", type=Path, default=Path("body.png"))
     options = parser.parse_args()
@@ -81,7 +82,7 @@ def main() -> None:
         if view is not None:
             print(view.url, flush=True)
         began = time.perf_counter()
-        rig, truth, _, fit = trial(options.seed, options.degrees, options.size, tries=options.tries, callback=view)
+        rig, truth, _, fit = trial(options.seed, options.degrees, options.size, options.search, callback=view)
         print(f"{fit.reason} after {time.perf_counter() - began:.0f} s")
         print("start:", Errors.of(rig, torch.zeros_like(truth), truth))
         print("fit:  ", Errors.of(rig, fit.values["rotations"], truth))

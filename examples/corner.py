@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_scene
+from edgegrad.fit import FitOptions, Parameter, fit_scene
 from edgegrad.fit.descent.result import Fit
 
 SIZE, SHOWN = 64, 160  # pixels on a side, of the pictures and of what is drawn
@@ -55,8 +55,8 @@ def fit(seen: list[Tensor], bounces: int, steps: int = 30) -> Fit:
     """Start from grey walls."""
     size = len(seen[0])
     sought = {name: Parameter(0.03, torch.full((3,), 0.5), low=0.0, high=1.0) for name in WALLS}
-    render = {"bounces": bounces}
-    return fit_scene(scene, cameras(size), seen, sought, method="gauss-newton", steps=steps, spp=16, render=render)
+    options = FitOptions(seed=0, method="gauss-newton", steps=steps, spp=16, bounces=bounces)
+    return fit_scene(scene, seen, cameras(size), sought, options=options)
 
 
 def errors(found: Fit) -> dict[str, float]:

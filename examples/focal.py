@@ -15,7 +15,7 @@ import roma
 import torch
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera
+from edgegrad.fit import FitOptions, fit_camera
 from edgegrad.fit.pose.fit_camera import CameraFit
 
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])
@@ -39,7 +39,7 @@ def trial(mesh: eg.Mesh, seed: int, size: int = 256) -> tuple[float, float, Came
     K = true.K.double().clone()
     K[:2, :2] *= 1.0 + ZOOM * float(even(1))
     start = true.to(torch.float64).replace(world_to_camera=true.world_to_camera.double() @ M, K=K)
-    fit = fit_camera(mesh, picture, start, background=BACKGROUND, seed=seed, progress=False)
+    fit = fit_camera(eg.Scene([mesh], BACKGROUND), picture, start, options=FitOptions(seed=seed, progress=False))
     before, after = (100.0 * (float(k[0, 0] / true.K[0, 0]) - 1.0) for k in (K, fit.camera.K))
     return before, after, fit
 

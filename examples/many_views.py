@@ -29,7 +29,8 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 import edgegrad as eg
-from edgegrad.fit.checkpoints import Checkpoint
+from edgegrad.fit import Checkpoint
+from edgegrad.fit.checkpoints import CheckpointFile
 from edgegrad.fit.descent.adam import Adam
 from edgegrad.fit.laplacian import LaplacianSolver
 
@@ -124,7 +125,8 @@ def fit(
     values = dict(module.named_parameters())
     optimizer = Adam(values, dict.fromkeys(values, task.rate), uniform=values)
     first, (rank, processes) = 0, _place()
-    file = Checkpoint(checkpoint, True, task._asdict())
+    kept = None if checkpoint is None else Checkpoint(checkpoint, every, resume=checkpoint.exists())
+    file = CheckpointFile(kept, task._asdict())
     saved = _shared(file.read)
     if saved is not None:
         first = saved["step"]

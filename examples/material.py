@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_scene
+from edgegrad.fit import FitOptions, Parameter, fit_scene
 from edgegrad.fit.descent.result import Fit
 
 ROUGHNESS, METALLIC = 0.3, 0.7
@@ -86,7 +86,8 @@ def fit(
         for name, value in zip(Made._fields, start or half(truth), strict=True)
     }
     seen = pictures(truth.scene(shape), cameras)
-    found = fit_scene(lambda values: Made(**values).scene(shape), cameras, seen, sought, **options)
+    given = FitOptions(seed=0, **options)
+    found = fit_scene(lambda values: Made(**values).scene(shape), seen, cameras, sought, options=given)
     return found, Made(**found.values)
 
 
@@ -97,7 +98,7 @@ def resized(image: Tensor, rows: int, columns: int) -> Tensor:
 
 def fit_textured(shape: eg.Mesh, truth: Made, size: int = 128, steps: tuple[int, int] = (300, 150)) -> tuple[Fit, Made]:
     """Fit coarse textures, then fine ones."""
-    options: dict[str, Any] = {"spp": 4, "views_per_step": 2, "tolerance": 0.0}
+    options: dict[str, Any] = {"spp": 4, "views_per_step": 2, "loss_tolerance": 0.0}
     rows, columns, _ = truth.base.shape
     start = half(truth)
     start = start._replace(base=start.base[: max(rows // 8, 1), : max(columns // 8, 1)].clone())
@@ -120,7 +121,12 @@ def main() -> None:
     numbers = torch.tensor(ROUGHNESS), torch.tensor(METALLIC)
     scan = scan.replace(normals=scan.vertex_normals())
     things = (
-        ("ball", ball(), Made(GOLD, *numbers), partial(fit, method="gauss-newton", steps=50, spp=4, tolerance=0.0)),
+        (
+            "ball",
+            ball(),
+            Made(GOLD, *numbers),
+            partial(fit, method="gauss-newton", steps=50, spp=4, loss_tolerance=0.0),
+        ),
         ("scan", scan, Made(scan.texture, *numbers), fit_textured),
     )
     rows = []

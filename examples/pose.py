@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import fit_pose
+from edgegrad.fit import FitOptions, fit_pose
 from edgegrad.fit.pose.result import PoseFit
 
 SIZE = 256
@@ -50,20 +50,21 @@ def scene(mesh: eg.Mesh, case: str, generator: torch.Generator, size: int = SIZE
     if case == "masks":
         masks = [eg.render_aovs(turned, c, ["alpha"], spp=64, seed=9)["alpha"] for c in cameras]
         plain = eg.Mesh(turned.verts, turned.faces)
-        return plain, {"target": [m.expand(-1, -1, 3) for m in masks], "camera": cameras, "mask": masks}
+        return plain, {"mesh": plain, "images": None, "cameras": cameras, "masks": masks}
     camera = cameras[3]
     seen = eg.render_aovs(turned, camera, ["image", "alpha"], spp=64, seed=9)
     image, alpha = seen["image"], seen["alpha"]
     behind = torch.rand(size, size, 3, generator=generator) if case == "unknown" else BACKGROUND
     picture = image + (1.0 - alpha) * behind
     if case in ("plain", "unknown"):
-        return turned, {"target": picture, "camera": camera, "background": None if case == "unknown" else BACKGROUND}
+        known = eg.Scene([turned], None if case == "unknown" else BACKGROUND)
+        return turned, {"mesh": known, "images": picture, "cameras": camera}
     cover = board(alpha, generator)
     stripes = torch.where(torch.arange(size)[:, None, None] // (size // 16) % 2 == 0, 0.8, 0.05)
     picture = cover * stripes + (1.0 - cover) * picture
     if case == "cut-out":
-        return turned, {"target": picture, "camera": camera, "mask": alpha * (1.0 - cover)}
-    return turned, {"target": picture, "camera": camera, "background": BACKGROUND}
+        return turned, {"mesh": turned, "images": picture, "cameras": camera, "masks": alpha * (1.0 - cover)}
+    return turned, {"mesh": eg.Scene([turned], BACKGROUND), "images": picture, "cameras": camera}
 
 
 def random_rotation(generator: torch.Generator, most: float) -> Tensor:
@@ -82,7 +83,7 @@ def trial(mesh: eg.Mesh, case: str, seed: int, size: int = SIZE) -> tuple[float,
     R = random_rotation(generator, math.radians(TURN))
     off = torch.rand(3, generator=generator, dtype=torch.float64) * 2.0 - 1.0
     start[:3, :3], start[:3, 3] = R, center - R @ center + SHIFT * diagonal * off / math.sqrt(3.0)
-    fit = fit_pose(turned, init=start, seed=seed, progress=False, **given)
+    fit = fit_pose(init=start, options=FitOptions(seed=seed, progress=False), **given)
     return degrees(R), degrees(fit.R), fit
 
 

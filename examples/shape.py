@@ -22,7 +22,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 import edgegrad as eg
-from edgegrad.fit import fit_shape
+from edgegrad.fit import FitOptions, Refinement, fit_shape
 from edgegrad.fit.descent.result import Fit
 
 # Radiance by the normal: constant, and a colour for each axis. Vertex colours, so no light has to be sampled.
@@ -49,7 +49,9 @@ def stone(subdivisions: int = 6) -> eg.Mesh:
 NOISE, MISSING, WALL = 0.002, 0.1, 2.2  # of the sensor; noise and the wall's depth in diagonals
 
 
-def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures", **options: Any) -> Fit:
+def fit(
+    mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures", levels: int = 3, **options: Any
+) -> Fit:
     """Start from a sphere around the middle of the mesh's box, 0.35 of its diagonal in radius."""
     cameras = objects.around(mesh, views, size, distance=1.35)
     seen = [
@@ -59,17 +61,18 @@ def fit(mesh: eg.Mesh, views: int = 16, size: int = 256, given: str = "pictures"
     low, high = mesh.verts.aminmax(dim=0)
     diagonal = float((high - low).norm())
     start = eg.shapes.sphere((low + high) / 2, 0.35 * diagonal, subdivisions=3)
-    options = {"levels": 3, "steps": 150, "spp": 4} | options
+    own = FitOptions(**{"seed": 0, "steps": 150, "spp": 4} | options)
+    shared: dict[str, Any] = {"cameras": cameras, "refinement": Refinement(levels), "options": own}
     images, masks = ([found[name] for found in seen] for name in ("image", "alpha"))
     if given == "pictures":
-        return fit_shape(start, cameras, images, masks=masks, look=lit, **options)
+        return fit_shape(start, images, masks=masks, appearance=lit, **shared)
     if given == "masks":
-        return fit_shape(start, cameras, masks=masks, **options)
+        return fit_shape(start, None, masks=masks, **shared)
     if given == "depths":
         depths = [torch.where(found["alpha"] > 0.999, found["depth"], 0.0) for found in seen]
-        return fit_shape(start, cameras, masks=masks, depths=depths, **options)
+        return fit_shape(start, None, masks=masks, depths=depths, **shared)
     depths = sensed(seen, diagonal)
-    return fit_shape(start, cameras, masks=[(mask > 0.5).float() for mask in masks], depths=depths, **options)
+    return fit_shape(start, None, masks=[(mask > 0.5).float() for mask in masks], depths=depths, **shared)
 
 
 def sensed(seen: list[dict[str, torch.Tensor]], diagonal: float) -> list[torch.Tensor]:

@@ -17,7 +17,7 @@ import torch
 from shape import lit, stone
 
 import edgegrad as eg
-from edgegrad.fit import fit_shape
+from edgegrad.fit import FitOptions, Refinement, fit_shape
 
 SIZE = 128
 
@@ -60,7 +60,13 @@ def simplify(mesh: eg.Mesh, faces: int = 300, steps: int = 100) -> tuple[eg.Mesh
 
     simple = simplified(mesh, faces)
     fit = fit_shape(
-        simple, cameras, images, masks=masks, look=lit, levels=1, lr=0.002, smoothness=1.0, steps=steps, spp=4
+        simple,
+        images,
+        cameras,
+        masks=masks,
+        appearance=lit,
+        refinement=Refinement(levels=1, lr=0.002, smoothness=1.0),
+        options=FitOptions(seed=0, steps=steps, spp=4),
     )
     assert fit.mesh is not None
     found = textured(fit.mesh, mesh)

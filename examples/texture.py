@@ -15,7 +15,7 @@ from typing import Any
 import objects
 
 import edgegrad as eg
-from edgegrad.fit import fit_texture
+from edgegrad.fit import FitOptions, fit_texture
 from edgegrad.fit.descent.result import Fit
 
 
@@ -23,7 +23,8 @@ def fit(mesh: eg.Mesh, size: int = 256, texels: int = 256, **options: Any) -> Fi
     cameras = objects.around(mesh, 8, size)
     pictures = [eg.render(mesh, camera, spp=64, seed=10_000 + k) for k, camera in enumerate(cameras)]
     bare = eg.Mesh(mesh.verts, mesh.faces, uvs=mesh.uvs, uv_faces=mesh.uv_faces)
-    return fit_texture(bare, cameras, pictures, texels, **({"steps": 120, "spp": 4} | options))
+    given = FitOptions(**{"seed": 0, "steps": 120, "spp": 4} | options)
+    return fit_texture(bare, pictures, cameras, texels, options=given)
 
 
 def held_out(mesh: eg.Mesh, found: eg.Mesh, size: int = 256) -> float:

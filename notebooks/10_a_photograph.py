@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, PoseParameter, fit_scene
+from edgegrad.fit import FitOptions, Parameter, PoseParameter, fit_scene
 from edgegrad.image import linear_to_srgb, srgb_to_linear
 
 photo = srgb_to_linear(torch.tensor(skimage.data.coffee() / 255.0).float())
@@ -108,7 +108,11 @@ def fitted(camera, R, t, shape, **options):
     free = {name: Parameter(0.01, value, low=0.02, high=1.2) for name, value in shape.items()}
     given = {"pose": pose, **free}
     return fit_scene(
-        scene, camera, photo, given, loss="region", spp=4, steps=150, tolerance=1e-3, progress=False, **options
+        scene,
+        photo,
+        camera,
+        given,
+        options=FitOptions(seed=0, loss="region", spp=4, steps=150, loss_tolerance=1e-3, progress=False, **options),
     )
 
 

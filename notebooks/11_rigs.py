@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import torch
 
 import edgegrad as eg
-from edgegrad.fit import fit_rig, track_rig
+from edgegrad.fit import FitOptions, fit_rig, track_rig
 from edgegrad.image import linear_to_srgb
 
 sys.path.append("../examples")
@@ -90,7 +90,7 @@ rig = rig.with_limits(rotations=(-0.75, 0.75))
 cameras = figure.cameras(128)
 truth = figure.pose(3)
 masks = [eg.render_aovs(rig.posed(truth), camera, ["alpha"], spp=64)["alpha"] for camera in cameras]
-fit = fit_rig(rig, cameras, masks=masks, progress=False)
+fit = fit_rig(rig, None, cameras, masks=masks, options=FitOptions(seed=0, progress=False))
 print(f"{fit.reason}; explained: {fit.fit.explained:.2f}")
 errors = body.Errors.of(rig, fit.values["rotations"], truth)
 print(errors)
@@ -114,7 +114,8 @@ small = figure.cameras(96)
 for pose in poses:
     frames.append({"masks": [eg.render_aovs(rig.posed(pose), one, ["alpha"], spp=32)["alpha"] for one in small]})
 start = {"rotations": fit.values["rotations"]}
-for pose, found in zip(poses, track_rig(rig, small, frames, start=start, tries=0, progress=False)):
+options = FitOptions(seed=0, progress=False)
+for pose, found in zip(poses, track_rig(rig, frames, small, init=start, search=0, options=options)):
     print(body.Errors.of(rig, found.values["rotations"], pose))
 
 # %% [markdown]

@@ -14,7 +14,7 @@ import torch
 import trimesh
 
 import edgegrad as eg
-from edgegrad.fit import fit_pose
+from edgegrad.fit import FitOptions, fit_pose
 from edgegrad.image import linear_to_srgb
 
 
@@ -154,7 +154,7 @@ print(f"rotation off by {by_hand:.3f}°, translation by {(t.detach() - true_t).n
 # believes what it found.
 
 # %%
-fit = fit_pose(stone, target, camera, background=behind, progress=False)
+fit = fit_pose(eg.Scene([stone], behind), target, camera, options=FitOptions(seed=0, progress=False))
 print(f"{fit.reason} after {fit.steps} steps in {fit.seconds:.1f} s")
 print(
     f"rotation off by {math.degrees(roma.rotmat_geodesic_distance(fit.R.float(), roma.rotvec_to_rotmat(true_w))):.3f}°"
@@ -174,7 +174,7 @@ y, x = torch.meshgrid(torch.arange(96), torch.arange(96), indexing="ij")
 board = (x + 0.4 * y < 55)[..., None] & (x > 12)[..., None]
 stripes = torch.where(y[..., None] // 6 % 2 == 0, 0.8, 0.05).expand(96, 96, 3)
 covered_target = torch.where(board, stripes, target)
-covered = fit_pose(stone, covered_target, camera, background=behind, progress=False)
+covered = fit_pose(eg.Scene([stone], behind), covered_target, camera, options=FitOptions(seed=0, progress=False))
 off = math.degrees(roma.rotmat_geodesic_distance(covered.R.float(), roma.rotvec_to_rotmat(true_w)))
 alpha = eg.render_aovs(posed(true_w, true_t), camera, ["alpha"])["alpha"] > 0.5
 print(

@@ -14,7 +14,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 import edgegrad as eg
-from edgegrad.fit import fit_shape
+from edgegrad.fit import FitOptions, Refinement, fit_shape
 from edgegrad.fit.laplacian import LaplacianSolver
 from edgegrad.image import linear_to_srgb
 
@@ -121,7 +121,13 @@ show([*pictures, images[2]], ["sphere", "a step by the gradient", "a smoothed st
 
 # %%
 found = fit_shape(
-    sphere, cameras, images, masks=masks, look=lit, levels=2, steps=60, lr=0.02, spp=4, faces=6000, progress=False
+    sphere,
+    images,
+    cameras,
+    masks=masks,
+    appearance=lit,
+    refinement=Refinement(levels=2, faces=6000, lr=0.02),
+    options=FitOptions(seed=0, steps=60, spp=4, progress=False),
 )
 print(f"{found.reason}; {len(found.mesh.faces)} faces, {found.seconds:.0f} s")
 

@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera
+from edgegrad.fit import FitOptions, fit_camera
 from edgegrad.image import linear_to_srgb
 
 
@@ -144,7 +144,7 @@ taken = eg.Camera.look_at((3.0, -5.2, 4.0), (0.1, 0.1, 0.2), (0.05, 0, 1), 50.0,
 with torch.no_grad():
     picture = eg.render(town, taken, spp=256, seed=7)
 first = eg.Camera.look_at((3.4, -5.4, 3.8), (0.0, 0.0, 0.2), (0, 0, 1), 55.0, size)
-fit = fit_camera(town, picture, first, distortion=4, progress=False)
+fit = fit_camera(town, picture, first, distortion=4, options=FitOptions(seed=0, progress=False))
 print(fit.reason)
 
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 import trimesh
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_scene, fit_texture
+from edgegrad.fit import FitOptions, Parameter, fit_scene, fit_texture
 from edgegrad.image import linear_to_srgb
 
 
@@ -64,7 +64,7 @@ painted = bare.replace(texture=texture)
 around = [(2.6, 0.3, 1.6), (-0.9, 2.4, 1.7), (-1.5, -2.2, 1.5), (1.4, 1.9, -1.9), (-2.6, 0.2, -1.6), (1.0, -2.3, -1.9)]
 cameras = [eg.Camera.look_at(eye, (0, 0, 0), (0, 0, 1), 40.0, (96, 96)) for eye in around]
 pictures = [eg.render(painted, camera, spp=64, seed=1000 + k) for k, camera in enumerate(cameras)]
-fit = fit_texture(bare, cameras, pictures, (64, 128), steps=60, spp=4, progress=False)
+fit = fit_texture(bare, pictures, cameras, (64, 128), options=FitOptions(seed=0, steps=60, spp=4, progress=False))
 
 new = eg.Camera.look_at((0.8, -2.0, 2.2), (0, 0, 0), (0, 0, 1), 40.0, (96, 96))  # none of the six
 held_out = [eg.render(mesh, new, spp=64, seed=k) for k, mesh in enumerate((painted, fit.mesh))]
@@ -228,8 +228,8 @@ pictures = [
     eg.render(made(gold), camera, 64, 1000 + k, sampling=eg.Sampling(lights=2)) for k, camera in enumerate(cameras)
 ]
 sought = {name: Parameter(0.02, torch.full_like(value, 0.5), low=0.0, high=1.0) for name, value in gold.items()}
-options = {"steps": 300, "spp": 4, "views_per_step": 1, "tolerance": 0.0, "progress": False}
-fit = fit_scene(made, cameras, pictures, sought, **options)
+options = {"steps": 300, "spp": 4, "views_per_step": 1, "loss_tolerance": 0.0, "progress": False}
+fit = fit_scene(made, pictures, cameras, sought, options=FitOptions(seed=0, **options))
 made_of = {name: (fit.values[name] - value).abs().max().item() for name, value in gold.items()}
 print("off by " + ", ".join(f"{value:.4f} in {name.replace('_', ' ')}" for name, value in made_of.items()))
 new = eg.Camera.look_at((2.4, 1.2, -2.0), (0, 0, 0), (0, 1, 0), 36.0, (48, 48))  # none of the four
@@ -271,7 +271,7 @@ sought = {name: Parameter(0.03, torch.full((3,), 0.5), low=0.0, high=1.0) for na
 options = {"method": "gauss-newton", "steps": 30, "spp": 16, "progress": False}
 wrong, took, corners = {}, 0.0, [pictures[0]]
 for bounces in (1, 3):
-    fit = fit_scene(room, cameras, pictures, sought, render={"bounces": bounces}, **options)
+    fit = fit_scene(room, pictures, cameras, sought, options=FitOptions(seed=0, bounces=bounces, **options))
     wrong[bounces] = max((fit.values[name] / color - 1).abs().max().item() for name, color in colors.items())
     took += fit.seconds
     corners.append(eg.render(room(fit.values), cameras[0], 64, bounces=3))

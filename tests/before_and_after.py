@@ -308,7 +308,7 @@ def posed() -> Arrays:
     view = camera().detach()
     moved = mesh.replace(verts=mesh.verts @ matrix[:3, :3].T)
     target = eg.render(moved, view, spp=32, seed=0)
-    found = fit.fit_pose(mesh, target, view, init=torch.eye(4), steps=6, progress=False)
+    found = fit.fit_pose(mesh, target, view, init=torch.eye(4), options=fit.FitOptions(seed=0, steps=6, progress=False))
     return {"matrix": found.matrix}
 
 
@@ -317,7 +317,9 @@ def fitted() -> Arrays:
     mesh, matrix = bracket()
     view = camera().detach()
     target = eg.render(mesh.replace(verts=mesh.verts @ matrix[:3, :3].T), view, spp=16, seed=0)
-    found = fit.fit_scene(mesh, view, [target], {"verts": 0.01, "face_colors": 0.02}, steps=8, progress=False)
+    found = fit.fit_scene(
+        mesh, [target], view, {"verts": 0.01, "face_colors": 0.02}, options=fit.FitOptions(seed=0, steps=8, progress=False),
+    )  # fmt: skip
     return {"verts": found.scene.meshes[0].verts, "colors": found.scene.meshes[0].face_colors}
 
 

@@ -12,7 +12,7 @@ import trimesh
 import edgegrad as eg
 from edgegrad.cli import main
 from edgegrad.cli.doctor import gradient_error
-from edgegrad.fit import fit_pose, fit_shape
+from edgegrad.fit import FitOptions, fit_pose, fit_shape
 from edgegrad.fit.losses import ssim
 
 
@@ -51,7 +51,7 @@ def files_and_fits() -> None:
     mesh, camera = painted(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, size=(64, 64))
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.1, 0.05], [0.1, 0, -0.1], [-0.05, 0.1, 0]]))
     target = eg.render(mesh.transformed(turn), camera, spp=64, seed=1)
-    fit = fit_pose(mesh, target, camera, background=0.0, progress=False)
+    fit = fit_pose(eg.Scene([mesh], torch.zeros(3)), target, camera, options=FitOptions(seed=0, progress=False))
     error = torch.rad2deg(torch.acos(((fit.R.T.to(turn) @ turn).trace() / 2 - 0.5).clamp(-1, 1)))
     assert fit.converged and float(error) < 0.5, (fit.reason, error)
     with tempfile.TemporaryDirectory() as folder:
@@ -66,11 +66,14 @@ def extras() -> None:
     """What needs a library that is not installed names the extra that brings it."""
     mesh, camera = painted(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, size=(16, 16))
     image = eg.render(mesh, camera, seed=0)
-    fit = fit_pose(mesh, image, camera, background=0.0, progress=False, steps=1)
+    fit = fit_pose(eg.Scene([mesh], torch.zeros(3)), image, camera, options=FitOptions(seed=0, progress=False, steps=1))
     needs = {
         "matplotlib": ("figures", fit.plot),
         "torchmetrics": ("fit", lambda: ssim(image, image)),
-        "gpytoolbox": ("fit", lambda: fit_shape(mesh, [camera], [image], levels=2, steps=1, progress=False)),
+        "gpytoolbox": (
+            "fit",
+            lambda: fit_shape(mesh, [image], [camera], options=FitOptions(seed=0, steps=1, progress=False)),
+        ),
         "xatlas": ("fit", lambda: eg.textures.unwrap(mesh)),
     }
     for library, (extra, call) in needs.items():

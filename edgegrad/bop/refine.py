@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..check import check_flag, check_int, check_positive, check_positive_int
+from ..check import check_flag, check_positive
+from ..fit.options import FitOptions
 from ..fit.pose.fit_pose import fit_pose
 from ..fit.pose.pose import angle
 from ..fit.pose.result import PoseFit
@@ -39,28 +39,25 @@ def refine(
     estimate: Estimate,
     *,
     margin: float = 0.5,
-    size: int = 256,
-    steps: int = 40,
-    seed: int = 0,
     unconverged: bool = False,
-    progress: bool = False,
-    callback: Callable[[PoseFit], None] | None = None,
+    options: FitOptions | None = None,
 ) -> Refined:
     """Fit the object's mesh, with its colours, to the image around the estimate.
 
-    margin       part of the image around the object that is used, in sizes of the object's box in the image
-    size         largest number of pixels on the longer side of that part; a larger one is reduced
-    steps, seed, progress, callback  as in fit_pose
-    unconverged  take the pose also of a fit that did not converge; False: keep the estimate's own
+    Parameters
+    ----------
+    margin : float, default 0.5
+        Part of the image around the object that is used, in sizes of the object's box in the image.
+    unconverged : bool, default False
+        Whether the pose is taken also of a fit that did not converge. Otherwise the estimate keeps its own.
+    options : FitOptions, optional
+        As of fit_pose(); `max_size` is that of the part of the image.
 
     Of the poses that symmetries make equal, the one nearest to the estimate's is returned. If no fit can be made, since the
     object is outside the image, say, the pose is kept with the reason. Raises FileNotFoundError or ValueError that names what
     the data set lacks.
     """
     check_positive("margin", margin, least=0.0, most=100.0)
-    for name, value in (("size", size), ("steps", steps)):
-        check_positive_int(name, value)
-    check_int("seed", seed, 0, 2**32 - 1)
     check_flag("unconverged", unconverged)
     began = time.perf_counter()
     frame, model = dataset.frame(estimate.scene_id, estimate.im_id), dataset.model(estimate.obj_id)
@@ -78,8 +75,8 @@ def refine(
         part = part.mean(-1, keepdim=True)
     try:
         fit = fit_pose(
-            mesh, part, camera.crop(top, left, height, width), init=_orthonormal(estimate.pose), max_size=size, steps=steps,
-            seed=seed, progress=progress, callback=callback, symmetries=model.symmetries,
+            mesh, part, camera.crop(top, left, height, width), init=_orthonormal(estimate.pose), symmetries=model.symmetries,
+            options=options,
         )  # fmt: skip
     except ValueError as error:
         return kept(f"no fit: {error}")

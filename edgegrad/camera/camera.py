@@ -162,6 +162,7 @@ class Camera(Viewpoints, Conventions):
         shift = torch.zeros_like(self.K)
         shift[..., 0, 2] = check_int("left", left, -(2**31), 2**31)
         shift[..., 1, 2] = check_int("top", top, -(2**31), 2**31)
+        height, width = check_int("height", height, 1, 1 << 16), check_int("width", width, 1, 1 << 16)
         return self.replace(K=self.K - shift, size=(height, width))
 
     def resized(self, size: tuple[int, int]) -> Camera:

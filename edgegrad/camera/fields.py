@@ -40,7 +40,7 @@ class CameraFields:
                 "give one K (3, 3) for all or as many as cameras"
             )
         object.__setattr__(self, "size", image_size(self.size))
-        if self.projection not in COEFFICIENT_COUNTS:
+        if self.projection not in tuple(COEFFICIENT_COUNTS):
             raise ValueError(
                 f"projection: expected one of {', '.join(map(repr, COEFFICIENT_COUNTS))}, got {self.projection!r}"
             )

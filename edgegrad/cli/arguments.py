@@ -91,7 +91,7 @@ def add_depth(parser: argparse.ArgumentParser) -> None:
 
 
 def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
-    """Add the arguments of fits by descent, for inputs.descent."""
+    """Add the arguments of fits by descent, for inputs.read_options."""
     parser.add_argument("--steps", type=count, default=150, help="most steps; of fit-shape on each level (%(default)s)")
     parser.add_argument("--spp", type=count, default=4, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)

@@ -98,6 +98,7 @@ def _refine(args: argparse.Namespace) -> int:
     from ..bop import Dataset, refine
     from ..bop.files import read_results, write_results
     from ..files.paths import check_suffix
+    from ..fit import FitOptions
     from . import INTERRUPTED
 
     check_suffix(args.out, (".csv",))
@@ -110,14 +111,13 @@ def _refine(args: argparse.Namespace) -> int:
         require("matplotlib", *DRAWING)
         make_folder(args.pictures)
     spent = {(row.scene_id, row.im_id): row.seconds - max(0.0, before.seconds) for row, before in zip(done, given)}  # noqa: B905
+    options = FitOptions(max_size=args.size, steps=args.steps, seed=args.seed, progress=False)
     kept = 0
     interrupted = False
     with tqdm(total=len(given), initial=len(done), desc="refine", unit="row", leave=False) as bar:
         for row in given[len(done) :]:
             try:
-                found = refine(
-                    dataset, row, size=args.size, steps=args.steps, seed=args.seed, unconverged=args.unconverged
-                )
+                found = refine(dataset, row, unconverged=args.unconverged, options=options)
             except KeyboardInterrupt:
                 interrupted = True
                 break

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .arguments import CHECKPOINT, add_background, add_live, add_mesh, add_out, add_resume, add_steps, add_view, number
-from .inputs import read_background, read_picture, read_scene, read_view, seen_by
+from .inputs import read_background, read_options, read_picture, read_scene, read_view, seen_by
 from .outputs import live_view, make_folder, wait_for_close, write_outputs
 
 
@@ -43,12 +43,13 @@ def run(args: argparse.Namespace) -> int:
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with an image that has alpha, got both; leave one out")
     start = read_view(args, scene, (picture.shape[0], picture.shape[1]), None)
+    if args.background is not None:
+        scene = scene.replace(background=read_background(args.background, picture))
     make_folder(args.out)
     with live_view(args) as view:
         fit = fit_camera(
-            scene, picture, start, mask=mask, background=read_background(args.background, picture), focal=not args.no_focal,
-            principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed, callback=view,
-            checkpoint=args.out / CHECKPOINT, resume=args.resume,
+            scene, picture, start, masks=mask, focal=not args.no_focal, principal=args.principal, distortion=args.distortion,
+            options=read_options(args, view),
         )  # fmt: skip
         print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}")
         K = fit.camera.K.tolist()

@@ -28,6 +28,7 @@ from .inputs import (
     read_background,
     read_coverage,
     read_depth,
+    read_options,
     read_photo_view,
     read_picture,
     read_pose,
@@ -52,16 +53,17 @@ def add(commands: Any) -> None:
         help="pose to start from: a pose.json, or mesh to world 4 × 4 by rows as JSON, text or .npy (as in the mesh file)",
     )  # fmt: skip
     parser.add_argument(
-        "--starts", type=_starts, default=1, metavar="N|global",
-        help="so many starts, around --init or in all rotations; global searches the whole picture (%(default)s)",
+        "--search", type=_search, default=True, metavar="no|N|global",
+        help="no: refine the start alone; N starts, around --init or in all rotations; global: the whole picture (other poses, "
+        "where the picture does not show the edges)",
     )  # fmt: skip
     add_resume(parser)
     parser.add_argument(
         "--weight", type=Path, help="image of the picture's size: how much a pixel counts, black not at all"
     )
     add_depth(parser)
-    parser.add_argument("--fit-scale", action="store_true", help="also find the scale; the distance then stays")
-    parser.add_argument("--fit-focal", action="store_true", help="also find the focal length")
+    parser.add_argument("--scale", action="store_true", help="also find the scale; the distance then stays")
+    parser.add_argument("--focal", action="store_true", help="also find the focal length")
     add_background(parser)
     add_size(parser)
     add_steps(parser)
@@ -71,10 +73,10 @@ def add(commands: Any) -> None:
     parser.set_defaults(run=run)
 
 
-def _starts(text: str) -> int | str:
-    if text == "global" or (text.isdecimal() and int(text) >= 1):
-        return text if text == "global" else int(text)
-    raise argparse.ArgumentTypeError(f"expected a whole number from 1 up, or global, got {text!r}")
+def _search(text: str) -> bool | int | str:
+    if text in ("no", "global") or (text.isdecimal() and int(text) >= 2):
+        return int(text) if text.isdecimal() else text == "global" and text
+    raise argparse.ArgumentTypeError(f"expected no, a whole number from 2 up, or global, got {text!r}")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -116,15 +118,14 @@ def run(args: argparse.Namespace) -> int:
                 view(fit)
 
         fit = fit_pose(
-            scene, picture, camera, mask, None if init is None else init.matrix,
-            fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=background,
-            weight=weight, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed, starts=args.starts,
-            callback=after_step, checkpoint=args.out / CHECKPOINT, resume=args.resume,
+            scene if background is None else scene.replace(background=background), picture, camera, mask,
+            None if init is None else init.matrix, scale=args.scale, focal=args.focal, weights=weight, depths=depth,
+            search=args.search, options=read_options(args, after_step, max_size=args.size),
         )  # fmt: skip
         # Neither a full disk nor a closed terminal may lose the result. It is printed before the files are written, and they
         # are written also if printing fails.
         try:
-            _print_fit(fit, args.fit_focal)
+            _print_fit(fit, args.focal)
         finally:
             written = [*outputs.write_outputs(args.out, fit), CHECKPOINT]
         print(f"wrote {', '.join(written)} in {args.out}")

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Find the poses of several meshes in a photograph, in which they may cover one another, from starts within about 15° and 5
     % of their sizes. Ctrl-C keeps the best poses so far."""
     from .. import Scene, load_scene
-    from ..fit import fit_poses
+    from ..fit import FitOptions, fit_poses
     from . import INTERRUPTED
 
     if args.init and len(args.init) != len(args.mesh):
@@ -60,9 +60,8 @@ def run(args: argparse.Namespace) -> int:
     camera, assumed = read_photo_view(args, everything, args.image, picture, args.init[0] if args.init else None)
     outputs.make_folder(args.out)
     outputs.print_note(assumed)
-    fits = fit_poses(
-        scenes, picture, camera, mask, init, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed
-    )  # fmt: skip
+    options = FitOptions(max_size=args.size, steps=args.steps, seed=args.seed)
+    fits = fit_poses(scenes, picture, camera, mask, init, depths=depth, options=options)
     # Neither a full disk nor a closed terminal may lose the result, as in fit-pose.
     folders = [args.out / str(k + 1) for k in range(len(fits))]
     try:

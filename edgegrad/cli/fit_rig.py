@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .arguments import add_descent, add_label, add_live, add_views, count, number
-from .inputs import descent, read_coverage, read_views
+from .inputs import read_coverage, read_options, read_views
 from .outputs import finish, live_view, make_folder, wait_for_close
 
 
@@ -18,8 +18,10 @@ def add(commands: Any) -> None:
     )
     add_views(parser, "masks, white on the object, or pictures whose alpha is one")
     add_label(parser)
-    parser.add_argument("--joints", nargs="+", metavar="NAME", help="that turn (all that vertices hang on)")
-    parser.add_argument("--tries", type=number, default=40, help="limbs drawn anew; 0 for a start nearby (%(default)s)")
+    parser.add_argument("--seek", nargs="+", metavar="NAME", help="joints and controls (all joints, and translation)")
+    parser.add_argument(
+        "--search", type=number, default=40, help="limbs drawn anew; 0 for a start nearby (%(default)s)"
+    )
     parser.add_argument("--coarsest", type=count, default=16, help="pixels of the first level (%(default)s)")
     add_descent(parser, "pose.json, posed.glb")
     parser.set_defaults(steps=15)
@@ -37,12 +39,12 @@ def run(args: argparse.Namespace) -> int:
     cameras, _, _ = read_views(args)
     masks = [read_coverage(path, args.label) for path in args.images]
     make_folder(args.out)
-    options = {"joints": args.joints, "tries": args.tries, "coarsest": args.coarsest, **descent(args)}
     with live_view(args) as view:
-        found = fit_rig(rig, cameras, masks=masks, callback=view, **options)
-        code = finish(found.fit, args.out, found.save, found.reason)
+        options = read_options(args, view, spp=args.spp, coarsest=args.coarsest)
+        found = fit_rig(rig, None, cameras, masks=masks, seek=args.seek, search=args.search, options=options)
+        code = finish(found, args.out)
         unknown = "" if found.uncertainty is None else found.uncertainty.unknown
         if unknown and unknown not in found.reason:
             print(f"not determined by the masks: {unknown}", flush=True)
-        wait_for_close(view, found.fit)
+        wait_for_close(view, found)
     return code

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .arguments import add_descent, add_label, add_live, add_views, count
-from .inputs import descent, read_coverage, read_views
+from .inputs import read_coverage, read_options, read_views
 from .outputs import finish, live_view, make_folder, wait_for_close
 
 
@@ -27,16 +27,16 @@ def run(args: argparse.Namespace) -> int:
     """Find the shape of an object from masks, beginning with the mesh, which may be a sphere around the object. Ctrl-C keeps
     the best so far, and --resume goes on from there."""
     from .. import load_mesh
-    from ..fit import fit_shape
+    from ..fit import Refinement, fit_shape
 
     mesh = load_mesh(args.mesh, materials=False)
     cameras, _, _ = read_views(args)
     masks = [read_coverage(path, args.label) for path in args.images]
     make_folder(args.out)
     with live_view(args) as view:
-        fit = fit_shape(
-            mesh, cameras, masks=masks, levels=args.levels, faces=args.faces, callback=view, **descent(args)
-        )
+        refinement = Refinement(args.levels, args.faces)
+        options = read_options(args, view, spp=args.spp)
+        fit = fit_shape(mesh, None, cameras, masks=masks, refinement=refinement, options=options)
         code = finish(fit, args.out)
         wait_for_close(view, fit)
     return code

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from .arguments import add_descent, add_live, add_mesh, add_views, count
-from .inputs import descent, read_background, read_mesh, read_views
+from .inputs import read_background, read_mesh, read_options, read_views
 from .outputs import finish, live_view, make_folder, wait_for_close
 
 
@@ -38,7 +38,8 @@ def run(args: argparse.Namespace) -> int:
     make_folder(args.out)
     with live_view(args) as view:
         fit = fit_texture(
-            mesh, cameras, pictures, args.size, masks=masks or None, background=background, callback=view, **descent(args)
+            mesh, pictures, cameras, args.size, masks=masks or None, background=background,
+            options=read_options(args, view, spp=args.spp),
         )  # fmt: skip
         code = finish(fit, args.out)
         wait_for_close(view, fit)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from .. import Camera, Mesh, Scene
+    from ..fit import FitOptions
     from ..fit.placement import Pose
 
 
@@ -88,7 +89,8 @@ def read_coverage(path: Path, label: int | None = None) -> Tensor:
 
 
 def read_labels(path: Path, count: int) -> list[Tensor]:
-    """Return (H, W) for each of so many meshes, where an image of labels has its number, from 1. Raises what read_mask raises."""
+    """Return (H, W) for each of so many meshes, where an image of labels has its number, from 1. Raises what read_mask
+    raises."""
     from .. import read_mask
 
     found = []
@@ -169,7 +171,8 @@ def check_not_black(mask: Tensor, path: Path) -> None:
 
 
 def read_pose(path: Path) -> Pose:
-    """Read what fit-pose or track writes, or mesh to world 4 × 4 by rows as JSON, text or .npy. Raises ValueError or OSError."""
+    """Read what fit-pose or track writes, or mesh to world 4 × 4 by rows as JSON, text or .npy. Raises ValueError or
+    OSError."""
     import numpy as np
 
     from ..files.paths import check_readable
@@ -281,8 +284,14 @@ def read_views(args: argparse.Namespace) -> tuple[list[Camera], list[Tensor], li
     return cameras, pictures, alphas
 
 
-def descent(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of a fit that arguments.add_descent asked for."""
-    return {
-        "steps": args.steps, "spp": args.spp, "seed": args.seed, "checkpoint": args.out / CHECKPOINT, "resume": args.resume,
-    }  # fmt: skip
+def read_options(args: argparse.Namespace, callback: Callable[[Any], Any] | None = None, **more: Any) -> FitOptions:
+    """Return the options of a fit whose steps, seed and checkpoint the arguments say. Without a checkpoint, --resume begins
+    anew and says so."""
+    from ..fit import Checkpoint, FitOptions
+
+    path = args.out / CHECKPOINT
+    resume = args.resume and path.exists()
+    if args.resume and not resume:
+        print(f"edgegrad: --resume: there is no {path}; the fit begins anew", file=sys.stderr)
+    checkpoint = Checkpoint(path, resume=resume)
+    return FitOptions(steps=args.steps, seed=args.seed, callback=callback, checkpoint=checkpoint, **more)

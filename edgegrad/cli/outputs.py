@@ -6,7 +6,7 @@ import argparse
 import errno
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ..fit.descent.result import Fit
     from ..fit.pose.fit_camera import CameraFit
     from ..fit.pose.result import PoseFit
+    from ..fit.rig.result import RigFit
     from ..live.view import Viewer
 
 
@@ -49,7 +50,7 @@ def live_view(args: argparse.Namespace) -> Iterator[Viewer | None]:
         yield view
 
 
-def wait_for_close(view: Viewer | None, fit: Fit | PoseFit | CameraFit) -> None:
+def wait_for_close(view: Viewer | None, fit: Fit | PoseFit | CameraFit | RigFit) -> None:
     """Show the result until the user closes the page, unless they ended the fit."""
     if view is not None and not fit.interrupted:
         view.show(fit)
@@ -94,14 +95,13 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
     return names
 
 
-def finish(fit: Fit, folder: Path, save: Callable[..., list[str]] | None = None, reason: str | None = None) -> int:
-    """Print how a fit by descent ended and save it, by its own reason and save() unless others are given; return the exit code.
-    Raises OSError."""
+def finish(fit: Fit | RigFit, folder: Path) -> int:
+    """Print how a fit by descent ended, save it, and return the exit code. Raises OSError."""
     from . import INTERRUPTED
     from .arguments import CHECKPOINT
 
-    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {reason or fit.reason}", flush=True)
-    written = [*(save or fit.save)(folder, figures=_can_draw()), CHECKPOINT]
+    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", flush=True)
+    written = [*fit.save(folder, figures=_can_draw()), CHECKPOINT]
     print(f"wrote {', '.join(written)} in {folder}")
     return INTERRUPTED if fit.interrupted else 0
 

@@ -57,7 +57,7 @@ def _rate(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Follow a mesh through the frames of a video, from its pose in the first one. poses.json is written every few frames;
     Ctrl-C and broken frames keep the poses so far."""
-    from ..fit import track
+    from ..fit import FitOptions, track
     from . import INTERRUPTED
 
     scene, init = read_scene(args), read_pose(args.init)
@@ -79,7 +79,8 @@ def run(args: argparse.Namespace) -> int:
     written: list[Path] = []
     interrupted = False
     try:
-        for pose in track(scene, watched(), camera, init.matrix, max_size=args.size, spp=args.spp, seed=args.seed):
+        options = FitOptions(max_size=args.size, spp=args.spp, seed=args.seed)
+        for pose in track(scene, watched(), camera, init.matrix, options=options):
             poses.append(pose)
             if pose.index % FRAMES_BETWEEN_WRITES == 0:
                 with suppress(OSError):  # the last copy reports errors

@@ -1,9 +1,12 @@
 from . import losses, priors, regularizers
+from .checkpoints import Checkpoint
 from .descent.fit_scene import fit_scene
-from .descent.fit_shape import fit_shape
+from .descent.fit_shape import Refinement, fit_shape
 from .descent.fit_texture import fit_texture
 from .hull import visual_hull
-from .options import Options, Parameter
+from .measured import Measured
+from .options import FitOptions
+from .parameter import Parameter
 from .placement import PoseParameter
 from .pose.calibrate import calibrate
 from .pose.fit_camera import fit_camera
@@ -14,6 +17,7 @@ from .rig.fit_rig import fit_rig
 from .rig.track_rig import track_rig
 
 __all__ = [
-    "Options", "Parameter", "PoseParameter", "calibrate", "fit_camera", "fit_pose", "fit_poses", "fit_rig", "fit_scene",
-    "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track", "track_rig", "visual_hull",
+    "Checkpoint", "FitOptions", "Measured", "Parameter", "PoseParameter", "Refinement", "calibrate", "fit_camera", "fit_pose",
+    "fit_poses", "fit_rig", "fit_scene", "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track", "track_rig",
+    "visual_hull",
 ]  # fmt: skip

@@ -1,4 +1,5 @@
-"""Checkpoints of fits: files that are written whole or not at all, and refused by any other fit than the one that wrote them."""
+"""Checkpoints of fits: files that are written whole or not at all, and refused by any other fit than the one that wrote
+them."""
 
 from __future__ import annotations
 
@@ -6,36 +7,70 @@ import dataclasses
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import dataclass
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 import torch
 
 from ..camera.camera import Camera
+from ..check import check_flag, check_positive_int
 from ..files.paths import PathLike, replacing
 from ..warnings import warn
-from .options import Options, Parameter
+from .parameter import Parameter
 from .placement import Placement
 from .views import Observation
 
-FORMAT = 9
-STEP_OPTIONS = (  # options that steps depend on
-    "loss", "mask_loss", "method", "views_per_step", "spp", "seed", "patience", "tolerance", "render",
-)  # fmt: skip
+FORMAT = 10
 
 
+@dataclass(frozen=True)
 class Checkpoint:
-    """The file of one fit, which the fit resumes from if `resumes` is True. `given` are the fit's arguments by name: tensors,
-    numbers, or dataclasses of them. Another fit is one with other arguments; functions are not compared."""
+    """The file in which a fit keeps its state.
 
-    def __init__(self, path: PathLike | None, resumes: bool, given: Mapping[str, Any]) -> None:
-        self.path, self._resumes = path, resumes
-        self._given = {} if path is None else {name: _digest(value) for name, value in given.items()}
+    Parameters
+    ----------
+    path : str or Path
+        The file, in a folder that exists. It is written whole or not at all.
+    every : int, default 25
+        Steps from one writing to the next. The state at the end is written too.
+    resume : bool, default False
+        Whether the fit goes on from the file, so that it ends as if it had never stopped. The file of a fit with other
+        arguments is refused. Where there is none, the fit begins anew and warns.
+
+    Raises
+    ------
+    TypeError, ValueError, FileNotFoundError
+        An argument has another type or range, or the folder does not exist.
+    """
+
+    path: PathLike
+    every: int = 25
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.path, (str, PurePath)):
+            raise TypeError(f"checkpoint: expected a path, got {type(self.path).__name__} ({self.path!r})")
+        check_positive_int("checkpoint.every", self.every)
+        check_flag("checkpoint.resume", self.resume)
+        if not (folder := Path(self.path).absolute().parent).is_dir():
+            raise FileNotFoundError(f"checkpoint: expected the folder {folder} to exist; make it first with Path.mkdir")
+
+
+class CheckpointFile:
+    """The file of one fit. `given` are the fit's arguments by name: tensors, numbers, or dataclasses of them. Another fit is
+    one with other arguments; functions are not compared."""
+
+    def __init__(self, checkpoint: Checkpoint | None, given: Mapping[str, Any]) -> None:
+        self.checkpoint, self._seed = checkpoint, given.get("seed")
+        self._given = {} if checkpoint is None else {name: _digest(value) for name, value in given.items()}
 
     @staticmethod
-    def from_fit(options: Options, views: Sequence[Observation], given: Mapping[str, Any]) -> Checkpoint:
-        """Return the checkpoint of a descent; `given` are the arguments that options and views do not hold."""
+    def from_views(
+        checkpoint: Checkpoint | None, views: Sequence[Observation], given: Mapping[str, Any]
+    ) -> CheckpointFile:
+        """Return the file of a descent; `given` are the arguments that the views do not hold."""
         of_views = {
             "cameras": [traits(view.camera) for view in views],
             "images": [view.image for view in views],
@@ -44,57 +79,74 @@ class Checkpoint:
         }
         if any(view.measured for view in views):
             of_views["measured"] = [dict(view.measured) for view in views]
-        of_options = {name: getattr(options, name) for name in STEP_OPTIONS}
-        return Checkpoint(options.checkpoint, options.resume, {**given, **of_views, **of_options})
+        return CheckpointFile(checkpoint, {**given, **of_views})
 
     def read(self) -> dict[str, Any] | None:
         """Return the state to go on from, or None to begin. Raises ValueError for a file that is no checkpoint, or another
         fit's."""
-        if not self._resumes or self.path is None or not Path(self.path).exists():
+        if self.checkpoint is None or not self.checkpoint.resume:
             return None
-        try:
-            state = torch.load(self.path, weights_only=True)
-        except Exception as error:  # torch raises errors of many kinds for a damaged file
-            raise ValueError(
-                f"{self.path}: expected a checkpoint of a fit, got something else ({type(error).__name__}); "
-                "remove it, or leave out resume"
-            ) from error
-        made = state.get("format") if isinstance(state, dict) else None
-        if isinstance(made, int) and made != FORMAT:
-            raise ValueError(
-                f"{self.path}: expected a checkpoint of format {FORMAT}, got {made}, which another version of edgegrad wrote; go "
-                "on with that version, or remove it to begin anew"
+        path = self.checkpoint.path
+        if (content := _content(path)) is None:
+            warn(
+                f"no checkpoint {path}",
+                f"checkpoint: expected {path} to go on from, got no such file; the fit begins anew and writes it",
             )
-        found = state.get("given") if made == FORMAT else None
-        if not isinstance(found, dict) or "state" not in state:
-            raise ValueError(
-                f"{self.path}: expected a checkpoint of a fit, got something else; remove it, or leave out resume"
-            )
+            return None
+        found = content["given"]
         if other := [name for name in {**self._given, **found} if self._given.get(name) != found.get(name)]:
             raise ValueError(
-                f"resume: expected {self.path} to be a checkpoint of this fit, got one that was made with another "
-                f"{', '.join(other)}; give what it was made with, or remove it to begin anew"
+                f"checkpoint: expected {path} to be of this fit, got one that was made with another {', '.join(other)}; give "
+                "what it was made with, or remove it to begin anew"
             )
-        return state["state"]
+        return content["state"]
 
     def write(self, state: dict[str, Any]) -> None:
         """Write the state. If that fails, as on a full disk, the fit goes on with a warning."""
-        if self.path is None:
+        if self.checkpoint is None:
             return
-        content = io.BytesIO()  # torch's own errors of writing do not give the reason
-        torch.save({"format": FORMAT, "given": self._given, "state": state}, content)
+        path, content = self.checkpoint.path, io.BytesIO()  # torch's own errors of writing do not give the reason
+        torch.save({"format": FORMAT, "given": self._given, "seed": self._seed, "state": state}, content)
         try:
-            with replacing(self.path) as temporary:
+            with replacing(path) as temporary:
                 temporary.write_bytes(content.getbuffer())
         except OSError as error:
             warn(
-                f"checkpoint {self.path}",
-                f"checkpoint: expected to write {self.path}, got: {error.strerror or error}; the fit goes on without",
+                f"checkpoint {path}",
+                f"checkpoint: expected to write {path}, got: {error.strerror or error}; the fit goes on without",
             )
 
 
+def saved_seed(checkpoint: Checkpoint | None) -> int | None:
+    """Return the seed of the fit that goes on, or None. Raises ValueError for a file that is no checkpoint."""
+    content = None if checkpoint is None or not checkpoint.resume else _content(checkpoint.path)
+    return None if content is None else content["seed"]
+
+
+def _content(path: PathLike) -> dict[str, Any] | None:
+    """Return what a checkpoint holds, or None where there is no file. Raises ValueError."""
+    if not Path(path).exists():
+        return None
+    fix = "remove it, or leave out resume"
+    try:
+        content = torch.load(path, weights_only=True)
+    except Exception as error:  # torch raises errors of many kinds for a damaged file
+        raise ValueError(
+            f"{path}: expected a checkpoint of a fit, got something else ({type(error).__name__}); {fix}"
+        ) from error
+    made = content.get("format") if isinstance(content, dict) else None
+    if isinstance(made, int) and made != FORMAT:
+        raise ValueError(
+            f"{path}: expected a checkpoint of format {FORMAT}, got {made}, which another version of edgegrad wrote; go on with "
+            "that version, or remove it to begin anew"
+        )
+    if made != FORMAT or not isinstance(content.get("given"), dict) or not {"state", "seed"} <= content.keys():
+        raise ValueError(f"{path}: expected a checkpoint of a fit, got something else; {fix}")
+    return content
+
+
 def traits(camera: Camera) -> tuple[Any, ...]:
-    """Return all that a camera consists of, for Checkpoint."""
+    """Return all that a camera consists of, for CheckpointFile."""
     return camera, camera.size, camera.projection, camera.lens
 
 

@@ -21,8 +21,8 @@ MIN_PIECE = 0.01  # of the largest piece's faces; smaller pieces are dropped
 
 
 def visual_hull(
-    cameras: Camera | Sequence[Camera],
     masks: Images,
+    cameras: Camera | Sequence[Camera],
     resolution: int = 96,
     faces: int | None = None,
     bounds: Tensor | None = None,
@@ -31,16 +31,28 @@ def visual_hull(
 
     As the start of fit_shape() it has the object's holes, and its parts where some view shows them apart.
 
-    cameras     at least two that look at the object from different sides
-    masks       (H, W) each, 1 on the object, 0 elsewhere; nothing is cut away beyond a side of an image that its mask touches,
-                for the object may go on there
-    resolution  cells on the longest side of the box around the object; smaller details are lost
-    faces       about so many even triangles; few are best for the first level of fit_shape(). None: those of the cells
-    bounds      (2, 3) opposite corners of a box that holds the object; None: found from the cameras
+    Parameters
+    ----------
+    masks : Tensor or sequence of Tensor
+        (H, W) each, 1 on the object, 0 elsewhere. Nothing is cut away beyond a side of an image that its mask touches, for the
+        object may go on there.
+    cameras : sequence of Camera
+        At least two that look at the object from different sides.
+    resolution : int, default 96
+        Cells on the longest side of the box around the object; smaller details are lost.
+    faces : int, optional
+        About so many even triangles; few are best for the first level of fit_shape(). By default those of the cells.
+    bounds : Tensor, optional
+        (2, 3) opposite corners of a box that holds the object. By default it is found from the cameras.
 
-    The surface is found by marching cubes at a mask of one half (Lorensen and Cline 1987). Pieces with less than 1 % of the
-    faces of the largest piece are dropped. Needs gpytoolbox (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError
-    that names the argument, ImportError.
+    Raises
+    ------
+    TypeError, ValueError, ImportError
+        An argument is wrong; the message names it. Or gpytoolbox is missing (`pip install 'edgegrad[fit]'`).
+
+    Notes
+    ----- The surface is found by marching cubes at a mask of one half (Lorensen and Cline 1987). Pieces with less than 1 % of
+    the faces of the largest piece are dropped.
     """
     check_int("resolution", resolution, 4, 512)
     if faces is not None:

@@ -53,7 +53,7 @@ def robust(
     With x = r/scale, alpha 2 is l2, 1 a smooth l1, 0 Cauchy's log(½ x² + 1), −2 Geman and McClure's 2x² / (x² + 4), and −∞
     Welsch's 1 − exp(−½ x²). At 0 and below, residuals far beyond `scale` hardly count, whatever hides the object there. The
     noise of the render must be well below `scale`: rare bright samples, as of glossy surfaces under small lights, would be
-    dropped too and bias the fit. Raise spp and light_samples first.
+    dropped too and bias the fit. Raise spp and Sampling.lights first.
     """
     square = ((image - target) / scale).square()
     if alpha == 2.0:
@@ -125,7 +125,7 @@ def loss_of(name: str, loss: str | Loss) -> Loss:
     if not isinstance(loss, str):
         raise TypeError(f"{name}: expected a name or a function of image, target and weight, got {type(loss).__name__}")
     if loss not in LOSSES:
-        known = ", ".join([*LOSSES, REGION] if name == "loss" else LOSSES)
+        known = ", ".join([*LOSSES, REGION] if name.endswith(".loss") else LOSSES)
         raise ValueError(f"{name}: expected one of {known}, or a function, got {loss!r}")
     return LOSSES[loss]
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..camera.camera import Camera
 from ..check import as_tensor, check_float, check_positive, check_shape
+from .by_camera import numbered, one_for_each
 
 # Arguments stand for these channels of render_aovs().
 CHANNELS = {"depths": "depth", "normals": "shading_normal", "positions": "position"}
@@ -27,16 +28,25 @@ MAD = 1.4826  # standard deviation of Gaussian noise over the median of its size
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Measured depths, normals or positions, and how far to trust them.
+    """Measured depths, normals, positions or keypoints, and how far to trust them.
 
-    values   for each camera (H, W), (H, W, 1) or (H, W, 3), or None where it has none; a pixel that is not finite, or 0 (for
-             normals and positions in all three), is not measured
-    weights  for each camera (H, W) or (H, W, 1), ≥ 0: how much a pixel counts, as a sensor's confidence says; None: 1
-    factor   weight of all of them relative to masks and colours
-    scale    residuals up to about this are noise, in the units of `values`; much larger ones count as outliers once most are
-             below. None: the width of a pixel at the object, and 0.1 for normals
+    Parameters
+    ----------
+    values : Tensor or sequence
+        For each camera (H, W), (H, W, 1) or (H, W, 3), or None where it has none. A pixel that is not finite, or 0 (of normals
+        and positions in all three), is not measured. Of keypoints pixels by the joints' names.
+    weights : Tensor or sequence, optional
+        For each camera (H, W) or (H, W, 1), ≥ 0: how much a pixel counts, as a sensor's confidence says; by default 1.
+    factor : float, default 1.0
+        Weight of all of them relative to their usual one.
+    scale : float, optional
+        Residuals up to about this are noise, in the units of `values`; much larger ones count as outliers once most are below.
+        By default the width of a pixel at the object, and 0.1 for normals.
 
-    Raises TypeError or ValueError that names the argument.
+    Raises
+    ------
+    TypeError, ValueError
+        A number is none, or out of range.
     """
 
     values: Any
@@ -84,11 +94,12 @@ def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[di
         if value is None:
             continue
         trust = value if isinstance(value, Measured) else Measured(value)
-        pictures = _each(name, trust.values, cameras)
-        weights = _each(f"weights of {name}", trust.weights, cameras)
+        dims = 2 if WIDTHS[CHANNELS[name]] == 1 else 3
+        pictures = one_for_each(name, trust.values, len(cameras), dims)
+        weights = one_for_each(f"weights of {name}", trust.weights, len(cameras), 2)
         checked: dict[int, tuple[Tensor, Tensor]] = {}
         for i, (picture, weight, camera) in enumerate(zip(pictures, weights, cameras, strict=True)):
-            where = name if len(cameras) == 1 else f"{name}[{i}]"
+            where = numbered(name, i, len(cameras))
             if picture is not None:
                 checked[i] = _checked(where, picture, weight, WIDTHS[CHANNELS[name]], camera.size)
             elif weight is not None:
@@ -108,21 +119,9 @@ def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[di
     return found
 
 
-def _each(name: str, value: Any, cameras: Sequence[Camera]) -> list[Any]:
-    """Return one for each camera. Raises ValueError."""
-    if value is None:
-        return [None] * len(cameras)
-    single = len(cameras) == 1 and not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) < 4
-    given = [value] if single else value
-    if len(given) != len(cameras):
-        raise ValueError(
-            f"{name}: expected {len(cameras)}, one for each camera, got {len(given)}; None where one has none"
-        )
-    return list(given)
-
-
 def _checked(name: str, picture: Any, weight: Any, width: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return values (H, W, width) and weights (H, W, 1), both zero where nothing was measured. Raises TypeError or ValueError."""
+    """Return values (H, W, width) and weights (H, W, 1), both zero where nothing was measured. Raises TypeError or
+    ValueError."""
     fix = "the camera must have the picture's size: camera.resized((H, W))"
     value = as_tensor(name, picture).detach().cpu()
     if not value.is_floating_point():

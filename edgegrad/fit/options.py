@@ -1,147 +1,180 @@
-"""The parameters and options of fits by descent."""
+"""Options that all fits share: what a user sets, and what a fit makes of it."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePath
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-import torch
-from torch import Tensor
-
-from ..aovs import render_aovs
-from ..check import as_tensor, check_finite, check_float, check_int, check_positive, check_positive_int
+from ..check import check_flag, check_int, check_positive
 from ..files.paths import PathLike
-from .history import Record
+from ..sampling import Sampling, drawn_seed
+from .checkpoints import Checkpoint, saved_seed
 from .losses import REGION, Loss, loss_of
 
 METHODS = ("adam", "gauss-newton")
-RENDER = tuple(inspect.signature(render_aovs).parameters)[3:]
+MIN_PICTURE_SIDE = 8  # Pixels on the shorter side of a picture: fewer show no contour.
+RANGES = {
+    **dict.fromkeys(("steps", "spp", "patience", "views_per_step"), (1, 2**31 - 1)), "seed": (0, 2**32 - 1),
+    "max_size": (MIN_PICTURE_SIDE, 2**31 - 1), "coarsest": (4, 65536),
+}  # fmt: skip
+# Options that only some fits use, and why others leave them out.
+POSE_OPTIONS = ("steps", "step_tolerance", "spp", "max_size", "callback")
+DESCENT_OPTIONS = (
+    "steps", "loss_tolerance", "patience", "spp", "views_per_step", "loss", "mask_loss", "method", "callback", "checkpoint",
+    "sampling", "shadows", "bounces",
+)  # fmt: skip
+UNUSED = {
+    "steps": "takes as many steps as each picture needs",
+    "step_tolerance": "ends by its loss, as options.loss_tolerance says",
+    **dict.fromkeys(("loss_tolerance", "patience"), "ends by the length of its steps, as options.step_tolerance says"),
+    "max_size": "compares pictures at their own size, which camera.resized() changes",
+    "views_per_step": "compares all views in each step",
+    **dict.fromkeys(("loss", "mask_loss", "method"), "has a loss and steps of its own"),
+    "coarsest": "chooses its levels of resolution",
+    "callback": "gives its results one by one to your loop",
+    "checkpoint": "keeps no state in files",
+    **dict.fromkeys(("sampling", "shadows", "bounces"), "compares colours without light"),
+}
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """A tensor to find, and how it moves.
+class FitOptions:
+    """Options of all fits. What is None takes the fit's own default, which its description names.
 
-    lr       learning rate: about how far each number moves in a step, in its own units
-    value    where the fit starts; None: the scene's tensor of this name
-    low      lower bound, a number or a tensor that broadcasts; None: none
-    high     upper bound, likewise
-    uniform  one step size for all numbers of the tensor, as coordinates of one surface need; False: one for each number
+    A fit refuses options that it does not use. The main ones are `steps`, `spp`, `seed`, `progress` and `callback`.
+
+    Parameters
+    ----------
+    steps : int
+        Largest number of steps; of fits on several levels, on each.
+    step_tolerance : float
+        Poses and cameras: a step is short below this, in radians, sizes of the object, and logarithms of scale and focal
+        length.
+    loss_tolerance, patience : float and int, default 0.01 and 40
+        Descents end where `patience` more steps would lower the loss by less than this share of it, or by less than its noise.
+        0: all steps are taken.
+    spp : int
+        Samples a pixel.
+    seed : int
+        Of all samples. By default torch's generator draws it, or it is that of the checkpoint.
+    max_size : int
+        Larger pictures are reduced to so many pixels on their longer side.
+    views_per_step : int
+        Number of views in each step, drawn anew. By default all are compared.
+    loss, mask_loss : str or function, default "l2"
+        Between render and picture, and between alpha and mask: "l1", "l2", "huber", "robust", "ssim", for masks "iou", or a
+        function of image, target and weight, as in edgegrad.fit.losses. "region" finds the object in photographs by its
+        colours.
+    method : "adam" or "gauss-newton"
+        The latter takes far fewer steps, for up to 400 numbers, all views in each step, and losses of single pixels.
+    progress : bool, default True
+        Whether a bar with the loss is shown on standard error.
+    callback : function
+        Called after each step with the result so far; of descents with the step's record, which has `scene` and `cameras`.
+        KeyboardInterrupt from it ends the fit with its best result.
+    checkpoint : Checkpoint or path
+        A file for the fit's state.
+    sampling, shadows, bounces : Sampling, bool, int
+        As render() takes them.
+    coarsest : int, default 16
+        Pixels on the shorter side of the pictures on the first level of fit_rig(); each further level has twice as many.
     """
 
-    lr: float
-    value: Tensor | None = None
-    low: float | Tensor | None = None
-    high: float | Tensor | None = None
-    uniform: bool = False
+    steps: int | None = None
+    step_tolerance: float | None = None
+    loss_tolerance: float | None = None
+    patience: int | None = None
+    spp: int | None = None
+    seed: int | None = None
+    max_size: int | None = None
+    views_per_step: int | None = None
+    loss: str | Loss | None = None
+    mask_loss: str | Loss | None = None
+    method: str | None = None
+    progress: bool = True
+    callback: Callable[[Any], Any] | None = None
+    checkpoint: Checkpoint | PathLike | None = None
+    sampling: Sampling | None = None
+    shadows: bool | None = None
+    bounces: int | None = None
+    coarsest: int | None = None
 
-    def checked(self, name: str) -> Parameter:
-        """Return a copy with a value of its own on the CPU. Raises TypeError or ValueError."""
-        check_positive(f"{name}: lr", self.lr, least=0.0, most=1e30)
-        if self.value is None:
-            raise ValueError(f"{name}: expected a value to start from, got None; give Parameter(lr, value)")
-        value = as_tensor(name, self.value, floating=True).detach().cpu().clone()
-        check_float(name, value)
-        check_finite(name, value)
-        if self.low is not None and self.high is not None:
-            low, high = torch.as_tensor(self.low), torch.as_tensor(self.high)
-            if bool((low > high).any()):
-                raise ValueError(f"{name}: expected low ≤ high, got {self.low} and {self.high}")
-        if not torch.equal(self.within(value), value):
-            raise ValueError(
-                f"{name}: expected a start within low and high, {self.low} and {self.high}, got {float(value.min()):g} to "
-                f"{float(value.max()):g}; clamp it first"
+    def __post_init__(self) -> None:
+        for name, (least, most) in RANGES.items():
+            if (number := getattr(self, name)) is not None:
+                check_int(f"options.{name}", number, least, most)
+        for name, smallest in (("loss_tolerance", 0.0), ("step_tolerance", 1e-30)):
+            if (number := getattr(self, name)) is not None:
+                check_positive(f"options.{name}", number, least=smallest, most=1.0)
+        if self.method not in (None, *METHODS):
+            raise ValueError(f"options.method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+        if self.loss not in (None, REGION):
+            loss_of("options.loss", self.loss)
+        if self.mask_loss is not None:
+            loss_of("options.mask_loss", self.mask_loss)
+        check_flag("options.progress", self.progress)
+        if self.callback is not None and not callable(self.callback):
+            raise TypeError(
+                f"options.callback: expected a function of the result so far, got {type(self.callback).__name__}"
             )
-        return replace(self, value=value)
+        if not isinstance(self.sampling, Sampling | None):
+            raise TypeError(f"options.sampling: expected a Sampling, got {type(self.sampling).__name__}")
+        _checkpoint(self.checkpoint)
 
-    def within(self, value: Tensor) -> Tensor:
-        low, high = (
-            b if b is None or isinstance(b, Tensor) else torch.as_tensor(b, dtype=value.dtype)
-            for b in (self.low, self.high)
-        )
-        return value if low is None and high is None else value.clamp(low, high)
+
+def _checkpoint(given: Checkpoint | PathLike | None) -> Checkpoint | None:
+    return given if given is None or isinstance(given, Checkpoint) else Checkpoint(given)
 
 
 @dataclass(frozen=True)
-class Options:
-    """Options of all fits by descent.
+class Settings:
+    """The options of one fit, as FitOptions has them, with its defaults in place of None."""
 
-    loss              between render and picture: "l1", "l2", "huber", "robust", "ssim", or a function of image, target and
-                      weight; edgegrad.fit.losses has more, with their parameters. "robust" is for what the render lacks, not
-                      for noise of glossy light. "region" is for photographs without masks in unknown light: the object is where
-                      the colours are that lie within its silhouette, counted near the contour. It moves shapes, poses and
-                      cameras, and takes all meshes of the scene for the object; the scene's own colours do not count. Colours
-                      are counted every three steps
-    mask_loss         between alpha and mask: one of the same, or "iou"
-    method            "adam", for any count of numbers; or "gauss-newton", for up to 400: far fewer steps, each with the
-                      derivative by every number in forward mode. It needs all views in each step, and a loss that compares each
-                      pixel by itself (not "ssim", "iou" or a pyramid); a step moves no number by more than ten learning rates
-    steps             largest number of steps
-    views_per_step    number of views in each step, drawn anew; None: all
-    spp               samples per pixel
-    seed              of the samples; the same seed gives the same fit
-    patience          number of steps over which the fit predicts the decrease of its loss, from gradients at the end of the
-                      last steps
-    tolerance         the fit ends if that decrease is less than this share of the loss, or of its decrease so far, or less than
-                      its noise; "adam" first shortens its steps, three times. 0: the fit takes all its steps
-    progress          show a bar with the loss on standard error
-    callback          called after each step with its Record, a Progress with scene and cameras; KeyboardInterrupt from it ends
-                      the fit
-    checkpoint        file for the fit's state, written every `checkpoint_every` steps and at the end, never in part; None: no
-                      file
-    checkpoint_every  steps
-    resume            go on from the checkpoint if there is one: the fit ends as if it had never stopped. A checkpoint of a fit
-                      with other arguments is refused
-    render            further arguments of render(), such as sampling
-    """
-
+    steps: int = 500
+    step_tolerance: float = 3e-4
+    loss_tolerance: float = 0.01
+    patience: int = 40
+    spp: int = 16
+    seed: int = 0
+    max_size: int = 256
+    views_per_step: int | None = None
     loss: str | Loss = "l2"
     mask_loss: str | Loss = "l2"
     method: str = "adam"
-    steps: int = 500
-    views_per_step: int | None = None
-    spp: int = 16
-    seed: int = 0
-    patience: int = 40
-    tolerance: float = 0.01
     progress: bool = True
-    callback: Callable[[Record], Any] | None = None
-    checkpoint: PathLike | None = None
-    checkpoint_every: int = 25
-    resume: bool = False
-    render: Mapping[str, Any] = field(default_factory=dict)
+    callback: Callable[[Any], Any] | None = None
+    checkpoint: Checkpoint | None = None
+    sampling: Sampling | None = None
+    shadows: bool | None = None
+    bounces: int | None = None
+    coarsest: int = 16
 
-    def __post_init__(self) -> None:
-        for name in ("steps", "spp", "patience"):
-            check_positive_int(name, getattr(self, name))
-        if self.views_per_step is not None:
-            check_positive_int("views_per_step", self.views_per_step)
-        if self.method not in METHODS:
-            raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
-        check_int("seed", self.seed, 0, 2**32 - 1)
-        check_positive("tolerance", self.tolerance, least=0.0, most=1.0)
-        for name in ("loss", "mask_loss"):
-            if name != "loss" or self.loss != REGION:
-                loss_of(name, getattr(self, name))
-        if self.callback is not None and not callable(self.callback):
-            raise TypeError(f"callback: expected a function of a Record, got {type(self.callback).__name__}")
-        own = ("spp", "seed")
-        if unknown := [name for name in self.render if name not in RENDER or name in own]:
-            fix = "; it is an option of its own" if unknown[0] in own else ""
-            known = ", ".join(name for name in RENDER if name not in own)
-            raise ValueError(f"render: expected arguments of render() among {known}, got {unknown[0]!r}{fix}")
-        check_checkpoint(self.checkpoint, self.checkpoint_every, self.resume)
+    @staticmethod
+    def from_options(options: FitOptions | None, fit: str, used: tuple[str, ...], **defaults: Any) -> Settings:
+        """Return the settings of a fit that uses some options. Raises TypeError, or ValueError for an option that it does not
+        use."""
+        given = FitOptions() if options is None else options
+        if not isinstance(given, FitOptions):
+            raise TypeError(f"options: expected FitOptions, got {type(given).__name__}; give FitOptions(steps=…)")
+        set_ones = {name: value for name, value in vars(given).items() if value is not None}
+        for name in set_ones:
+            if name in UNUSED and name not in used:
+                raise ValueError(f"options.{name}: {fit} {UNUSED[name]}; leave it out")
+        checkpoint = _checkpoint(given.checkpoint)
+        seed = saved_seed(checkpoint) if given.seed is None else given.seed
+        seed = int(drawn_seed()) % 2**32 if seed is None else seed
+        return Settings(**{**defaults, **set_ones, "seed": seed, "checkpoint": checkpoint})
 
+    @property
+    def of_steps(self) -> dict[str, Any]:
+        """The settings of a descent that its steps depend on."""
+        names = ("loss", "mask_loss", "method", "views_per_step", "spp", "seed", "patience", "loss_tolerance")
+        return {name: getattr(self, name) for name in (*names, "sampling", "shadows", "bounces")}
 
-def check_checkpoint(checkpoint: PathLike | None, every: int, resume: bool) -> None:
-    """Check arguments for checkpoints. Raises TypeError, ValueError or FileNotFoundError."""
-    check_positive_int("checkpoint_every", every)
-    if resume and checkpoint is None:
-        raise ValueError("resume: expected a checkpoint to go on from, got none; give checkpoint=path")
-    if checkpoint is not None and not isinstance(checkpoint, (str, PurePath)):
-        raise TypeError(f"checkpoint: expected a path, got {type(checkpoint).__name__} ({checkpoint!r})")
-    if checkpoint is not None and not (folder := Path(checkpoint).absolute().parent).is_dir():
-        raise FileNotFoundError(f"checkpoint: expected the folder {folder} to exist; make it first with Path.mkdir")
+    @property
+    def render(self) -> dict[str, Any]:
+        """Further arguments of render_aovs()."""
+        return {
+            name: value for name in ("sampling", "shadows", "bounces") if (value := getattr(self, name)) is not None
+        }

@@ -15,7 +15,7 @@ from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..scene.symmetries import Symmetries
 from .history import Record
-from .options import Parameter
+from .parameter import Parameter
 
 
 class Pose(NamedTuple):
@@ -53,19 +53,51 @@ class Pose(NamedTuple):
         return Pose(R.reshape(3, 3), t, scale[0], focal[0], principal, distortion)
 
 
+def pose_from_matrix(name: str, matrix: object) -> Pose:
+    """Return the pose of a 4 × 4 similarity for column vectors. Raises TypeError or ValueError."""
+    if not isinstance(matrix, Tensor):
+        try:
+            matrix = torch.tensor(matrix, dtype=torch.float64)  # Lists would become float32.
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name}: expected 4 × 4 numbers, got something else ({error})") from error
+    M = matrix.detach().cpu().double()
+    check_shape(name, M, (4, 4))
+    check_finite(name, M)
+    if M[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        raise ValueError(f"{name}: expected the last row 0, 0, 0, 1, got {M[3].tolist()}; is it transposed?")
+    det = float(torch.linalg.det(M[:3, :3]))
+    if det <= 0:
+        raise ValueError(f"{name}: expected a rotation times a scale above 0, got determinant {det:.3g}; flip one axis")
+    scale = det ** (1 / 3)
+    R = M[:3, :3] / scale
+    # 1e-3 is far above what rounding to six digits leaves, and far below any intended shear.
+    if (error := float((R @ R.T - torch.eye(3)).abs().max())) > 1e-3:
+        raise ValueError(
+            f"{name}: expected a rotation times a scale, got |R Rᵀ − 1| up to {error:.2g}; remove the shear"
+        )
+    U, _, Vh = torch.linalg.svd(R)
+    one = torch.ones((), dtype=torch.float64)
+    return Pose(U @ Vh, M[:3, 3].clone(), scale * one, one)
+
+
 @dataclass(frozen=True, eq=False)
 class PoseParameter:
     """A pose to find, in steps of a rotation vector about the object's centre and a shift in sizes of the object.
 
-    start     initial pose, (R, t), (R, t, scale) or a Pose; None: the vertices stay where they are
-    of        the object, a Mesh or a Scene: centre and size are those of its bounding box. None: the part of the scene that the
-              parameter's name names
-    rotation  learning rate, about radians per step
-    shift     learning rate, about sizes of the object (diagonals of its bounding box) per step
-    scale     learning rate of the logarithm of the scale; None: the scale is fixed
+    Parameters
+    ----------
+    init : PoseFit, Tensor or tuple, optional
+        An earlier fit, mesh to world (4, 4), (R, t) or (R, t, scale). By default the vertices stay where they are.
+    of : Mesh or Scene, optional
+        The object: centre and size are those of its bounding box. By default the part of the scene that the parameter's name
+        names.
+    rotation, shift : float, default 0.01
+        Learning rates, about radians, and sizes of the object (diagonals of its bounding box), per step.
+    scale : float, optional
+        Learning rate of the logarithm of the scale, which is fixed by default.
     """
 
-    start: tuple[Tensor, ...] | None = None
+    init: Any = None
     of: Mesh | Scene | None = None
     rotation: float = 0.01
     shift: float = 0.01
@@ -88,17 +120,17 @@ class PoseParameter:
         size = float((high - low).norm())
         if size == 0.0:
             raise ValueError(f"{name}: of: expected an object with a size, got all vertices at one place")
-        return Placement(self, _checked(name, self.start), 0.5 * (low + high), size, meshes[0].verts.dtype)
+        return Placement(self, _checked(name, self.init), 0.5 * (low + high), size, meshes[0].verts.dtype)
 
 
-def _checked(name: str, start: object) -> Pose:
+def _checked(name: str, init: Any) -> Pose:
     """Return the pose in float64 on the CPU. Raises TypeError or ValueError."""
     f64 = torch.float64
-    if start is None:
+    if init is None:
         return Pose(torch.eye(3, dtype=f64), torch.zeros(3, dtype=f64))
-    if not isinstance(start, tuple) or not 2 <= len(start) <= 6:
-        raise TypeError(f"{name}: start: expected a tuple (R, t), got {type(start).__name__}; R is (3, 3), and t (3,)")
-    R, t, scale = (torch.as_tensor(x).detach().cpu().to(f64, copy=True) for x in Pose(*start)[:3])
+    if not isinstance(init, tuple) or not 2 <= len(init) <= 6:
+        return pose_from_matrix(f"{name}: init", getattr(init, "matrix", init))
+    R, t, scale = (torch.as_tensor(x).detach().cpu().to(f64, copy=True) for x in Pose(*init)[:3])
     for part, value, shape in (("R", R, (3, 3)), ("t", t, (3,)), ("scale", scale, ())):
         check_shape(f"{name}: {part}", value, shape)
         check_finite(f"{name}: {part}", value)

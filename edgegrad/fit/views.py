@@ -17,9 +17,10 @@ from ..check import as_tensor, check_finite, check_float, check_shape
 from ..files.image import linear_to_srgb
 from ..scene.tree import map_tensors
 from ..warnings import warn
+from .by_camera import numbered, one_for_each
 from .measured import Measurement, area_mean, measurements
 
-Images = Tensor | Sequence[Tensor]
+Images = Tensor | Sequence[Tensor | None]
 FULL = 0.98  # a pixel with a higher mask is covered
 FILL_REACH = 8  # pixels by which colours grow into partly covered ones
 WITH_ALPHA = 2, 4  # channels of pictures with alpha
@@ -103,8 +104,13 @@ def views_of(
     In a sequence of any of them None stands where a camera has none.
     """
     split = cameras_of(cameras)
+    n = len(split)
     pictures, shapes, counts = (
-        _images(name, value, split) for name, value in (("images", images), ("masks", masks), ("weights", weights))
+        [
+            None if one is None else check_image(numbered(name, k, n), one, split[k].size)
+            for k, one in enumerate(one_for_each(name, value, n, dims))
+        ]
+        for name, value, dims in (("images", images, 3), ("masks", masks, 2), ("weights", weights, 2))
     )
     by_camera = measurements(measured or {}, split)
     views = []
@@ -160,7 +166,7 @@ def _counted(measured: dict[str, Measurement], mask: Tensor | None, weight: Tens
 def cameras_of(cameras: object) -> list[Camera]:
     """Return cameras one by one, as copies on the CPU. Raises TypeError."""
     given = [cameras] if isinstance(cameras, Camera) else cameras
-    if not isinstance(given, Sequence):
+    if not isinstance(given, Sequence) or isinstance(given, str):
         raise TypeError(f"cameras: expected a Camera or a sequence of them, got {type(cameras).__name__}")
     if not given:
         raise ValueError("cameras: expected one for each picture, got an empty list; give at least one")
@@ -181,22 +187,6 @@ def part_of(camera: Camera, k: int) -> Camera:
     return camera.replace(
         **{name: v[k] if v is not None and v.dim() == fields[name] else v for name, v in values.items()}
     )
-
-
-def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | None]:
-    """Return (H, W, c) float32 on the CPU, one for each camera. Raises TypeError or ValueError."""
-    if value is None:
-        return [None] * len(cameras)
-    if len(cameras) == 1 and isinstance(value, (list, tuple)) and len(value) > 1 and hasattr(value[0], "ndim"):
-        raise ValueError(f"{name}: expected one for each camera, got {len(value)} and one camera; give as many cameras")
-    single = len(cameras) == 1 and not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) < 4
-    given: Any = [value] if single else value
-    if len(given) != len(cameras):
-        raise ValueError(f"{name}: expected {len(cameras)}, one for each camera, got {len(given)}")
-    return [
-        None if image is None else check_image(name if single else f"{name}[{i}]", image, camera.size)
-        for i, (image, camera) in enumerate(zip(given, cameras, strict=True))
-    ]
 
 
 def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:

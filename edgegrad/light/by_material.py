@@ -17,6 +17,10 @@ def points_by_material(hits: Hits, light: Light, samples: int) -> list[LightPoin
     Those of a light whose shadow boundary is sampled are given. For hits of trace(), each of which has another viewer, they are
     drawn by what the light emits.
     """
+    if not isinstance(hits, Hits):
+        raise TypeError(f"hits: expected Hits, got {type(hits).__name__}")
+    if not isinstance(light, Light):
+        raise TypeError(f"light: expected one of hits.lights, got {type(light).__name__}")
     if light.punctual or hits._knows_light(light) or not isinstance(hits._view, CameraView):
         return [hits.light_points(light, k, samples) for k in range(samples)]
     return in_kernel.light_points(hits, light, samples)

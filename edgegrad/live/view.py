@@ -41,7 +41,7 @@ def viewer(port: int = 8080, host: str = "127.0.0.1", *, server: bool | None = N
 
         with eg.viewer() as view:
             print(view.url)
-            fit = eg.fit.fit_pose(mesh, image, camera, callback=view)
+            fit = eg.fit.fit_pose(mesh, image, camera, options=eg.fit.FitOptions(callback=view))
 
     port     of the page, or the next free one; 0: any
     host     address of the page. "127.0.0.1" is visible on this computer alone; "0.0.0.0" to all who reach it, without a

@@ -357,7 +357,9 @@ class Hits:
         sides of an edge, get the same numbers. Those of successive points, and of the `parts` of one point, fill the unit cube
         evenly (a Kronecker sequence with the powers of the generalised golden ratio of three dimensions). Each `stream` gives
         other numbers."""
-        return uniform(self._seed * parts + part, n, stream)
+        n, parts = check_int("n", n, 0, 1 << 16), check_int("parts", parts, 1, 1 << 31)
+        part = check_int("part", part, 0, parts - 1)
+        return uniform(self._seed * parts + part, n, check_int("stream", stream, 0, 1 << 31))
 
     def light_points(
         self, light: Light, sample: int = 0, samples: int = 1, by: LightSampler | None = None

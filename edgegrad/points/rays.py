@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_finite, check_float, check_shape
+from ..check import as_tensor, check_finite, check_float, check_not_meta, check_shape
 from ..kernel.derivatives import moves
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene, as_scene
@@ -30,6 +30,7 @@ def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
     for name, value in (("origins", origins), ("directions", directions)):
         tensor = as_tensor(name, value, like=like, floating=True)
         check_float(name, tensor)
+        check_not_meta(name, tensor)
         check_shape(name, tensor, (len(tensor) if tensor.dim() == 2 and len(tensor) == 0 else "N", 3), (3,))
         check_finite(name, tensor, largest=1e30)
         given[name] = tensor.to(like.device, torch.float64)

@@ -42,6 +42,8 @@ def sample_seeds(seed: int, stream: int, first: int, count: int) -> Tensor:
 def uniform(seed: Tensor, n: int, stream: int = 0) -> Tensor:
     """Return numbers (N, n) float64 in [0, 1) of seeds (N,). Successive seeds fill the unit cube evenly: a Kronecker sequence
     with the powers of the generalised golden ratio of three dimensions. Each `stream` gives other numbers."""
+    if n == 0:
+        return torch.zeros((len(seed), 0), dtype=torch.float64, device=seed.device)
     columns = []
     for k in range(n):
         mixed = seed * STEPS[k % 3] + signed(mixed_bits(stream * 0x10001 + k))

@@ -13,6 +13,7 @@ import pytest
 import torch
 from bop_scenes import SIZE, TRUTHS, K, camera, estimates, meshes, pose
 from PIL import Image
+from quiet_fits import quiet
 
 import edgegrad as eg
 from edgegrad import bop, cli
@@ -258,10 +259,10 @@ def test_command_line_writes_errors_and_refined_poses(folder: Path, capsys: pyte
 def test_refine_keeps_poses_whose_fit_fails(made: Path) -> None:
     data = bop.Dataset(made)
     off_image = bop.files.Estimate(3, 0, 1, 1.0, pose((0.1, 0, 0), (5000.0, 0.0, 400.0)))
-    found = bop.refine(data, off_image)
+    found = bop.refine(data, off_image, options=quiet())
     assert found.kept and found.fit is None and "does not show" in found.why and found.estimate is off_image
     start = replace(estimates()[0], pose=pose_off(TRUTHS[0][0][1]))
-    early = bop.refine(data, start, size=32, steps=1)
+    early = bop.refine(data, start, options=quiet(max_size=32, steps=1))
     assert early.kept and early.estimate is start and "steps ran out" in early.why
     with pytest.raises(ValueError, match="expected object 7 in it, got 1, 5"):
         bop.refine(data, bop.files.Estimate(3, 0, 7, 1.0, TRUTHS[0][0][1]))

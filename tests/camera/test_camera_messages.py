@@ -55,6 +55,8 @@ CAMERAS = {
         V,
         "projection: expected one of 'perspective', 'fisheye', 'panorama', 'orthographic', got 'cylinder'",
     ),
+    "projection is a list": (lambda: camera(projection=[]), V, "projection: expected one of", "got []"),
+    "crop of no height": (lambda: camera().crop(0, 0, 0, 4), V, "height: expected an int from 1 to 65536, got 0"),
     "eye in 2-D": (lambda: look_at(eye=(0.0, 1.0)), V, "eye: expected shape (3,), got (2,)"),
     "eye on target": (
         lambda: look_at(eye=(0, 0, 0)),

@@ -55,8 +55,8 @@ def given(monkeypatch):
     """Return the arguments that fit-pose and fit-poses give to their fits, which do nothing."""
     found = {}
 
-    def fit_pose(_, picture, camera, mask=None, init=None, **options):
-        found.update(options, picture=picture, mask=mask, init=init)
+    def fit_pose(scene, images, cameras, masks=None, init=None, **given):
+        found.update(given, scene=scene, images=images, masks=masks, init=init)
         raise ValueError("seen")
 
     monkeypatch.setattr("edgegrad.fit.fit_pose", fit_pose)
@@ -68,18 +68,18 @@ def test_images_reach_the_fit(files, given):
     """A mask is given, or is the picture's alpha."""
     view, out = camera(48), ("--out", files / "out")
     assert fit(files, "--mask", files / "mask.png", *out) == 2
-    torch.testing.assert_close(given["mask"].reshape(48, 48, 1), silhouette(view), atol=0.01, rtol=0.0)
+    torch.testing.assert_close(given["masks"].reshape(48, 48, 1), silhouette(view), atol=0.01, rtol=0.0)
     colour = "#" + bytes((linear_to_srgb(BACKGROUND) * 255).round().to(torch.uint8).tolist()).hex()
     assert fit(files, "--background", colour, *out) == 2
-    assert given["mask"] is None and torch.allclose(given["background"], BACKGROUND, atol=0.01)
+    assert given["masks"] is None and torch.allclose(given["scene"].background, BACKGROUND, atol=0.01)
     levels = np.repeat(np.uint8([0, 128, 255]), 16)[:, None].repeat(48, 1)
     Image.fromarray(levels).save(files / "weight.png")
     assert fit(files, "--weight", files / "weight.png", *out) == 2
-    np.testing.assert_allclose(given["weight"].reshape(48, 48), levels / 255, atol=1e-6)
+    np.testing.assert_allclose(given["weights"].reshape(48, 48), levels / 255, atol=1e-6)
     write_image(files / "target.png", torch.cat([picture(view), silhouette(view)], -1))
     assert fit(files, *out) == 2
-    assert given["picture"].shape == (48, 48, 3)
-    torch.testing.assert_close(given["mask"].reshape(48, 48, 1), silhouette(view), atol=0.01, rtol=0.0)
+    assert given["images"].shape == (48, 48, 3)
+    torch.testing.assert_close(given["masks"].reshape(48, 48, 1), silhouette(view), atol=0.01, rtol=0.0)
 
 
 def test_depth_reaches_the_fit(files, given):
@@ -88,11 +88,11 @@ def test_depth_reaches_the_fit(files, given):
     Image.fromarray((1000 * z).round().numpy().astype(np.uint16)).save(files / "depth.png")
     more = ["--depth", files / "depth.png", "--depth-scale", 0.001, "--out", files / "out"]
     assert fit(files, *more) == 2
-    depth = given.pop("depth")
+    depth = given.pop("depths")
     torch.testing.assert_close(depth, z, atol=5.1e-4, rtol=0.0)
     view = ["--mesh", files / "mesh.ply", "--camera", files / "camera.json"]
     assert run("fit-poses", files / "target.png", *view, *more) == 2
-    assert torch.equal(given["depth"], depth)
+    assert torch.equal(given["depths"], depth)
 
 
 def test_fit_pose_is_written_when_interrupted_and_resumes(files, capsys, monkeypatch):

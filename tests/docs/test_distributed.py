@@ -123,7 +123,7 @@ def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, undisturbed: Tensor) 
 
 def test_a_checkpoint_of_another_task(tmp_path: Path) -> None:
     many_views.fit(TASK._replace(steps=2), tmp_path / "fit.pt", every=2)
-    with pytest.raises(ValueError, match=r"resume: expected .* made with another steps;"):
+    with pytest.raises(ValueError, match=r"checkpoint: expected .* made with another steps;"):
         many_views.fit(TASK, tmp_path / "fit.pt")
 
 

@@ -64,7 +64,11 @@ def errors(fit, R=None):
     return degrees, 100.0 * float(moved.norm()) / SIZE
 
 
+def before_sky():
+    return eg.Scene([bracket()], BACKGROUND)
+
+
 def task_of(image, view, mesh=None, mask=None, weight=None, background=None, unknowns=None):
     """Return the task of a pose search for a bracket, or another mesh, of scale 1."""
-    mesh, unknowns = mesh or bracket(), unknowns or Unknowns()
-    return PoseTask.from_arguments(mesh, image, view, mask, weight, background, unknowns, 1.0, ArgumentNames())
+    scene, unknowns = eg.Scene([mesh or bracket()], background), unknowns or Unknowns()
+    return PoseTask.from_arguments(scene, image, view, mask, weight, unknowns, 1.0, ArgumentNames())

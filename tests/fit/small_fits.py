@@ -10,6 +10,7 @@ from typing import Any
 import torch
 import trimesh
 from brackets import CENTER, SIZE, bracket, rotation
+from quiet_fits import arranged
 from torch import Tensor
 
 import edgegrad as eg
@@ -84,7 +85,7 @@ class Problem:
 
     def fit(self, **options: Any) -> Fit:
         given = {"spp": 8, "progress": False, "steps": 400, **self.options, **options}
-        return fit_scene(self.scene, self.views, self.targets, self.parameters, **given)
+        return fit_scene(self.scene, self.targets, self.views, self.parameters, **arranged(**given))
 
 
 def colours() -> Problem:

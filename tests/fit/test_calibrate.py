@@ -8,12 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from brackets import BACKGROUND, about_center, bracket, camera, picture, rotation, silhouette, task_of
+from brackets import BACKGROUND, about_center, before_sky, bracket, camera, picture, rotation, silhouette, task_of
+from quiet_fits import arranged, quiet
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import calibrate, fit_camera
+from edgegrad.fit import FitOptions, calibrate, fit_camera
 from edgegrad.fit.ending import Ending
+from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.calibrate import Calibration
 from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
 from edgegrad.fit.pose.loss_model import ColorLoss, score_covariance
@@ -99,7 +101,7 @@ def test_deviations_are_those_of_pictures_with_noise(blocks: int) -> None:
     for seed in range(10):
         lens = Unknowns(False, True, True, 2)
         task = task_of(noisy(clean, blocks, seed), true, background=BACKGROUND, unknowns=lens)
-        loss = ColorLoss(task, pose, 512, 16, seed).at(pose)
+        loss = ColorLoss(task, pose, Settings(max_size=512, seed=seed)).at(pose)
         step = torch.linalg.solve(loss.curvature, loss.gradient)
         found.append(float(loss.gradient @ torch.linalg.solve(loss.scores, loss.gradient)) / len(step))
     # The mean over ten has a deviation of 0.13. Bartlett's weights leave out a part of the correlation: of blocks of 3, a ninth.
@@ -111,7 +113,7 @@ def test_a_lens_that_a_picture_does_not_show() -> None:
     (true,) = taken(1, 96, distance=11.0)
     (start,) = guessed([true], 1.0)
     start = start.replace(K=true.K)
-    fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, distortion=2, progress=False)
+    fit = fit_camera(before_sky(), picture(true), start, distortion=2, options=quiet())
     known = fit.uncertainty
     assert known is not None and fit.explained > 0.9
     assert not fit.converged and fit.reason.startswith("not known: ") and "k2 known to ±" in fit.reason
@@ -125,9 +127,7 @@ def test_a_lens_that_a_picture_does_not_show() -> None:
 def test_a_near_object_shows_the_lens() -> None:
     (true,) = taken(1, 64, distance=2.2, distortion=SIMPLE)
     (start,) = guessed([true])
-    fit = fit_camera(
-        bracket(), picture(true), start, background=BACKGROUND, principal=True, distortion=1, progress=False
-    )
+    fit = fit_camera(before_sky(), picture(true), start, principal=True, distortion=1, options=quiet())
     known = fit.uncertainty
     assert known is not None and fit.converged and fit.search.converged
     assert fit.history[-1].loss == fit.loss and fit.steps == len(fit.history)
@@ -167,7 +167,7 @@ def chi_square(found: eg.Camera, true: eg.Camera, known: CameraUncertainty | Non
 def test_a_lens_from_several_pictures(tmp_path) -> None:
     true = taken(2, 48, distortion=SIMPLE)
     seen: list[Calibration] = []
-    fit = calibrate(scene(), pictures(true), guessed(true), distortion=1, progress=False, callback=seen.append)
+    fit = calibrate(scene(), pictures(true), guessed(true), distortion=1, options=quiet(callback=seen.append))
     assert fit.converged and fit.reason == "converged" and fit.explained > 0.9 and fit.uncertainty is not None
     checked(fit, true, 0.005, 0.25)
     for one in fit.cameras:  # one lens
@@ -205,7 +205,7 @@ def test_a_resumed_calibration_ends_as_if_it_had_never_stopped(tmp_path) -> None
             raise KeyboardInterrupt
 
     def fit(**options) -> Calibration:
-        return calibrate(scene(), pictures(true), guessed(true), distortion=1, progress=False, **options)
+        return calibrate(scene(), pictures(true), guessed(true), distortion=1, **arranged(**options))
 
     whole, kept = fit(), {"checkpoint": tmp_path / "lens"}
     assert fit(**kept, callback=stop).interrupted
@@ -218,7 +218,7 @@ def test_a_calibration_that_is_interrupted() -> None:
         raise KeyboardInterrupt
 
     true = taken(2, 48)
-    fit = calibrate(scene(), pictures(true), guessed(true), progress=False, callback=stop)
+    fit = calibrate(scene(), pictures(true), guessed(true), options=quiet(callback=stop))
     assert fit.interrupted and not fit.converged and fit.reason == "interrupted" and fit.uncertainty is None
     assert len(fit.cameras) == 1 and fit.steps == 0
 
@@ -230,8 +230,8 @@ ONE = taken(1, 16)[0]
     "change, message",
     [
         ({"mesh": 3}, "mesh: expected a Mesh or a Scene, got int"),
-        ({"cameras": 3}, "cameras: expected a list of cameras, got int"),
-        ({"cameras": []}, "cameras: expected one for each picture, got none"),
+        ({"cameras": 3}, "cameras: expected a Camera or a sequence of them, got int"),
+        ({"cameras": []}, "cameras: expected one for each picture, got an empty list"),
         ({"cameras": [ONE, 3]}, "cameras[1]: expected a Camera, got int"),
         ({"cameras": [ONE]}, "images: expected "),
         ({"cameras": [ONE, ONE.resized((16, 20))]}, "cameras[1]: expected perspective, 16 × 16 pixels, like cameras[0]"),
@@ -241,14 +241,14 @@ ONE = taken(1, 16)[0]
         ({"distortion": 9}, "distortion: expected at most 8 for a camera that is perspective, got 9"),
         ({"distortion": -1}, "distortion: expected"),
         ({"principal": 1}, "principal: expected True or False"),
-        ({"images": None}, "images: expected a picture, or a masks"),
+        ({"images": None}, "images: expected pictures or masks to compare with"),
         ({"images": torch.rand(3, 16, 16, 3)}, "images: expected 2, one for each camera, got 3"),
         ({"images": [torch.rand(16, 16, 3), torch.rand(8, 8, 3)]}, "images[1]: expected "),
         ({"masks": [torch.ones(16, 16)]}, "masks: expected 2, one for each camera, got 1"),
         ({"masks": 2 * [torch.zeros(9, 9)]}, "masks[0]: expected "),
         ({"max_size": 2}, "max_size: expected"),
-        ({"resume": True}, "resume: expected a checkpoint"),
-        ({"callback": 3}, "callback: expected a function of a Calibration"),
+        ({"loss": "l1"}, "options.loss: calibrate has a loss and steps of its own; leave it out"),
+        ({"callback": 3}, "callback: expected a function of the result so far"),
     ],
 )  # fmt: skip
 def test_errors_of_calibrate(change: dict, message: str) -> None:
@@ -257,7 +257,7 @@ def test_errors_of_calibrate(change: dict, message: str) -> None:
         "cameras": [ONE, ONE], "progress": False, **change,
     }  # fmt: skip
     with pytest.raises((TypeError, ValueError)) as caught:
-        calibrate(**given)
+        calibrate(**arranged(**given))
     assert message in str(caught.value)
 
 
@@ -265,7 +265,7 @@ def test_errors_of_calibrate(change: dict, message: str) -> None:
 def test_a_lens_from_masks_alone() -> None:
     true = taken(4, 96, distortion=SIMPLE)
     masks = [silhouette(one) for one in true]
-    fit = calibrate(bracket(plain=True), None, guessed(true), masks=masks, distortion=1, progress=False)
+    fit = calibrate(bracket(plain=True), None, guessed(true), masks=masks, distortion=1, options=quiet())
     assert fit.explained > 0.9
     # Contours alone have other places of rest nearby, of which deviations do not know: the focal length is 0.4 % off.
     assert abs(float(fit.camera.K[0, 0] / true[0].K[0, 0]) - 1.0) < 0.01
@@ -279,7 +279,7 @@ def test_a_lens_from_photographs() -> None:
     coarse = 0.05 + 0.5 * torch.rand(4, 3, 11, 11, generator=torch.Generator().manual_seed(3))
     clutter = torch.nn.functional.interpolate(coarse, (128, 128), mode="bilinear").movedim(1, -1)
     shot = [picture(one, background=behind) for one, behind in zip(true, clutter, strict=True)]
-    fit = calibrate(bracket(), shot, guessed(true, 1.02), distortion=1, progress=False)
+    fit = calibrate(bracket(), shot, guessed(true, 1.02), distortion=1, options=quiet())
     assert fit.explained > 0.8
     assert abs(float(fit.camera.K[0, 0] / true[0].K[0, 0]) - 1.0) < 0.02
 
@@ -293,7 +293,7 @@ def test_deviations_of_cameras_are_calibrated() -> None:
         true = taken(4, 96, distance)[k]
         (start,) = guessed([true], 1.03)
         fit = fit_camera(
-            bracket(), picture(true), start, background=BACKGROUND, principal=True, distortion=2, seed=k, progress=False
+            before_sky(), picture(true), start, principal=True, distortion=2, options=FitOptions(seed=k, progress=False)
         )
         known = fit.uncertainty
         assert known is not None and fit.camera.distortion is not None

@@ -4,10 +4,23 @@ import pickle
 
 import pytest
 import torch
-from brackets import BACKGROUND, CENTER, START, about_center, bracket, camera, errors, picture, rotation, silhouette
+from brackets import (
+    BACKGROUND,
+    CENTER,
+    START,
+    about_center,
+    before_sky,
+    bracket,
+    camera,
+    errors,
+    picture,
+    rotation,
+    silhouette,
+)
+from quiet_fits import quiet
 
 import edgegrad as eg
-from edgegrad.fit import fit_pose
+from edgegrad.fit import FitOptions, fit_pose
 from edgegrad.fit.pose.result import PoseFit, pose_from_json
 
 pytestmark = pytest.mark.unsanitized
@@ -23,7 +36,7 @@ def test_finds_the_pose(background, capsys):
     if background == "image":
         background = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
     target = picture(view, background=BACKGROUND if background is None else background)
-    fit = fit_pose(bracket(), target, view, init=START, background=background, progress=False)
+    fit = fit_pose(eg.Scene([bracket()], background), target, view, init=START, options=quiet())
     degrees, percent = errors(fit)
     # 64² pixels: a tenth of a pixel is 0.25 % of the size.
     assert degrees < 0.5 and percent < 0.5
@@ -39,7 +52,7 @@ def test_finds_the_pose(background, capsys):
 def test_a_start_that_is_the_answer_is_converged():
     """More steps would not find a better one."""
     target = picture(camera())
-    fit = fit_pose(bracket(), target, camera(), background=BACKGROUND, steps=12, progress=False)
+    fit = fit_pose(before_sky(), target, camera(), options=quiet(steps=12))
     assert fit.converged and errors(fit)[0] < 0.2 and errors(fit)[1] < 0.5
 
 
@@ -52,8 +65,8 @@ def test_where_gradients_are_off(mode):
         mesh = bracket()
         mesh = mesh.replace(verts=1.0 * mesh.verts, faces=mesh.faces.int())
         return fit_pose(
-            mesh, picture(view), view, init=1.0 * START, background=1.0 * BACKGROUND, fit_focal=True, steps=2,
-            search=False, progress=False,
+            eg.Scene([mesh], 1.0 * BACKGROUND), picture(view), view, init=1.0 * START, focal=True, search=False,
+            options=quiet(steps=2),
         )  # fmt: skip
 
     expected = fit()
@@ -69,7 +82,7 @@ def test_finds_the_pose_with_a_mask(plain):
     view = camera()
     clutter = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
     fit = fit_pose(
-        bracket(plain), picture(view, background=clutter), view, silhouette(view), START, steps=12, progress=False
+        bracket(plain), picture(view, background=clutter), view, silhouette(view), START, options=quiet(steps=12)
     )
     degrees, percent = errors(fit)
     # Pixels on the border mix in what lies behind the object, which the mask does not undo.
@@ -84,16 +97,7 @@ def test_finds_the_scale():
     off = forward @ (START[:3, :3] @ CENTER + START[:3, 3] - CENTER)
     start[:3, 3] -= off * forward
     larger = bracket().transformed(torch.eye(3).double(), -0.12 * CENTER, 1.12)
-    fit = fit_pose(
-        bracket(),
-        picture(view, larger),
-        view,
-        init=start,
-        background=BACKGROUND,
-        fit_scale=True,
-        steps=12,
-        progress=False,
-    )
+    fit = fit_pose(before_sky(), picture(view, larger), view, init=start, scale=True, options=quiet(steps=12))
     degrees, percent = errors(fit)
     assert fit.scale == pytest.approx(1.12, rel=0.005)
     assert degrees < 0.5 and percent < 0.5
@@ -105,16 +109,9 @@ def test_finds_the_focal_length():
     K[:2, :2] *= 1.1
     start = about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05))
     fit = fit_pose(
-        bracket(),
-        picture(near.replace(K=K)),
-        near,
-        init=start,
-        background=BACKGROUND,
-        fit_focal=True,
-        steps=12,
-        seed=1,  # of other samples, 1 of 12 takes more steps
-        progress=False,
-    )
+        before_sky(), picture(near.replace(K=K)), near, init=start, focal=True,
+        options=FitOptions(steps=12, seed=1, progress=False),
+    )  # fmt: skip
     degrees, percent = errors(fit)
     assert float(fit.camera.K[0, 0] / K[0, 0]) == pytest.approx(1.0, abs=0.02)
     assert float(fit.camera.K[0, 2]) == float(near.K[0, 2])
@@ -123,7 +120,7 @@ def test_finds_the_focal_length():
 
 def test_orthographic_camera_leaves_the_depth():
     view = eg.Camera.orthographic(CENTER + torch.tensor([1.4, 1.2, 3.5]).double(), CENTER, height=3.5, size=(64, 64))
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, steps=10, progress=False)
+    fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(steps=10))
     degrees, _ = errors(fit)
     q = view.world_to_camera[:3, :3] @ (fit.R @ CENTER + fit.t - CENTER)
     started = view.world_to_camera[:3, :3] @ (START[:3, :3] @ CENTER + START[:3, 3] - CENTER)
@@ -133,24 +130,24 @@ def test_orthographic_camera_leaves_the_depth():
 def test_scene_of_several_meshes_moves_together():
     view, mesh = camera(), bracket()
     parts = [mesh.replace(faces=mesh.faces[k], face_colors=mesh.face_colors[k]) for k in (slice(0, 9), slice(9, 20))]
-    fit = fit_pose(eg.Scene(parts, BACKGROUND), picture(view), view, init=START, steps=10, progress=False)
+    fit = fit_pose(eg.Scene(parts, BACKGROUND), picture(view), view, init=START, options=quiet(steps=10))
     assert max(errors(fit)) < 0.5
 
 
 def test_a_picture_larger_than_max_size_is_reduced():
     view = camera(96)
-    fit = fit_pose(
-        bracket(), picture(view), view, init=START, background=BACKGROUND, max_size=32, steps=12, progress=False
-    )
+    fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(max_size=32, steps=12))
     assert max(max(step.size) for step in fit.history) == 32
     assert max(errors(fit)) < 1.5
-    assert fit.camera is view
+    assert torch.equal(fit.camera.K, view.K) and fit.camera.size == view.size
 
 
 def test_the_same_seed_gives_the_same_fit():
     view = camera(24)
-    given = {"init": START, "background": BACKGROUND, "steps": 2, "search": False, "progress": False}
-    fits = [fit_pose(bracket(), picture(view), view, seed=seed, **given) for seed in (3, 3, 4)]
+    fits = [
+        fit_pose(before_sky(), picture(view), view, init=START, search=False, options=quiet(steps=2, seed=seed))
+        for seed in (3, 3, 4)
+    ]
     assert torch.equal(fits[0].matrix, fits[1].matrix)
     assert not torch.equal(fits[0].matrix, fits[2].matrix)
 
@@ -164,7 +161,7 @@ def test_interruption_keeps_the_best_pose():
         if len(seen) == 7:
             raise KeyboardInterrupt
 
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False, callback=stop)
+    fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(callback=stop))
     assert fit.interrupted and not fit.converged and fit.steps == 7
     assert torch.equal(fit.matrix, seen[-1].matrix)
     assert fit.loss == min(f.loss for f in seen) and fit.loss < seen[0].loss
@@ -173,17 +170,13 @@ def test_interruption_keeps_the_best_pose():
 
 def test_json_round_trip():
     view = camera(24)
-    fit = fit_pose(
-        bracket(), picture(view), view, init=START, background=BACKGROUND, steps=1, search=False, progress=False
-    )
+    fit = fit_pose(before_sky(), picture(view), view, init=START, search=False, options=quiet(steps=1))
     back = PoseFit.from_json(fit.to_json())
     torch.testing.assert_close(back.matrix, fit.matrix, rtol=0, atol=1e-12)
     assert torch.equal(back.camera.K, fit.camera.K) and back.camera.size == fit.camera.size
     assert (back.loss, back.steps, back.converged, back.interrupted) == (fit.loss, fit.steps, fit.converged, False)
     torch.testing.assert_close(pose_from_json(fit.to_json()).matrix, fit.matrix, rtol=0, atol=1e-12)
-    again = fit_pose(
-        bracket(), picture(view), view, init=back, background=BACKGROUND, steps=1, search=False, progress=False
-    )
+    again = fit_pose(before_sky(), picture(view), view, init=back, search=False, options=quiet(steps=1))
     assert torch.allclose(again.history[0].pose.matrix, fit.matrix)
 
 

@@ -5,10 +5,12 @@ import math
 
 import pytest
 import torch
-from brackets import BACKGROUND, about_center, bracket, camera, picture, rotation
+from brackets import BACKGROUND, about_center, before_sky, bracket, camera, picture, rotation
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.fit import fit_camera
+from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.robust_loss import Comparison
 from edgegrad.fit.pose.task import STEP_PARTS
 
@@ -19,7 +21,7 @@ def test_a_camera_and_its_focal_length():
     K = true.K.clone()
     K[:2, :2] *= 1.1
     start = true.replace(world_to_camera=true.world_to_camera @ off, K=K)
-    fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, steps=16, progress=False)
+    fit = fit_camera(before_sky(), picture(true), start, options=quiet(steps=16))
     found = fit.camera
     assert float(found.K[0, 0] / true.K[0, 0]) == pytest.approx(1.0, abs=0.02)
     assert fit.converged and fit.reason == "converged"
@@ -44,8 +46,7 @@ def test_the_history_of_a_camera(tmp_path):
     start = started_aside(true, 1.05)
 
     def fit(**options):
-        given = {"background": BACKGROUND, "steps": 4, "progress": False, **options}
-        return fit_camera(bracket(), picture(true), start, **given)
+        return fit_camera(before_sky(), picture(true), start, **arranged(**{"steps": 4, **options}))
 
     whole = fit()
     history = whole.history
@@ -75,11 +76,11 @@ def test_the_gradient_in_the_history():
     """It is that of the loss, by finite differences of renders with the same samples, which leave some percent."""
     true = camera(48)
     fit = fit_camera(
-        bracket(), picture(true), started_aside(true), background=BACKGROUND, focal=False, steps=1, spp=64, progress=False
+        before_sky(), picture(true), started_aside(true), focal=False, options=quiet(steps=1, spp=64),
     )  # fmt: skip
     task, first, h = fit.search.task, fit.search.history[0], 2e-3
     assert task is not None
-    level = task.pyramid(first.pose, 512, 64)[0]
+    level = task.pyramid(first.pose, Settings(max_size=512, spp=64))[0]
     assert level.size == first.size
 
     def loss(entry, step, c=None):
@@ -95,7 +96,7 @@ def test_the_gradient_in_the_history():
 
 def test_a_camera_is_saved(tmp_path):
     view = camera(32)
-    fit = fit_camera(bracket(), picture(view), view, background=BACKGROUND, focal=False, steps=2, progress=False)
+    fit = fit_camera(before_sky(), picture(view), view, focal=False, options=quiet(steps=2))
     names = fit.save(tmp_path)
     assert names == ["camera.json", "history.json", "pose.json", "fit.png", "loss.png", "fit.webp"]
     assert {path.name for path in tmp_path.iterdir()} == set(names) and torch.equal(fit.camera.K, view.K)
@@ -119,7 +120,7 @@ def test_a_rig_of_cameras(tmp_path):
     ]
     for one, was in zip(start, true, strict=True):
         one.K[:2, 2] = was.K[:2, 2]
-    fit = fit_camera(bracket(), [picture(one) for one in true], start, background=BACKGROUND, progress=False)
+    fit = fit_camera(before_sky(), [picture(one) for one in true], start, options=quiet())
     assert fit.converged and len(fit.cameras) == 2 and fit.camera is fit.cameras[0]
     for found, one in zip(fit.cameras, true, strict=True):
         assert float(found.K[0, 0] / one.K[0, 0]) == pytest.approx(1.0, abs=0.01)
@@ -133,20 +134,20 @@ def test_a_rig_of_cameras(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"camera": 3}, "camera: expected a Camera"),
-        ({"camera": []}, "camera: expected at least one"),
-        ({"camera": [camera(8), camera(8)]}, "image: expected 2, one for each camera"),
+        ({"cameras": 3}, "cameras: expected a Camera"),
+        ({"cameras": []}, "cameras: expected one for each picture"),
+        ({"cameras": [camera(8), camera(8)]}, "images: expected 2, one for each camera"),
         ({"distortion": 9}, "distortion: expected at most 8 for a camera that is perspective"),
         ({"focal": 1}, "focal: expected True or False"),
-        ({"image": None}, "image: expected a picture, or a mask"),
-        ({"image": torch.zeros(8, 9, 3)}, "image: expected "),
-        ({"image": torch.ones(8, 8, 3)}, "image: expected "),
-        ({"image": None, "mask": torch.zeros(9, 8)}, "mask: expected "),
+        ({"images": None}, "images: expected pictures or masks"),
+        ({"images": torch.zeros(8, 9, 3)}, "images: expected "),
+        ({"images": torch.ones(8, 8, 3)}, "images: expected "),
+        ({"images": None, "masks": torch.zeros(9, 8)}, "masks: expected "),
         ({"scene": 3}, "scene: expected a Mesh or a Scene"),
     ],
 )
 def test_errors_of_fit_camera(change, message):
-    arguments = {"scene": bracket(), "image": torch.zeros(8, 8, 3), "camera": camera(8), "progress": False, **change}
+    arguments = {"scene": bracket(), "images": torch.zeros(8, 8, 3), "cameras": camera(8), "progress": False, **change}
     with pytest.raises((TypeError, ValueError)) as caught:
-        fit_camera(**arguments)
+        fit_camera(**arranged(**arguments))
     assert message in str(caught.value)

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from brackets import BACKGROUND, START, bracket, camera, picture, silhouette
+from brackets import START, bracket, camera, picture, silhouette
+from quiet_fits import arranged
 
 from edgegrad.fit import fit_pose
 from edgegrad.fit.checkpoints import FORMAT
@@ -12,9 +13,9 @@ PICTURE = picture(camera(96))
 
 
 def small_fit(**options):
-    target = options.get("target", PICTURE)
-    given = {"mesh": bracket(), "target": target, "camera": camera(len(target)), "init": START, "steps": 6} | options
-    return fit_pose(**given, progress=False)
+    target = options.get("images", PICTURE)
+    given = {"mesh": bracket(), "images": target, "cameras": camera(len(target)), "init": START, "steps": 6} | options
+    return fit_pose(**arranged(**given))
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def same(fit, other):
         assert all(torch.equal(x, y) for x, y in zip(a.pose, b.pose, strict=True))
 
 
-SECOND_OPINION = {"target": picture(camera(32)).flip(1), "steps": 21, "fit_focal": True, "seed": 3}
+SECOND_OPINION = {"images": picture(camera(32)).flip(1), "steps": 21, "focal": True, "seed": 3}
 
 
 @pytest.mark.parametrize(
@@ -74,7 +75,7 @@ def test_a_fit_that_was_killed_goes_on_from_its_last_checkpoint(uninterrupted, t
 
     steps = []
     with pytest.raises(MemoryError):
-        small_fit(checkpoint=tmp_path / "fit.ckpt", checkpoint_every=8, callback=die)
+        small_fit(checkpoint=tmp_path / "fit.ckpt", every=8, callback=die)
     again = small_fit(checkpoint=tmp_path / "fit.ckpt", resume=True, callback=lambda fit: steps.append(fit.steps))
     assert steps[0] == 9
     same(again, uninterrupted)
@@ -87,22 +88,25 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     view = camera(size=96)
     for name, value in {
         "mesh": bracket().transformed(scale=1.01),
-        "target": PICTURE + 0.01,
-        "camera": camera(size=96, distance=4.6),
-        "mask": silhouette(view),
-        "weight": torch.ones(96, 96).numpy(),
+        "images": PICTURE + 0.01,
+        "cameras": camera(size=96, distance=4.6),
+        "masks": silhouette(view),
+        "weights": torch.ones(96, 96).numpy(),
         "init": torch.eye(4),
-        "background": BACKGROUND,
-        "fit_scale": True,
+        "scale": True,
         "spp": 4,
         "steps": 2,
     }.items():
-        with pytest.raises(ValueError, match=rf"resume: expected .* with another {name}; give what it was made with"):
+        with pytest.raises(
+            ValueError, match=rf"checkpoint: expected .* with another {name}; give what it was made with"
+        ):
             small_fit(**{**quick, name: value}, checkpoint=file, resume=True)
     for other in ({"filter": "nearest"}, {"alpha_cutoff": 0.9}, {"wrap": "clamp"}):  # of no tensors
         with pytest.raises(ValueError, match="with another mesh; give what it was made with"):
             small_fit(**quick, mesh=bracket().replace(**other), checkpoint=file, resume=True)
     same(small_fit(**quick, mesh=bracket().replace(name="it"), checkpoint=file, resume=True), fit)
+    drawn = small_fit(**quick, seed=None, checkpoint=tmp_path / "drawn.ckpt")  # by torch's generator
+    same(small_fit(**quick, seed=None, checkpoint=tmp_path / "drawn.ckpt", resume=True), drawn)
     for damaged in ({"format": 2}, {"format": FORMAT}, {"format": FORMAT, "given": 3, "state": {}}):
         torch.save(damaged, tmp_path / "damaged.ckpt")
         expected = (
@@ -114,9 +118,9 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
             small_fit(checkpoint=tmp_path / "damaged.ckpt", resume=True)
     with pytest.raises(TypeError, match=r"checkpoint: expected a path, got int \(3\)"):
         small_fit(checkpoint=3)
-    with pytest.raises(ValueError, match="resume: expected a checkpoint to go on from, got none"):
-        small_fit(resume=True)
-    with pytest.raises(TypeError, match="resume: expected True or False, got str"):
+    with pytest.warns(UserWarning, match=r"checkpoint: expected .*new\.ckpt to go on from, got no such file"):
+        same(small_fit(**quick, checkpoint=tmp_path / "new.ckpt", resume=True), fit)
+    with pytest.raises(TypeError, match=r"checkpoint\.resume: expected True or False, got str"):
         small_fit(resume="yes", checkpoint=file)
     with pytest.raises(FileNotFoundError, match="checkpoint: expected the folder"):
         small_fit(checkpoint=tmp_path / "none" / "fit.ckpt")
@@ -128,5 +132,5 @@ def test_a_checkpoint_that_cannot_be_written_ends_no_fit(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.replace", replace)
     with pytest.warns(UserWarning, match=r"checkpoint: expected to write .*fit\.ckpt, got: No space left on device;"):
-        fit = small_fit(steps=1, search=False, checkpoint=tmp_path / "fit.ckpt", checkpoint_every=1)
+        fit = small_fit(steps=1, search=False, checkpoint=tmp_path / "fit.ckpt", every=1)
     assert fit.steps > 3 and list(tmp_path.iterdir()) == []

@@ -12,7 +12,7 @@ from small_fits import RIGHT, WRONG
 from edgegrad.fit.descent.adam import Adam
 from edgegrad.fit.descent.convergence import MAX_PARTS, MIN_BLOCKS, ConvergenceMonitor, _in_parts
 from edgegrad.fit.ending import Ending, reason_of
-from edgegrad.fit.options import Options
+from edgegrad.fit.options import Settings
 
 MOST = {"adam": 260, "gauss-newton": 40}  # steps
 QUICK = {
@@ -94,7 +94,7 @@ def test_oscillating_steps_predict_no_decrease():
     """With so long a rate each step lands on the other side of the minimum, as far off."""
     assert monitored(lambda x: x, 20, rate=2.0).predicted_decrease(40) == 0.0
     down = monitored(lambda x: x, 20)
-    assert down.predicted_decrease(40) > down.least_decrease(Options())
+    assert down.predicted_decrease(40) > down.least_decrease(Settings())
 
 
 def test_shaking_steps_do_not_hide_a_slope():
@@ -151,7 +151,7 @@ def test_tolerance_is_relative_to_the_decrease_so_far():
     monitor = ConvergenceMonitor({"x": torch.zeros(1)})
     for k in range(40):
         monitor.end_step(10.0 + 0.5**k, {})
-    assert monitor.least_decrease(Options(tolerance=0.01)) == pytest.approx(0.01 * 1.0, rel=0.05)
+    assert monitor.least_decrease(Settings(loss_tolerance=0.01)) == pytest.approx(0.01 * 1.0, rel=0.05)
 
 
 @pytest.mark.parametrize(

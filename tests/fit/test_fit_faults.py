@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -69,15 +70,14 @@ class Forked:
 # -- killed -----------------------------------------------------------------------------------------------------------
 
 
-def printing_fit(*args, callback, **options):
+def printing_fit(*args, options, **given):
     """Run fit_pose and print the best pose before it may be written, so that the file is at most one step behind."""
 
     def print_and_call(fit):
         print(fit.to_json().replace("\n", " "), flush=True)
-        callback(fit)
+        options.callback(fit)
 
-    options["progress"] = False
-    return FIT_POSE(*args, callback=print_and_call, **options)
+    return FIT_POSE(*args, options=replace(options, callback=print_and_call, progress=False), **given)
 
 
 FIT_POSE = edgegrad.fit.fit_pose
@@ -108,14 +108,14 @@ def test_a_killed_fit_leaves_the_best_pose_so_far(files, kills, monkeypatch):
 def test_the_pose_on_disk_follows_the_search(files, monkeypatch):
     poses = []
 
-    def watched(*args, callback, **options):
+    def watched(*args, options, **given):
         def watch(fit):
-            callback(fit)
+            options.callback(fit)
             text = (files / "out" / "pose.json").read_text()
             assert text == fit.to_json() + "\n"
             poses.append(PoseFit.from_json(text))
 
-        return FIT_POSE(*args, callback=watch, **options)
+        return FIT_POSE(*args, options=replace(options, callback=watch), **given)
 
     monkeypatch.setattr(edgegrad.fit, "fit_pose", watched)
     assert cli.main(arguments(files, steps=4)) == 0
@@ -153,13 +153,13 @@ def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsy
 
 
 def test_a_folder_that_vanishes_during_the_fit(files, monkeypatch, capsys):
-    def vanishing(*args, callback, **options):
+    def vanishing(*args, options, **given):
         def after_step(fit):
-            callback(fit)
+            options.callback(fit)
             if fit.steps == 3:
                 shutil.rmtree(files / "out")
 
-        return FIT_POSE(*args, callback=after_step, search=False, **options)
+        return FIT_POSE(*args, options=replace(options, callback=after_step), **{**given, "search": False})
 
     monkeypatch.setattr(edgegrad.fit, "fit_pose", vanishing)
     assert cli.main(arguments(files, steps=1)) == 0  # it is made again

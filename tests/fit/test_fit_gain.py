@@ -6,8 +6,9 @@ import math
 
 import pytest
 import torch
-from brackets import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, task_of
+from brackets import BACKGROUND, START, about_center, before_sky, bracket, camera, errors, picture, rotation, task_of
 from photographs import clutter
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
@@ -22,14 +23,14 @@ from edgegrad.fit.views import has_levels, white_level
 @pytest.fixture(scope="module")
 def expected() -> PoseFit:
     view = camera(48)
-    return fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
+    return fit_pose(before_sky(), picture(view), view, init=START, options=quiet())
 
 
 @pytest.mark.parametrize("gain", [1 / 256, pytest.param(16.0, marks=pytest.mark.slow), 256.0])
 def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> None:
     """The background is given in the unit of the mesh's colours."""
     view = camera(48)
-    fit = fit_pose(bracket(), gain * picture(view), view, init=START, background=BACKGROUND, progress=False)
+    fit = fit_pose(before_sky(), gain * picture(view), view, init=START, options=quiet())
     off = errors(fit)
     assert off[0] < 0.1 and off[1] < 0.1 and fit.converged and fit.explained > 0.95, (off, fit.explained)
     assert errors(expected)[0] < 0.1 and fit.loss == pytest.approx(expected.loss, rel=0.3)
@@ -40,7 +41,7 @@ def test_a_broken_pixel_does_not_stop_a_fit() -> None:
     view = camera(48)
     image = picture(view)
     image[3, 3] = 1e5
-    fit = fit_pose(bracket(), image, view, init=START, background=BACKGROUND, progress=False)
+    fit = fit_pose(before_sky(), image, view, init=START, options=quiet())
     off = errors(fit)
     assert off[0] < 0.2 and off[1] < 0.2 and fit.converged, off
 
@@ -50,7 +51,7 @@ def test_a_dim_picture_before_clutter(gain: float) -> None:
     view = camera(48)
     with torch.no_grad():
         image = gain * eg.render(eg.Scene([bracket()], clutter(48)), view, 64, seed=0)
-    fit = fit_pose(bracket(), image, view, init=START, spp=8, search=False, progress=False)
+    fit = fit_pose(bracket(), image, view, init=START, search=False, options=quiet(spp=8))
     assert errors(fit)[0] < 2.0 and fit.converged, errors(fit)
 
 
@@ -93,7 +94,7 @@ def test_a_scene_whose_pictures_are_brighter_is_not_converged(gain: float) -> No
     start = pose_from_matrix("", about_center(rotation(0.03, -0.1, 0.04), (0.04, 0.0, 0.0)))
     wanted = {"meshes.0.pose": PoseParameter(start, rotation=0.02, shift=0.01)}
     options = {"steps": 20, "spp": 4, "progress": False, "method": "gauss-newton"}
-    fit = fit_scene(eg.Scene([bracket()], BACKGROUND), view, gain * picture(view), wanted, **options)
+    fit = fit_scene(eg.Scene([bracket()], BACKGROUND), gain * picture(view), view, wanted, **arranged(**options))
     assert (fit.explained > 0.9) == (gain == 1.0) and (fit.explained < 0.6) == (gain > 1.0), fit.explained
     assert gain == 1.0 or not fit.converged
 
@@ -104,9 +105,7 @@ def test_the_deviation_that_noise_leaves() -> None:
     clean = picture(view)
     for seed in range(4):
         noise = 0.05 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed))
-        fit = fit_pose(
-            bracket(), clean + noise, view, init=torch.eye(4), background=BACKGROUND, search=False, progress=False
-        )
+        fit = fit_pose(before_sky(), clean + noise, view, init=torch.eye(4), search=False, options=quiet())
         assert fit.uncertainty is not None and fit.task is not None
         degrees, percent = errors(fit)
         ratios += [degrees / fit.uncertainty.degrees, 0.01 * percent * fit.task.size / fit.uncertainty.shift]
@@ -138,4 +137,4 @@ def test_units_that_differ_are_named(scale: float, said: str) -> None:
     view = camera(32)
     mesh = bracket().transformed(scale=scale)
     with pytest.warns(UserWarning, match=said):
-        fit_pose(mesh, picture(view), view, background=BACKGROUND, steps=1, spp=1, search=False, progress=False)
+        fit_pose(eg.Scene([mesh], BACKGROUND), picture(view), view, search=False, options=quiet(steps=1, spp=1))

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from brackets import BACKGROUND, bracket, camera, rotation
+from quiet_fits import arranged
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, PoseParameter, fit_scene, losses
@@ -15,7 +16,7 @@ from edgegrad.fit.descent.curvature import curvature, weights_of
 from edgegrad.fit.descent.gauss_newton import GaussNewtonOptimizer
 from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.descent.scene_builder import builder
-from edgegrad.fit.options import Options
+from edgegrad.fit.options import Settings
 from edgegrad.fit.placement import Coordinates, Pose
 from edgegrad.fit.views import views_of
 
@@ -33,7 +34,7 @@ def objective_of(scene, cameras, targets, parameters, regularizer=None, weights=
     build, _ = builder(scene, [view.camera for view in seen], False)
     coordinates = Coordinates(parameters)
     tensors = {name: p.value for name, p in coordinates.parameters.items()}
-    given = Options(**{"spp": 16, **options})
+    given = Settings(**{"spp": 16, **options})
     return Objective(lambda values: build(coordinates.values(values)), seen, given, regularizer), tensors
 
 
@@ -140,7 +141,7 @@ def valley(monkeypatch):
         monkeypatch.setattr(gauss_newton, "curvature", lambda *_: curvature * torch.eye(2, dtype=F64))
         monkeypatch.setattr(gauss_newton, "check_pointwise", lambda objective: None)
         x = Parameter(lr, torch.tensor(start, dtype=F64), **bounds)
-        return GaussNewtonOptimizer({"x": x}, Options()), Valley()
+        return GaussNewtonOptimizer({"x": x}, Settings()), Valley()
 
     return made
 
@@ -200,7 +201,7 @@ def test_is_far_quicker_than_adam_by_steps():
     start = Pose(rotation(0.1, -0.1, 0.05), torch.tensor([0.05, 0.0, 0.1], dtype=F64))
     seen = []
     wanted = {"meshes.0.pose": PoseParameter(start, rotation=0.02, shift=0.01)}
-    fit = fit_scene(scene, view, target, wanted, method="gauss-newton", callback=seen.append, **QUIET)
+    fit = fit_scene(scene, target, view, wanted, **arranged(method="gauss-newton", callback=seen.append, **QUIET))
     assert fit.converged and fit.steps < 40 and [record.step for record in seen] == list(range(fit.steps))
     assert float((fit.poses["meshes.0.pose"].R - torch.eye(3)).norm()) < 0.02
     assert set(seen[0].gradient) == {"meshes.0.pose.rotation", "meshes.0.pose.shift"}
@@ -240,7 +241,7 @@ def test_errors_name_the_argument(change, error, message):
         arguments["parameters"] = {"v": Parameter(0.01, quad().verts)}
     view = eg.Camera.look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), size=(16, 16))
     with pytest.raises(error, match=message):
-        fit_scene(cameras=view, images=torch.zeros(16, 16, 3), **arguments)
+        fit_scene(images=torch.zeros(16, 16, 3), cameras=view, **arranged(**arguments))
 
 
 def quad():

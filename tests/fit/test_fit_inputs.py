@@ -8,11 +8,12 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from brackets import BACKGROUND, START, about_center, bracket, camera, picture, silhouette
+from brackets import START, about_center, before_sky, bracket, camera, picture, silhouette
 from photographs import coverage, depth_of, photograph
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
+from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
 from edgegrad.fit.pose.photo.depth import warn_of_units
@@ -37,20 +38,20 @@ def one_pixel(value=1.0):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"weight": torch.zeros(SIZE, SIZE)}, r"weight: expected numbers above 0 somewhere, got zero"),
-        ({"mask": one_pixel()}, r"mask: expected the object in 10 pixels or more, got it in 1;"),
-        ({"mask": one_pixel(), "init": None}, r"mask: expected the object in 10 pixels"),
+        ({"weights": torch.zeros(SIZE, SIZE)}, r"weights: expected numbers above 0 somewhere, got zero"),
+        ({"masks": one_pixel()}, r"masks: expected the object in 10 pixels or more, got it in 1;"),
+        ({"masks": one_pixel(), "init": None}, r"masks: expected the object in 10 pixels"),
         ({"max_size": 1}, r"max_size: expected an int from 8 "),
     ],
 )
 def test_what_shows_nothing_is_named(taken, given, message):
     view, image = taken
     with pytest.raises(ValueError, match=message):
-        fit_pose(bracket(), image, view, **{**QUICK, **given})
-    if "mask" in given:
-        given = {**given, "mask": given["mask"].int()}
-    with pytest.raises(ValueError, match=message.replace("mask:", r"mask\[0\]:")):
-        fit_poses([bracket()], image, view, **{**QUICK, **given, "init": [START]})
+        fit_pose(bracket(), image, view, **arranged(**{**QUICK, **given}))
+    if "masks" in given:
+        given = {**given, "masks": given["masks"].int()}
+    with pytest.raises(ValueError, match=message.replace("masks:", r"masks\[0\]:")):
+        fit_poses([bracket()], image, view, **arranged(**{**QUICK, **given, "init": [START]}))
 
 
 @pytest.mark.parametrize("side", [1, 3, 7])
@@ -58,10 +59,10 @@ def test_what_shows_nothing_is_named(taken, given, message):
 def test_a_tiny_picture_is_named(side, plain):
     picture = torch.rand(side, side, 3, generator=torch.Generator().manual_seed(0))
     message = rf"{{}}: expected a picture of 8 × 8 pixels or more, got {side} × {side}"
-    with pytest.raises(ValueError, match=message.format("target")):
-        fit_pose(bracket(plain), picture, camera(side), **QUICK)
-    with pytest.raises(ValueError, match=message.format("image")):
-        fit_camera(bracket(plain), picture, camera(side), progress=False)
+    with pytest.raises(ValueError, match=message.format("images")):
+        fit_pose(bracket(plain), picture, camera(side), **arranged(**QUICK))
+    with pytest.raises(ValueError, match=message.format("images")):
+        fit_camera(bracket(plain), picture, camera(side), options=quiet())
 
 
 def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
@@ -75,45 +76,45 @@ def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
         (labels, several), (one, several), (one[..., None], several), ([one.astype(np.uint8)], several), (one[None], several),
         (masks, several), ([[m] for m in masks], several), ([m[None].numpy() for m in masks], several),
     ):  # fmt: skip
-        for own, expected in zip(_masks(mask, 2, cameras), masks, strict=True):
+        for own, expected in zip(_masks(mask, 2, [view]), masks, strict=True):
             picture = torch.zeros(SIZE, SIZE, 3)
-            ((_, _, _, found, _),) = shots_of(cameras, picture, own, None, ArgumentNames())
+            ((_, _, _, found, _),) = shots_of(picture, cameras, own, None, ArgumentNames())
             assert torch.equal(torch.as_tensor(found).reshape(SIZE, SIZE), expected), (type(mask), cameras)
     for target in (torch.zeros(SIZE, SIZE, 3), np.zeros((1, SIZE, SIZE, 3)), [np.zeros((SIZE, SIZE, 3))]):
-        ((_, _, found, _, _),) = shots_of([view], target, None, None, ArgumentNames())
+        ((_, _, found, _, _),) = shots_of(target, [view], None, None, ArgumentNames())
         assert found.shape == (SIZE, SIZE, 3)
 
 
 def test_poses_to_start_from_may_be_an_array(taken):
     view, image = taken
     labels = (coverage(view)[..., 0] > 0.5).numpy().astype(np.int32)
-    (fit,) = fit_poses([bracket()], image, view, labels, **{**QUICK, "init": START[None].numpy()})
+    (fit,) = fit_poses([bracket()], image, view, labels, **arranged(**{**QUICK, "init": START[None].numpy()}))
     assert fit.steps > 0
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"mask": torch.ones(9, 9).int()}, r"mask: expected shape \(48, 48\) .*, got \(9, 9\); an image of labels"),
-        ({"mask": np.ones((9, 9), int)}, r"mask: expected shape \(48, 48\) .*, got \(9, 9\)"),
-        ({"mask": np.ones((SIZE, SIZE))}, r"mask: expected an image of labels, of integers.*float64"),
+        ({"masks": torch.ones(9, 9).int()}, r"masks: expected shape \(48, 48\) .*, got \(9, 9\); an image of labels"),
+        ({"masks": np.ones((9, 9), int)}, r"masks: expected shape \(48, 48\) .*, got \(9, 9\)"),
+        ({"masks": np.ones((SIZE, SIZE))}, r"masks: expected an image of labels, of integers.*float64"),
         ({"init": START}, r"init: expected a list with one for each mesh, got Tensor; give \[init\]"),
     ],
 )
 def test_errors_of_labels(taken, given, message):
     view, image = taken
     with pytest.raises((TypeError, ValueError), match=message):
-        fit_poses([bracket()], image, view, **{**QUICK, "init": [START], **given})
+        fit_poses([bracket()], image, view, **arranged(**{**QUICK, "init": [START], **given}))
 
 
 def test_one_picture_for_two_cameras(taken):
     view, image = taken
-    with pytest.raises(ValueError, match=r"target: expected 2, one for each camera, got one of shape \(48, 48, 3\)"):
-        fit_pose(bracket(), image, [view, view], **QUICK)
+    with pytest.raises(ValueError, match=r"images: expected 2, one for each camera, got 1 in shape \(48, 48, 3\)"):
+        fit_pose(bracket(), image, [view, view], **arranged(**QUICK))
     mask = coverage(view)[..., 0]
     for given in (mask, [mask]):
-        with pytest.raises(ValueError, match=r"mask.*: expected 2, one for each camera, got one of shape \(48, 48\)"):
-            fit_poses([bracket()], [image] * 2, [view] * 2, given, **{**QUICK, "init": [START]})
+        with pytest.raises(ValueError, match=r"masks.*: expected 2, one for each camera, got 1"):
+            fit_poses([bracket()], [image] * 2, [view] * 2, given, **arranged(**{**QUICK, "init": [START]}))
 
 
 def test_units_of_depth(taken):
@@ -121,7 +122,7 @@ def test_units_of_depth(taken):
     depth, scene = depth_of(view)[..., 0], eg.Scene([bracket()])
     depth[depth == 0.0] = torch.nan
     for factor, scale in ((1e-3, r"1e\+03"), (10.0, r"0\.1"), (6.56, r"0\.15")):
-        with pytest.warns(UserWarning, match=rf"depth: expected distances in world units.* multiply it by {scale}"):
+        with pytest.warns(UserWarning, match=rf"depths: expected distances in world units.* multiply it by {scale}"):
             warn_of_units(scene, [view], [factor * depth], "at the start")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -133,13 +134,13 @@ def test_units_of_depth(taken):
 def test_depth_in_other_units_is_warned_of(taken, fit):
     view, image = taken
     depth = 1000.0 * depth_of(view)[..., 0]
-    with pytest.warns(UserWarning, match=r"depth: expected .* multiply it by 0\.001"):
+    with pytest.warns(UserWarning, match=r"depths: expected .* multiply it by 0\.001"):
         if fit is track:
-            next(track(bracket(), [image], view, START, depth=[depth]))
+            next(track(bracket(), [image], view, START, depths=[depth], options=FitOptions(seed=0)))
         elif fit is fit_poses:
-            fit_poses([bracket()], image, view, depth=depth, **{**QUICK, "init": [START]})
+            fit_poses([bracket()], image, view, depths=depth, **arranged(**{**QUICK, "init": [START]}))
         else:
-            fit_pose(bracket(), image, view, depth=depth, **QUICK)
+            fit_pose(bracket(), image, view, depths=depth, **arranged(**QUICK))
 
 
 @pytest.mark.parametrize(
@@ -151,7 +152,7 @@ def test_a_film_begins_where_the_object_is_seen(taken, along, message):
     init = START.clone()
     init[:3, 3] -= 50.0 * view.world_to_camera[along, :3].double()
     with pytest.raises(ValueError, match=message):
-        track(bracket(), [image], view, init)  # at once
+        track(bracket(), [image], view, init, options=FitOptions(seed=0))  # at once
 
 
 def test_more_steps_are_taken_where_they_are_asked_for():
@@ -164,7 +165,7 @@ def test_more_steps_are_taken_where_they_are_asked_for():
 def test_what_is_not_explained_is_not_blamed_on_steps(taken):
     """A plain mesh has to show more of its edges than one with colours."""
     view, image = taken
-    fit = fit_pose(bracket(True), image, view, init=START, search=False, progress=False, steps=2)
+    fit = fit_pose(bracket(True), image, view, init=START, search=False, options=quiet(steps=2))
     assert 0.6 < fit.explained < CONTOUR_SUPPORT and not fit.converged, fit.explained
     assert fit.reason.startswith("edges not explained"), fit.reason
 
@@ -173,9 +174,9 @@ def test_what_is_not_explained_is_not_blamed_on_steps(taken):
 def test_a_picture_from_the_bottom_up_is_named(masked):
     view = camera(24)
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
-    options = {"mask": mask} if masked else {"background": BACKGROUND}
-    with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=3, **options)
+    options = {"masks": mask} if masked else {}
+    with pytest.warns(UserWarning, match=r"^images: expected the upper row first.*image\.flip\(0\)"):
+        fit = fit_pose(before_sky(), target, view, init=START, **arranged(steps=3, **options))
     assert not fit.converged
 
 
@@ -185,10 +186,12 @@ def test_masks_from_the_bottom_up_are_named():
     parameters = {"verts": 1e-4}
     options = {"masks": masks, "steps": 2, "spp": 2, "progress": False}
     with pytest.warns(UserWarning, match=r"^masks: expected the upper row first.*IoU of \d+%, as given at \d+%"):
-        fit_scene(bracket(), views, None, parameters, **options)
+        fit_scene(bracket(), None, views, parameters, **arranged(**options))
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        fit_scene(bracket(), views, None, parameters, **options | {"masks": [mask.flip(0) for mask in masks]})
+        fit_scene(
+            bracket(), None, views, parameters, **arranged(**options | {"masks": [mask.flip(0) for mask in masks]})
+        )
 
 
 BLANK = torch.zeros(64, 64, 3)
@@ -198,35 +201,36 @@ BLANK = torch.zeros(64, 64, 3)
     "change, error, message",
     [
         ({"mesh": "bracket.obj"}, TypeError, "mesh: expected a Mesh or a Scene, got str"),
-        ({"target": torch.zeros(32, 64, 3)}, ValueError, "target: expected shape (64, 64, C), got (32, 64, 3)"),
-        ({"target": torch.zeros(64, 64, 4)}, ValueError, "target: expected 3 channels"),
-        ({"target": [BLANK] * 2}, ValueError, "target: expected one, for the one camera, got a list of 2"),
-        ({"target": BLANK}, ValueError, "target: expected a picture of the object, got the same in every"),
-        ({"target": BLANK, "mask": torch.ones(64, 64)}, ValueError, "mask: expected a picture of the object"),
-        ({"target": torch.full((64, 64, 3), math.nan)}, ValueError, "target: expected finite"),
-        ({"target": "photo.png"}, TypeError, "target: expected an image (H, W, C) of numbers, got the path 'photo.png'; read"),
-        ({"target": None}, TypeError, "target: expected an image (H, W, C) of numbers, got None; read one with read_image"),
-        ({"camera": np.eye(4)}, TypeError, "camera: expected a Camera, got ndarray"),
-        ({"camera": eg.Camera.stack([camera(), camera()])}, ValueError, "camera: expected one camera, got 2"),
-        ({"camera": []}, ValueError, "camera: expected at least one"),
-        ({"mask": torch.ones(8, 8)}, ValueError, "mask: expected shape (64, 64) or (64, 64, 1), got (8, 8)"),
-        ({"camera": [camera()], "target": [BLANK], "mask": [torch.ones(4, 4)]}, ValueError, "mask[0]: expected"),
-        ({"mask": torch.ones(64, 64), "background": 0.0}, ValueError, "background: expected None with a mask"),
-        ({"background": torch.ones(2)}, ValueError, "background: expected shape (3,) or (64, 64, 3), got (2,)"),
-        ({"weight": -torch.ones(64, 64)}, ValueError, "weight: expected numbers from 0 up"),
-        ({"weight": torch.ones(64, 64, 3)}, ValueError, "weight: expected shape (64, 64) or (64, 64, 1)"),
+        ({"images": torch.zeros(32, 64, 3)}, ValueError, "images: expected shape (64, 64, C), got (32, 64, 3)"),
+        ({"images": torch.zeros(64, 64, 4)}, ValueError, "images: expected 3 channels"),
+        ({"images": [BLANK] * 2}, ValueError, "images: expected 1, one for each camera, got 2; give as many cameras"),
+        ({"images": BLANK}, ValueError, "images: expected a picture of the object, got the same in every"),
+        ({"images": BLANK, "masks": torch.ones(64, 64)}, ValueError, "masks: expected a picture of the object"),
+        ({"images": torch.full((64, 64, 3), math.nan)}, ValueError, "images: expected finite"),
+        ({"images": "photo.png"}, TypeError, "images: expected an image (H, W, C) of numbers, got the path 'photo.png'; read"),
+        ({"images": None}, ValueError, "images: expected pictures or masks to compare with, got neither"),
+        ({"cameras": np.eye(4)}, TypeError, "cameras: expected a Camera or a sequence of them, got ndarray"),
+        ({"cameras": eg.Camera.stack([camera(), camera()])}, ValueError, "images: expected 2, one for each camera"),
+        ({"cameras": []}, ValueError, "cameras: expected one for each picture, got an empty list"),
+        ({"masks": torch.ones(8, 8)}, ValueError, "masks: expected shape (64, 64) or (64, 64, 1), got (8, 8)"),
+        ({"cameras": [camera()], "images": [BLANK], "masks": [torch.ones(4, 4)]}, ValueError, "masks: expected"),
+        ({"mesh": eg.Scene([bracket()], torch.ones(9, 9, 3))}, ValueError, "background: expected shape"),
+        ({"weights": -torch.ones(64, 64)}, ValueError, "weights: expected numbers from 0 up"),
+        ({"weights": torch.ones(64, 64, 3)}, ValueError, "weights: expected shape (64, 64) or (64, 64, 1)"),
         ({"init": torch.eye(3)}, ValueError, "init: expected shape (4, 4), got (3, 3)"),
         ({"init": about_center(torch.eye(3).double(), (20.0, 0.0, -8.0))}, ValueError, "init: expected a pose at which"),
         ({"init": about_center(torch.eye(3).double(), (3.0, 3.0, 9.0))}, ValueError, "init: expected the object in front"),
         ({"steps": 0}, ValueError, "steps: expected an int from 1"),
         ({"spp": 1.5}, TypeError, "spp: expected an int"),
-        ({"tolerance": 0.0}, ValueError, "tolerance: expected a number above 0 and below 1, got 0"),
+        ({"step_tolerance": 0.0}, ValueError, "step_tolerance: expected a number from 1e-30 to 1, got 0"),
     ],
 )  # fmt: skip
 def test_errors_name_the_argument(change, error, message):
     something = torch.eye(64)[..., None].expand(-1, -1, 3)
     with pytest.raises(error) as caught:
-        fit_pose(**{"mesh": bracket(), "target": something, "camera": camera(), "progress": False, **change})
+        fit_pose(
+            **arranged(**{"mesh": bracket(), "images": something, "cameras": camera(), "progress": False, **change})
+        )
     assert message in str(caught.value)
 
 
@@ -234,20 +238,20 @@ def test_pictures_and_masks_of_bytes_are_named():
     view = camera(16)
     image = picture(view)
     bytes_ = (255 * image / image.max()).round()
-    with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
-        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, steps=1, search=False, progress=False)
+    with pytest.warns(UserWarning, match=r"images: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
+        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, search=False, options=quiet(steps=1))
     resized = 40.0 + 0.7 * bytes_  # no whole numbers any more
     with pytest.warns(
-        UserWarning, match=r"target: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
+        UserWarning, match=r"images: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
     ):
-        fit_pose(bracket(), resized, view, silhouette(view), init=START, steps=1, search=False, progress=False)
+        fit_pose(bracket(), resized, view, silhouette(view), init=START, search=False, options=quiet(steps=1))
     with pytest.raises(
-        ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
+        ValueError, match=r"masks: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
     ):
-        fit_pose(bracket(), image, view, 255.0 * torch.eye(16), progress=False)
-    with pytest.raises(ValueError, match=r"masks\[0\]: expected numbers from 0 to 1"):
+        fit_pose(bracket(), image, view, 255.0 * torch.eye(16), options=quiet())
+    with pytest.raises(ValueError, match=r"masks: expected numbers from 0 to 1"):
         masks = [255.0 * torch.eye(16)]
-        fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
+        fit_scene(bracket(), None, [view], {"meshes[0].verts": 0.01}, masks=masks, options=quiet())
 
 
 def test_alpha_is_no_colour_of_a_picture():
@@ -257,10 +261,10 @@ def test_alpha_is_no_colour_of_a_picture():
     words = (
         r"expected grey or colours, got 4 channels.*read_image\(path, channels=3\), or, .* x\[\.\.\., -1:\] as its mask"
     )
-    with pytest.raises(ValueError, match="target: " + words):
-        fit_pose(bracket(plain=True), image, view, progress=False)
     with pytest.raises(ValueError, match="images: " + words):
-        fit_scene(bracket(plain=True), view, image, {"verts": 0.01}, loss="region", progress=False)
+        fit_pose(bracket(plain=True), image, view, options=quiet())
+    with pytest.raises(ValueError, match="images: " + words):
+        fit_scene(bracket(plain=True), image, view, {"verts": 0.01}, options=quiet(loss="region"))
 
 
 def test_faint_masks_are_named():
@@ -270,16 +274,16 @@ def test_faint_masks_are_named():
     view, other = camera(16), camera(16, distance=2.6)
     mask, options = silhouette(view), {"callback": stop, "progress": False}
     with pytest.warns(
-        UserWarning, match=r"mask: expected 1 where the object covers .* got at most 0\.216; .* read_mask"
+        UserWarning, match=r"masks: expected 1 where the object covers .* got at most 0\.216; .* read_mask"
     ):
-        fit_pose(bracket(), picture(view), view, 0.216 * mask, init=START, **options)
+        fit_pose(bracket(), picture(view), view, 0.216 * mask, init=START, **arranged(**options))
     what = {"verts": 0.01}
     with pytest.warns(UserWarning, match=r"masks: expected 1 where the object covers .* got at most 0\.00392"):
-        fit_scene(bracket(), view, None, what, masks=mask / 255, **options)
+        fit_scene(bracket(), None, view, what, masks=mask / 255, **arranged(**options))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # In one of two views the object is hardly seen.
-        fit_scene(bracket(), [view, other], None, what, masks=[mask, 0.1 * silhouette(other)], **options)
+        fit_scene(bracket(), None, [view, other], what, masks=[mask, 0.1 * silhouette(other)], **arranged(**options))
 
 
 @pytest.mark.parametrize("channels", [1, 2, 4])
@@ -287,7 +291,7 @@ def test_faint_masks_are_named():
 def test_pictures_of_scenes_have_the_channels_of_the_scene(channels, method):
     image = torch.rand(16, 16, channels)
     with pytest.raises(ValueError, match=f"images: expected 3 channels like the scene's colours, got {channels}"):
-        fit_scene(bracket(), camera(16), image, parameters={"verts": 0.1}, method=method, steps=1, progress=False)
+        fit_scene(bracket(), image, camera(16), parameters={"verts": 0.1}, options=quiet(method=method, steps=1))
 
 
 def test_pictures_of_a_texture_have_its_channels():
@@ -296,4 +300,4 @@ def test_pictures_of_a_texture_have_its_channels():
     verts = torch.cat([corners, torch.zeros(3, 1)], 1)
     mesh = eg.Mesh(verts, faces, texture=torch.rand(4, 4, 3), uvs=corners, uv_faces=faces)
     with pytest.raises(ValueError, match="images: expected 3 channels like the mesh's texture, got 4"):
-        fit_texture(mesh, camera(16), torch.rand(16, 16, 4), steps=1, progress=False)
+        fit_texture(mesh, torch.rand(16, 16, 4), camera(16), options=quiet(steps=1))

@@ -9,11 +9,13 @@ import torch
 import trimesh
 from brackets import CENTER, START, about_center, bracket, camera, errors, rotation, task_of
 from photographs import clutter, coverage, depth_of, photograph
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import srgb_to_linear
-from edgegrad.fit import fit_camera, fit_pose
+from edgegrad.fit import Checkpoint, fit_camera, fit_pose
+from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.photo import photo_descent, photo_search
 from edgegrad.fit.pose.photo.level import photo_levels
@@ -38,7 +40,8 @@ def test_a_result_is_judged_by_the_limit_of_the_terms_that_it_is_from(photograph
     """Colours that show 62 % of the edges converged, though the terms of photographs would need more."""
     view = camera(48)
     image = eg.render(eg.Scene([bracket()], torch.tensor([0.1, 0.2, 0.3])), view, spp=16, seed=0)
-    search = photo_search.PhotoSearch(task_of(image, view), pose_from_matrix("pose", START), [None], 48, 8, 10, 1e-3, 0)
+    few = Settings(steps=10, step_tolerance=1e-3, spp=8, max_size=48)
+    search = photo_search.PhotoSearch(task_of(image, view), pose_from_matrix("pose", START), [None], few)
     assert search.colors_first
     colors = SimpleNamespace(
         best=search.start, loss=1.0, edge_support=0.62, converged=True, information=None, enough=0.6, history=[]
@@ -75,9 +78,9 @@ def taken():
 )
 def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     view, image = taken
-    given = {"mask": {"mask": coverage(view)}, "depth": {"depth": depth_of(view)}}.get(kind, {})
+    given = {"mask": {"masks": coverage(view)}, "depth": {"depths": depth_of(view)}}.get(kind, {})
     given["search"] = kind in ("colours", "plain")
-    fit = fit_pose(bracket(kind == "plain"), image, view, init=START, progress=False, **given)
+    fit = fit_pose(bracket(kind == "plain"), image, view, init=START, **arranged(**given))
     off = errors(fit)
     assert off[0] < degrees and off[1] < percent, (off, fit.explained)  # 12.3° and 8.4 % off at the start
     assert fit.explained >= photo_descent.PHOTO_SUPPORT and fit.converged == (kind != "plain")
@@ -91,8 +94,8 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
 @pytest.mark.parametrize(("unit", "weight"), [(40.0, 1.0), (1e-3, 1.0), (1.0, 0.01), (1.0, 255.0)])
 def test_radiance_and_weights_of_any_unit(taken, unit, weight):
     view, image = taken
-    given = {"init": START, "weight": torch.full(view.size, weight), "search": False, "progress": False}
-    fit = fit_pose(bracket(), unit * image, view, **given)
+    given = {"init": START, "weights": torch.full(view.size, weight), "search": False, "progress": False}
+    fit = fit_pose(bracket(), unit * image, view, **arranged(**given))
     off = errors(fit)
     assert off[0] < 2.5 and off[1] < 0.6 and fit.converged, (off, fit.explained)
     assert float(fit.uncertainty.degrees) == pytest.approx(2.3, abs=0.1)
@@ -104,13 +107,9 @@ def test_two_photographs_of_one_pose(taken):
         CENTER + 4.5 * torch.tensor([-0.6, 0.35, 0.72]).double(), CENTER, fov_y=45.0, size=(96, 96)
     )
     fit = fit_pose(
-        bracket(),
-        [image, photograph(other, seed=1, gain=(0.7, 0.8, 0.9))],
-        [view, other],
-        init=START,
-        search=False,
-        progress=False,
-    )
+        bracket(), [image, photograph(other, seed=1, gain=(0.7, 0.8, 0.9))], [view, other], init=START, search=False,
+        options=quiet(),
+    )  # fmt: skip
     off = errors(fit)
     assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, off
 
@@ -119,7 +118,7 @@ def test_a_camera_in_a_photograph(taken):
     """fit_camera takes the same terms; the camera starts as far from the bracket as the bracket did from its pose."""
     view, image = taken
     moved = view.replace(world_to_camera=view.world_to_camera.double() @ START)
-    fit = fit_camera(bracket(), image, moved, focal=False, search=False, progress=False)
+    fit = fit_camera(bracket(), image, moved, focal=False, search=False, options=quiet())
     found = fit.camera.world_to_camera.double() @ torch.linalg.inv(view.world_to_camera.double())
     degrees = math.degrees(math.acos(min(1.0, (float(found[:3, :3].trace()) - 1.0) / 2.0)))
     seen, before, right = (one.project(bracket().verts) for one in (fit.camera, moved, view))
@@ -129,7 +128,7 @@ def test_a_camera_in_a_photograph(taken):
 
 def test_a_photograph_of_something_else_is_not_converged():
     view = camera(64)
-    fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, progress=False)
+    fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, options=quiet())
     assert not fit.converged and fit.explained < photo_descent.PHOTO_SUPPORT
     assert fit.reason.startswith("edges not explained")
 
@@ -144,14 +143,14 @@ def test_a_faint_contour_proves_little(step, least, most):
     image = srgb_to_linear((255.0 * display).round() / 255.0)  # of 8 bits, in which 1 is white
     task = task_of(image, view, bracket(True))
     pose = pose_from_matrix("init", torch.eye(4))
-    level = photo_levels(task, pose, [None], 96, 16, 0)[-1]
+    level = photo_levels(task, pose, [None], Settings(max_size=96))[-1]
     assert least <= level.edge_support(pose, 0) <= most
 
 
 @pytest.mark.slow
 def test_noise_is_refused_without_following_other_starts():
     noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
-    fit = fit_pose(bracket(), noise, camera(96), init=START, progress=False)
+    fit = fit_pose(bracket(), noise, camera(96), init=START, options=quiet())
     assert not fit.converged and fit.explained < 0.1
     assert fit.reason.startswith("edges not explained")
     finest = [step for step in fit.history if step.size == fit.history[-1].size]
@@ -161,36 +160,39 @@ def test_noise_is_refused_without_following_other_starts():
 def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
     view, image = taken
     start, whole = about_center(rotation(0.05, -0.04, 0.03)), {"progress": False, "search": False, "spp": 8, "steps": 4}
-    expected = fit_pose(bracket(), image, view, init=start, **whole)
+    expected = fit_pose(bracket(), image, view, init=start, **arranged(**whole))
 
     def stop(fit):
         if fit.steps == 5:
             raise KeyboardInterrupt
 
     file = tmp_path / "fit.pt"
-    first = fit_pose(bracket(), image, view, init=start, checkpoint=file, callback=stop, **whole)
+    first = fit_pose(bracket(), image, view, init=start, **arranged(callback=stop, checkpoint=file, **whole))
     assert first.interrupted and first.steps == 5 and not first.converged
-    found = fit_pose(bracket(), image, view, init=start, checkpoint=file, resume=True, **whole)
+    found = fit_pose(bracket(), image, view, init=start, **arranged(checkpoint=Checkpoint(file, resume=True), **whole))
     assert torch.equal(found.matrix, expected.matrix) and found.explained == expected.explained
     assert found.steps == expected.steps and found.converged == expected.converged
     with pytest.raises(ValueError, match="depth"):
-        fit_pose(bracket(), image, view, init=start, checkpoint=file, resume=True, depth=depth_of(view), **whole)
+        fit_pose(
+            bracket(), image, view, init=start, depths=depth_of(view),
+            **arranged(checkpoint=Checkpoint(file, resume=True), **whole),
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("depth", "error", "message"),
     [
-        (torch.ones(10, 10), ValueError, r"depth: expected shape .*96.*, got .*10.*"),
-        (torch.full((96, 96), -1.0), ValueError, r"depth: expected distances along the camera's axis.*got -1"),
-        (torch.ones(96, 96, dtype=torch.int32), TypeError, r"depth: expected .*float.*take depth / 1000"),
-        (torch.zeros(96, 96), ValueError, r"depth: expected distances somewhere, got none"),
-        ([torch.ones(96, 96)] * 2, ValueError, r"depth: expected 1, one for each camera, got 2"),
+        (torch.ones(10, 10), ValueError, r"depths: expected shape .*96.*, got .*10.*"),
+        (torch.full((96, 96), -1.0), ValueError, r"depths: expected distances along the camera's axis.*got -1"),
+        (torch.ones(96, 96, dtype=torch.int32), TypeError, r"depths: expected .*float.*take depth / 1000"),
+        (torch.zeros(96, 96), ValueError, r"depths: expected distances somewhere, got none"),
+        ([torch.ones(96, 96)] * 2, ValueError, r"depths: expected 1, one for each camera, got 2"),
     ],
 )
 def test_errors_of_depth(taken, depth, error, message):
     view, image = taken
     with pytest.raises(error, match=message):
-        fit_pose(bracket(), image, view, init=START, depth=depth, progress=False)
+        fit_pose(bracket(), image, view, init=START, depths=depth, options=quiet())
 
 
 @pytest.mark.slow
@@ -204,7 +206,7 @@ def test_an_ambiguous_pose_in_unknown_light_is_not_converged():
     R = turned(torch.tensor([0.0, 0.25, 0.0], dtype=torch.float64))
     start = torch.eye(4, dtype=torch.float64)
     start[:3, :3] = turned(torch.tensor([0.05, -0.2, 0.0], dtype=torch.float64))
-    fit = fit_pose(box, photograph(view, box.transformed(R), seed=4), view, init=start, spp=8, progress=False)
+    fit = fit_pose(box, photograph(view, box.transformed(R), seed=4), view, init=start, options=quiet(spp=8))
     assert fit.explained >= photo_descent.PHOTO_SUPPORT and not fit.uncertainty.unknown and not fit.converged
     assert fit.reason.startswith("ambiguous: the pictures hardly separate it from a pose that is turned by "), (
         fit.reason
@@ -230,7 +232,7 @@ def test_an_ambiguous_pose_is_not_converged(monkeypatch):
     ):  # the colours of this clutter make the right one likelier, by a factor of some exp(2.6)
         monkeypatch.setattr(photo_search, "AMBIGUITY_NATS", least)
         monkeypatch.setattr(photo_search, "CONTOUR_AMBIGUITY_NATS", least)
-        found.append(fit_pose(box, image, view, init=start, progress=False))
+        found.append(fit_pose(box, image, view, init=start, options=quiet()))
     for fit in found:
         assert math.degrees(math.acos(min(1.0, (float((fit.R.T @ R).trace()) - 1.0) / 2.0))) < 3.0
         assert fit.explained >= photo_descent.CONTOUR_SUPPORT

@@ -11,12 +11,14 @@ from brackets import CENTER, bracket, rotation, task_of
 from motions import about
 from photographs import clutter, depth_of, photograph
 from PIL import Image
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.cli import main
 from edgegrad.files.image import linear_to_srgb
 from edgegrad.fit import fit_pose, fit_poses
+from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.jacobian import Motions, Rendered
 from edgegrad.fit.pose.photo.level import photo_levels
 from edgegrad.fit.pose.photo.light import FittedLight
@@ -178,13 +180,13 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
     view, image = two
     given = {"search": kind not in ("colours", "depth")}
     if kind == "labels":
-        given = {"mask": labels_of(view, scene_of(2))}
+        given = {"masks": labels_of(view, scene_of(2))}
     if kind == "shares":
-        given = {"mask": list(shares_of(view, scene_of(2), 256).unbind(-1))}
+        given = {"masks": list(shares_of(view, scene_of(2), 256).unbind(-1))}
     if kind == "depth":
-        given["depth"] = depth_of(view, *scene_of(2))
+        given["depths"] = depth_of(view, *scene_of(2))
     meshes = [mesh.replace(face_colors=None) for mesh in MESHES[:2]] if kind == "plain" else MESHES[:2]
-    fits = fit_poses(meshes, image, view, init=STARTS[:2], progress=False, **given)
+    fits = fit_poses(meshes, image, view, init=STARTS[:2], **arranged(**given))
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=False):
         off = errors(fit, mesh, truth)
         assert off[0] < degrees and off[1] < percent, (kind, off, fit.explained)
@@ -202,7 +204,7 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
 def test_three_objects():
     view = view_of(96)
     image = photograph(view, *scene_of(3), seed=1)
-    fits = fit_poses(MESHES, image, view, init=STARTS, depth=depth_of(view, *scene_of(3)), progress=False)
+    fits = fit_poses(MESHES, image, view, init=STARTS, depths=depth_of(view, *scene_of(3)), options=quiet())
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=True):
         off = errors(fit, mesh, truth)
         assert off[0] < 0.3 and off[1] < 0.1 and fit.converged, (off, fit.explained)
@@ -212,7 +214,7 @@ def test_three_objects():
 def test_a_mesh_that_is_not_there_makes_no_other_wrong(two):
     view, image = two
     absent = at(rotation(0.2, 0.3, 0.1), CENTER + torch.tensor([-1.2, -1.0, 0.2]).double())
-    fits = fit_poses(MESHES, image, view, init=[*STARTS[:2], absent], search=False, progress=False)
+    fits = fit_poses(MESHES, image, view, init=[*STARTS[:2], absent], search=False, options=quiet())
     assert fits[0].converged and fits[1].converged and not fits[2].converged, [fit.explained for fit in fits]
     assert fits[2].explained < 0.65 and fits[2].reason.startswith(("edges not explained", "steps ran out"))
     assert errors(fits[1], MESHES[1], TRUTHS[1])[0] < 1.5
@@ -226,7 +228,7 @@ def test_a_hidden_mesh_is_said_to_be_hidden(two):
     away = torch.nn.functional.normalize(CENTER + ASIDE - eye, dim=0)
     small = box((0.3, 0.3, 0.3), seed=5)
     hidden = at(torch.eye(3).double(), CENTER + ASIDE + 1.3 * away)
-    fits = fit_poses([*MESHES[:2], small], image, view, init=[*STARTS[:2], hidden], search=False, progress=False)
+    fits = fit_poses([*MESHES[:2], small], image, view, init=[*STARTS[:2], hidden], search=False, options=quiet())
     assert fits[0].converged and fits[1].converged and not fits[2].converged
     assert fits[2].visible < 0.1 and fits[2].reason.startswith("hidden: the other objects leave"), fits[2].reason
     torch.testing.assert_close(fits[2].matrix, hidden, atol=0.05, rtol=0.0)
@@ -241,7 +243,7 @@ def test_a_stopped_fit_keeps_the_poses_so_far(two):
         if len(seen) == 3:
             raise KeyboardInterrupt
 
-    fits = fit_poses(MESHES[:2], image, view, init=STARTS[:2], callback=stop, progress=False)
+    fits = fit_poses(MESHES[:2], image, view, init=STARTS[:2], options=quiet(callback=stop))
     assert len(seen) == 3 and all(fit.interrupted and not fit.converged and fit.steps == 3 for fit in fits)
     assert all(fit.reason == "interrupted" for fit in fits)
     assert not torch.equal(fits[0].matrix, STARTS[0])
@@ -265,19 +267,19 @@ WITHIN = at(torch.eye(3).double(), CENTER + ASIDE)
         ([*MESHES[:2], box((0.3, 0.3, 0.3))], {"init": [*STARTS[:2], WITHIN]}, ValueError,
          r"init\[2\]: expected the objects next to one another, got meshes\[2\] inside meshes\[1\]"),
         ([MESHES[0]] * 2, {"init": [STARTS[0]] * 2}, ValueError, r"init\[0\]: expected the objects apart"),
-        (MESHES[:2], {"init": STARTS[:2], "mask": BLANK[..., 0]}, TypeError, r"mask: expected an image of labels, of integers"),
-        (MESHES[:2], {"init": STARTS[:2], "mask": [BLANK[..., 0]]}, ValueError, r"mask: expected 2, one for each mesh, got 1"),
-        (MESHES[:2], {"init": STARTS[:2], "mask": BLANK[..., 0].int() + 1}, ValueError, r"mask: expected the label 2 where"),
-        (MESHES[:2], {"init": STARTS[:2], "mask": [BLANK[:9, :9, 0]] * 2}, ValueError, r"mask\[0\]: expected .*160.*, got .*9"),
-        (MESHES[:2], {"init": STARTS[:2], "depth": BLANK[:9, :9, 0]}, ValueError, r"depth: expected shape .*160.*, got .*9"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": BLANK[..., 0]}, TypeError, r"masks: expected an image of labels, of integers"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": [BLANK[..., 0]]}, ValueError, r"masks: expected 2, one for each mesh, got 1"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": BLANK[..., 0].int() + 1}, ValueError, r"masks: expected the label 2 where"),
+        (MESHES[:2], {"init": STARTS[:2], "masks": [BLANK[:9, :9, 0]] * 2}, ValueError, r"masks\[0\]: expected .*160.*, got .*9"),
+        (MESHES[:2], {"init": STARTS[:2], "depths": BLANK[:9, :9, 0]}, ValueError, r"depths: expected shape .*160.*, got .*9"),
         (MESHES[:2], {"init": STARTS[:2], "symmetries": ["find"]}, ValueError, r"symmetries: expected 2, .* got 1"),
-        (MESHES[:2], {"init": STARTS[:2], "callback": 3}, TypeError, r"callback: expected a function of a list of PoseFits"),
+        (MESHES[:2], {"init": STARTS[:2], "callback": 3}, TypeError, r"callback: expected a function of the result so far"),
     ],
 )  # fmt: skip
 def test_errors_name_the_argument(two, meshes, given, error, message):
     view, image = two
     with pytest.raises(error, match=message):
-        fit_poses(meshes, image, view, progress=False, **given)
+        fit_poses(meshes, image, view, **arranged(**given))
 
 
 @pytest.mark.slow
@@ -338,7 +340,7 @@ def test_what_covers_an_object_is_found_by_its_light(covered, strength):
     image = torch.lerp(bare, image, strength)
     task = task_of(image, view)
     pose = pose_from_matrix("pose", torch.eye(4))
-    level = photo_levels(task, pose, [None], 256, 16, 0)[-1]
+    level = photo_levels(task, pose, [None], Settings())[-1]
     (weight,) = occluder_weights(level.comparisons(pose, 0))
     # The level is a part of the picture.
     top, left = (
@@ -355,7 +357,7 @@ def test_what_covers_an_object_is_found_by_its_light(covered, strength):
 @pytest.mark.slow
 def test_a_quarter_covered(covered):
     view, image, _, _ = covered
-    fit = fit_pose(bracket(), image, view, init=STARTS[0], progress=False)
+    fit = fit_pose(bracket(), image, view, init=STARTS[0], options=quiet())
     off = errors(fit, MESHES[0], TRUTHS[0])
     assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, (off, fit.explained)
 
@@ -380,11 +382,11 @@ def test_two_meshes_that_end_in_one_place_have_not_converged():
     neighbour = moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
     image = photograph(view, *scene_of(1), seed=4)
     starts = [TRUTHS[0], neighbour]
-    fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, spp=8, steps=2, search=False, progress=False)
+    fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, search=False, options=quiet(spp=8, steps=2))
     for k, fit in enumerate(fits):
         assert not fit.converged and fit.reason.startswith(f"in one place: meshes[{k}] ends where")
     apart = [TRUTHS[0], moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (2.5, 0.02, 0.02))]
-    fits = fit_poses([MESHES[0]] * 2, image, view, init=apart, spp=8, steps=2, search=False, progress=False)
+    fits = fit_poses([MESHES[0]] * 2, image, view, init=apart, search=False, options=quiet(spp=8, steps=2))
     assert not any(fit.reason.startswith("in one place") for fit in fits)
 
 
@@ -392,6 +394,6 @@ def test_two_meshes_that_end_in_one_place_have_not_converged():
 def test_a_direction_that_contours_do_not_show_is_unknown():
     view = view_of(96)
     plain = [mesh.replace(face_colors=None) for mesh in MESHES[:2]]
-    first, _ = fit_poses(plain, photograph(view, *scene_of(2), seed=2), view, init=STARTS[:2], spp=8, progress=False)
+    first, _ = fit_poses(plain, photograph(view, *scene_of(2), seed=2), view, init=STARTS[:2], options=quiet(spp=8))
     assert not first.converged and first.uncertainty is not None and first.uncertainty.unknown
     assert first.reason.startswith("directions unknown")

@@ -9,11 +9,12 @@ import torch
 import trimesh
 from brackets import START, bracket, camera, errors
 from photographs import clutter, photograph
+from quiet_fits import arranged, quiet
 from vases import AROUND, RADII, VIEW, vase
 
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
-from edgegrad.fit import Parameter, PoseParameter, fit_scene, fit_shape, fit_texture, losses
+from edgegrad.fit import Checkpoint, Parameter, PoseParameter, Refinement, fit_scene, fit_shape, fit_texture, losses
 from edgegrad.fit.contour_colors import CONTOUR_BLURS, ContourColors
 from edgegrad.fit.descent.region_loss import RENEWAL_STEPS, RegionLoss
 from edgegrad.fit.placement import Pose
@@ -45,7 +46,7 @@ def test_finds_a_shape_and_its_translation():
         pose = values["pose"]
         return vase(values["radii"]).transformed(pose.R, pose.t)
 
-    fit = fit_scene(scene, VIEW, picture(16), given, loss="region", spp=8, progress=False)
+    fit = fit_scene(scene, picture(16), VIEW, given, options=quiet(loss="region", spp=8))
     assert fit.converged and fit.steps < 150, (fit.reason, fit.steps)
     torch.testing.assert_close(fit.values["radii"], RADII, rtol=0.08, atol=0.0)
     shown = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=64, seed=0)["alpha"]
@@ -58,7 +59,7 @@ def test_finds_a_pose(method):
     view = camera(128)
     given = {"pose": PoseParameter(Pose(START[:3, :3], START[:3, 3]))}
     image = photograph(view, seed=2, sampling=eg.Sampling(lights=16))
-    fit = fit_scene(bracket(plain=True), view, image, given, loss="region", method=method, spp=8, progress=False)
+    fit = fit_scene(bracket(plain=True), image, view, given, options=quiet(loss="region", method=method, spp=8))
     degrees, percent = errors(fit.poses["pose"])
     assert degrees < 2.0 and percent < 2.0 and fit.converged, (degrees, percent, fit.reason)
 
@@ -69,7 +70,7 @@ def test_finds_a_camera(taken):
         world_to_camera=VIEW.world_to_camera + torch.tensor([[0.0, 0.0, 0.0, 0.15]] * 2 + [[0.0] * 4] * 2)
     )
     given = {"cameras.0.pose": PoseParameter(rotation=0.005, shift=0.005)}
-    fit = fit_scene(vase(RADII), moved, taken, given, loss="region", spp=8, progress=False)
+    fit = fit_scene(vase(RADII), taken, moved, given, options=quiet(loss="region", spp=8))
     corners = vase(RADII).verts
     off = (fit.cameras[0].project(corners) - VIEW.project(corners)).norm(dim=-1)
     assert float((moved.project(corners) - VIEW.project(corners)).norm(dim=-1).mean()) > 4.0
@@ -91,7 +92,9 @@ def test_finds_a_shape_from_several_views():
     eyes = torch.stack([3.6 * angles.cos(), torch.tensor([1.5, -1.5] * 4), 3.6 * angles.sin()], -1)
     views = [eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=40.0, size=(96, 96)) for eye in eyes]
     images = [photograph(view, true, seed=k) for k, view in enumerate(views)]
-    fit = fit_shape(eg.Mesh(*sphere(2)), views, images, loss="region", levels=2, steps=80, spp=4, progress=False)
+    fit = fit_shape(
+        eg.Mesh(*sphere(2)), images, views, refinement=Refinement(levels=2), options=quiet(loss="region", steps=80, spp=4),
+    )  # fmt: skip
 
     def off(mesh):
         shown = [[eg.render_aovs(m, view, ["alpha"], spp=32, seed=0)["alpha"] for m in (mesh, true)] for view in views]
@@ -194,27 +197,27 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
     """It may stop between two counts of the colours."""
     given = {"pose": PoseParameter(Pose(torch.eye(3), torch.tensor([0.1, 0.0, 0.0])))}
     options = {"loss": "region", "method": "gauss-newton", "spp": 4, "steps": 8, "progress": False}
-    expected = fit_scene(vase(RADII), VIEW, taken, given, **options)
+    expected = fit_scene(vase(RADII), taken, VIEW, given, **arranged(**options))
 
     def stop(record):
         if record.step == 4:
             raise KeyboardInterrupt
 
     file = tmp_path / "fit.pt"
-    fit_scene(vase(RADII), VIEW, taken, given, checkpoint=file, callback=stop, **options)
-    found = fit_scene(vase(RADII), VIEW, taken, given, checkpoint=file, resume=True, **options)
+    fit_scene(vase(RADII), taken, VIEW, given, **arranged(callback=stop, checkpoint=file, **options))
+    found = fit_scene(vase(RADII), taken, VIEW, given, **arranged(checkpoint=Checkpoint(file, resume=True), **options))
     assert found.loss == expected.loss and torch.equal(found.values["pose"], expected.values["pose"])
 
 
 def test_edge_support_is_low_without_the_object():
     fit = fit_scene(
-        vase(RADII), VIEW, clutter(96, 3), {"pose": PoseParameter()}, loss="region", spp=4, steps=30, progress=False
+        vase(RADII), clutter(96, 3), VIEW, {"pose": PoseParameter()}, options=quiet(loss="region", spp=4, steps=30)
     )
     assert not fit.converged and fit.explained < 0.5
 
 
 def test_plot_draws_contours_into_the_picture(taken):
-    fit = fit_scene(vase(RADII), VIEW, taken, {"pose": PoseParameter()}, loss="region", spp=4, steps=2, progress=False)
+    fit = fit_scene(vase(RADII), taken, VIEW, {"pose": PoseParameter()}, options=quiet(loss="region", spp=4, steps=2))
     assert fit.render().shape == (96, 96, 1) and len(fit.plot().axes) == 3  # target, start, fit; no difference
 
 
@@ -238,18 +241,16 @@ FIRST = {"pose": PoseParameter()}
 def test_errors_name_the_argument(taken, scene, given, error, message):
     whole = {"images": taken, "parameters": FIRST, "loss": "region", "progress": False, **given}
     with pytest.raises(error, match=message):
-        fit_scene(scene, VIEW, **whole)
+        fit_scene(scene, cameras=VIEW, **arranged(**whole))
 
 
 def test_other_fits_refuse_the_region_loss(taken):
     with pytest.raises(ValueError, match=r"loss: expected .* got 'region'"):
         fit_texture(
-            MESH.replace(uvs=torch.rand(6 * AROUND, 2), uv_faces=MESH.faces, colors=None),
-            VIEW,
-            taken,
-            8,
-            loss="region",
-            progress=False,
-        )
+            MESH.replace(uvs=torch.rand(6 * AROUND, 2), uv_faces=MESH.faces, colors=None), taken, VIEW, 8,
+            options=quiet(loss="region"),
+        )  # fmt: skip
     with pytest.raises(ValueError, match=r"depths: expected none with loss=\"region\""):
-        fit_shape(MESH, VIEW, taken, depths=torch.ones(96, 96), loss="region", levels=1, progress=False)
+        fit_shape(
+            MESH, taken, VIEW, depths=torch.ones(96, 96), refinement=Refinement(levels=1), options=quiet(loss="region")
+        )

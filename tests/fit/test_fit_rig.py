@@ -11,15 +11,16 @@ from typing import Any
 import pytest
 import torch
 from arms import TRUTH, arm, degrees, shown, views
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import fit_rig, priors, track_rig
+from edgegrad.fit import Checkpoint, FitOptions, Measured, fit_rig, priors, track_rig
 
 
 def test_a_pose_from_masks() -> None:
     rig, cameras = arm(), views(32)
     masks = shown(rig.posed(TRUTH, translation=[0.05, 0.0, -0.1]), cameras)
-    found = fit_rig(rig, cameras, masks=masks, tries=0, coarsest=32, progress=False)
+    found = fit_rig(rig, None, cameras, masks=masks, search=0, options=quiet(coarsest=32))
     assert found.converged and degrees(found.values["rotations"], TRUTH) < 2.0
     assert torch.allclose(found.values["translation"], torch.tensor([0.05, 0.0, -0.1]).double(), atol=0.02)
     assert torch.allclose(found.posed().verts, found.fit.mesh.verts, atol=1e-6)
@@ -28,15 +29,15 @@ def test_a_pose_from_masks() -> None:
     assert not unsure.converged and "rotations unknown: bone 1 known to ±7° only" in unsure.reason
     # A limb in another's place still shows some edges, but fewer than the others.
     for share, enough in ((0.8, False), (0.9, True)):
-        aside = replace(found, explained={"bone 0": 0.99, "bone 1": share, "bone 2": 0.98, "bone 3": 0.99})
+        aside = replace(found, explained_joints={"bone 0": 0.99, "bone 1": share, "bone 2": 0.98, "bone 3": 0.99})
         assert aside.converged == enough and ("80% at bone 1" in aside.reason) != enough
 
 
 def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
     rig, cameras = arm(colored=True).with_limits(rotations={"bone 1": ([-0.2] * 3, [0.2] * 3)}), views()
     pictures = shown(rig.posed(TRUTH), cameras, "image")
-    options = {"seek": ["rotations"], "joints": ["bone 1"], "start": {"rotations": {"bone 0": TRUTH[0]}}, "tries": 0}
-    found = fit_rig(rig, cameras, pictures, progress=False, steps=5, **options)
+    options = {"seek": ["bone 1"], "init": {"rotations": {"bone 0": TRUTH[0]}}, "search": 0}
+    found = fit_rig(rig, pictures, cameras, **arranged(steps=5, **options))
     assert (
         torch.allclose(found.values["rotations"][0], TRUTH[0])
         and found.values["rotations"][1].abs().max() <= 0.2 + 1e-12
@@ -61,12 +62,12 @@ def test_a_pose_from_photographs_without_masks() -> None:
     rig, cameras = arm(), views(48)
     _, photos = photographs(rig, cameras, 5)
     start = {"rotations": 0.5 * TRUTH}
-    found = fit_rig(rig, cameras, photos, loss="region", start=start, coarsest=24, progress=False)
+    found = fit_rig(rig, photos, cameras, init=start, options=quiet(loss="region", coarsest=24))
     assert degrees(0.5 * TRUTH, TRUTH) > 15.0 and degrees(found.values["rotations"], TRUTH) < 5.0
     assert found.converged and all(view.by_region for view in found.fit.views)
     far = {"translation": [50.0, 0.0, 0.0]}
     with pytest.raises(ValueError, match="expected an object that the pictures show at the start"):
-        fit_rig(rig, cameras, photos, loss="region", start=far, progress=False)
+        fit_rig(rig, photos, cameras, init=far, options=quiet(loss="region"))
 
 
 @pytest.mark.slow
@@ -75,8 +76,8 @@ def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
     rig, cameras = arm(), views(48)
     posed, photos = photographs(rig, cameras, 1)
     start = {"rotations": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.6]]).double()}
-    options = {"loss": "region", "start": start, "progress": False}
-    alone, helped = (fit_rig(rig, cameras, photos, tries=n, **options) for n in (0, 40))
+    options = {"loss": "region", "init": start, "progress": False}
+    alone, helped = (fit_rig(rig, photos, cameras, search=n, **arranged(**options)) for n in (0, 40))
     off = [float((fit.posed().verts - posed.verts).norm(dim=1).max()) for fit in (alone, helped)]
     assert off[0] > 0.5 and not alone.converged and "bone 1" in alone.reason
     assert off[1] < 0.1 and helped.converged
@@ -94,8 +95,9 @@ def test_keypoints_find_what_masks_do_not() -> None:
     masks = shown(rig.posed(truth), cameras)
     given = {f"bone {k}": seen[k] for k in range(3)}
     found = fit_rig(
-        rig, cameras, masks=masks, keypoints=given, keypoint_weight=0.1, tries=0, coarsest=48, steps=30, progress=False
-    )
+        rig, None, cameras, masks=masks, keypoints=Measured(given, factor=100.0), search=0,
+        options=quiet(coarsest=48, steps=30),
+    )  # fmt: skip
     assert (found.rig.shape({"rotations": found.values["rotations"]}).joints - joints).norm(dim=1).max() < 0.1
 
 
@@ -107,13 +109,13 @@ def test_a_limb_is_found_from_new_starts() -> None:
     masks = shown(rig.posed(truth), cameras)
     options = {
         "masks": masks,
-        "start": {"rotations": -truth},
+        "init": {"rotations": -truth},
         "coarsest": 24,
         "progress": False,
         "seek": ["rotations"],
         "steps": 8,
     }
-    alone, helped = (fit_rig(rig, cameras, tries=tries, **options) for tries in (0, 6))
+    alone, helped = (fit_rig(rig, None, cameras, search=tries, **arranged(**options)) for tries in (0, 6))
     assert helped.loss < 0.3 * alone.loss and not alone.converged
 
 
@@ -123,8 +125,8 @@ def test_ctrl_c_in_the_search_of_limbs_keeps_the_descent(monkeypatch) -> None:
 
     monkeypatch.setattr("edgegrad.fit.rig.limbs.LimbSearch.run", stop)
     rig, cameras = arm(), views(32, 2)
-    found = fit_rig(rig, cameras, masks=shown(rig.posed(TRUTH), cameras), steps=2, progress=False)
-    assert found.fit.interrupted and not found.converged
+    found = fit_rig(rig, None, cameras, masks=shown(rig.posed(TRUTH), cameras), options=quiet(steps=2))
+    assert found.interrupted and not found.converged
     assert float(found.values["rotations"].abs().max()) > 0.05  # of the descent before
 
 
@@ -133,7 +135,7 @@ def test_a_sequence() -> None:
     rig, cameras = arm(), views()
     truths = [TRUTH * 0.25 * k for k in range(4)]
     frames = [{"masks": shown(rig.posed(truth), cameras)} for truth in truths]
-    found = list(track_rig(rig, cameras, frames, start={}, tries=0, steps=8, progress=False))
+    found = list(track_rig(rig, frames, cameras, init={}, search=0, options=quiet(steps=8)))
     errors = [degrees(one.values["rotations"], truth) for one, truth in zip(found, truths, strict=True)]
     assert max(errors) < 3.0
 
@@ -143,32 +145,35 @@ def test_what_a_frame_misses_is_searched_once(monkeypatch, loss: float, angles: 
     """A result is kept where it is better. A limb that is still missed is not searched again in the next frame."""
     calls: list[tuple[int | None, float]] = []
 
-    def fit(rig: eg.rig.Rig, cameras: object, *, start: dict[str, torch.Tensor], **options: Any) -> Any:
-        angle = float(start["rotations"][0, 0]) + (1.0 if calls else 0.0)
-        calls.append((options.get("tries"), angle))
-        assert options["resume"] == (options["checkpoint"] is not None)
+    def fit(
+        rig: eg.rig.Rig, *, init: dict[str, torch.Tensor], search: bool | int, options: FitOptions, **_: Any
+    ) -> Any:
+        angle = float(init["rotations"][0, 0]) + (1.0 if calls else 0.0)
+        calls.append((search, angle))
+        assert (options.checkpoint is None) == (search == 5)
         values = {"rotations": torch.full((2, 3), angle, dtype=torch.float64)}
         missed = ["bone 1"] if len(calls) > 1 else []
         return SimpleNamespace(
             values=values,
             missed=missed,
-            loss=loss if options.get("tries") else 1.0,
-            fit=SimpleNamespace(interrupted=False),
+            loss=loss if search else 1.0,
+            interrupted=False,
         )
 
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.fit_rig", fit)
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.MOTION_SHARE", 0.0)
     start = {"rotations": torch.zeros(2, 3, dtype=torch.float64)}
-    found = list(track_rig(arm(), views(16, 1), [{}, {}, {}], start=start, again=5, checkpoint="a.ckpt", resume=True))
+    found = list(track_rig(arm(), [{}, {}, {}], views(16, 1), init=start, again=5, options=quiet(checkpoint="a.ckpt")))
     assert [float(one.values["rotations"][0, 0]) for one in found] == angles
-    assert [tries for tries, _ in calls] == [None, 0, 5, 0]
+    assert [search for search, _ in calls] == [True, 0, 5, 0]
 
 
 def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
     rig, cameras = arm(), views(16, 2)
     frames = [{"masks": shown(rig.posed(TRUTH * k), cameras)} for k in (0.1, 0.2)]
-    options = {"tries": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
-    first, again = (list(track_rig(rig, cameras, frames, start={}, resume=True, **options)) for _ in range(2))
+    options = {"search": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
+    first = list(track_rig(rig, frames, cameras, init={}, **arranged(**options)))
+    again = list(track_rig(rig, frames, cameras, init={}, **arranged(resume=True, **options)))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["walk-0001.ckpt", "walk-0002.ckpt"]
     for a, b in zip(first, again, strict=True):
         assert torch.equal(a.values["rotations"], b.values["rotations"])
@@ -177,19 +182,25 @@ def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
         (TypeError, r"frames\[0\]: expected arguments by name", {"frames": [frames[0]["masks"]]}),
     ):
         with pytest.raises(error, match=message):
-            next(track_rig(rig, cameras, **given))
+            next(track_rig(rig, cameras=cameras, **given))
 
 
 def test_a_start_within_limits_that_leave_out_rest() -> None:
     rig, cameras = arm().with_limits(rotations={"bone 1": ([0.1] * 3, [0.6] * 3)}), views(16, 2)
-    found = fit_rig(rig, cameras, masks=shown(rig.posed(TRUTH.abs()), cameras), tries=0, steps=1, progress=False)
+    found = fit_rig(rig, None, cameras, masks=shown(rig.posed(TRUTH.abs()), cameras), search=0, options=quiet(steps=1))
     assert float(found.values["rotations"][1].min()) >= 0.1
 
 
 def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
     rig, cameras = arm(), views(32, 2)
-    options = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
-    whole = fit_rig(rig, cameras, **options)
+    options = {
+        "masks": shown(rig.posed(TRUTH), cameras),
+        "search": 0,
+        "steps": 4,
+        "progress": False,
+        "loss_tolerance": 0.0,
+    }
+    whole = fit_rig(rig, None, cameras, **arranged(**options))
     count = 0
 
     def stop(record: object) -> None:
@@ -199,9 +210,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path) -> None:
             raise KeyboardInterrupt
 
     path = tmp_path / "checkpoint.pt"
-    half = fit_rig(rig, cameras, checkpoint=path, callback=stop, **options)
-    assert half.fit.interrupted and half.reason == "interrupted"
-    rest = fit_rig(rig, cameras, checkpoint=path, resume=True, **options)
+    half = fit_rig(rig, None, cameras, **arranged(callback=stop, checkpoint=path, **options))
+    assert half.interrupted and half.reason == "interrupted"
+    rest = fit_rig(rig, None, cameras, **arranged(checkpoint=Checkpoint(path, resume=True), **options))
     assert torch.equal(rest.values["rotations"], whole.values["rotations"]) and len(rest.history) == len(whole.history)
     assert "pose.json" in rest.save(tmp_path / "out", figures=False)
 
@@ -222,10 +233,11 @@ def test_the_command_line(tmp_path, capsys) -> None:
         tmp_path / "mask.png",
         "--camera",
         tmp_path / "camera.json",
-        "--joints",
+        "--seek",
         "upper",
+        "translation",
     ]
-    command += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
+    command += ["--search", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
     assert cli.main([str(word) for word in command]) == 0
     assert "wrote pose.json, joints.json, posed.glb" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "pose.json").read_text())["rotations"]
@@ -249,19 +261,17 @@ def test_errors_name_the_argument() -> None:
         (TypeError, "rig: expected a Rig", {"rig": rig.posed()}),
         (ValueError, "seek: expected names among .*got 'pose'", {"seek": ["pose"]}),
         (ValueError, "seek: expected a name or more", {"seek": []}),
-        (ValueError, "start: expected names among", {"start": {"turns": 1.0}}),
-        (ValueError, "rotations: expected names among bone 0, bone 1", {"joints": ["elbow"]}),
+        (ValueError, "init: expected names among", {"init": {"turns": 1.0}}),
+        (ValueError, "seek: expected names among .*bone 0, bone 1, got 'elbow'", {"seek": ["elbow"]}),
         (ValueError, "keypoints: expected joints among", {"keypoints": {"elbow": torch.zeros(2, 2)}}),
         (ValueError, "a pixel for each camera", {"keypoints": {"bone 0": torch.zeros(3, 2)}}),
         (ValueError, "expected numbers for one at least", {"keypoints": {"bone 0": torch.full((2, 2), math.nan)}}),
         (TypeError, "keypoints: expected pixels .*got none", {"keypoints": {}}),
         (TypeError, "keypoints: expected pixels .*got Tensor", {"keypoints": torch.zeros(2, 2)}),
-        (ValueError, "joints: expected names of joints .*got none", {"joints": []}),
-        (ValueError, "joints: expected None where turns", {"joints": ["bone 0"], "seek": ["translation"]}),
         (
             ValueError,
-            r"start\['rotations'\]: expected shape .*one pose",
-            {"start": {"rotations": torch.zeros(2, 2, 3)}},
+            r"init\['rotations'\]: expected shape .*one pose",
+            {"init": {"rotations": torch.zeros(2, 2, 3)}},
         ),
         (TypeError, "priors: expected a list of functions", {"priors": lambda values: 0.0}),
         (TypeError, r"priors\[0\]: expected a function", {"priors": [0.5]}),
@@ -270,11 +280,14 @@ def test_errors_name_the_argument() -> None:
             r"priors\[0\]: expected it to return a number, got \(2, 3\)",
             {"priors": [lambda v: v["rotations"]]},
         ),
-        (TypeError, "look: expected it to return a Mesh or a Scene, got NoneType", {"look": lambda posed: None}),
-        (ValueError, "parameters: expected a look that takes light", {"parameters": {"light": None}}),
-        (TypeError, "expected options among", {"step": 3}),
+        (
+            TypeError,
+            "appearance: expected it to return a Mesh or a Scene, got NoneType",
+            {"appearance": lambda posed: None},
+        ),
+        (ValueError, "options.max_size: fit_rig compares pictures at their own size", {"max_size": 64}),
         (ValueError, "images: expected pictures or masks", {"masks": None}),
     ):
-        given = {"rig": rig, "cameras": cameras, "masks": masks, "progress": False, **change}
+        given = {"rig": rig, "images": None, "cameras": cameras, "masks": masks, **change}
         with pytest.raises(error, match=message):
-            fit_rig(**given)
+            fit_rig(**arranged(**given))

@@ -10,6 +10,7 @@ from brackets import (
     CENTER,
     START,
     about_center,
+    before_sky,
     bracket,
     camera,
     errors,
@@ -19,6 +20,7 @@ from brackets import (
     task_of,
 )
 from photographs import compressed
+from quiet_fits import quiet
 
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb
@@ -43,10 +45,8 @@ def covered(view, image):
 def test_a_quarter_covered(how, steps):
     view = camera(64)
     image, free = covered(view, picture(view))
-    options = {"background": BACKGROUND}
-    if how == "weight":
-        options["weight"] = free
-    fit = fit_pose(bracket(), image, view, init=START, steps=steps, progress=False, **options)
+    weights = free if how == "weight" else None
+    fit = fit_pose(before_sky(), image, view, init=START, weights=weights, options=quiet(steps=steps))
     degrees, percent = errors(fit)
     assert degrees < 1.0 and percent < 1.0, (degrees, percent)
     assert fit.converged and fit.explained > 0.5
@@ -69,7 +69,7 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(searched, monkeypatch):
     monkeypatch.setattr(color_search, "MIN_EDGE_SUPPORT", 0.0)  # all ends are taken for right
     if not searched:
         monkeypatch.setattr(color_search, "MIN_BLOCK_ERROR", math.inf)
-    fit = fit_pose(bracket(), image, view, init=START, background=BACKGROUND, steps=24, progress=False)
+    fit = fit_pose(before_sky(), image, view, init=START, options=quiet(steps=24))
     assert (errors(fit)[0] < 1.0) == searched and fit.converged
     assert torch.equal([step for step in fit.history if step.best][-1].pose.matrix, fit.matrix)
 
@@ -88,7 +88,7 @@ WORN = {
 def test_blur_and_compression_cost_no_second_search(kind):
     """One descent is enough and ends as near."""
     view = camera(80)
-    fit = fit_pose(bracket(), WORN[kind](picture(view)), view, init=START, background=BACKGROUND, progress=False)
+    fit = fit_pose(before_sky(), WORN[kind](picture(view)), view, init=START, options=quiet())
     degrees, percent = errors(fit)
     limit = 0.15 if kind in ("sharp", "soft") else 1.0  # without the blur of renders: 0.5 for soft
     shown = 0.9 if kind in ("sharp", "soft") else 0.75  # what compression makes stronger is not the render's
@@ -124,7 +124,7 @@ def test_an_unlit_mesh_in_a_lit_picture_stays_near_its_start(further):
     view = camera(64)
     target = picture(view, lit())
     start = about_center(rotation(0.03, -0.03, 0.02), (0.02, 0.01, 0.0))
-    fit = fit_pose(bracket(), target, view, init=start, background=BACKGROUND, search=further, progress=False)
+    fit = fit_pose(before_sky(), target, view, init=start, search=further, options=quiet())
     degrees, percent = errors(fit)
     assert degrees < 3.0 and percent < 2.0, (degrees, percent)
     if not further:
@@ -161,7 +161,7 @@ def test_what_is_not_in_the_picture_is_not_found(size, steps, most):
     image = torch.nn.functional.interpolate(cells, (size, size), mode="bicubic")[0].movedim(0, -1)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # nor turned over
-        fit = fit_pose(bracket(), image, camera(size), background=BACKGROUND, steps=steps, progress=False)
+        fit = fit_pose(before_sky(), image, camera(size), options=quiet(steps=steps))
     assert not fit.converged and fit.explained < most
     assert fit.reason.startswith(("edges not explained: the pictures show", "directions unknown: rotation about"))
 
@@ -173,9 +173,7 @@ def test_several_pictures_share_the_pose():
     larger = bracket().transformed(torch.eye(3).double(), -0.08 * CENTER, 1.08)
     views = [first, second]
     images = [picture(view, larger) for view in views]
-    fit = fit_pose(
-        bracket(), images, views, init=START, background=BACKGROUND, fit_scale=True, steps=12, progress=False
-    )
+    fit = fit_pose(before_sky(), images, views, init=START, scale=True, options=quiet(steps=12))
     assert max(errors(fit)) < 0.5 and fit.scale == pytest.approx(1.08, rel=0.01) and fit.converged
     figure = fit.plot()
     assert len(figure.axes) == 8
@@ -186,7 +184,7 @@ def test_the_start_is_placed_where_the_picture_shows_the_object():
     view, away = camera(48), torch.tensor([40.0, -30.0, 25.0]).double()
     far = bracket().transformed(t=away)
     mask = silhouette(view)
-    fit = fit_pose(far, picture(view), view, mask, steps=12, progress=False)
+    fit = fit_pose(far, picture(view), view, mask, options=quiet(steps=12))
     where = fit.R @ (CENTER + away) + fit.t
     assert float((where - CENTER).norm()) < 0.1
     started = fit.history[0].pose

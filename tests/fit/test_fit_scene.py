@@ -6,10 +6,11 @@ import math
 import pytest
 import torch
 from brackets import BACKGROUND, bracket
+from quiet_fits import arranged
 from small_scenes import QUIET, pictures, views
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_scene, losses
+from edgegrad.fit import Checkpoint, Parameter, fit_scene, losses
 from edgegrad.fit.descent.adam import Adam
 from edgegrad.fit.ending import Ending
 from edgegrad.fit.laplacian import LaplacianSolver
@@ -48,8 +49,8 @@ def test_finds_named_tensors_each_at_its_rate():
     start = eg.Scene([mesh.replace(face_colors=torch.full((20, 3), 0.4))], torch.zeros(3))
     seen = []
     fit = fit_scene(
-        start, cameras, target, {"meshes.0.face_colors": Parameter(0.05, low=0.0), "background": 0.02},
-        steps=250, patience=15, callback=seen.append, **QUIET,
+        start, target, cameras, {"meshes.0.face_colors": Parameter(0.05, low=0.0), "background": 0.02}, **arranged(steps=250,
+        patience=15, callback=seen.append, **QUIET),
     )  # fmt: skip
     assert fit.converged and fit.reason == "converged" and fit.explained > 0.95
     torch.testing.assert_close(fit.values["background"], BACKGROUND, atol=0.01, rtol=0)
@@ -64,8 +65,8 @@ def test_finds_the_values_of_a_function_that_makes_the_scene():
     mesh, cameras = bracket(), views(2)
     target = pictures(mesh.transformed(t=torch.tensor([0.1, 0.0, 0.0]).double()), cameras)
     fit = fit_scene(
-        lambda values: mesh.transformed(t=torch.cat([values["shift"], torch.zeros(2)]).double()),
-        cameras, target, {"shift": Parameter(0.01, torch.zeros(1))}, steps=60, **QUIET,
+        lambda values: mesh.transformed(t=torch.cat([values["shift"], torch.zeros(2)]).double()), target, cameras, {"shift":
+        Parameter(0.01, torch.zeros(1))}, **arranged(steps=60, **QUIET),
     )  # fmt: skip
     assert float(fit.values["shift"]) == pytest.approx(0.1, abs=0.005)
 
@@ -75,7 +76,7 @@ def test_finds_a_camera_by_name():
     K = view.K.clone()
     K[0, 2] += 1.5
     target = pictures(mesh, [view.replace(K=K)])
-    fit = fit_scene(mesh, view, target, {"cameras.0.K": 0.1}, steps=40, **QUIET)
+    fit = fit_scene(mesh, target, view, {"cameras.0.K": 0.1}, **arranged(steps=40, **QUIET))
     assert float(fit.cameras[0].K[0, 2]) == pytest.approx(float(K[0, 2]), abs=0.2)
 
 
@@ -93,7 +94,7 @@ def test_weights_and_a_robust_loss_exclude_what_covers_the_object():
 
     def off(**options):
         parameters = {"colour": Parameter(0.02, torch.full((3,), 0.45))}
-        fit = fit_scene(one_colour, view, target, parameters, steps=80, **options, **QUIET)
+        fit = fit_scene(one_colour, target, view, parameters, **arranged(steps=80, **options, **QUIET))
         return float((fit.values["colour"] - mesh.face_colors[0]).abs().max())
 
     assert off(weights=weight) < 0.03 and off(loss=lambda a, b, w: losses.robust(a, b, w, scale=0.1)) < 0.03
@@ -108,8 +109,8 @@ def test_a_flat_loss_alone_is_no_convergence():
     )
     target = pictures(eg.Scene([other], BACKGROUND), cameras)
     fit = fit_scene(
-        eg.Scene([bracket()], BACKGROUND), cameras, target, {"background": 0.02}, steps=200, patience=8, **QUIET
-    )
+        eg.Scene([bracket()], BACKGROUND), target, cameras, {"background": 0.02}, **arranged(steps=200, patience=8, **QUIET),
+    )  # fmt: skip
     assert fit.ending is Ending.FLAT and not fit.converged and fit.explained < 0.6
     assert fit.reason.startswith("edges not explained: the pictures show")
 
@@ -122,7 +123,9 @@ def test_a_tolerance_of_0_takes_all_steps(method, rate):
 
     def steps(tolerance):
         scene = eg.Scene([bracket()], torch.zeros(3))
-        return fit_scene(scene, cameras, target, {"background": rate}, tolerance=tolerance, **options).steps
+        return fit_scene(
+            scene, target, cameras, {"background": rate}, **arranged(loss_tolerance=tolerance, **options)
+        ).steps
 
     assert steps(0.01) < 60 and steps(0.0) == 60
 
@@ -130,13 +133,17 @@ def test_a_tolerance_of_0_takes_all_steps(method, rate):
 def test_a_loss_that_still_falls_is_no_convergence():
     cameras = views(1)
     target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
-    fit = fit_scene(eg.Scene([bracket()], torch.zeros(3)), cameras, target, {"background": 1e-3}, steps=20, **QUIET)
+    fit = fit_scene(
+        eg.Scene([bracket()], torch.zeros(3)), target, cameras, {"background": 1e-3}, **arranged(steps=20, **QUIET)
+    )
     assert not fit.converged and fit.reason.startswith("loss still falling: give it more steps")
 
 
 def colour_fit(cameras, target, **options):
     start = eg.Scene([bracket().replace(face_colors=torch.full((20, 3), 0.4))], torch.zeros(3))
-    return fit_scene(start, cameras, target, {"meshes.0.face_colors": 0.03, "background": 0.02}, **QUIET, **options)
+    return fit_scene(
+        start, target, cameras, {"meshes.0.face_colors": 0.03, "background": 0.02}, **arranged(**QUIET, **options)
+    )
 
 
 def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path):
@@ -149,8 +156,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path):
 
     whole = colour_fit(cameras, target, steps=30, patience=5, views_per_step=2)
     file = tmp_path / "fit.ckpt"
-    options = {"steps": 30, "patience": 5, "checkpoint": file, "resume": True, "views_per_step": 2}
+    options = {"steps": 30, "patience": 5, "checkpoint": file, "views_per_step": 2}
     half = colour_fit(cameras, target, callback=stop, **options)
+    options["resume"] = True
     assert half.interrupted and not half.converged and half.steps == 14 and file.exists()
     again = colour_fit(cameras, target, **options)
     assert again.steps == whole.steps and not again.interrupted
@@ -166,16 +174,19 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
     target = pictures(bracket(), cameras)
     file = tmp_path / "fit.ckpt"
     colour_fit(cameras, target, steps=1, checkpoint=file)
-    with pytest.raises(ValueError, match=r"resume: expected .* made with another scene, parameters;"):
-        fit_scene(bracket(), cameras, target, {"verts": 1e-3}, steps=1, checkpoint=file, resume=True, **QUIET)
+    with pytest.raises(ValueError, match=r"checkpoint: expected .* made with another scene, parameters;"):
+        fit_scene(
+            bracket(), target, cameras, {"verts": 1e-3},
+            **arranged(steps=1, checkpoint=Checkpoint(file, resume=True), **QUIET),
+        )  # fmt: skip
     for name, given in {
         "images": (cameras, [picture + 0.1 for picture in target], {}),
         "cameras": ([eg.Camera.look_at((0, 0, 7), (0, 0, 0), size=view.size) for view in cameras], target, {}),
         "masks": (cameras, target, {"masks": [torch.ones(picture.shape[:2]) for picture in target]}),
         "seed": (cameras, target, {"seed": 1}),
-        "render": (cameras, target, {"render": {"filter": "gaussian"}}),
+        "bounces": (cameras, target, {"bounces": 2}),
     }.items():
-        with pytest.raises(ValueError, match=rf"fit\.ckpt to be a checkpoint of this fit.* another {name};"):
+        with pytest.raises(ValueError, match=rf"fit\.ckpt to be of this fit.* another {name};"):
             colour_fit(*given[:2], steps=2, checkpoint=file, resume=True, **given[2])
     assert colour_fit(cameras, target, steps=2, checkpoint=file, resume=True).steps == 2  # of the same fit
     file.write_bytes(file.read_bytes()[:200])
@@ -203,8 +214,9 @@ def test_a_step_too_far_is_taken_back():
         return loss * (math.nan if float(image.detach().max()) > 1.5 else 1.0)
 
     fit = fit_scene(
-        eg.Scene([bracket()], torch.zeros(3)), cameras, target, {"background": 0.9}, loss=broken, steps=40, **QUIET
-    )
+        eg.Scene([bracket()], torch.zeros(3)), target, cameras, {"background": 0.9},
+        **arranged(loss=broken, steps=40, **QUIET),
+    )  # fmt: skip
     assert all(bool(value.isfinite().all()) for value in fit.values.values())
     assert fit.loss < fit.history[0].loss
 
@@ -212,7 +224,7 @@ def test_a_step_too_far_is_taken_back():
 def test_saves_everything_and_draws_itself(tmp_path):
     cameras = views(2)
     mesh = bracket()
-    fit = fit_scene(mesh, cameras, pictures(mesh, cameras), {"verts": 1e-3}, steps=3, **QUIET)
+    fit = fit_scene(mesh, pictures(mesh, cameras), cameras, {"verts": 1e-3}, **arranged(steps=3, **QUIET))
     names = fit.save(tmp_path / "new")
     assert sorted(names) == sorted(path.name for path in (tmp_path / "new").iterdir())
     assert {"fit.json", "values.pt", "history.json", "mesh.ply", "camera0.json", "fit.png", "loss.png"} <= set(names)
@@ -227,7 +239,7 @@ def test_saves_the_materials_it_found(tmp_path):
     cameras = views(1)
     mesh = bracket().replace(material=eg.Material(roughness=0.4, emission=torch.tensor([0.2, 3.0, 0.1])))
     target = pictures(mesh.replace(material=mesh.material.replace(emission=torch.tensor([0.4, 2.0, 0.3]))), cameras)
-    fit = fit_scene(mesh, cameras, target, {"material.emission": 0.05}, steps=5, **QUIET)
+    fit = fit_scene(mesh, target, cameras, {"material.emission": 0.05}, **arranged(steps=5, **QUIET))
     assert "mesh.glb" in fit.save(tmp_path, figures=False)
     (found,) = eg.load_scene(tmp_path / "mesh.glb", lit=True).meshes
     assert float(fit.values["material.emission"][1]) < 2.95
@@ -262,19 +274,18 @@ def test_saves_the_materials_it_found(tmp_path):
             ValueError,
             "background: expected low ≤ high",
         ),
-        ({"images": torch.zeros(8, 8, 3)}, ValueError, "images: expected 2, one for each camera, got 8"),
+        ({"images": torch.zeros(8, 8, 3)}, ValueError, "images: expected 2, one for each camera, got 1 in shape"),
         ({"images": None}, ValueError, "images: expected pictures or masks"),
         ({"weights": -torch.ones(2, 32, 32)}, ValueError, "weights: expected numbers from 0 up"),
         ({"masks": torch.ones(2, 32, 32, 3)}, ValueError, "masks[0]: expected shape (32, 32) or (32, 32, 1)"),
-        ({"cameras": "here"}, TypeError, "cameras[0]: expected a Camera"),
+        ({"cameras": "here"}, TypeError, "cameras: expected a Camera"),
         ({"scene": 3}, TypeError, "scene: expected a Scene, a Mesh, or a function"),
         ({"loss": "l3"}, ValueError, "loss: expected one of l1, l2"),
-        ({"step": 3}, TypeError, "did you mean 'steps'"),
+        ({"max_size": 64}, ValueError, "options.max_size: fit_scene compares pictures at their own size"),
+        ({"options": {"steps": 3}}, TypeError, "options: expected FitOptions, got dict; give FitOptions(steps=…)"),
         ({"steps": 0}, ValueError, "steps: expected an int from 1"),
-        ({"resume": True}, ValueError, "resume: expected a checkpoint"),
         ({"checkpoint": "/nowhere/at/all"}, FileNotFoundError, "checkpoint: expected the folder"),
-        ({"render": {"spps": 3}}, ValueError, "render: expected arguments of render() among filter"),
-        ({"render": {"spp": 3}}, ValueError, "got 'spp'; it is an option of its own"),
+        ({"sampling": {"lights": 3}}, TypeError, "options.sampling: expected a Sampling, got dict"),
         (
             {"loss": lambda image, target: image.mean()},
             TypeError,
@@ -293,7 +304,9 @@ def test_errors_name_the_argument(change, error, message):
         "parameters": {"background": 0.1},
     }  # fmt: skip
     with pytest.raises(error) as caught:
-        fit_scene(**{**arguments, "progress": False, **change})
+        fit_scene(
+            **{**arranged(**arguments), **(change if "options" in change else arranged(**{**arguments, **change}))}
+        )
     assert message in str(caught.value)
 
 
@@ -305,13 +318,7 @@ def test_the_best_values_are_not_those_of_the_easiest_views():
     easy, hard = (torch.full((8, 8, 1), value) for value in (0.45, 1.0))
     for images in ([easy, hard], [hard, easy]):
         fit = fit_scene(
-            mesh,
-            cameras,
-            images,
-            {"face_colors": 0.02},
-            views_per_step=1,
-            steps=60,
-            weights=torch.ones(2, 8, 8),
-            **QUIET,
-        )
+            mesh, images, cameras, {"face_colors": 0.02}, weights=torch.ones(2, 8, 8),
+            **arranged(views_per_step=1, steps=60, **QUIET),
+        )  # fmt: skip
         assert float(fit.values["face_colors"].mean()) > 0.6  # the mean of both is the best

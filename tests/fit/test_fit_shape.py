@@ -4,10 +4,11 @@ import math
 
 import pytest
 import torch
+from quiet_fits import arranged
 from small_scenes import QUIET, ball, egg_views, pictures
 
 import edgegrad as eg
-from edgegrad.fit import fit_shape, fit_texture
+from edgegrad.fit import Refinement, fit_shape, fit_texture
 
 
 def test_finds_a_texture():
@@ -19,7 +20,7 @@ def test_finds_a_texture():
     mesh = eg.Mesh(square, faces, texture=image[0].movedim(0, -1).clamp(0.05, 1.0), uvs=uvs, uv_faces=faces)
     cameras = [eg.Camera.look_at((x, 0.3, 3.0), (0, 0, 0), size=(48, 48)) for x in (-1.0, 0.5, 1.5)]
     bare = eg.Mesh(square, faces, uvs=uvs, uv_faces=faces)
-    fit = fit_texture(bare, cameras[:2], pictures(mesh, cameras[:2]), 24, steps=80, **QUIET)
+    fit = fit_texture(bare, pictures(mesh, cameras[:2]), cameras[:2], 24, **arranged(steps=80, **QUIET))
     (truth,), (found,) = pictures(mesh, cameras[2:]), pictures(fit.mesh, cameras[2:])
     assert -10.0 * math.log10(float((truth - found).square().mean())) > 30.0
     assert fit.mesh.texture.shape == (24, 24, 3) and float(fit.mesh.texture.min()) >= 0.0
@@ -28,7 +29,10 @@ def test_finds_a_texture():
 def test_finds_a_shape_from_masks():
     pytest.importorskip("gpytoolbox")
     cameras, masks = egg_views()
-    fit = fit_shape(ball(1), cameras, masks=masks, levels=2, faces=600, steps=40, mask_loss="l2", **QUIET)
+    fit = fit_shape(
+        ball(1), None, cameras, masks=masks, refinement=Refinement(levels=2, faces=600),
+        **arranged(steps=40, mask_loss="l2", **QUIET),
+    )  # fmt: skip
     v = fit.mesh.verts - 0.05
     off = ((v / torch.tensor([0.7, 1.1, 0.8])).norm(dim=1) - 1.0).abs()
     assert float(off.mean()) < 0.04, float(off.mean())
@@ -43,8 +47,13 @@ def test_a_shape_that_cannot_be_remeshed_is_refused_before_the_first_level():
     fin = torch.cat([mesh.faces[0, :2], torch.tensor([len(mesh.verts)])])[None]
     finned = eg.Mesh(torch.cat([mesh.verts, mesh.verts[:1] * 2]), torch.cat([mesh.faces, fin]))
     with pytest.raises(ValueError, match=r"mesh: expected no more than two triangles at each edge, .* got 1 edges"):
-        fit_shape(finned, cameras, masks=masks, levels=2, steps=2, **QUIET)
-    assert fit_shape(finned, cameras, masks=masks, levels=1, steps=2, **QUIET).steps == 2
+        fit_shape(finned, None, cameras, masks=masks, refinement=Refinement(levels=2), **arranged(steps=2, **QUIET))
+    assert (
+        fit_shape(
+            finned, None, cameras, masks=masks, refinement=Refinement(levels=1), **arranged(steps=2, **QUIET)
+        ).steps
+        == 2
+    )
 
 
 def test_a_shape_resumes_on_a_later_level(tmp_path):
@@ -58,11 +67,11 @@ def test_a_shape_resumes_on_a_later_level(tmp_path):
             raise KeyboardInterrupt
 
     stop.count = 0
-    options = {"masks": masks, "levels": 2, "steps": 6, "checkpoint": file, "resume": True, **QUIET}
-    half = fit_shape(ball(1), cameras, callback=stop, **options)
+    options = {"masks": masks, "refinement": Refinement(2), "steps": 6, "checkpoint": file, **QUIET}
+    half = fit_shape(ball(1), None, cameras, **arranged(callback=stop, **options))
     assert half.interrupted and half.steps == 9
-    again = fit_shape(ball(1), cameras, **options)
+    again = fit_shape(ball(1), None, cameras, **arranged(resume=True, **options))
     file.unlink()
-    whole = fit_shape(ball(1), cameras, **options)
+    whole = fit_shape(ball(1), None, cameras, **arranged(**options))
     assert again.steps == whole.steps == 12
     torch.testing.assert_close(again.mesh.verts, whole.mesh.verts, rtol=0, atol=1e-6)

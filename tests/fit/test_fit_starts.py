@@ -10,12 +10,13 @@ import pytest
 import torch
 from brackets import bracket, task_of
 from objects import pebble
+from quiet_fits import quiet
 from torch import Tensor
 
 import edgegrad as eg
 from benchmarks import photo_cases
 from edgegrad.camera.poses import rotation
-from edgegrad.fit import fit_pose
+from edgegrad.fit import FitOptions, fit_pose
 from edgegrad.fit.pose.photo.match import BEAM_ROUNDS, SIZE_SPACING, VIEW_PIXELS, Matches, Mips, _in_mask, closer
 from edgegrad.fit.pose.photo.nearby import EVERYWHERE, comparable, nearby
 from edgegrad.fit.pose.photo.template_views import TemplateViews, all_sides, ball, pose_at, seen_at, spread
@@ -163,7 +164,7 @@ def test_matches_that_are_kept_are_distinct() -> None:
 def test_with_a_mask_no_start_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
     R, t = truth((0.4, 2.0, -0.7), (0.3, -0.2, 0.4))
     mesh, picture, mask = pictured(R, t)
-    fit = fit_pose(mesh, picture, camera(), mask, starts="global", progress=True)
+    fit = fit_pose(mesh, picture, camera(), mask, search="global", options=FitOptions(seed=0, progress=True))
     said = capsys.readouterr().err
     assert "views from all sides" in said and "views nearby" in said and "start 1 of" in said
     assert fit.converged
@@ -175,7 +176,7 @@ def test_the_same_seed_gives_the_same_fit() -> None:
     R, t = truth((0.4, 2.0, -0.7), (0.3, -0.2, 0.4))
     mesh, picture, mask = pictured(R, t)
     first, again = (
-        fit_pose(mesh, picture, camera(), mask, starts="global", progress=False, max_size=size) for size in (256, SIZE)
+        fit_pose(mesh, picture, camera(), mask, search="global", options=quiet(max_size=size)) for size in (256, SIZE)
     )
     assert torch.equal(again.matrix, first.matrix)
 
@@ -191,7 +192,7 @@ def test_nine_of_ten_are_found_without_a_start(masked: bool) -> None:
         if masked:
             placed = case.mesh.transformed(case.truth.R, case.truth.t)
             mask = (eg.render_aovs(placed, case.camera, ["alpha"], 16, seed=0)["alpha"] >= 0.5).float()
-        fit = fit_pose(case.mesh, case.picture, case.camera, mask, starts="global", progress=False)
+        fit = fit_pose(case.mesh, case.picture, case.camera, mask, search="global", options=quiet())
         off = case.apart(photo_cases.Placed(fit.R, fit.t), case.truth)
         right += off[0] < 1.0 and off[1] < 0.01 * case.size
         assert not fit.converged or off[0] < 3.0, (k, off)
@@ -200,10 +201,10 @@ def test_nine_of_ten_are_found_without_a_start(masked: bool) -> None:
 
 def test_errors_name_the_argument() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    for starts, says in ((0, "starts"), ("all", 'or "global"'), (10**6, "starts")):
+    for search, says in ((0, "search"), ("all", 'or "global"'), (10**6, "search")):
         with pytest.raises(ValueError, match=says):
-            fit_pose(mesh, picture, camera(), mask, starts=starts, progress=False)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="starts"):
-        fit_pose(mesh, picture, camera(), mask, starts=2.5, progress=False)  # type: ignore[arg-type]
+            fit_pose(mesh, picture, camera(), mask, search=search, options=quiet())  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="search"):
+        fit_pose(mesh, picture, camera(), mask, search=2.5, options=quiet())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="leave init out"):
-        fit_pose(mesh, picture, camera(), mask, torch.eye(4), starts="global", progress=False)
+        fit_pose(mesh, picture, camera(), mask, torch.eye(4), search="global", options=quiet())

@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 from brackets import task_of
+from quiet_fits import quiet
 from torch import Tensor
 
 import edgegrad as eg
@@ -116,7 +117,7 @@ def test_a_vase_is_not_converged_about_its_axis_unless_that_is_a_symmetry() -> N
     spun = Symmetries(continuous=[Symmetries.Axis(torch.tensor([0.0, 1.0, 0.0]))])
 
     def fitted(symmetries: Symmetries | None) -> PoseFit:
-        return fit_pose(vase(), shot, camera(), init=start, search=False, symmetries=symmetries, progress=False)
+        return fit_pose(vase(), shot, camera(), init=start, search=False, symmetries=symmetries, options=quiet())
 
     alone, known = fitted(None), fitted(spun)
     for fit in (alone, known):

@@ -4,11 +4,12 @@ import math
 
 import pytest
 import torch
+from quiet_fits import arranged, quiet
 from small_scenes import QUIET, ball, egg_views
 
 import edgegrad as eg
-from edgegrad.fit import fit_shape
-from edgegrad.fit.measured import Measured, measured_loss, measurements
+from edgegrad.fit import Measured, Refinement, fit_shape
+from edgegrad.fit.measured import measured_loss, measurements
 from edgegrad.fit.views import views_of
 
 CAMERA = eg.Camera.look_at((0.0, 0.0, 4.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(4, 6))
@@ -126,7 +127,7 @@ GOOD = torch.full((4, 6), 3.0)
 )
 def test_errors_name_the_argument(given, error, message):
     with pytest.raises(error, match=message):
-        fit_shape(ball(1), CAMERA, levels=1, **given)
+        fit_shape(ball(1), None, CAMERA, refinement=Refinement(levels=1), **arranged(**given))
 
 
 def test_errors_of_weights_and_of_views_without_pictures():
@@ -135,7 +136,7 @@ def test_errors_of_weights_and_of_views_without_pictures():
     with pytest.raises(ValueError, match="factor: expected a number from"):
         Measured(GOOD, factor=-1.0)
     with pytest.raises(ValueError, match=r"images: expected pictures or masks .* got neither for cameras\[1\]"):
-        fit_shape(ball(1), [CAMERA, CAMERA], depths=[GOOD, None], levels=1)
+        fit_shape(ball(1), None, [CAMERA, CAMERA], depths=[GOOD, None], refinement=Refinement(1), options=quiet())
 
 
 # -- what they find ---------------------------------------------------------------------------------------------------
@@ -176,7 +177,7 @@ def dent():
     return seen()
 
 
-OPTIONS = {"levels": 2, "faces": 1600, "steps": 60, **QUIET}
+OPTIONS = {"refinement": Refinement(2, 1600), "steps": 60, **QUIET}
 
 
 @pytest.mark.slow
@@ -185,8 +186,14 @@ def test_depths_find_a_dent_that_masks_do_not_show(dent):
     masks = [v["alpha"] for v in views]
     start = ball(2).replace(verts=1.15 * ball(2).verts)
     assert error(start) > 0.2
-    depths = error(fit_shape(start, cameras, masks=masks, depths=covered(views, "depth"), **OPTIONS).mesh)
-    normals = error(fit_shape(start, cameras, masks=masks, normals=covered(views, "shading_normal"), **OPTIONS).mesh)
+    depths = error(
+        fit_shape(start, None, cameras, masks=masks, depths=covered(views, "depth"), **arranged(**OPTIONS)).mesh
+    )
+    normals = error(
+        fit_shape(
+            start, None, cameras, masks=masks, normals=covered(views, "shading_normal"), **arranged(**OPTIONS)
+        ).mesh
+    )
     assert depths < 0.03 and normals < 0.03, (depths, normals)  # of a dent 0.4 deep; by masks alone 0.07
 
 
@@ -209,7 +216,7 @@ def test_a_sensor_with_holes_noise_and_mixed_pixels(dent):
         depths.append(depth if k in (1, 3) else None)
         positions.append(None if k in (1, 3) else there)
     start = ball(2).replace(verts=1.15 * ball(2).verts)
-    found = error(fit_shape(start, cameras, depths=depths, positions=positions, **OPTIONS).mesh)
+    found = error(fit_shape(start, None, cameras, depths=depths, positions=positions, **arranged(**OPTIONS)).mesh)
     assert found < 0.04, found
 
 
@@ -220,8 +227,8 @@ def test_views_that_have_only_some_of_it(dent, tmp_path):
     depths = [None, *covered(views, "depth")[1:3], None, None]
     normals = [covered(views, "shading_normal")[0], None, None, None, None]
     given = {"masks": masks, "depths": depths, "normals": Measured(normals, factor=0.5)}
-    options = {"levels": 1, "steps": 4, "checkpoint": tmp_path / "fit.pt", "resume": True, **QUIET}
-    fit = fit_shape(ball(2), cameras, **given, **options)
+    options = {"refinement": Refinement(1), "steps": 4, "checkpoint": tmp_path / "fit.pt", **QUIET}
+    fit = fit_shape(ball(2), None, cameras, **arranged(**given, **options))
     assert [view.aovs for view in fit.views] == [
         ["alpha", "shading_normal"], ["depth", "alpha"], ["alpha", "depth"], ["alpha"], ["alpha"],
     ]  # fmt: skip
@@ -229,16 +236,21 @@ def test_views_that_have_only_some_of_it(dent, tmp_path):
     assert fit.render(1).shape == (40, 40, 1) and float(fit.render(1).max()) > 2.0
     pytest.importorskip("matplotlib")
     assert "fit.png" in fit.save(tmp_path)
-    again = fit_shape(ball(2), cameras, **given, **options)
+    options["resume"] = True
+    again = fit_shape(ball(2), None, cameras, **arranged(**given, **options))
     assert again.steps == 4 and torch.equal(again.mesh.verts, fit.mesh.verts)
     with pytest.raises(ValueError, match=r"made with another measured;"):
-        fit_shape(ball(2), cameras, **{**given, "depths": [None, depths[1], None, None, None]}, **options)
+        fit_shape(
+            ball(2), None, cameras, **arranged(**{**given, "depths": [None, depths[1], None, None, None]}, **options)
+        )
 
 
 def test_without_pictures_of_depth_nothing_changes():
     cameras, masks = egg_views()
     one, other = (
-        fit_shape(ball(1), cameras, masks=masks, levels=1, steps=3, **QUIET, **more)
+        fit_shape(
+            ball(1), None, cameras, masks=masks, refinement=Refinement(levels=1), **arranged(steps=3, **QUIET, **more)
+        )
         for more in ({}, {"depths": None, "normals": None, "positions": None})
     )
     assert torch.equal(one.mesh.verts, other.mesh.verts)

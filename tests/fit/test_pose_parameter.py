@@ -9,6 +9,7 @@ import pytest
 import torch
 from brackets import BACKGROUND, CENTER, bracket, camera, rotation
 from brackets import START as START_MATRIX
+from quiet_fits import arranged
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, PoseParameter, fit_scene
@@ -27,7 +28,7 @@ def fitted(size=24, **options):
     view = camera(size)
     start = eg.Scene([bracket()], BACKGROUND)
     wanted = {"meshes.0.pose": PoseParameter(START, rotation=0.02, shift=0.01)}
-    return fit_scene(start, view, target(view), wanted, **{**QUIET, **options})
+    return fit_scene(start, target(view), view, wanted, **arranged(**{**QUIET, **options}))
 
 
 # -- what it is -------------------------------------------------------------------------------------------------------
@@ -68,7 +69,9 @@ def test_a_function_gets_a_pose_in_the_type_of_the_object():
         seen.append(values["place"])
         return mesh.transformed(values["place"].R, values["place"].t, values["place"].scale)
 
-    fit = fit_scene(scene, camera(16), target(camera(16)), {"place": PoseParameter(START, mesh)}, steps=2, **QUIET)
+    fit = fit_scene(
+        scene, target(camera(16)), camera(16), {"place": PoseParameter(START, mesh)}, **arranged(steps=2, **QUIET)
+    )
     assert all(isinstance(pose, Pose) and pose.R.dtype == pose.t.dtype == torch.float32 for pose in seen)
     assert seen[1].R.requires_grad and fit.mesh.verts.dtype == torch.float32
     assert fit.values["place"].shape == (4, 4) and fit.values["place"].dtype == F64
@@ -101,13 +104,15 @@ def test_a_mesh_has_a_pose_and_other_parameters():
     """The mesh's vertices move with its pose. A scene's second mesh moves alone."""
     mesh, view = bracket(), camera(16)
     pose = Pose(START.R, START.t)
-    fit = fit_scene(mesh, view, target(view), {"pose": PoseParameter(pose), "verts": 1e-3}, steps=2, **QUIET)
+    fit = fit_scene(
+        mesh, target(view), view, {"pose": PoseParameter(pose), "verts": 1e-3}, **arranged(steps=2, **QUIET)
+    )
     found = fit.poses["pose"]
     torch.testing.assert_close(
         fit.mesh.verts, mesh.replace(verts=fit.values["verts"]).transformed(found.R, found.t, found.scale).verts
     )
     two = eg.Scene([mesh, mesh.transformed(t=torch.tensor([1.4, 1.2, 0.5], dtype=F64), scale=0.3)], BACKGROUND)
-    fit = fit_scene(two, view, target(view), {"meshes.1.pose": PoseParameter()}, steps=9, **QUIET)
+    fit = fit_scene(two, target(view), view, {"meshes.1.pose": PoseParameter()}, **arranged(steps=9, **QUIET))
     assert torch.equal(fit.scene.meshes[0].verts, mesh.verts)
     assert float((fit.scene.meshes[1].verts - two.meshes[1].verts).abs().max()) > 1e-3
 
@@ -116,7 +121,7 @@ def test_a_camera_moves_the_other_way():
     """A camera moved by M sees what the old one sees moved by M⁻¹."""
     view = camera(16)
     scene = eg.Scene([bracket()], BACKGROUND)
-    fit = fit_scene(scene, view, target(view), {"cameras.0.pose": PoseParameter(START)}, steps=1, **QUIET)
+    fit = fit_scene(scene, target(view), view, {"cameras.0.pose": PoseParameter(START)}, **arranged(steps=1, **QUIET))
     expected = view.world_to_camera.double() @ torch.linalg.inv(START_MATRIX)
     started = fit.history[0].values["cameras.0.pose"]
     torch.testing.assert_close(started, START_MATRIX)
@@ -162,8 +167,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path, method):
             raise KeyboardInterrupt
 
     whole = fitted(steps=12, method=method)
-    options = {"steps": 12, "checkpoint": tmp_path / "fit.ckpt", "resume": True, "method": method}
+    options = {"steps": 12, "checkpoint": tmp_path / "fit.ckpt", "method": method}
     half = fitted(callback=stop, **options)
+    options["resume"] = True
     assert half.reason == "interrupted" and half.steps == 6
     again = fitted(**options)
     assert again.steps == whole.steps and again.reason == whole.reason
@@ -172,7 +178,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path, method):
         assert a.loss == b.loss and torch.equal(a.values["meshes.0.pose"], b.values["meshes.0.pose"])
     other = {"meshes.0.pose": PoseParameter(START, rotation=0.03)}
     with pytest.raises(ValueError, match="another parameters"):
-        fit_scene(eg.Scene([bracket()], BACKGROUND), camera(24), target(camera(24)), other, **QUIET, **options)
+        fit_scene(
+            eg.Scene([bracket()], BACKGROUND), target(camera(24)), camera(24), other, **arranged(**QUIET, **options)
+        )
 
 
 def test_coordinates_without_poses_are_the_values():
@@ -189,9 +197,9 @@ def test_coordinates_without_poses_are_the_values():
         ({"background": PoseParameter()}, ValueError, "expected a pose's name among meshes.0.pose, cameras.0.pose"),
         ({"cameras.0.pose": PoseParameter(scale=0.1)}, ValueError, "cameras.0.pose: scale: expected None for a camera"),
         (
-            {"meshes.0.pose": PoseParameter(torch.eye(4))},
-            TypeError,
-            "meshes.0.pose: start: expected a tuple",
+            {"meshes.0.pose": PoseParameter(torch.eye(3))},
+            ValueError,
+            r"meshes.0.pose: init: expected shape \(4, 4\)",
         ),
         (
             {"meshes.0.pose": PoseParameter(Pose(2.0 * torch.eye(3), torch.zeros(3)))},
@@ -215,7 +223,7 @@ def test_coordinates_without_poses_are_the_values():
 def test_errors_name_the_argument(parameters, error, message):
     view = camera(16)
     with pytest.raises(error, match=message):
-        fit_scene(eg.Scene([bracket()], BACKGROUND), view, target(view), parameters, **QUIET)
+        fit_scene(eg.Scene([bracket()], BACKGROUND), target(view), view, parameters, **arranged(**QUIET))
 
 
 def test_a_function_needs_the_mesh_that_is_moved():
@@ -223,4 +231,4 @@ def test_a_function_needs_the_mesh_that_is_moved():
     with pytest.raises(
         TypeError, match=r"place: of: expected the Mesh or Scene that is moved, got none; give PoseParam"
     ):
-        fit_scene(lambda values: bracket(), view, target(view), {"place": PoseParameter()}, **QUIET)
+        fit_scene(lambda values: bracket(), target(view), view, {"place": PoseParameter()}, **arranged(**QUIET))

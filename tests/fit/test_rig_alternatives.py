@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import edgegrad as eg
-from edgegrad.fit import Options
 from edgegrad.fit.descent.objective import Objective
+from edgegrad.fit.options import Settings
 from edgegrad.fit.rig.alternatives import Alternatives, exchanged
 from edgegrad.fit.rig.axial_rotations import search_axial_rotations
 from edgegrad.fit.rig.free_parameters import FreeParameters
@@ -88,7 +88,7 @@ def test_axial_rotations_are_found(seed: int) -> None:
 
 def arm_of(rig: eg.rig.Rig) -> tuple[FreeParameters, Alternatives]:
     """Return the rotations of one arm of a figure as free parameters, and their alternatives."""
-    free = FreeParameters.from_arguments(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
+    free = FreeParameters.from_arguments(rig, ARM, {"rotations": figure.pose(7, 40.0)}, {})
     return free, Alternatives(rig, free, "rotations")
 
 
@@ -127,7 +127,7 @@ def test_axial_rotations_are_found_by_the_loss_along_them() -> None:
     objective = Objective(
         lambda values: (eg.Scene([rig.posed(**free.all(values))]), cameras),
         views,
-        Options(spp=32),
+        Settings(spp=32),
     )
     shared, _, across = alternatives.axial_rotations(truth)
     wrong = {"rotations": alternatives.with_rotation(truth, shared, 0.35)}

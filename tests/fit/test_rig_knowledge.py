@@ -7,11 +7,13 @@ import math
 import pytest
 import torch
 from arms import arm, shown, views
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import Options, Parameter, fit_rig
+from edgegrad.fit import Parameter, fit_rig
 from edgegrad.fit.descent.curvature import curvature, derivatives
 from edgegrad.fit.descent.objective import Objective
+from edgegrad.fit.options import Settings
 from edgegrad.fit.rig.joint_support import edge_support_by_joint, left_out
 from edgegrad.fit.rig.uncertainty import uncertainty_of
 from edgegrad.fit.views import views_of
@@ -24,7 +26,7 @@ def objective(rig: eg.rig.Rig, cameras: list[eg.Camera], **pictures: list[torch.
     def build(values: dict[str, torch.Tensor]) -> tuple[eg.Scene, list[eg.Camera]]:
         return eg.Scene([rig.posed(values["rotations"])]), cameras
 
-    return Objective(build, views_of(cameras, pictures.get("images"), pictures.get("masks"), None), Options(spp=64))
+    return Objective(build, views_of(cameras, pictures.get("images"), pictures.get("masks"), None), Settings(spp=64))
 
 
 def test_a_misplaced_hand_has_low_edge_support() -> None:
@@ -92,15 +94,9 @@ def test_what_no_picture_shows_is_unknown() -> None:
     camera = cameras[0].replace(world_to_camera=cameras[0].world_to_camera.clone())
     camera.world_to_camera[1, 3] += 2.2  # of the upper limb hardly anything is seen
     fit = fit_rig(
-        rig,
-        camera,
-        masks=shown(rig.posed(), [camera]),
-        seek=["rotations"],
-        tries=0,
-        coarsest=32,
-        steps=3,
-        progress=False,
-    )
+        rig, None, camera, masks=shown(rig.posed(), [camera]), seek=["rotations"], search=0,
+        options=quiet(coarsest=32, steps=3),
+    )  # fmt: skip
     assert fit.uncertainty is not None and fit.uncertainty.degrees["bone 1"] > 5.0
     assert "bone 1 known to ±" in fit.uncertainty.unknown
 
@@ -119,11 +115,13 @@ def test_light_is_found_with_the_pose() -> None:
     pictures = [eg.render(lit(rig.posed(truth), light), camera, 64, 9) for camera in cameras]
     start = torch.zeros_like(light)
     start[0] = 2.0
-    options = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
-    found = fit_rig(rig, cameras, pictures, parameters={"light": Parameter(0.2, start)}, **options)
+    options = {"seek": ["rotations"], "search": 0, "coarsest": 32, "steps": 12}
+    sought = {"light": Parameter(0.2, start)}
+    found = fit_rig(rig, pictures, cameras, appearance=(lit, sought), **arranged(**options))
     assert math.degrees(float((found.values["rotations"] - truth).norm(dim=1).max())) < 5.0
     assert torch.allclose(found.fit.values["light"][:4], light[:4], atol=0.3) and "light" not in found.values
     with pytest.raises(ValueError, match="parameters: expected names that the rig does not have, got 'rotations'"):
-        fit_rig(rig, cameras, pictures, parameters={"rotations": Parameter(0.2, start)}, **options)
+        sought = {"rotations": Parameter(0.2, start)}
+        fit_rig(rig, pictures, cameras, appearance=(lit, sought), **arranged(**options))
     with pytest.raises(TypeError, match=r"parameters\['light'\]: expected a Parameter, got float"):
-        fit_rig(rig, cameras, pictures, parameters={"light": 0.2}, **options)
+        fit_rig(rig, pictures, cameras, appearance=(lit, {"light": 0.2}), **arranged(**options))

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from brackets import START, bracket, camera, errors
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.fit import fit_pose, fit_texture
@@ -24,7 +25,7 @@ def test_what_a_picture_holds_at_a_soft_mask_does_not_matter(kind):
     view = camera(64)
     seen = eg.render_aovs(bracket(), view, ["image", "alpha"], spp=256, seed=1 << 40)
     image = of_object(kind, seen["image"], seen["alpha"])
-    fit = fit_pose(bracket(), image, view, seen["alpha"], START, spp=128, progress=False)
+    fit = fit_pose(bracket(), image, view, seen["alpha"], START, options=quiet(spp=128))
     degrees, percent = errors(fit)
     assert degrees < 0.08 and percent < 0.15, (degrees, percent)  # mostly 0.02 and 0.01; a hard mask: 0.7 and 0.8
 
@@ -51,5 +52,5 @@ def test_a_texture_under_a_soft_mask(kind):
     seen = eg.render_aovs(square.replace(texture=colour.expand(8, 8, 3)), view, ["image", "alpha"], spp=256, seed=9)
     image = of_object(kind, seen["image"], seen["alpha"])
     options = {"steps": 80, "spp": 8, "progress": False}
-    fit = fit_texture(square, view, image, 8, masks=seen["alpha"], **options)
+    fit = fit_texture(square, image, view, 8, masks=seen["alpha"], **arranged(**options))
     torch.testing.assert_close(fit.mesh.texture, colour.expand(8, 8, 3), atol=0.03, rtol=0)

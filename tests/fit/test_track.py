@@ -10,11 +10,12 @@ import pytest
 import torch
 from moving import DISTANCE, Film, errors, worst
 from PIL import Image
+from quiet_fits import arranged
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation
 from edgegrad.cli import main
-from edgegrad.fit import track
+from edgegrad.fit import FitOptions, track
 from edgegrad.fit.pose.result import pose_from_json
 
 pytest_plugins = "film_fixtures"
@@ -29,7 +30,7 @@ def test_a_rotating_stone_is_followed(film, frames):
             read.append(frame)
             yield frame
 
-    poses = track(film.mesh, one_by_one(), film.camera, film.poses[0])
+    poses = track(film.mesh, one_by_one(), film.camera, film.poses[0], options=FitOptions(seed=0))
     first = next(poses)
     assert len(read) == 1 and first.index == 0  # no more than is asked for
     found = [first, *poses]
@@ -43,7 +44,7 @@ def test_a_rotating_stone_is_followed(film, frames):
 @pytest.mark.slow
 def test_lost_and_found_again(film):
     gone = replace(film, poses=[film.poses[0]] * 8, gone=(1, 6))
-    found = list(track(film.mesh, gone, film.camera, film.poses[0], spp=2))
+    found = list(track(film.mesh, gone, film.camera, film.poses[0], options=FitOptions(seed=0, spp=2)))
     assert [pose.lost for pose in found[:6]] == [False] * 4 + [True] * 2
     assert not found[-1].lost
     degrees, percent = errors(gone, 7, found[-1].R, found[-1].t)
@@ -63,7 +64,7 @@ def test_found_again_elsewhere_and_rotated(film):
     gone = replace(film, poses=[film.poses[0]] * 7 + [there] * 2, gone=(1, 7))
     larger = film.mesh.replace(verts=100.0 * film.mesh.verts)
     init = film.poses[0] @ torch.diag(torch.tensor([0.01, 0.01, 0.01, 1.0]).double())
-    found = list(track(larger, gone, film.camera, init, spp=2))
+    found = list(track(larger, gone, film.camera, init, options=FitOptions(seed=0, spp=2)))
     assert all(pose.lost for pose in found[4:7]) and not found[-1].lost
     assert found[-1].scale == pytest.approx(0.01)
     degrees, percent = errors(gone, 8, found[-1].R, found[-1].t)
@@ -82,8 +83,10 @@ def test_found_again_elsewhere_and_rotated(film):
 def test_a_broken_frame_is_named(film, frames, spoil, words):
     found = []
     with pytest.raises((ValueError, OSError)) as caught:
-        found.extend(track(film.mesh, [], film.camera, film.poses[0]))
-        for pose in track(film.mesh, [frames[0], spoil(frames[1])], film.camera, film.poses[0]):
+        found.extend(track(film.mesh, [], film.camera, film.poses[0], options=FitOptions(seed=0)))
+        for pose in track(
+            film.mesh, [frames[0], spoil(frames[1])], film.camera, film.poses[0], options=FitOptions(seed=0)
+        ):
             found.append(pose)
     assert words in str(caught.value) and len(found) == 1
 
@@ -97,19 +100,19 @@ def test_a_broken_frame_is_named(film, frames, spoil, words):
         ({"mesh": 3}, "mesh: expected"),
         ({"init": torch.eye(3)}, "init: expected"),
         ({"spp": 0}, "spp: expected"),
-        ({"depth": 1.0}, "depth: expected"),
-        ({"depth": torch.ones(SIZE, SIZE)}, r"depth: expected \(T, H, W\), got"),
+        ({"depths": 1.0}, "depths: expected"),
+        ({"depths": torch.ones(SIZE, SIZE)}, r"depths: expected \(T, H, W\), got"),
     ],
 )
 def test_bad_arguments_are_named_at_once(film, frames, change, words):
     given = {"mesh": film.mesh, "frames": frames, "camera": film.camera, "init": film.poses[0], **change}
     with pytest.raises((TypeError, ValueError), match=words):
-        track(**given)
+        track(**arranged(**given))
 
 
 def test_depth_for_each_frame(film, frames):
-    with pytest.raises(ValueError, match="depth: expected one for each frame, got 1"):
-        list(track(film.mesh, frames[:2], film.camera, film.poses[0], depth=[None]))
+    with pytest.raises(ValueError, match="depths: expected one for each frame, got 1"):
+        list(track(film.mesh, frames[:2], film.camera, film.poses[0], depths=[None], options=FitOptions(seed=0)))
     plain = eg.Mesh(film.mesh.verts, film.mesh.faces)
     depths = []
     for pose in film.poses[:4]:
@@ -117,7 +120,7 @@ def test_depth_for_each_frame(film, frames):
         channels = eg.render_aovs(eg.Scene([moved]), film.camera, ["depth", "alpha"], seed=0)
         alpha = channels["alpha"][..., 0]
         depths.append(torch.where(alpha > 0.99, channels["depth"][..., 0] / alpha, torch.nan))
-    for pose in track(plain, frames[:4], film.camera, film.poses[0], depth=depths):
+    for pose in track(plain, frames[:4], film.camera, film.poses[0], depths=depths, options=FitOptions(seed=0)):
         degrees, percent = errors(film, pose.index, pose.R, pose.t)
         assert degrees < 0.3 and percent < 0.1
 
@@ -179,7 +182,7 @@ def test_a_hand_that_covers_more_than_half(film):
     """The hand stays for three pictures while the stone rotates, so the light of one picture alone would be the
     hand's."""
     going = replace(film, poses=film.poses[:3] + [film.poses[k] for k in range(3, COUNT)], hand=(-4, 9))
-    found = list(track(film.mesh, going, film.camera, film.poses[0]))
+    found = list(track(film.mesh, going, film.camera, film.poses[0], options=FitOptions(seed=0)))
     assert not any(pose.lost for pose in found) and max(pose.covered for pose in found) > 0.4
     degrees, percent = worst([errors(film, pose.index, pose.R, pose.t) for pose in found])
     assert degrees < 3.0 and percent < 6.0
@@ -188,7 +191,7 @@ def test_a_hand_that_covers_more_than_half(film):
 @pytest.mark.slow
 def test_two_hundred_frames_and_a_hand():
     film = Film.turning(256, 200, hand=(60, 120))
-    found = list(track(film.mesh, film, film.camera, film.poses[0]))
+    found = list(track(film.mesh, film, film.camera, film.poses[0], options=FitOptions(seed=0)))
     degrees = [errors(film, pose.index, pose.R, pose.t)[0] for pose in found]
     assert not any(pose.lost for pose in found)
     assert sum(degrees) / len(degrees) <= 0.5

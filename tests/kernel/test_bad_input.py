@@ -26,6 +26,7 @@ from malformed_calls import (
     good_case,
     malformed_cases,
 )
+from quiet_fits import arranged
 from torch import Tensor
 
 import edgegrad as eg
@@ -157,16 +158,14 @@ HELPERS: dict[str, tuple[Callable[..., object], dict[str, Any], dict[str, list[A
     "scene transformed": (eg.Scene(GOOD_MESH).transformed, {"R": torch.eye(3), "t": torch.ones(3), "scale": 2.0},
                           {"R": [m for m in MATRIX3 if m is not None], "scale": NUMBER}),
     "stack": (eg.Camera.stack, {"cameras": [GOOD_CAMERA] * 2}, {"cameras": [[], GOOD_CAMERA]}),
-    "fit_pose": (fit_pose, {"mesh": GOOD_MESH, "target": torch.rand(8, 8, 3), "camera": GOOD_CAMERA, "progress": False,
-                            "steps": 1, "spp": 1, "max_size": 8},
-                 {"mesh": ["text", None, torch.eye(3)], "target": PICTURE,
-                  "camera": ["text", None, torch.eye(4), eg.Camera.stack([GOOD_CAMERA] * 2)],
-                  "mask": [bad for bad in PICTURE if bad is not None] + [torch.rand(8, 8, 3)],
+    "fit_pose": (lambda **given: fit_pose(**arranged(**given)),
+                 {"mesh": GOOD_MESH, "images": torch.rand(8, 8, 3), "cameras": GOOD_CAMERA, "steps": 1, "spp": 1, "max_size": 8},
+                 {"mesh": ["text", None, torch.eye(3)], "images": PICTURE, "cameras": ["text", None, torch.eye(4)],
+                  "masks": [bad for bad in PICTURE if bad is not None] + [torch.rand(8, 8, 3)],
                   "init": ["text", torch.eye(3), torch.full((4, 4), NAN), -torch.eye(4), torch.ones(4, 4), [1, 2], object()],
-                  "background": ["red", NAN, torch.ones(2), torch.ones(9, 8, 3), [NAN] * 3],
-                  "max_size": COUNTS, "steps": COUNTS, "spp": COUNTS, "tolerance": [0.0, -1.0, NAN, "x", None],
-                  "seed": [-1, 1.5, "x", None, True, 2**70], "fit_scale": ["yes", 1, None], "fit_focal": ["yes", 1, None],
-                  "callback": [3, "print"]}),
+                  **{name: [bad for bad in COUNTS if bad is not None] for name in ("max_size", "steps", "spp")},
+                  "step_tolerance": [0.0, -1.0, NAN, "x"], "seed": [-1, 1.5, "x", True, 2**70], "scale": ["yes", 1, None],
+                  "focal": ["yes", 1, None], "search": ["all", 1, -2, None, 2.5], "callback": [3, "print"]}),
     "profile": (eg.profile, {"scene": GOOD_MESH, "camera": GOOD_CAMERA, "spp": 1},
                 {"repeats": COUNTS, "spp": COUNTS, "scene": [None, "x"], "camera": [None, "x"],
                  "adjoint": [*PICTURE[:1], *PICTURE[2:]]}),
@@ -184,7 +183,7 @@ def test_helpers_work_before_they_are_malformed(helper: str):
         assert function(**good) is not None
     else:
         with pytest.raises(ValueError, match="init: expected a pose at which the picture changes"):
-            function(**good | {"camera": GOOD_CAMERA.crop(500, 500, 8, 8), "init": torch.eye(4)})
+            function(**good | {"cameras": GOOD_CAMERA.crop(500, 500, 8, 8), "init": torch.eye(4)})
 
 
 @pytest.mark.parametrize("helper", HELPERS)
@@ -193,7 +192,7 @@ def test_helpers_refuse_and_name(helper: str):
     function, good, bad = HELPERS[helper]
     for name, values in bad.items():
         for value in values:
-            names = {name, f"{name}[0]"}
+            names = {name, f"{name}[0]", f"options.{name}"}
             check_refused(lambda v=value, n=name: function(**{**good, n: v}), names, f"{helper} {name} {value!r}")
 
 
@@ -208,7 +207,7 @@ def helper_calls(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
 def helper_refuses(malformed: tuple[str, dict[str, Any]]) -> None:
     helper, bad = malformed
     function, good, _ = HELPERS[helper]
-    check_refused(lambda: function(**{**good, **bad}), set(bad), f"{helper} {bad}")
+    check_refused(lambda: function(**{**good, **bad}), {*bad, *(f"options.{n}" for n in bad)}, f"{helper} {bad}")
 
 
 # -- the runs -----------------------------------------------------------------------------------------------------

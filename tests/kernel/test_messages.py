@@ -281,6 +281,23 @@ def test_import_without_a_usable_embree(tmp_path):
         assert reason in message
 
 
+@pytest.mark.unwatched
+@pytest.mark.parametrize("place", ["lib/libembree4.so", "lib/libembree4.dylib", "Library/bin/embree4.dll"])
+def test_embree_of_conda_is_found(tmp_path, monkeypatch, place):
+    """Its package embree brings the library without the distribution embreex."""
+
+    def distribution(name):
+        raise library.importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(library.importlib.metadata, "distribution", distribution)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    with pytest.raises(ImportError, match="embreex is not installed"):
+        library.embree_path()
+    (tmp_path / place).parent.mkdir(parents=True)
+    (tmp_path / place).touch()
+    assert library.embree_path() == str(tmp_path / place)
+
+
 def test_index_into_another_mesh_in_place() -> None:
     """After the checks, an index beyond its own mesh must not read the next one."""
     for bad in (len(VERTS), -1):

@@ -2,6 +2,7 @@
 
 import pytest
 from brackets import bracket
+from quiet_fits import arranged
 from small_scenes import QUIET, pictures, views
 
 import edgegrad as eg
@@ -22,5 +23,6 @@ def page(viewer) -> Browser:
 def colour_fit(**options):
     cameras = views(1)
     return fit_scene(
-        bracket(), cameras, pictures(bracket(), cameras), {"face_colors": Parameter(0.01)}, **{**QUIET, **options}
-    )
+        bracket(), pictures(bracket(), cameras), cameras, {"face_colors": Parameter(0.01)},
+        **arranged(**{**QUIET, **options}),
+    )  # fmt: skip

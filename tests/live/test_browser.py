@@ -9,7 +9,8 @@ import time
 import numpy as np
 import pytest
 import torch
-from brackets import BACKGROUND, START, bracket, camera, picture
+from brackets import START, before_sky, bracket, camera, picture
+from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, fit_pose, fit_scene
@@ -87,7 +88,7 @@ def test_the_page_pauses_goes_on_and_stops_a_running_fit(browser):
 
         def run():
             options = {"steps": 10**6, "tolerance": 0.0, "spp": 4, "progress": False, "callback": callback}
-            found.append(fit_scene(mesh, at, picture(at), {"face_colors": Parameter(0.002)}, **options))
+            found.append(fit_scene(mesh, picture(at), at, {"face_colors": Parameter(0.002)}, **arranged(**options)))
 
         opened(browser, viewer)
         fit = threading.Thread(target=run)
@@ -140,7 +141,7 @@ def test_the_page_shows_materials(browser):
 def test_the_page_shows_the_meshes_where_the_camera_sees_them(browser):
     """three.js draws the same outline in the page as render() does with the same camera."""
     at = camera(96)
-    fit = fit_pose(bracket(), picture(at), at, init=START, background=BACKGROUND, steps=3, spp=4, progress=False)
+    fit = fit_pose(before_sky(), picture(at), at, init=START, options=quiet(steps=3, spp=4))
     moved = bracket().transformed(fit.R, fit.t, fit.scale)
     mask = eg.render_aovs(moved, at, ["alpha"], spp=16, seed=0)["alpha"][..., 0].numpy()
     with eg.viewer(port=0) as viewer:

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from brackets import BACKGROUND, START, bracket, camera, picture
+from brackets import START, before_sky, bracket, camera, picture
 from live_fixtures import page
+from quiet_fits import arranged
 from small_scenes import QUIET, pictures, views
 
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb
-from edgegrad.fit import fit_camera, fit_pose, fit_rig, fit_shape, fit_texture
+from edgegrad.fit import Refinement, fit_camera, fit_pose, fit_rig, fit_shape, fit_texture
 from edgegrad.fit.views import white_level
 from edgegrad.live import snapshot, view
 
@@ -40,7 +41,7 @@ def extent(points):
 
 def test_a_pose_moves_the_mesh_and_keeps_the_camera(viewer):
     at = camera(32)
-    fit = fit_pose(bracket(), picture(at), at, init=START, background=BACKGROUND, callback=viewer, **QUIET)
+    fit = fit_pose(before_sky(), picture(at), at, init=START, **arranged(callback=viewer, **QUIET))
     viewer.show(fit)
     moved = bracket().verts @ fit.matrix[:3, :3].T + fit.matrix[:3, 3]
     shown = vertices(page(viewer)._meshes[0].handle)
@@ -63,8 +64,10 @@ def test_a_camera_moves_before_a_scene_at_rest(viewer):
     at = camera(32)
     away = at.world_to_camera.clone()
     away[0, 3] += 0.1
-    fit = fit_camera(bracket(), picture(at), at.replace(world_to_camera=away), focal=False, background=BACKGROUND,
-                     callback=viewer, **QUIET | {"spp": 64})  # fmt: skip
+    fit = fit_camera(
+        before_sky(), picture(at), at.replace(world_to_camera=away), focal=False, **arranged(callback=viewer, **QUIET |
+        {"spp": 64}),
+    )  # fmt: skip
     viewer.show(fit)
     np.testing.assert_allclose(
         extent(vertices(page(viewer)._meshes[0].handle)), extent(bracket().verts.T.numpy()), atol=1e-6
@@ -86,7 +89,7 @@ def test_the_skeleton_of_a_rig_is_drawn(viewer, monkeypatch):
         viewer(progress)
         seen.append(progress.bones)
 
-    fit = fit_rig(rig, cameras, masks=masks, tries=0, steps=3, coarsest=24, callback=look, **QUIET)
+    fit = fit_rig(rig, None, cameras, masks=masks, search=0, **arranged(steps=3, coarsest=24, callback=look, **QUIET))
     viewer.show(fit)
     assert len(seen) == fit.history[-1].step + 1 and seen[0].shape == (2, 2, 3) and not torch.equal(seen[0], seen[-1])
     joints = rig.shape({"rotations": fit.values["rotations"]}, translation=fit.values["translation"]).joints
@@ -114,7 +117,10 @@ def test_shapes_are_shown_as_they_move_also_after_remeshing(viewer, monkeypatch)
         viewer(progress)
         seen.append((progress.step, len(progress.scene.meshes[0].faces), progress.views[0].camera.size))
 
-    fit = fit_shape(start, cameras, masks=masks, levels=2, steps=4, faces=600, callback=look, **QUIET)
+    fit = fit_shape(
+        start, None, cameras, masks=masks, refinement=Refinement(levels=2, faces=600),
+        **arranged(steps=4, callback=look, **QUIET),
+    )  # fmt: skip
     viewer.show(fit)
     handle = page(viewer)._meshes[0].handle
     np.testing.assert_allclose(handle.vertices, fit.mesh.verts, atol=1e-6)
@@ -129,7 +135,7 @@ def test_textures_and_colours_are_those_of_the_mesh(viewer, tmp_path):
         uv_faces=torch.tensor([[0, 1, 2], [0, 2, 3]]),
     )  # fmt: skip
     at = eg.Camera.look_at((0.5, 0.5, 2.0), (0.5, 0.5, 0.0), size=(16, 16))
-    fit = fit_texture(square, at, torch.full((16, 16, 3), 0.6), (4, 4), steps=30, callback=viewer, **QUIET)
+    fit = fit_texture(square, torch.full((16, 16, 3), 0.6), at, (4, 4), **arranged(steps=30, callback=viewer, **QUIET))
     viewer.show(fit)
     loaded = trimesh.load(io.BytesIO(page(viewer)._meshes[0].handle.glb_data), file_type="glb", force="mesh")
     texels = np.asarray(loaded.visual.material.baseColorTexture)[..., :3]

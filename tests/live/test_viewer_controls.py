@@ -35,7 +35,9 @@ def test_a_pause_holds_the_fit_and_stop_ends_it_with_its_best(viewer):
         viewer(record)
 
     found = []
-    thread = threading.Thread(target=lambda: found.append(colour_fit(steps=10**6, tolerance=0.0, callback=callback)))
+    thread = threading.Thread(
+        target=lambda: found.append(colour_fit(steps=10**6, loss_tolerance=0.0, callback=callback))
+    )
     thread.start()
     assert reached.wait(20)
     time.sleep(0.5)

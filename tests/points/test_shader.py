@@ -200,8 +200,19 @@ def test_what_is_refused(name: str):
 
 
 def test_more_arguments_that_are_refused():
-    with pytest.raises(ValueError, match="creases: expected"):
-        eg.Sampling(creases="all")
+    hits = eg.points.primary_hits(icosphere(1), front_camera(8), 1, seed=0).hits
+    meta = torch.zeros(1, 3, device="meta")
+    for error, match, call in (
+        (ValueError, "creases: expected", lambda: eg.Sampling(creases="all")),
+        (ValueError, "creases: expected", lambda: eg.Sampling(creases=torch.tensor([1, 0]))),
+        (TypeError, "n: expected an int", lambda: hits.random("a")),
+        (ValueError, "part: expected an int from 0 to 1", lambda: hits.random(2, part=2, parts=2)),
+        (TypeError, "light: expected one of", lambda: eg.lights.points_by_material(hits, 3, 1)),
+        (TypeError, "hits: expected Hits", lambda: eg.lights.points_by_material(3, 3, 1)),
+        (ValueError, "origins: expected numbers", lambda: eg.points.trace(icosphere(1), meta, torch.ones(1, 3))),
+    ):
+        with pytest.raises(error, match=match):
+            call()
     plain = eg.Mesh(icosphere(1).verts, icosphere(1).faces)
     with pytest.raises(ValueError, match="as many channels as the background"):
         eg.render(eg.Scene([plain], torch.zeros(2)), front_camera(8), shader=lambda hits: hits.position, seed=0)

@@ -61,9 +61,10 @@ camera = eg.Camera.look_at((0.8, 0.6, 3.0), (0.3, 0.3, 0.3), (0.0, 1.0, 0.0), 40
 target = eg.render(mesh.transformed(t=torch.tensor([0.05, 0.0, 0.0])), camera)
 def stop(*fit):
     raise KeyboardInterrupt
-fit = eg.fit.fit_pose(mesh, target, camera, init=torch.eye(4), callback=stop, progress=False)
+options = eg.fit.FitOptions(seed=0, callback=stop, progress=False)
+fit = eg.fit.fit_pose(mesh, target, camera, init=torch.eye(4), options=options)
 assert fit.interrupted and fit.steps
-eg.fit.fit_scene(mesh, camera, [target], {"verts": 1e-3}, steps=1, progress=False)
+eg.fit.fit_scene(mesh, [target], camera, {"verts": 1e-3}, options=eg.fit.FitOptions(steps=1, seed=0, progress=False))
 motion = Motion(torch.zeros(1, 3, 3, dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64))
 Rendered(eg.Scene([mesh]), camera, ["image", "alpha", "normal"]).derivatives(motion)
 libraries = {"roma", "trimesh", "matplotlib", "OpenImageIO", "PIL", "viser"}

@@ -15,6 +15,7 @@ from edgegrad.fit import fit_rig
 yourdfpy = pytest.importorskip("yourdfpy")
 pytest.importorskip("pytorch_kinematics")
 import arm  # noqa: E402
+from quiet_fits import arranged  # noqa: E402
 
 GRIPPER = """<?xml version="1.0"?>
 <robot name="gripper">
@@ -107,11 +108,11 @@ def test_only_the_joints_that_are_named_turn(tmp_path) -> None:
     truth = 0.2 * torch.ones(7, dtype=torch.float64)
     with torch.no_grad():
         mask = eg.render_aovs(robot.posed(angles=truth), camera, ["alpha"], spp=16, seed=0)["alpha"]
-    options = {"masks": [mask], "tries": 0, "steps": 2, "coarsest": 24, "progress": False}
-    found = fit_rig(robot, [camera], joints=[names[1]], **options).values["angles"]
+    options = {"masks": [mask], "search": 0, "steps": 2, "coarsest": 24, "progress": False}
+    found = fit_rig(robot, None, [camera], seek=[names[1]], **arranged(**options)).values["angles"]
     assert float(found[1]) != 0.0 and float(found.abs().sum()) == float(found[1].abs())
-    with pytest.raises(ValueError, match="angles: expected names among"):
-        fit_rig(robot, [camera], joints=["nope"], **options)
+    with pytest.raises(ValueError, match="seek: expected names among"):
+        fit_rig(robot, None, [camera], seek=["nope"], **arranged(**options))
 
 
 BAD = {

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from quiet_fits import quiet
 
 import edgegrad as eg
 from edgegrad.fit.pose.result import PoseFit
@@ -236,7 +237,7 @@ def test_fit_pose_reports_the_nearest() -> None:
 
     def fitted(symmetries: eg.Symmetries | None, mesh: eg.Mesh = cylinder) -> PoseFit:
         return eg.fit.fit_pose(
-            mesh, shown["image"], camera, shown["alpha"][..., 0], start, steps=2, progress=False, symmetries=symmetries
+            mesh, shown["image"], camera, shown["alpha"][..., 0], start, symmetries=symmetries, options=quiet(steps=2),
         )  # fmt: skip
 
     free, found = fitted(None), eg.Symmetries.find(cylinder)

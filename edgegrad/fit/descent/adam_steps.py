@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from ..history import Record
-from ..options import Options, Parameter
+from ..options import Settings
+from ..parameter import Parameter
 from .adam import Adam
 from .loop import Optimizer, is_finite
 from .objective import Objective
@@ -25,7 +26,7 @@ class AdamOptimizer(Optimizer):
 
     saved = (*Optimizer.saved, "cuts", "since", "smooth", "least", "total")
 
-    def __init__(self, parameters: Mapping[str, Parameter], options: Options) -> None:
+    def __init__(self, parameters: Mapping[str, Parameter], options: Settings) -> None:
         super().__init__(parameters, options)
         rates = {name: p.lr for name, p in parameters.items()}
         self.adam = Adam(self.values, rates, {name for name, p in parameters.items() if p.uniform})
@@ -65,11 +66,11 @@ class AdamOptimizer(Optimizer):
         p = self.options.patience
         if self.impatient:
             self._cut()
-        elif self.options.tolerance > 0.0 and self.step - self.since >= 2 * p:
+        elif self.options.loss_tolerance > 0.0 and self.step - self.since >= 2 * p:
             losses = [record.loss for record in self.history[-2 * p :]]
             before, now = sum(losses[:p]) / p, sum(losses[p:]) / p
             # With `not >` instead of `<=`, losses that are NaN count as flat.
-            if not before - now > self.options.tolerance * abs(before):
+            if not before - now > self.options.loss_tolerance * abs(before):
                 self._cut()
 
     def _cut(self) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..options import Options
+from ..options import Settings
 
 MIN_BLOCKS = 8  # blocks of steps, before which nothing is predicted
 MAX_PARTS = 4096  # sums that are kept of one tensor
@@ -101,7 +101,7 @@ class ConvergenceMonitor:
         even, odd = (2.0 / MIN_BLOCKS / self._length * sum(last[k::2], torch.zeros_like(last[0])) for k in (0, 1))
         return steps * 0.5 * float(odd[even > 0].double().sum() + even[odd > 0].double().sum())
 
-    def least_decrease(self, options: Options) -> float:
+    def least_decrease(self, options: Settings) -> float:
         """Return the smallest decrease of the loss that counts. It is the tolerated share of the loss, or of its decrease so
         far where that is less, for no step may mend much of a loss. It is at least the noise of the mean loss over as many
         steps as the patience."""
@@ -112,7 +112,7 @@ class ConvergenceMonitor:
             return 0.0
         now = float(last.nanmean())
         noise = float(differences.square().mean()) / 2.0  # a steady decrease hardly adds to it
-        share = options.tolerance * min(abs(now), abs(self.first - now))
+        share = options.loss_tolerance * min(abs(now), abs(self.first - now))
         return max(share, math.sqrt(noise / options.patience))
 
     def state(self) -> dict[str, Any]:

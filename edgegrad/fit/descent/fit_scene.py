@@ -12,10 +12,11 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
-from ..checkpoints import Checkpoint
+from ..checkpoints import CheckpointFile
 from ..history import Record
 from ..losses import REGION
-from ..options import Options, Parameter
+from ..options import DESCENT_OPTIONS, FitOptions, Settings
+from ..parameter import Parameter
 from ..placement import Coordinates, Placement, PoseParameter
 from ..row_order import check_mask_rows
 from ..views import Images, Observation, region_views, views_of
@@ -24,7 +25,7 @@ from .gauss_newton import GaussNewtonOptimizer
 from .loop import Optimizer, descend
 from .objective import Objective
 from .result import Fit, make_fit
-from .scene_builder import Build, Built, Values, build_detached, builder, checked_parameters, suggestion
+from .scene_builder import Build, Built, Values, build_detached, builder, checked_parameters
 
 
 class Progress(Record):
@@ -73,53 +74,61 @@ def reporter(
 
 def fit_scene(
     scene: Scene | Mesh | Callable[[Values], Any],
-    cameras: Camera | Sequence[Camera],
     images: Images | None,
+    cameras: Camera | Sequence[Camera],
     parameters: Mapping[str, float | Parameter | PoseParameter],
     *,
     masks: Images | None = None,
     weights: Images | None = None,
     regularizer: Callable[[Scene], Tensor] | None = None,
-    **options: Any,
+    options: FitOptions | None = None,
 ) -> Fit:
     """Find tensors of a scene and its cameras, and poses of objects, whose renders match the pictures.
 
-    scene        initial Scene or Mesh; or a function of the parameters' values, a dict of tensors, that returns a Scene, a
-                 Mesh, or a pair of one and a list of cameras
-    cameras      one, a batch, or a sequence of cameras, of any sizes
-    images       linear radiance, (H, W, C) for one camera, else (B, H, W, C) or a sequence; None: masks alone
-    parameters   by name, a learning rate, a Parameter or a PoseParameter. Names are those of fields: "verts" or "texture" of a
-                 Mesh; "meshes.0.verts", "lights.1.direction" or "background" of a Scene; "cameras.0.K" of a camera. Poses are
-                 named "pose" of a Mesh, "meshes.0.pose" of a Scene's mesh, "cameras.0.pose" of a camera, which turns about the
-                 middle of the scene. A function has names of its own: each Parameter needs a value, and each PoseParameter its
-                 object, PoseParameter(of=…); it gets a Pose with R, t and scale for mesh.transformed()
-    masks        (H, W) each, 1 on the object, 0 elsewhere. Pictures are multiplied by them and compared over black, and alpha
-                 is compared with the mask; where a soft mask is between 0 and 1, alpha alone is compared. None: whole pictures
-    weights      (H, W) each, ≥ 0: how much a pixel counts; None: all count the same
-    regularizer  function of the scene that is added to the loss; None: nothing is
-    options      see edgegrad.fit.Options: loss, method, steps, spp, seed, callback, checkpoint, …
+    Parameters
+    ----------
+    scene : Scene, Mesh or function
+        The initial scene; or a function of the parameters' values by name that returns a Scene, a Mesh, or a pair of one and a
+        list of cameras.
+    images : Tensor or sequence of Tensor, or None
+        Linear radiance (H, W, C), one for each camera; None: masks alone.
+    cameras : Camera or sequence of Camera
+        One for each picture, of any sizes.
+    parameters : mapping
+        By name, a learning rate, a Parameter or a PoseParameter. Names are those of fields: "verts" of a Mesh;
+        "meshes.0.verts", "lights.1.direction" or "background" of a Scene; "cameras.0.K". Poses are "pose" of a Mesh,
+        "meshes.0.pose", and "cameras.0.pose", which turns about the middle of the scene. A function has names of its own: each
+        Parameter then needs a value, and each PoseParameter its object, PoseParameter(of=…); the function gets R, t and scale
+        of it.
+    masks : Tensor or sequence of Tensor, optional
+        (H, W) each, 1 on the object and 0 elsewhere. Pictures are then compared over black, and alpha with the mask.
+    weights : Tensor or sequence of Tensor, optional
+        (H, W) each, ≥ 0: how much a pixel counts.
+    regularizer : function, optional
+        Of the scene, added to the loss.
+    options : FitOptions, optional
+        Of its defaults, `steps` is 500 and `spp` 16.
 
-    Raises TypeError or ValueError that names the argument.
+    Returns
+    -------
+    Fit
+        The `values` by name, the `scene` and `cameras` with them.
+
+    Raises
+    ------
+    TypeError, ValueError
+        An argument is wrong; the message names it.
     """
-    opts = options_of(options)
+    settings = Settings.from_options(options, "fit_scene", DESCENT_OPTIONS)
     views = views_of(cameras, images, masks, weights)
-    if opts.loss == REGION:
+    if settings.loss == REGION:
         views = region_views(views)
     build, known = builder(scene, [view.camera for view in views], drop_background=masks is not None)
     wanted = checked_parameters(parameters, known)
-    return fit_views(build, views, wanted, opts, {"scene": scene, "parameters": wanted}, regularizer)
+    return fit_views(build, views, wanted, settings, {"scene": scene, "parameters": wanted}, regularizer)
 
 
-def options_of(options: Mapping[str, Any]) -> Options:
-    """Return Options. Raises TypeError that names an unknown option."""
-    names = list(Options.__dataclass_fields__)
-    for name in options:
-        if name not in names:
-            raise TypeError(f"expected options among {', '.join(names)}, got {name!r}{suggestion(name, names)}")
-    return Options(**options)
-
-
-def make_optimizer(parameters: Mapping[str, Parameter], options: Options) -> Optimizer:
+def make_optimizer(parameters: Mapping[str, Parameter], options: Settings) -> Optimizer:
     """Return the optimizer that `options.method` names. Raises ValueError where it cannot serve."""
     return {"adam": AdamOptimizer, "gauss-newton": GaussNewtonOptimizer}[options.method](parameters, options)
 
@@ -130,12 +139,12 @@ def fit_views(
     build: Build,
     views: list[Observation],
     parameters: Mapping[str, Parameter | Placement],
-    options: Options,
+    options: Settings,
     given: Mapping[str, Any],
     regularizer: Callable[[Scene], Tensor] | None = None,
 ) -> Fit:
     """Run fit_scene() on checked arguments. `given` are the arguments that views and options do not hold."""
-    checkpoint = Checkpoint.from_fit(options, views, given)
+    checkpoint = CheckpointFile.from_views(options.checkpoint, views, {**given, **options.of_steps})
     saved = checkpoint.read()
     coordinates = Coordinates(parameters)
 

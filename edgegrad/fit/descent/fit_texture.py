@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -14,9 +13,10 @@ from ...check import check_positive, check_positive_int
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..losses import REGION
-from ..options import Parameter
+from ..options import DESCENT_OPTIONS, FitOptions, Settings
+from ..parameter import Parameter
 from ..views import Images, views_of
-from .fit_scene import fit_views, options_of
+from .fit_scene import fit_views
 from .result import Fit
 
 COARSEST_TEXELS = 4  # on a side
@@ -24,8 +24,8 @@ COARSEST_TEXELS = 4  # on a side
 
 def fit_texture(
     mesh: Mesh,
-    cameras: Camera | Sequence[Camera],
     images: Images,
+    cameras: Camera | Sequence[Camera],
     size: int | tuple[int, int] = 512,
     *,
     lr: float = 0.05,
@@ -33,23 +33,45 @@ def fit_texture(
     masks: Images | None = None,
     weights: Images | None = None,
     regularizer: Callable[[Scene], Tensor] | None = None,
-    **options: Any,
+    options: FitOptions | None = None,
 ) -> Fit:
     """Find the texture of a mesh from pictures of it.
 
-    mesh        with texture coordinates, as unwrap() makes them; its texture, if it has one, is where the fit starts
-    size        texels: one number, or (h, w)
-    lr          learning rate, radiance per step
-    background  radiance behind the mesh, (C,) or (H, W, C); None: black
+    Parameters
+    ----------
+    mesh : Mesh
+        With texture coordinates, as unwrap() makes them. Its texture, if it has one, is where the fit starts.
+    images, cameras, masks, weights, regularizer
+        As of fit_scene().
+    size : int or (int, int), default 512
+        Texels on a side, or (h, w).
+    lr : float, default 0.05
+        Learning rate, radiance per step.
+    background : Tensor, optional
+        Radiance behind the mesh, (C,) or (H, W, C); by default black.
+    options : FitOptions, optional
+        Of its defaults, `steps` is 500 and `spp` 16.
 
-    The other arguments are those of fit_scene(). The texture is the sum of an image pyramid whose levels are fitted at once, so
-    texels that no picture shows take the colours of their surroundings from coarse levels. Colours stay above 0. `fit.mesh` is
-    the mesh with the texture found, `fit.mesh.texture`. Raises TypeError or ValueError that names the argument.
+    Returns
+    -------
+    Fit
+        `mesh` has the texture found, `mesh.texture`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        An argument is wrong; the message names it.
+
+    Notes
+    -----
+    The texture is the sum of an image pyramid whose levels are fitted at once, so texels that no picture shows take the colours
+    of their surroundings. Colours stay above 0.
     """
-    opts = options_of(options)
-    if opts.loss == REGION:
+    settings = Settings.from_options(options, "fit_texture", DESCENT_OPTIONS)
+    if settings.loss == REGION:
         raise ValueError(
-            f'loss: expected one between render and picture, got {opts.loss!r}, which is for shapes and poses; give "l1" or "l2"'
+            f"options.loss: expected one between render and picture, got {settings.loss!r}, which is for shapes and poses; give "
+            '"l1" or "l2"'
         )
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; load one with load_mesh(path)")
@@ -86,7 +108,7 @@ def fit_texture(
         sizes.append((max(1, sizes[-1][0] // 2), max(1, sizes[-1][1] // 2)))
     levels = {f"level{k}": Parameter(lr / len(sizes), torch.zeros(*s, C)) for k, s in enumerate(sizes)}
     given = {"mesh": shape, "size": (h, w), "lr": lr, "background": behind}
-    return fit_views(build, views, levels, opts, given, regularizer)
+    return fit_views(build, views, levels, settings, given, regularizer)
 
 
 def resampled(image: Tensor, size: tuple[int, int]) -> Tensor:

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from ..history import Record
 from ..losses import REGION
-from ..options import Options, Parameter
+from ..options import Settings
+from ..parameter import Parameter
 from .curvature import MAX_NUMBERS, check_pointwise, curvature
 from .loop import Optimizer, is_finite
 from .objective import Objective
@@ -40,16 +41,17 @@ class GaussNewtonOptimizer(Optimizer):
         "slope", "H",
     )  # fmt: skip
 
-    def __init__(self, parameters: Mapping[str, Parameter], options: Options) -> None:
+    def __init__(self, parameters: Mapping[str, Parameter], options: Settings) -> None:
         super().__init__(parameters, options, apart=False)
         count = sum(value.numel() for value in self.values.values())
         if count > MAX_NUMBERS:
             raise ValueError(
-                f'method: expected at most {MAX_NUMBERS} numbers to be sought by "gauss-newton", got {count}; give method="adam"'
+                f'options.method: expected at most {MAX_NUMBERS} numbers to be sought by "gauss-newton", got {count}; '
+                'give method="adam"'
             )
         if options.views_per_step is not None:
             raise ValueError(
-                'views_per_step: expected None for method="gauss-newton", which compares losses of all views'
+                'options.views_per_step: expected None for method="gauss-newton", which compares losses of all views'
             )
         rates = [torch.full((v.numel(),), parameters[n].lr, dtype=torch.float64) for n, v in self.values.items()]
         self.rates = torch.cat(rates)

@@ -16,7 +16,8 @@ from tqdm import tqdm
 
 from ..ending import Ending
 from ..history import Record
-from ..options import Options, Parameter
+from ..options import Settings
+from ..parameter import Parameter
 from .convergence import ConvergenceMonitor
 from .objective import Objective
 
@@ -37,7 +38,7 @@ class Optimizer:
 
     saved: ClassVar[tuple[str, ...]] = ("best", "step", "seconds", "flat", "renewed")  # attributes in checkpoints
 
-    def __init__(self, parameters: Mapping[str, Parameter], options: Options, apart: bool = True) -> None:
+    def __init__(self, parameters: Mapping[str, Parameter], options: Settings, apart: bool = True) -> None:
         self.parameters, self.options = parameters, options
         self.values = {name: p.value.clone().requires_grad_() for name, p in parameters.items() if p.value is not None}
         self.best = self.copied()
@@ -67,7 +68,7 @@ class Optimizer:
     @property
     def impatient(self) -> bool:
         """Whether the steps lead down no longer. With a tolerance of 0 this is never so."""
-        return self.options.tolerance > 0.0 and not self.falling
+        return self.options.loss_tolerance > 0.0 and not self.falling
 
     def ending(self, interrupted: bool) -> Ending:
         if interrupted:
@@ -124,7 +125,7 @@ def descend(
 ) -> Descent:
     """Take steps until the optimizer is flat or the steps run out. Ctrl-C ends the loop with the best values so far.
 
-    save    called with the optimizer's state every `checkpoint_every` steps and at the end
+    save    called with the optimizer's state every few steps, as the checkpoint says, and at the end
     saved   such a state to go on from; None: begin anew
     report  makes what the callback gets, of a step's record and the tensors after the step
     """
@@ -150,7 +151,7 @@ def descend(
             bar.update()
             if options.callback is not None:
                 options.callback(report(record, optimizer.values))
-            if optimizer.step % options.checkpoint_every == 0:
+            if options.checkpoint is not None and optimizer.step % options.checkpoint.every == 0:
                 keep()
     except KeyboardInterrupt:
         interrupted = True

@@ -13,7 +13,7 @@ from ...camera.camera import Camera
 from ...scene.scene import Scene
 from ..losses import REGION, loss_of
 from ..measured import measured_loss
-from ..options import Options
+from ..options import Settings
 from ..views import Observation, batch_groups
 from .region_loss import RENEWAL_STEPS, RegionLoss
 from .scene_builder import Built, build_detached
@@ -25,7 +25,7 @@ class Objective:
     """The loss of some of the views at a step, with samples of its own, as a function of tensors."""
 
     def __init__(
-        self, build: Callable[[Tensors], Built], views: list[Observation], options: Options,
+        self, build: Callable[[Tensors], Built], views: list[Observation], options: Settings,
         regularizer: Callable[[Scene], Tensor] | None = None, prior: Callable[[Tensors], Tensor] | None = None,
         build_batch: Callable[[Tensors], Sequence[Built]] | None = None,
     ) -> None:  # fmt: skip
@@ -33,10 +33,10 @@ class Objective:
         values, where that is faster."""
         self.build, self.views, self.options, self.regularizer, self.prior = build, views, options, regularizer, prior
         self.build_batch = build_batch
-        self.losses = {"alpha": loss_of("mask_loss", options.mask_loss)}
+        self.losses = {"alpha": loss_of("options.mask_loss", options.mask_loss)}
         self.regions = RegionLoss(views, options.seed) if options.loss == REGION else None
         if options.loss != REGION:
-            self.losses["image"] = loss_of("loss", options.loss)
+            self.losses["image"] = loss_of("options.loss", options.loss)
 
     def __call__(self, tensors: Tensors, step: int) -> Tensor:
         scene, cameras = self.build(tensors)

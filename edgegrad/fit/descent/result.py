@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +25,7 @@ from ..ending import Ending, reason_of
 from ..history import Record, history_rows, number_or_none
 from ..measured import comparable
 from ..placement import Coordinates, Pose
+from ..result import FitResult, chosen
 from ..views import Observation
 from .loop import Descent
 from .objective import Objective
@@ -39,8 +39,8 @@ RESULT_SPP = 64  # samples per pixel at least, of the renders by which the resul
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """The result of fit_scene(), fit_shape() and fit_texture().
+class Fit(FitResult):
+    """The result of fit_scene(), fit_shape() and fit_texture(), a FitResult.
 
     values     parameters by name; a PoseParameter as its matrix (4, 4) float64, mesh to world
     poses      PoseParameters by name
@@ -96,10 +96,8 @@ class Fit:
 
     def plot(self, most: int = 4) -> Figure:
         """Draw target, start, fit and difference of at most `most` views; with the loss "region" contours in the picture."""
-        n = len(self.views)
-        chosen = sorted({round(k * (n - 1) / max(1, min(most, n) - 1)) for k in range(min(most, n))})
         rows = []
-        for i in chosen:
+        for i in chosen(len(self.views), most):
             view = self.views[i]
             start, end = _render(self.start, view.camera, view, 64, 0), self.render(i)
             if (measured := view.measured.get(view.aovs[0])) is not None:
@@ -109,18 +107,16 @@ class Fit:
             rows.append((view.shown, start, end))
         return require("edgegrad.fit.plots", *DRAWING).comparison(rows, not self.views[0].by_region)
 
-    def plot_history(self) -> Figure:
-        """Draw the loss and the norm of each gradient over the steps."""
-        return require("edgegrad.fit.plots", *DRAWING).curves(self.history)
-
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write the result to a folder, which is made if missing, and return the names of the files.
 
-        fit.json      loss, reason, cameras, and values of up to 64 numbers values.pt     all values, for torch.load
-        history.json  loss, gradient norms and small values of each step mesh*.ply     shapes that moved texture*.png  textures
-        of 1 or 3 channels, as sRGB mesh*.glb     meshes with textures and materials, as save_mesh() writes them, if pillow is
-        installed camera*.json  cameras, as load_camera reads them fit.png       plot(), loss.png: plot_history(); not with
-        figures=False
+        - fit.json: loss, reason, cameras, and values of up to 64 numbers
+        - values.pt: all values, for torch.load
+        - history.json: loss, gradient norms and small values of each step
+        - mesh*.ply: shapes that moved; texture*.png: textures of 1 or 3 channels, as sRGB
+        - mesh*.glb: meshes with textures and materials, as save_mesh() writes them, if pillow is installed
+        - camera*.json: cameras, as load_camera reads them
+        - fit.png: plot(), loss.png: plot_history(); not with figures=False
 
         Each file is written whole or not at all. Raises OSError, or at last ImportError if matplotlib is missing.
         """
@@ -157,12 +153,6 @@ class Fit:
             "reason": self.reason, "converged": self.converged, "loss": number_or_none(self.loss), "explained": self.explained,
             "steps": self.steps, "seconds": round(self.seconds, 3), "values": small,
         }  # fmt: skip
-
-    def _repr_png_(self) -> bytes:
-        """Show plot() in a notebook."""
-        file = io.BytesIO()
-        self.plot().savefig(file, format="png", dpi=100)
-        return file.getvalue()
 
 
 def _render(scene: Scene, camera: Camera, view: Observation, spp: int, seed: int) -> Tensor:

@@ -14,7 +14,7 @@ from ...camera.poses import rigid
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors, named_tensors, with_named
-from ..options import Parameter
+from ..parameter import Parameter
 from ..placement import Placement, Pose, PoseParameter
 
 Values = dict[str, Any]  # tensors, and poses

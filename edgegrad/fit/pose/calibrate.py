@@ -7,7 +7,7 @@ the one lens together (bundle_adjustment.py).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,22 +17,26 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...camera.camera import Camera
-from ...check import check_flag, check_int
+from ...check import check_flag
 from ...files.cameras import save_camera
 from ...files.paths import PathLike, write_figures, write_json
 from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..by_camera import one_for_each
+from ..checkpoints import Checkpoint
 from ..ending import Ending
 from ..history import Record, history_rows, number_or_none
-from ..views import check_image
+from ..options import MIN_PICTURE_SIDE, POSE_OPTIONS, FitOptions, Settings
+from ..result import FitResult, chosen
+from ..views import Images, cameras_of, check_image
 from .bundle_adjustment import Adjustment, adjust_bundle, poses_of
 from .camera_uncertainty import CameraUncertainty
-from .fit_camera import CameraFit, compared_with, ended, fitted, moved, pose_of, with_coefficients
-from .fit_pose import check_callback, search_pose
-from .inputs import MIN_PICTURE_SIDE, ArgumentNames, check_max_size, one_for_each
+from .fit_camera import CameraFit, ended, fitted, moved, pose_of, with_coefficients
+from .fit_pose import search_pose
+from .inputs import ArgumentNames
 from .loss_model import LossSource, loss_source
-from .result import PoseFit, png
+from .result import PoseFit
 from .task import DISTORTION, FOCAL_LENGTH, Unknowns
 
 if TYPE_CHECKING:
@@ -42,8 +46,8 @@ PROJECTIONS = "perspective", "fisheye"
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """The result of calibrate(): cameras with one lens, and how exactly each number is known.
+class Calibration(FitResult):
+    """The result of calibrate(), a FitResult: cameras with one lens, and how exactly each number is known.
 
     fits     a CameraFit of each picture: its camera, the search by itself at a lower resolution, and the uncertainty of all
              numbers, None before the lens was found
@@ -119,13 +123,8 @@ class Calibration:
 
     def plot(self, most: int = 4) -> Figure:
         """Draw target | start | fit | difference of at most so many pictures, as they were compared."""
-        n = len(self.fits)
-        chosen = sorted({round(k * (n - 1) / max(1, min(most, n) - 1)) for k in range(min(most, n))})
-        return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(*(self.fits[k].search for k in chosen))
-
-    def plot_history(self) -> Figure:
-        """Draw the loss and the norm of each gradient, step by step."""
-        return require("edgegrad.fit.plots", *DRAWING).curves(self.history)
+        fits = [self.fits[k].search for k in chosen(len(self.fits), most)]
+        return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(*fits)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write the result to a folder, which is made where it is missing, and return the files' names.
@@ -168,94 +167,106 @@ class Calibration:
             "explained": [fit.explained for fit in self.fits], "steps": self.steps, "seconds": round(self.seconds, 3),
         }  # fmt: skip
 
-    def _repr_png_(self) -> bytes | None:
-        """Return the picture of plot() for a notebook."""
-        if any(not fit.search.history for fit in self.fits):
-            return None
-        return png(self.plot())
+    @property
+    def _can_draw(self) -> bool:
+        return all(fit.search.history for fit in self.fits)
 
 
 def calibrate(
     mesh: Mesh | Scene,
-    images: Tensor | Sequence[Tensor] | None,
-    cameras: Sequence[Camera] | Camera,
+    images: Images | None,
+    cameras: Camera | Sequence[Camera],
     *,
-    masks: Tensor | Sequence[Tensor] | None = None,
+    masks: Images | None = None,
     principal: bool = True,
     distortion: int = 4,
-    max_size: int = 512,
-    seed: int = 0,
-    progress: bool = True,
-    callback: Callable[[Calibration], None] | None = None,
-    checkpoint: PathLike | None = None,
-    resume: bool = False,
+    options: FitOptions | None = None,
 ) -> Calibration:
     """Find the lens that took several pictures of a known object, and the place of each.
 
-    mesh        what the pictures show, with its colours; or a Scene, whose background is known if it has one
-    images      (H, W, C) linear radiance each, as read_image gives it, of one size; None with masks: these alone are compared
-    cameras     one for each picture, or a batch, with one K and distortion: where the fit starts, each within about 30° and
-                15 % of the mesh's size
-    masks       (H, W) or (H, W, 1) each, 1 on the object and 0 elsewhere
-    principal   also find the principal point. The focal length is always found: one factor for both of K
-    distortion  number of coefficients to find, at most 8 (of a fisheye 4): the first of those of OpenCV's model (k1, k2, p1,
-                p2, k3, …) or a fisheye's, as a Camera has them. The cameras' further ones stay
-    max_size    larger pictures are reduced to so many pixels on their longer side
-    callback    called after each step with the Calibration so far
-    checkpoint  a path: PATH.0, PATH.1, … hold the search of each picture, from which `resume` continues
+    Parameters
+    ----------
+    mesh : Mesh or Scene
+        What the pictures show, with its colours; the background of a Scene is known, if it has one.
+    images, masks
+        As of fit_pose(), of one size.
+    cameras : Camera or sequence of Camera
+        One for each picture, with one K and distortion: where the fit starts, each within about 30° and 15 % of the mesh's
+        size.
+    principal, distortion
+        As of fit_camera(). The focal length is always found.
+    options : FitOptions, optional
+        Of its defaults, `steps` is 60 on each level of a search, `step_tolerance` 3e-4, `spp` 16 and `max_size` 512. The files
+        of a checkpoint are PATH.0, PATH.1, … with the search of each picture.
 
-    Pictures that were cropped or zoomed have another lens than the others. The result has the standard deviation of each
-    number (`uncertainty`). It is not `converged` where a number is hardly known, and `reason` names it. The object should
-    fill the pictures, lie near their corners in some, and be seen from several sides. Seed and progress are as for
-    fit_camera(). KeyboardInterrupt, also from the callback, ends the fit and returns it with `interrupted` set. Raises
-    TypeError or ValueError that names the argument.
+    Returns
+    -------
+    Calibration
+        `camera`, `cameras`, and `uncertainty` with the standard deviation of each number.
+
+    Raises
+    ------
+    TypeError, ValueError
+        An argument is wrong; the message names it.
+
+    Notes
+    ----- Pictures that were cropped or zoomed have another lens than the others. The object should fill the pictures, lie near
+    their corners in some, and be seen from several sides. Where a number is hardly known, the fit has not `converged`, and
+    `reason` names it.
     """
     began = time.perf_counter()
     given = _cameras(cameras, distortion)
     lens = Unknowns(False, True, check_flag("principal", principal), distortion)
-    check_max_size(max_size)
-    check_int("seed", seed, 0, 2**32 - 1)
-    check_callback(callback, "a Calibration")
-    mesh, target = compared_with("images", mesh, images, "masks", masks)
-    pictures = one_for_each("masks" if images is None else "images", target, len(given), 2 if images is None else 3)
-    shapes = [None] * len(given) if masks is None else one_for_each("masks", masks, len(given), 2)
+    used = (*POSE_OPTIONS, "checkpoint")
+    first = None if options is None else _file(options.checkpoint, 0)
+    own = options if first is None or options is None else replace(options, checkpoint=first)
+    settings = Settings.from_options(own, "calibrate", used, steps=60, max_size=512)
+    if images is None and masks is None:
+        raise ValueError("images: expected pictures or masks to compare with, got neither")
+    n = len(given)
+    pictures, shapes = one_for_each("images", images, n, 3), one_for_each("masks", masks, n, 2)
+    name = "masks" if images is None else "images"
     for k, (camera, picture) in enumerate(
-        zip(given, pictures, strict=True)
+        zip(given, shapes if images is None else pictures, strict=True)
     ):  # All are checked before the first search.
-        check_image(f"{'masks' if images is None else 'images'}[{k}]", picture, camera.size)
+        check_image(f"{name}[{k}]", picture, camera.size)
     fits: list[CameraFit] = []
+    callback = settings.callback
 
     def report(now: PoseFit) -> None:
         assert callback is not None
         callback(Calibration([*fits, fitted(now)], Ending.STEPS, time.perf_counter() - began, []))
 
+    start = torch.eye(4, dtype=torch.float64)
     for k, (camera, picture, shape) in enumerate(zip(given, pictures, shapes, strict=True)):
-        names = ArgumentNames(
-            "mesh", f"masks[{k}]" if images is None else f"images[{k}]", f"cameras[{k}]",
-            ("fit_scale", "focal", "principal", "distortion"), f"masks[{k}]",
+        names = ArgumentNames(images=f"images[{k}]", masks=f"masks[{k}]")
+        alone = replace(
+            settings, max_size=max(MIN_PICTURE_SIDE, min(settings.max_size, max(camera.size)) // 2),
+            callback=None if callback is None else report, checkpoint=_file(None if options is None else options.checkpoint, k),
         )  # fmt: skip
-        smaller = max(MIN_PICTURE_SIDE, min(max_size, max(camera.size)) // 2)
-        search = search_pose(
-            mesh, picture, camera, shape, torch.eye(4, dtype=torch.float64), lens, None, None, None, names, max_size=smaller,
-            steps=60, spp=16, tolerance=3e-4, seed=seed, search=True, progress=progress, resume=resume, checkpoint_every=25,
-            callback=None if callback is None else report, checkpoint=None if checkpoint is None else f"{checkpoint}.{k}",
-        )  # fmt: skip
+        search = search_pose(mesh, picture, camera, shape, start, lens, None, None, names, alone)
         fits.append(fitted(search))
         if search.interrupted:
             return Calibration(fits, Ending.INTERRUPTED, time.perf_counter() - began, [])
-    return _adjust(fits, given, max_size, seed, progress, callback, began)
+    return _adjust(fits, given, settings, began)
+
+
+def _file(checkpoint: Checkpoint | PathLike | None, k: int) -> Checkpoint | None:
+    """Return the checkpoint of picture k. Only the first must be there to go on from: a fit may end before the others begin."""
+    if checkpoint is None:
+        return None
+    whole = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
+    path = f"{whole.path}.{k}"
+    return replace(whole, path=path, resume=whole.resume and (k == 0 or Path(path).exists()))
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def _adjust(
-    fits: list[CameraFit], given: list[Camera], max_size: int, seed: int, progress: bool,
-    callback: Callable[[Calibration], None] | None, began: float,
-) -> Calibration:  # fmt: skip
+def _adjust(fits: list[CameraFit], given: list[Camera], settings: Settings, began: float) -> Calibration:
     """Refine all poses and the lens together, from the fits of single pictures."""
     searches, history = [fit.search for fit in fits], list[Record]()
     sources: list[LossSource] = []
-    bar = tqdm(desc="calibrate", unit="step", disable=not progress, leave=False)
+    bar = tqdm(desc="calibrate", unit="step", disable=not settings.progress, leave=False)
 
     def result(end: Adjustment, ending: Ending, judged: Sequence[tuple[float, float]]) -> Calibration:
         found = [
@@ -273,14 +284,15 @@ def _adjust(
         bar.update()
         shares = zip(end.evidence, searches, strict=True)
         best = result(end, Ending.STEPS, [(one.loss, search.explained) for one, search in shares])
-        if callback is not None:
-            callback(best)
+        if settings.callback is not None:
+            settings.callback(best)
 
     best = Calibration(fits, Ending.INTERRUPTED, 0.0, history)
     try:
         for k, search in enumerate(searches):
             assert search.task is not None
-            sources.append(loss_source(search.task, pose_of(search), max_size, 16, (seed + 7919 * k) % 2**32))
+            own = replace(settings, seed=(settings.seed + 7919 * k) % 2**32)
+            sources.append(loss_source(search.task, pose_of(search), own))
         end = adjust_bundle(sources, [pose_of(search) for search in searches], after_step=after_step)
         judged = [source.judged(pose) for source, pose in zip(sources, end.poses, strict=True)]
         return result(end, Ending.FLAT if end.short else Ending.STEPS, judged)
@@ -313,13 +325,7 @@ def _record(number: int, sources: Sequence[LossSource], end: Adjustment) -> Reco
 
 def _cameras(cameras: object, distortion: object) -> list[Camera]:
     """Return the cameras one by one, with one lens. Raises TypeError or ValueError."""
-    batch = isinstance(cameras, Camera)
-    if not batch and (not isinstance(cameras, Sequence) or isinstance(cameras, str)):
-        raise TypeError(f"cameras: expected a list of cameras, got {type(cameras).__name__}; give one for each picture")
-    given: list[Any] = [cameras] if isinstance(cameras, Camera) and cameras.batch is None else list(cameras)  # type: ignore[call-overload]
-    if not given:
-        raise ValueError("cameras: expected one for each picture, got none")
-    found = [with_coefficients(f"cameras[{k}]", camera, distortion) for k, camera in enumerate(given)]
+    found = [with_coefficients(f"cameras[{k}]", camera, distortion) for k, camera in enumerate(cameras_of(cameras))]
     first = found[0]
     for k, camera in enumerate(found):
         if camera.projection not in PROJECTIONS:

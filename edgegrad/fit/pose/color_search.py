@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..edge_support import MIN_EDGE_SUPPORT, block_error, edge_amount, edge_support
+from ..options import Settings
 from .blur_estimate import estimate_blur
 from .gauss_newton import INITIAL_DAMPING, PROBES_MEMORY, GaussNewton
 from .pose import Pose, angle
@@ -72,13 +73,13 @@ class ColorSearch:
     ambiguous = ()  # Ambiguous poses are not known.
 
     def __init__(
-        self, task: PoseTask, levels: list[PyramidLevel], start: Pose, steps: int, tolerance: float, seed: int,
-        log: ReplayLog | None = None, further: bool = True,
+        self, task: PoseTask, levels: list[PyramidLevel], start: Pose, settings: Settings, log: ReplayLog | None = None,
+        further: bool = True,
     ) -> None:  # fmt: skip
         """`further`: try other starts where the refinement of the given one does not end well."""
         self.task, self.levels, self.start = task, levels, start
-        self.steps, self.tolerance, self.seed, self.further = steps, tolerance, seed, further
-        self.generator = torch.Generator().manual_seed(seed)
+        self.settings, self.steps, self.seed, self.further = settings, settings.steps, settings.seed, further
+        self.generator = torch.Generator().manual_seed(self.seed)
         self.best, self.loss, self.converged, self.edge_support = start, math.nan, False, math.nan
         self.information: Tensor | None = None  # inverse covariance of the answer
         self.history: list[Step] = []
@@ -230,7 +231,7 @@ class ColorSearch:
                 self.log.record(state := state._replace(done=True))
                 break
             move = search.step()
-            still = float(move.abs().max()) < self.tolerance * level.coarseness
+            still = float(move.abs().max()) < self.settings.step_tolerance * level.coarseness
             short = still and search.damping <= INITIAL_DAMPING  # Rejected points alone do not count.
             settled = search.settled and not last
             good = taken and loss <= state.lowest + LOSS_NOISE * abs(state.lowest)
@@ -265,7 +266,7 @@ class ColorSearch:
         c = seen.compared.scale()
         curvature = seen.equations(c, first=True).curvature / max(seen.compared.variance(c), 1e-30)
         values, vectors = torch.linalg.eigh(0.5 * (curvature + curvature.T))
-        known = (values.clamp(min=1e-30).reciprocal() + self.tolerance**2).reciprocal()
+        known = (values.clamp(min=1e-30).reciprocal() + self.settings.step_tolerance**2).reciprocal()
         return ((vectors * known) @ vectors.T).flatten().tolist()
 
     def _judge(self, pose: Pose, short: bool) -> ColorCandidate:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,17 +20,20 @@ from ...files.paths import PathLike, write_json
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..history import Record, history_rows
+from ..options import POSE_OPTIONS, FitOptions, Settings
+from ..result import FitResult, delegated
+from ..views import Images, cameras_of
 from .bundle_adjustment import MAX_ADJUST_STEPS, adjust_bundle
 from .camera_uncertainty import CameraUncertainty
 from .fit_pose import search_pose
-from .inputs import ArgumentNames, without_colors
+from .inputs import ArgumentNames
 from .loss_model import ColorLoss, LossSource, loss_source
 from .pose import Pose
 from .result import PoseFit, Step
 from .task import STEP_PARTS, Unknowns
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 # Each part of a step moves one tensor of a camera.
 TENSOR_OF = {
@@ -39,8 +42,9 @@ TENSOR_OF = {
 
 
 @dataclass(frozen=True, eq=False)
-class CameraFit:
-    """The result of fit_camera(): the cameras, and the search for them, in which the scene moved before cameras at rest.
+class CameraFit(FitResult):
+    """The result of fit_camera(), a FitResult: the cameras, and the search for them, in which the scene moved before cameras at
+    rest.
 
     `history` has a Record of each step: the loss, comparable within one level of the image pyramid; the cameras, float64, by
     the names that fit_scene() has for them ("cameras.0.world_to_camera", and "cameras.0.K" and "cameras.0.distortion" where
@@ -56,6 +60,9 @@ class CameraFit:
     cameras: list[Camera]
     search: PoseFit
     uncertainty: CameraUncertainty | None = None
+    loss, explained, steps, seconds, converged, interrupted, plot, plot_history, _repr_png_ = delegated(
+        "search", "loss explained steps seconds converged interrupted plot plot_history _repr_png_"
+    )
 
     @property
     def camera(self) -> Camera:
@@ -63,32 +70,8 @@ class CameraFit:
         return self.cameras[0]
 
     @property
-    def loss(self) -> float:
-        return self.search.loss
-
-    @property
     def history(self) -> list[Record]:
         return [self._record(number, step) for number, step in enumerate(self.search.history)]
-
-    @property
-    def steps(self) -> int:
-        return self.search.steps
-
-    @property
-    def seconds(self) -> float:
-        return self.search.seconds
-
-    @property
-    def explained(self) -> float:
-        return self.search.explained
-
-    @property
-    def converged(self) -> bool:
-        return self.search.converged
-
-    @property
-    def interrupted(self) -> bool:
-        return self.search.interrupted
 
     @property
     def reason(self) -> str:
@@ -98,15 +81,7 @@ class CameraFit:
             return self.search.reason
         return reason_with(replace(self.search, uncertainty=None, converged=True).reason, known)
 
-    def plot(self) -> Figure:
-        """Draw target | start | fit | difference."""
-        return self.search.plot()
-
-    def plot_history(self) -> Figure:
-        """Draw the loss and the norm of each gradient, step by step."""
-        return self.search.plot_history()
-
-    def save(self, folder: PathLike) -> list[str]:
+    def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write history.json, camera.json for load_camera (of several cameras camera-0.json and so on) and what PoseFit.save
         writes; return the names. Raises OSError, or at last ImportError when matplotlib or pillow is missing."""
         Path(folder).mkdir(parents=True, exist_ok=True)
@@ -115,7 +90,7 @@ class CameraFit:
         for name, camera in zip(own, self.cameras, strict=True):
             save_camera(Path(folder) / name, camera)
         own.append(self.write_history(folder))
-        return [*own, *self.search.save(folder)]
+        return [*own, *self.search.save(folder, figures)]
 
     def write_history(self, folder: PathLike) -> str:
         """Write history.json alone, with loss, gradient norms and cameras of each step; return its name. Raises OSError."""
@@ -137,91 +112,79 @@ class CameraFit:
             squares[TENSOR_OF[part]] = squares.get(TENSOR_OF[part], 0.0) + norm**2
         return Record(number, step.loss, {name: math.sqrt(square) for name, square in squares.items()}, values)
 
-    def _repr_png_(self) -> bytes | None:
-        return self.search._repr_png_()
-
 
 def fit_camera(
     scene: Mesh | Scene,
-    image: Tensor | Sequence[Tensor] | None,
-    camera: Camera | Sequence[Camera],
+    images: Images | None,
+    cameras: Camera | Sequence[Camera],
     *,
-    mask: Tensor | Sequence[Tensor] | None = None,
-    weight: Tensor | Sequence[Tensor] | None = None,
-    background: Tensor | float | None = None,
+    masks: Images | None = None,
+    weights: Images | None = None,
     focal: bool = True,
     principal: bool = False,
     distortion: int = 0,
-    max_size: int = 512,
-    steps: int = 60,
-    spp: int = 16,
-    tolerance: float = 3e-4,
-    seed: int = 0,
     search: bool = True,
-    progress: bool = True,
-    callback: Callable[[CameraFit], None] | None = None,
-    checkpoint: PathLike | None = None,
-    checkpoint_every: int = 25,
-    resume: bool = False,
+    options: FitOptions | None = None,
 ) -> CameraFit:
     """Find pose and lens of the camera that took a picture of a known scene.
 
-    scene       what the picture shows, where it is; unlit, or all colours as they are in the picture
-    image       (H, W, C) linear radiance, or a list of pictures; None with a mask: that alone is compared
-    camera      of size (H, W), where the fit starts: within about 30° and 15 % of the scene's size; or a list of cameras, one
-                for each picture, which keep their places to one another, as those of a rig, and share what is found of the
-                lens
-    focal       also find the focal length: one factor for both of K
-    principal   also find the principal point
-    distortion  number of coefficients to find, at most 8 (of a fisheye 4): the first of those of OpenCV's model (k1, k2, p1,
-                p2, k3, …) or a fisheye's, as a Camera has them. The camera's further ones stay
+    Parameters
+    ----------
+    scene : Mesh or Scene
+        What the picture shows, where it is; unlit, or all colours as they are in the picture.
+    images, masks, weights, search
+        As of fit_pose().
+    cameras : Camera or sequence of Camera
+        Where the fit starts, within about 30° and 15 % of the scene's size. Several, one for each picture, keep their places to
+        one another, as those of a rig, and share what is found of the lens.
+    focal, principal : bool, default True and False
+        Whether the focal length, one factor for both of K, and the principal point are sought.
+    distortion : int, default 0
+        Number of coefficients to find, at most 8 (of a fisheye 4): the first of those that a Camera has. Further ones stay.
+    options : FitOptions, optional
+        Of its defaults, `steps` is 60 on each level, `step_tolerance` 3e-4, `spp` 16 and `max_size` 512.
 
-    mask, weight, background, search, checkpoint, resume and the rest are as for fit_pose(), whose search this is. What a
-    picture does not show stays uncertain: focal length against distance where there is hardly any perspective, the principal
-    point against a rotation of the camera. `uncertainty` has the standard deviation of each number. A fit is not `converged`
-    where a number of the lens is hardly known, and `reason` names it: one whose deviation moves a corner of the image by more
-    than 3 % of its distance from the principal point, or about which a guess says as much. Several pictures from different
-    sides say more: see calibrate(). Raises TypeError or ValueError that names the argument.
+    Returns
+    -------
+    CameraFit
+        `camera` and `cameras`; `uncertainty` has the standard deviation of each number.
+
+    Raises
+    ------
+    TypeError, ValueError
+        An argument is wrong; the message names it.
+
+    Notes
+    ----- A picture may leave focal length and distance open, or the principal point and a rotation of the camera. The fit has
+    not `converged` where a number of the lens is hardly known: where its deviation moves a corner of the image by more than 3 %
+    of its distance from the principal point, or where a guess says as much. Several pictures from different sides say more, see
+    calibrate().
     """
-    several = isinstance(camera, (list, tuple))
-    given = [with_coefficients("camera", one, distortion) for one in (camera if several else [camera])]
+    given = [with_coefficients("cameras", one, distortion) for one in cameras_of(cameras)]
     lens = Unknowns(False, check_flag("focal", focal), check_flag("principal", principal), distortion)
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback: expected a function of a CameraFit, got {type(callback).__name__}")
-    scene, target = compared_with("image", scene, image, "mask", mask)
-    names = ArgumentNames(
-        "scene", "mask" if image is None else "image", "camera", ("fit_scale", "focal", "principal", "distortion")
-    )
-
-    def step(search: PoseFit) -> None:
-        assert callback is not None
-        callback(fitted(search))
-
+    settings = Settings.from_options(options, "fit_camera", (*POSE_OPTIONS, "checkpoint"), steps=60, max_size=512)
+    callback = settings.callback
+    watched = replace(settings, callback=None if callback is None else lambda search: callback(fitted(search)))
     start = torch.eye(4, dtype=torch.float64)
+    names = ArgumentNames("scene")
     found = search_pose(
-        scene, target, given if several else given[0], mask, start, lens, background, weight, None, names, max_size=max_size,
-        steps=steps, spp=spp, tolerance=tolerance, seed=seed, search=search, progress=progress,
-        callback=None if callback is None else step, checkpoint=checkpoint, checkpoint_every=checkpoint_every, resume=resume,
-    )  # fmt: skip
-    if found.interrupted:
-        return fitted(found)
-    return finished(found, given, max_size, min(MAX_ADJUST_STEPS, steps), spp, seed)
+        scene, images, given, masks, start, lens, weights, None, names, watched, check_flag("search", search)
+    )
+    return fitted(found) if found.interrupted else finished(found, given, settings)
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def finished(
-    search: PoseFit, cameras: Sequence[Camera], max_size: int, most: int, spp: int, seed: int
-) -> CameraFit:  # fmt: skip
-    """Finish a search by at most so many steps of all numbers at once, and add their uncertainty."""
+def finished(search: PoseFit, cameras: Sequence[Camera], settings: Settings) -> CameraFit:
+    """Finish a search by some steps of all numbers at once, and add their uncertainty."""
     began, task = time.perf_counter(), search.task
     assert task is not None
     pose, shown = pose_of(search), search.explained >= search.enough
-    source = loss_source(task, pose, max_size, spp, seed)
+    source = loss_source(task, pose, settings)
     # A search by colours holds back numbers that the pictures hardly show; one by photographs is at its end.
     further = shown and isinstance(source, ColorLoss)
     try:
-        end = adjust_bundle([source], [pose], most if further else 0)
+        end = adjust_bundle([source], [pose], min(MAX_ADJUST_STEPS, settings.steps) if further else 0)
     except KeyboardInterrupt:
         return fitted(replace(search, interrupted=True, converged=False))
     rests = end.short if further else search.converged or search.reason.startswith("directions unknown")
@@ -264,17 +227,6 @@ def reason_with(words: str, known: CameraUncertainty) -> str:
         return words
     fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
     return f"not known: {known.unknown}; {fix}"
-
-
-def compared_with(
-    name: str, scene: Mesh | Scene, image: object, name_of_mask: str, mask: object
-) -> tuple[Mesh | Scene, object]:  # fmt: skip
-    """Return the scene and what it is compared with: pictures, or masks alone. Raises ValueError."""
-    if image is not None:
-        return scene, image
-    if mask is None:
-        raise ValueError(f"{name}: expected a picture, or a {name_of_mask}, to compare with, got neither")
-    return without_colors(scene), mask
 
 
 def with_coefficients(name: str, camera: object, count: object) -> Camera:

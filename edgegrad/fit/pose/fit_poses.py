@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,8 +15,11 @@ from ...check import as_tensor, check_flag, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
-from .fit_pose import ambiguity, check_callback, depth_images, symmetries_of
-from .inputs import ArgumentNames, check_in_front, check_seen, check_settings, one_for_each
+from ..by_camera import numbered, one_for_each
+from ..options import POSE_OPTIONS, FitOptions, Settings
+from ..views import Images, cameras_of
+from .fit_pose import ambiguity, depth_images, symmetries_of
+from .inputs import ArgumentNames, check_in_front, check_seen
 from .photo.depth import warn_of_units
 from .photo.poses_search import PosesSearch
 from .pose import Pose, pose_from_matrix
@@ -32,68 +35,67 @@ INNER_SCALE = 0.9  # At the end, they are tested at this share of their distance
 @torch.enable_grad()
 def fit_poses(
     meshes: Sequence[Mesh | Scene],
-    target: Tensor | Sequence[Tensor],
-    camera: Camera | Sequence[Camera],
-    mask: Tensor | Sequence[Any] | None = None,
+    images: Images,
+    cameras: Camera | Sequence[Camera],
+    masks: Tensor | Sequence[Any] | None = None,
     init: Sequence[PoseFit | Tensor] | None = None,
     *,
-    weight: Tensor | Sequence[Tensor] | None = None,
-    depth: Tensor | Sequence[Tensor] | None = None,
-    max_size: int = 256,
-    steps: int = 40,
-    spp: int = 16,
-    tolerance: float = 3e-4,
-    seed: int = 0,
+    weights: Images | None = None,
+    depths: Images | None = None,
     search: bool = True,
-    progress: bool = True,
-    callback: Callable[[list[PoseFit]], None] | None = None,
     symmetries: Sequence[Symmetries | None] | None = None,
+    options: FitOptions | None = None,
 ) -> list[PoseFit]:
-    """Find rotation and translation of several known meshes in a picture, or in several, in one fit; return a PoseFit for
-    each.
+    """Find rotation and translation of several known meshes in a picture, or in several, in one fit.
 
-    meshes      the objects, each a Mesh, or a Scene whose meshes move together, with colours or without
-    target      (H, W, C) linear radiance, as read_image gives it; or a list of pictures
-    camera      the camera of the picture, of size (H, W), or a list of them
-    mask        where each object is seen, without what covers it: an image of labels (H, W) of integers, k + 1 where
-                meshes[k] is seen and 0 elsewhere; or a list with a mask (H, W) for each mesh, as read_mask gives it. Of
-                several pictures each of these is a list with one for each picture
-    init        the pose of each mesh to start from, within some 15° and 5 % of its size: earlier fits, or matrices (4, 4),
-                mesh to world, for column vectors; None: where the mesh files put them
-    weight, depth, max_size, steps, spp, tolerance, seed, progress      as of fit_pose
-    search      whether an object whose edges the pictures do not show at its end starts again from other poses
-    callback    called after each step with the best fits so far
-    symmetries  of each mesh, or None for one without; poses are reported as of fit_pose
+    Parameters
+    ----------
+    meshes : sequence of Mesh or Scene
+        The objects, with colours or without; the meshes of a Scene move together.
+    images, cameras, weights, depths
+        As of fit_pose().
+    masks : Tensor or sequence, optional
+        Where each object is seen, without what covers it: an image of labels (H, W) of integers, k + 1 where meshes[k] is seen
+        and 0 elsewhere; or a list with a mask (H, W) for each mesh. Of several pictures each of these is a list with one for
+        each.
+    init : sequence of PoseFit or Tensor, optional
+        Of each mesh an earlier fit, or mesh to world (4, 4), within some 15° and 5 % of its size. By default where the mesh
+        files put them.
+    search : bool, default True
+        Whether an object whose edges the pictures do not show at its end starts again from other poses.
+    symmetries : sequence of Symmetries or None, optional
+        Of each mesh, as of fit_pose().
+    options : FitOptions, optional
+        Of its defaults, `steps` is 40, `step_tolerance` 3e-4, `spp` 16 and `max_size` 256.
 
-    The fit includes which object stands in front: an object is compared where the others do not hide it, and contours at
-    which one covers another move both. The light and the background need not be known, and something that is none of the
-    meshes may cover a part of them. Each fit is `converged` and `explained` by itself; a wrong one does not make others
-    wrong. `visible` is the share of an object that the others do not hide. Below a tenth, it is not `converged`, and `reason`
-    says that it is hidden; its pose is then little more than its start. Neither is an object that ends inside another one, or
-    whose pose the pictures do not show exactly, as of fit_pose.
+    Returns
+    -------
+    list of PoseFit
+        One for each mesh, with `visible`, the share of it that the others do not hide. Each is `converged` by itself, and not
+        if less than a tenth is visible, or if it ends inside another one.
 
-    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set. Raises
-    TypeError or ValueError that names the argument, also where an object is out of the picture, or inside another one, at the
-    start.
+    Raises
+    ------
+    TypeError, ValueError
+        An argument is wrong, or an object is out of the picture, or inside another one, at the start; the message names it.
     """
     began = time.perf_counter()
-    check_settings(max_size, steps, spp, seed, tolerance)
-    check_callback(callback, "a list of PoseFits")
-    count = _counted(meshes)
+    settings = Settings.from_options(options, "fit_poses", POSE_OPTIONS, steps=40)
+    count, views = _counted(meshes), cameras_of(cameras)
     starts = _starts(init, count)
-    masks = _masks(mask, count, camera)
+    own_masks = _masks(masks, count, views)
     known = _each("symmetries", symmetries, count)
     known_symmetries = [
         symmetries_of(one, mesh, f"symmetries[{k}]") for k, (one, mesh) in enumerate(zip(known, meshes, strict=True))
     ]
     tasks = [
         PoseTask.from_arguments(
-            mesh, target, camera, own, weight, None, Unknowns(), float(start.scale),
-            ArgumentNames(f"meshes[{k}]", init=f"init[{k}]", mask=f"mask[{k}]"),
+            mesh, images, views, own, weights, Unknowns(), float(start.scale),
+            ArgumentNames(f"meshes[{k}]", init=f"init[{k}]", masks=f"masks[{k}]"),
         )
-        for k, (mesh, own, start) in enumerate(zip(meshes, masks, starts, strict=True))
+        for k, (mesh, own, start) in enumerate(zip(meshes, own_masks, starts, strict=True))
     ]  # fmt: skip
-    depths = depth_images(depth, tasks[0])
+    measured = depth_images(depths, tasks[0])
     for task, start in zip(tasks, starts, strict=True):
         for shot in task.shots:
             check_in_front(task.names.init, shot.camera, start, task.center)
@@ -101,9 +103,8 @@ def fit_poses(
     for task, start in zip(tasks, starts, strict=True):
         check_seen(task.names.init, task.scene, [shot.camera for shot in task.shots], start)
     moved = [mesh for task, start in zip(tasks, starts, strict=True) for mesh in _moved(task, start)]
-    warn_of_units(Scene(moved), [shot.camera for shot in tasks[0].shots], depths, "at the start")
-    state = PosesSearch(tasks, starts, depths, max_size, spp, steps, tolerance, seed, check_flag("search", search))
-    cameras: list[Camera] = list(camera) if isinstance(camera, Sequence) else [camera]
+    warn_of_units(Scene(moved), [shot.camera for shot in tasks[0].shots], measured, "at the start")
+    state = PosesSearch(tasks, starts, measured, settings, check_flag("search", search))
     interrupted = False
 
     def results() -> list[PoseFit]:
@@ -120,21 +121,21 @@ def fit_poses(
             conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
             sure = state.converged[k] and not interrupted and not conflict and not unknown
             found.append(PoseFit(
-                best.R, best.t, float(best.scale), cameras[0], state.loss, len(history), time.perf_counter() - began,
-                sure, interrupted, state.edge_support[k], history, task, cameras, known, state.visible[k], conflict,
+                best.R, best.t, float(best.scale), views[0], state.loss, len(history), time.perf_counter() - began,
+                sure, interrupted, state.edge_support[k], history, task, views, known, state.visible[k], conflict,
                 state.needed[k],
             ))  # fmt: skip
         return found
 
-    bar = tqdm(total=None, desc="fit", unit="step", disable=not progress, leave=False)
+    bar = tqdm(total=None, desc="fit", unit="step", disable=not settings.progress, leave=False)
 
     def after_step() -> None:
         bar.set_postfix_str(
             f"{state.levels[-1].size[1]} × {state.levels[-1].size[0]} px, loss {state.loss:.2e}", refresh=False
         )
         bar.update()
-        if callback is not None:
-            callback(results())
+        if settings.callback is not None:
+            settings.callback(results())
 
     state.after_step = after_step
     try:
@@ -178,42 +179,37 @@ def _starts(init: object, count: int) -> list[Pose]:
     ]
 
 
-def _masks(mask: object, count: int, camera: object) -> list[Any]:
-    """Return, for each mesh, what fit_pose calls the mask. Raises TypeError or ValueError."""
-    cameras: list[Any] = list(camera) if isinstance(camera, Sequence) else [camera]
-    if hasattr(mask, "ndim"):
-        labels = one_for_each("mask", mask, len(cameras), 2) if isinstance(camera, Sequence) else [mask]
-    elif isinstance(camera, Sequence) and isinstance(mask, Sequence) and mask and all(map(_is_labels, mask)):
-        labels = one_for_each("mask", mask, len(cameras), 2)
-    else:
-        found = _each("mask", mask, count)
+def _masks(masks: Any, count: int, cameras: Sequence[Camera]) -> list[Any]:
+    """Return, for each mesh, what fit_pose calls the masks. Raises TypeError or ValueError."""
+    n = len(cameras)
+    labelled = isinstance(masks, Sequence) and len(masks) == n and all(map(_is_labels, masks))
+    if not hasattr(masks, "ndim") and not labelled:
+        found = _each("masks", masks, count)
         if 0 < (missing := sum(one is None for one in found)) < count:
-            raise ValueError(f"mask: expected a mask for each mesh or for none, got {count - missing} of {count}")
+            raise ValueError(f"masks: expected a mask for each mesh or for none, got {count - missing} of {count}")
         return found
-    names = ["mask"] if not isinstance(camera, Sequence) else [f"mask[{k}]" for k in range(len(labels))]
     columns = [
-        _of_labels(name, one, count, getattr(view, "size", None))
-        for name, one, view in zip(names, labels, cameras, strict=True)
+        _of_labels(numbered("masks", k, n), one, count, camera.size)
+        for k, (one, camera) in enumerate(zip(one_for_each("masks", masks, n, 2), cameras, strict=True))
     ]
-    return [list(row) for row in zip(*columns, strict=True)] if isinstance(camera, Sequence) else list(columns[0])
+    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _is_labels(given: object) -> bool:
     if not hasattr(given, "ndim"):
         return False
-    value = as_tensor("mask", given)
+    value = as_tensor("masks", given)
     return not value.is_floating_point() and value.dtype != torch.bool
 
 
-def _of_labels(name: str, labels: object, count: int, size: tuple[int, int] | None) -> list[Tensor]:
+def _of_labels(name: str, labels: object, count: int, size: tuple[int, int]) -> list[Tensor]:
     """Return a mask for each mesh, for a camera of that size."""
     value = as_tensor(name, labels).detach().cpu()
     if not _is_labels(value):
         raise TypeError(
             f"{name}: expected an image of labels, of integers, or a list with a mask for each mesh, got {value.dtype}"
         )
-    if size is not None:
-        check_shape(name, value, size, (*size, 1), fix="an image of labels needs the picture's size")
+    check_shape(name, value, size, (*size, 1), fix="an image of labels needs the picture's size")
     found = [(value == k + 1).float() for k in range(count)]
     for k, one in enumerate(found):
         if not bool(one.any()):

@@ -10,96 +10,44 @@ from torch import Tensor
 
 from ...aovs import render_aovs
 from ...camera.camera import Camera
-from ...check import check_int, check_positive_int, shape_text
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...warnings import warn
+from ..by_camera import numbered, one_for_each
 from ..region import VISIBLE
+from ..views import cameras_of
 from .pose import Pose
 
 CHECK_SPP = 4  # samples a pixel
-MIN_PICTURE_SIDE = 8  # Pixels on the shorter side of a picture: fewer show no contour.
 
 
 class ArgumentNames(NamedTuple):
     """The names of a function's arguments, for error messages."""
 
     mesh: str = "mesh"
-    target: str = "target"
+    images: str = "images"
     init: str = "init"
-    lens: tuple[str, ...] = ("fit_scale", "fit_focal")  # entries of Unknowns
-    mask: str = "mask"
+    masks: str = "masks"
 
 
 def shots_of(
-    camera: Any, target: Any, mask: Any, weight: Any, names: ArgumentNames
+    images: Any, cameras: object, masks: Any, weights: Any, names: ArgumentNames
 ) -> list[tuple[str, Camera, Any, Any, Any]]:
     """Return the suffix of the arguments' names, camera, picture, mask and weight of each view. Raises TypeError or
     ValueError."""
-    several = isinstance(camera, Sequence) and not isinstance(camera, str)
-    cameras: list[Any] = list(camera) if several else [camera]
-    if not cameras:
-        raise ValueError("camera: expected at least one, got none")
-    columns = []
-    for name, value, needed in ((names.target, target, True), (names.mask, mask, False), ("weight", weight, False)):
-        if value is None and not needed:
-            columns.append([None] * len(cameras))
-        elif not several:
-            if isinstance(value, Sequence) and any(hasattr(one, "shape") for one in value):
-                raise ValueError(
-                    f"{name}: expected one, for the one camera, got a list of {len(value)}; give a list of cameras too"
-                )
-            columns.append([value])
-        else:
-            columns.append(one_for_each(name, value, len(cameras), 3 if needed else 2))
-    for i, one in enumerate(cameras):
-        if not isinstance(one, Camera):
-            raise TypeError(f"camera: expected a Camera, got {type(one).__name__}; make one with Camera.look_at(…)")
-        if one.batch is not None:
-            raise ValueError(f"camera: expected one camera, got {one.batch}; give a list of cameras, and of pictures")
-        if one.world_to_camera.dtype != one.K.dtype:
-            cameras[i] = one.to(torch.float64)
-    suffixes = [f"[{i}]" for i in range(len(cameras))] if several else [""]
-    return list(zip(suffixes, cameras, *columns, strict=True))
-
-
-def one_for_each(name: str, given: Any, count: int, dims: int) -> list[Any]:
-    """Return one image for each camera, from a list or from an array with one more dimension. Raises ValueError."""
-    shape = getattr(given, "shape", None)
-    if shape is not None and (len(shape) <= dims or (len(shape) == 3 and shape[-1] == 1 and len(given) != count)):
-        if count == 1:
-            return [given]
-        raise ValueError(
-            f"{name}: expected {count}, one for each camera, got one of shape {shape_text(shape)}; give a list of them"
-        )
-    if not isinstance(given, Sequence) and shape is None:
-        raise ValueError(f"{name}: expected a list of {count}, one for each camera, got {type(given).__name__}")
-    if len(given) != count:
-        raise ValueError(f"{name}: expected {count}, one for each camera, got {len(given)}")
-    return list(given)
+    views = [one if one.world_to_camera.dtype == one.K.dtype else one.to(torch.float64) for one in cameras_of(cameras)]
+    n = len(views)
+    columns = [
+        one_for_each(name, given, n, dims)
+        for name, given, dims in ((names.images, images, 3), (names.masks, masks, 2), ("weights", weights, 2))
+    ]
+    return list(zip([numbered("", k, n) for k in range(n)], views, *columns, strict=True))
 
 
 def without_colors(scene: Mesh | Scene) -> Scene:
     """Return the shapes alone."""
     meshes: Sequence[Mesh] = [scene] if isinstance(scene, Mesh) else scene.meshes
     return Scene([Mesh(mesh.verts, mesh.faces) for mesh in meshes])
-
-
-def check_max_size(max_size: object) -> None:
-    """Raise TypeError or ValueError for a `max_size` that is too small."""
-    check_int("max_size", max_size, MIN_PICTURE_SIDE, 2**31 - 1)
-
-
-def check_settings(max_size: object, steps: object, spp: object, seed: object, tolerance: object) -> None:
-    """Raise TypeError or ValueError for settings that no search can have."""
-    check_max_size(max_size)
-    for name, count in (("steps", steps), ("spp", spp)):
-        check_positive_int(name, count)
-    check_int("seed", seed, 0, 2**32 - 1)
-    if not isinstance(tolerance, (int, float)) or isinstance(tolerance, bool):
-        raise TypeError(f"tolerance: expected a number, got {type(tolerance).__name__} ({tolerance!r})")
-    if not 0.0 < tolerance < 1.0:
-        raise ValueError(f"tolerance: expected a number above 0 and below 1, got {tolerance:g}")
 
 
 def check_in_front(name: str, camera: Camera, pose: Pose, center: Tensor) -> None:

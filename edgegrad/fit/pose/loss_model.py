@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...render import jvp
+from ..options import Settings
 from .blur_estimate import estimate_blur
 from .color_search import JUDGE_SPP, ColorSearch
 from .gauss_newton import NormalEquations
@@ -45,12 +46,12 @@ class LossModel(NamedTuple):
 class ColorLoss:
     """The loss that ColorSearch minimises, for masks and for pictures that show the mesh's colours unlit."""
 
-    def __init__(self, task: PoseTask, pose: Pose, max_size: int, spp: int, seed: int) -> None:
-        self.task, self.seed = task, seed
-        finest = min(1.0, max_size / max(task.shots[0].camera.size))
-        sharp = task.level(finest, 0.0, 1.0, max(spp, JUDGE_SPP), task.dofs)
+    def __init__(self, task: PoseTask, pose: Pose, settings: Settings) -> None:
+        self.task, self.seed = task, settings.seed
+        finest = min(1.0, settings.max_size / max(task.shots[0].camera.size))
+        sharp = task.level(finest, 0.0, 1.0, max(settings.spp, JUDGE_SPP), task.dofs)
         with torch.no_grad():
-            both = [task.images(sharp, pose, sharp.spp, (seed + k) % 2**32) for k in (0, 1)]
+            both = [task.images(sharp, pose, sharp.spp, (self.seed + k) % 2**32) for k in (0, 1)]
         self.level = sharp._replace(image_blur=estimate_blur(task, sharp, *both))
         self.c = MIN_WIDTH * task.extent
 
@@ -81,7 +82,7 @@ class ColorLoss:
 
     def judged(self, pose: Pose) -> tuple[float, float]:
         """Return the loss, and the share of the render's edges that the pictures show."""
-        found = ColorSearch(self.task, [self.level], pose, 1, 0.5, self.seed)._judged(pose, self.level)
+        found = ColorSearch(self.task, [self.level], pose, Settings(seed=self.seed))._judged(pose, self.level)
         return found.loss, found.edge_support
 
 
@@ -109,16 +110,16 @@ class PhotoLoss:
 LossSource = ColorLoss | PhotoLoss
 
 
-def loss_source(task: PoseTask, pose: Pose, max_size: int, spp: int, seed: int) -> LossSource:
+def loss_source(task: PoseTask, pose: Pose, settings: Settings) -> LossSource:
     """Return the loss that suits the pictures best, by what light does to the mesh's colours at a pose."""
     if task.aovs != ("alpha",):
-        levels = photo_levels(task, pose, [None] * len(task.shots), max_size, spp, seed)
-        lit = [] if task.colorless else [seen.lit for seen in levels[-1].comparisons(pose, seed)]
+        levels = photo_levels(task, pose, [None] * len(task.shots), settings)
+        lit = [] if task.colorless else [seen.lit for seen in levels[-1].comparisons(pose, settings.seed)]
         # A surface too small to show its light is compared by colours where the background is known.
         changes = [one.change() for one in lit if one is not None]
         if (task.clutter and not changes) or max(changes, default=0.0) > UNCHANGED_COLORS:
-            return PhotoLoss(task, pose, levels, seed)
-    return ColorLoss(task, pose, max_size, spp, seed)
+            return PhotoLoss(task, pose, levels, settings.seed)
+    return ColorLoss(task, pose, settings)
 
 
 def score_covariance(scores: Tensor) -> Tensor:

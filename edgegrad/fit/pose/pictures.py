@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ...files.paths import PathLike, replacing
 from ..plots import comparison, draw_gradients
+from ..result import chosen
 from ..views import displayed
 from .photo.overlay import overlay
 from .result import PoseFit, Step
@@ -29,15 +30,15 @@ def draw_fit(path: PathLike, fit: PoseFit) -> None:
         figure.savefig(temporary)
 
 
-def sheet(*fits: PoseFit) -> Figure:
-    """Return a row for each picture, of one fit or several."""
+def sheet(*fits: PoseFit, most: int | None = None) -> Figure:
+    """Return a row for each picture, of one fit or several, or for at most so many."""
     rows = []
     for fit in fits:
         task = _task(fit)
         level = _level(task, PANEL_SIDE)
         start, end = (overlay(task, level, step.pose) for step in (fit.history[0], _best_steps(fit)[-1]))
         rows += [(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)]
-    return comparison(rows)
+    return comparison([rows[k] for k in chosen(len(rows), len(rows) if most is None else most)])
 
 
 def draw_loss(path: PathLike, fit: PoseFit) -> None:

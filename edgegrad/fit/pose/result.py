@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..ending import Ending, reason_of
 from ..history import number_or_none
+from ..result import FitResult
 from .pose import Pose, pose_from_matrix
 from .uncertainty import MAX_FOCAL, Uncertainty
 
@@ -45,16 +45,16 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class PoseFit:
-    """The result of fit_pose().
+class PoseFit(FitResult):
+    """The result of fit_pose(), a FitResult.
 
     R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given one
     (of several the first), with the focal length found when that was asked for.
 
     `loss` belongs to the finest level, and compares only fits to the same pictures that ended by the same terms. By colours as
     they are, or by the mask of a plain mesh, it is the mean over pixels and channels of Geman and McClure's ρ(r) = r² / (1 +
-    r²/c²): r is the difference of a pixel to the picture, in linear radiance of which 1 is the picture's white, and c a tenth of
-    the picture's range. Before an unknown background a reward for what the object covers is subtracted. By the terms for
+    r²/c²): r is the difference of a pixel to the picture, in linear radiance of which 1 is the picture's white, and c a tenth
+    of the picture's range. Before an unknown background a reward for what the object covers is subtracted. By the terms for
     photographs it is the region term alone: the mean of −log(likelihood) over the pixels around the object, in nats.
     """
 
@@ -101,16 +101,15 @@ class PoseFit:
             fix = "give a picture from nearer, where perspective shows, or the lens as it was calibrated"
         return f"directions unknown: {self.uncertainty.unknown}; {fix}"
 
-    def plot(self) -> Figure:
-        """Draw target | start | fit | difference, a row for each picture; with a mask all over black, as they were
-        compared."""
-        return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(self)
+    def plot(self, most: int = 4) -> Figure:
+        """Draw target | start | fit | difference, a row for each of at most so many pictures; with a mask all over black, as
+        they were compared."""
+        return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(self, most=most)
 
     def plot_history(self) -> Figure:
-        """Draw the loss and the norm of each gradient, step by step."""
         return require("edgegrad.fit.pose.pictures", *DRAWING).curves_of(self)
 
-    def save(self, folder: PathLike) -> list[str]:
+    def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write pose.json, fit.png, loss.png (plot_history()) and fit.webp to a folder, and return their names.
 
         The folder is made where it is missing, and each file is written whole or not at all. A fit that took no step writes
@@ -119,7 +118,7 @@ class PoseFit:
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         write_text(out / "pose.json", self.to_json() + "\n")
-        if not self.history:
+        if not self.history or not figures:
             return ["pose.json"]
         pictures = require("edgegrad.fit.pose.pictures", *DRAWING)
         draw = {"fit.png": pictures.draw_fit, "loss.png": pictures.draw_loss, "fit.webp": pictures.draw_animation}
@@ -127,11 +126,9 @@ class PoseFit:
             function(out / name, self)
         return ["pose.json", *draw]
 
-    def _repr_png_(self) -> bytes | None:
-        """Return the picture of plot() for a notebook."""
-        if self.task is None or not self.history:
-            return None
-        return png(self.plot())
+    @property
+    def _can_draw(self) -> bool:
+        return self.task is not None and bool(self.history)
 
     def to_json(self) -> str:
         """Return JSON text with the pose, `mesh_to_world` 4 × 4 by rows for column vectors, the camera, and figures of the
@@ -171,13 +168,6 @@ class PoseFit:
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
         flags = bool(data["converged"]), bool(data["interrupted"])
         return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags, share, uncertainty=known)
-
-
-def png(figure: Figure) -> bytes:
-    """Return a figure as a PNG file."""
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=100)
-    return file.getvalue()
 
 
 def pose_from_json(text: str) -> Pose:

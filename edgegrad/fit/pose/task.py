@@ -17,9 +17,10 @@ from ...camera.poses import rotation
 from ...check import check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..options import MIN_PICTURE_SIDE, Settings
 from ..region import VISIBLE
 from ..views import area_mean, check_image, check_without_alpha, has_levels, over_black, warn_of_faint, white_level
-from .inputs import MIN_PICTURE_SIDE, ArgumentNames, depth_of, shots_of
+from .inputs import ArgumentNames, depth_of, shots_of
 from .jacobian import Motion, cross_matrices
 from .pose import Pose
 from .target_images import background_of, blurred, is_clutter, scaled
@@ -93,8 +94,8 @@ class PoseTask:
 
     @staticmethod
     def from_arguments(
-        mesh: Mesh | Scene, target: Any, camera: Any, mask: Any, weight: Any, background: Tensor | float | None,
-        lens: Unknowns, scale: float, names: ArgumentNames,
+        mesh: Mesh | Scene, images: Any, cameras: object, masks: Any, weights: Any, lens: Unknowns, scale: float,
+        names: ArgumentNames,
     ) -> PoseTask:  # fmt: skip
         """Check a fit's arguments; `scale` is the mesh's at the start. Raises TypeError or ValueError."""
         if not isinstance(mesh, Mesh | Scene):
@@ -104,59 +105,58 @@ class PoseTask:
         # Autograd does not keep tensors that were made in torch.inference_mode(), so they are copied.
         scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu", copy=True)
         plain = all(part.channels is None for part in scene.meshes)
-        if mask is not None and background is not None:
-            raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
-        shots, masks, clutter, levels = [], [], False, True
-        for name, view, picture, shape, count in shots_of(camera, target, mask, weight, names):
-            image = check_image(f"{names.target}{name}", picture, view.size)
+        masked = masks is not None
+        shots, shapes, clutter, levels = [], [], False, True
+        for name, view, picture, shape, count in shots_of(images, cameras, masks, weights, names):
+            image = check_image(f"{names.images}{name}", picture, view.size)
             levels = levels and has_levels(image)
             if min(view.size) < MIN_PICTURE_SIDE:
                 raise ValueError(
-                    f"{names.target}{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
+                    f"{names.images}{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
                     f"{view.size[1]} × {view.size[0]}; take a larger one"
                 )
-            if plain and mask is None:
-                check_without_alpha(f"{names.target}{name}", image)
+            if plain and not masked:
+                check_without_alpha(f"{names.images}{name}", image)
             C = image.shape[-1] if plain else scene.channels
             if image.shape[-1] != C:
                 raise ValueError(
-                    f"{names.target}{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
+                    f"{names.images}{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
                     f"read it with read_image(path, channels={C}), or give its alpha as the mask"
                 )
             if count is not None:
-                count = check_image(f"weight{name}", count, view.size)
-                check_shape(f"weight{name}", count, (*view.size, 1))
+                count = check_image(f"weights{name}", count, view.size)
+                check_shape(f"weights{name}", count, (*view.size, 1))
                 if not bool((count >= 0).all()):
-                    raise ValueError(f"weight{name}: expected numbers from 0 up, got {float(count.min()):g}")
+                    raise ValueError(f"weights{name}: expected numbers from 0 up, got {float(count.min()):g}")
             behind = None
-            if mask is not None:
-                shape = check_image(f"{names.mask}{name}", shape, view.size)
-                check_shape(f"{names.mask}{name}", shape, (*view.size, 1))
-                masks.append(shape)
+            if masked:
+                shape = check_image(f"{names.masks}{name}", shape, view.size)
+                check_shape(f"{names.masks}{name}", shape, (*view.size, 1))
+                shapes.append(shape)
                 image = shape if plain else torch.cat([over_black(image, shape)[0], shape], -1)
             else:
-                behind = background if background is not None else scene.background
+                behind = scene.background
                 clutter = clutter or plain  # Unknown colours cannot be compared.
                 if behind is None:
                     clutter = clutter or is_clutter(image)
                 behind = background_of(behind, image)
             shots.append(TargetView(view.to("cpu", torch.float64, copy=True), image, behind, count))
-        warn_of_faint(names.mask, masks)
+        warn_of_faint(names.masks, shapes)
         if all(shot.weight is not None and not bool((shot.weight > 0).any()) for shot in shots):
             raise ValueError(
-                "weight: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
+                "weights: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
             )
-        if colorless := plain and mask is None:
+        if colorless := plain and not masked:
             scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
         if clutter:
             shots = [shot._replace(background=None) for shot in shots]
         white = 1.0
-        if not levels and not (plain and mask is not None):
-            shots, white = _in_units_of_white(shots, mask is not None)
+        if not levels and not (plain and masked):
+            shots, white = _in_units_of_white(shots, masked)
         most = max((float(shot.weight.max()) for shot in shots if shot.weight is not None), default=1.0)
         shots = [shot if shot.weight is None else shot._replace(weight=shot.weight / most) for shot in shots]
-        aovs = ("image", "alpha") if clutter or (mask is not None and not plain) else ("image",)
-        aovs = ("alpha",) if mask is not None and plain else aovs
+        aovs = ("image", "alpha") if clutter or (masked and not plain) else ("image",)
+        aovs = ("alpha",) if masked and plain else aovs
 
         double = [part.replace(verts=part.verts.detach().double()) for part in scene.meshes]
         low, high = torch.cat([part.verts for part in double]).aminmax(dim=0)
@@ -169,7 +169,7 @@ class PoseTask:
         orthographic = all(shot.camera.projection == "orthographic" for shot in shots)
         depth = len(shots) > 1 or (not orthographic and not lens.scale)
         if lens.scale and lens.focal and orthographic:
-            raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
+            raise ValueError("focal: expected False with scale and an orthographic camera, where both are one")
         dofs = [0, 1, 2, 3, 4] + [5] * depth + [SCALE] * lens.scale + [FOCAL_LENGTH] * lens.focal
         dofs += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(DISTORTION, DISTORTION + lens.distortion))
         # Pixels brighter than white, as of a light source or a defect, say nothing of the range of the others, nor does a mask.
@@ -177,30 +177,30 @@ class PoseTask:
         colors = seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
         # A black object before black has no range of colours, but its mask has.
         extent = next((r for x in (colors, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
-        if masks and not any(bool((one > 0.0).any()) for one in masks):
+        if shapes and not any(bool((one > 0.0).any()) for one in shapes):
             raise ValueError(
-                f"{names.mask}: expected 1 on the object, got a mask that is black, 0 in every pixel; is it the object's mask?"
+                f"{names.masks}: expected 1 on the object, got a mask that is black, 0 in every pixel; is it the object's mask?"
             )
         if extent == 0.0:
-            given = names.target if mask is None else names.mask
+            given = names.masks if masked else names.images
             raise ValueError(
                 f"{given}: expected a picture of the object, got the same in every pixel; "
                 "was it read or rendered right?"
             )
-        if masks and (most := max(int((one > 0.0).sum()) for one in masks)) < VISIBLE:
+        if shapes and (most := max(int((one > 0.0).sum()) for one in shapes)) < VISIBLE:
             raise ValueError(
-                f"{names.mask}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
+                f"{names.masks}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
             )
         without_colors = scene.replace(meshes=double, background=None)
         return PoseTask(
             without_colors, aovs, shots, clutter, colorless, extent, (low + high) / 2, size, dofs, names, white
         )
 
-    def pyramid(self, start: Pose, max_size: int, spp: int) -> list[PyramidLevel]:
+    def pyramid(self, start: Pose, settings: Settings) -> list[PyramidLevel]:
         """Return the levels from coarse to fine. Raises ValueError when the object is behind the camera."""
         camera = self.shots[0].camera
         H, W = camera.size
-        finest = min(1.0, max_size / max(H, W))
+        finest, spp = min(1.0, settings.max_size / max(H, W)), settings.spp
         depth = float(depth_of(camera, start, self.center))
         perspective = camera.projection != "orthographic"
         if perspective and depth <= 0:

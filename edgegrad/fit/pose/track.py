@@ -18,16 +18,16 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...camera.poses import rigid
-from ...check import check_int, check_positive_int
 from ...files.image import read_image
 from ...files.paths import PathLike
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..options import FitOptions, Settings
 from ..region import Palette, palette
 from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import NormalEquations
-from .inputs import ArgumentNames, check_in_front, check_max_size, check_seen, depth_of
+from .inputs import ArgumentNames, check_in_front, check_seen, depth_of
 from .photo.depth import warn_of_units
 from .photo.level import PhotoLevel, PictureComparison, photo_levels
 from .photo.light_history import LightHistory
@@ -96,34 +96,43 @@ def track(
     camera: Camera,
     init: PoseFit | Tensor,
     *,
-    depth: Iterable[Tensor | None] | None = None,
-    max_size: int = 256,
-    spp: int = 8,
-    seed: int = 0,
+    depths: Iterable[Tensor | None] | None = None,
+    options: FitOptions | None = None,
 ) -> Iterator[TrackedPose]:
     """Yield the pose of a known mesh in each picture of a film, one after the other.
 
-    mesh      what the pictures show, with its colours or without; the meshes of a Scene move together
-    frames    pictures (H, W, C) of linear radiance with the mesh's channels, or paths of image files; a list, a tensor (T, H,
-              W, C), or any iterable, which is read only as far as poses are asked for
-    camera    the camera of all pictures, of size (H, W)
-    init      the pose in the first picture, within about 10° and 5 % of the object's size: what fit_pose found, or mesh to
-              world as a matrix (4, 4) for column vectors
-    depth     of each picture (H, W) or (H, W, 1), as a depth camera measures it from where the picture was taken: distances
-              along +Z of the camera in world units, 0 or NaN where there is none; None for pictures without
-    max_size  the part around the object of a larger picture is reduced to so many pixels on its longer side
-    spp       samples a pixel of each render
-    seed      the same seed gives the same poses
+    Parameters
+    ----------
+    mesh : Mesh or Scene
+        What the pictures show, with its colours or without; the meshes of a Scene move together.
+    frames : iterable of Tensor or path
+        Pictures (H, W, C) of linear radiance with the mesh's channels, or image files; a list, a tensor (T, H, W, C), or any
+        iterable, which is read only as far as poses are asked for.
+    camera : Camera
+        The camera of all pictures, of their size.
+    init : PoseFit or Tensor
+        The pose in the first picture, within about 10° and 5 % of the object's size: an earlier fit, or mesh to world (4, 4).
+    depths : iterable of Tensor or None, optional
+        Of each picture, as of fit_pose().
+    options : FitOptions, optional
+        `max_size`, by default 256, of the part around the object, `spp`, by default 8, and `seed`.
 
-    The light and the background need not be known. The mesh may move by some 10° and a fifth of its size from a picture to
-    the next, more where it moves evenly; something may pass before it. Where four pictures in a row hardly show the object
-    (`explained` below 0.45), it is `lost`, and is searched for until it is found again: where it was seen last in each
-    picture, and in every fifth all over it, rotated by up to some 60° and up to a fifth larger or smaller, by perspective and
-    orthographic cameras.
+    Yields
+    ------
+    TrackedPose
+        `R`, `t` and `matrix` in a picture. Where four in a row hardly show the object (`explained` below 0.45), it is `lost`,
+        and is searched for until it is found again.
 
-    Arguments are checked at once; an `init` at which the camera sees nothing of the object is refused. A picture that cannot
-    be used (another size, numbers that are not finite, a missing file) raises ValueError, TypeError or OSError that names it
-    as `frames[k]`, when it is asked for; the poses before it have been given by then.
+    Raises
+    ------
+    TypeError, ValueError, OSError
+        An argument is wrong, or the camera sees nothing of the object at `init`. A picture that cannot be used is named as
+        `frames[k]` when it is asked for.
+
+    Notes
+    -----
+    The light and the background need not be known. The mesh may move by some 10° and a fifth of its size from a picture to the
+    next, more where it moves evenly; something may pass before it.
     """
     if not isinstance(camera, Camera) or camera.batch is not None:
         got = type(camera).__name__ if not isinstance(camera, Camera) else f"a batch of {camera.batch}"
@@ -137,32 +146,30 @@ def track(
         )
     if isinstance(frames, Tensor) and frames.dim() != 4:
         raise ValueError(f"frames: expected (T, H, W, C), got {tuple(frames.shape)}; give a list of pictures")
-    if depth is not None and not isinstance(depth, (Iterable, Tensor)):
-        raise TypeError(f"depth: expected one for each frame or None, got {type(depth).__name__}")
-    if isinstance(depth, Tensor) and depth.dim() not in (3, 4):
-        raise ValueError(f"depth: expected (T, H, W), got {tuple(depth.shape)}; give a list of depth images")
-    check_max_size(max_size)
-    check_positive_int("spp", spp)
-    check_int("seed", seed, 0, 2**32 - 1)
+    if depths is not None and not isinstance(depths, (Iterable, Tensor)):
+        raise TypeError(f"depths: expected one for each frame or None, got {type(depths).__name__}")
+    if isinstance(depths, Tensor) and depths.dim() not in (3, 4):
+        raise ValueError(f"depths: expected (T, H, W), got {tuple(depths.shape)}; give a list of depth images")
+    settings = Settings.from_options(options, "track", ("max_size", "spp"), spp=8)
     start = pose_from_matrix("init", getattr(init, "matrix", init))
     scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu").detach()
     low, high = torch.cat([part.verts.double() for part in scene.meshes]).aminmax(dim=0)
     check_in_front("init", camera.to("cpu"), start, (low + high) / 2)
     check_seen("init", scene, [camera.to("cpu")], start)
-    return _poses(Tracker(mesh, camera, start, max_size, spp, seed), frames, depth)
+    return _poses(Tracker(mesh, camera, start, settings), frames, depths)
 
 
 def _poses(
-    tracker: Tracker, frames: Iterable[FrameLike], depth: Iterable[Tensor | None] | None
+    tracker: Tracker, frames: Iterable[FrameLike], depths: Iterable[Tensor | None] | None
 ) -> Iterator[TrackedPose]:
-    depths = None if depth is None else iter(depth)
+    depths = None if depths is None else iter(depths)
     for index, frame in enumerate(frames):
         measured = None
         if depths is not None:
             try:
                 measured = next(depths)
             except StopIteration:
-                raise ValueError(f"depth: expected one for each frame, got {index}, and more frames") from None
+                raise ValueError(f"depths: expected one for each frame, got {index}, and more frames") from None
         yield tracker.follow(index, frame, measured)
 
 
@@ -183,9 +190,9 @@ class FrameCandidate(NamedTuple):
 class Tracker:
     """The state of tracking through a film."""
 
-    def __init__(self, mesh: Mesh | Scene, camera: Camera, start: Pose, max_size: int, spp: int, seed: int) -> None:
+    def __init__(self, mesh: Mesh | Scene, camera: Camera, start: Pose, settings: Settings) -> None:
         self.mesh, self.camera = mesh, camera
-        self.max_size, self.spp, self.seed = max_size, spp, seed
+        self.settings, self.seed = settings, settings.seed
         self.pose = self.good = start  # last pose, and last one at which the object was seen
         self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
         self.poor = self.lost = 0  # successive pictures that hardly show the object, and in which it is lost
@@ -205,7 +212,7 @@ class Tracker:
         if self.task is None:
             self.task = self._task(name, picture)
         task = replace(self.task, shots=[self.task.shots[0]._replace(target=picture / self.task.white)])
-        near = None if measured is None else depth_image(f"depth[{index}]", measured, self.camera.size)
+        near = None if measured is None else depth_image(f"depths[{index}]", measured, self.camera.size)
         if self.first:
             there = task.scene.transformed(self.pose.R, self.pose.t, self.pose.scale)
             warn_of_units(there, [task.shots[0].camera], [near], "at the start")
@@ -301,7 +308,7 @@ class Tracker:
         return pose, views
 
     def _levels(self, task: PoseTask, depth: Tensor | None, pose: Pose) -> list[PhotoLevel]:
-        return photo_levels(task, pose, [depth], self.max_size, self.spp, self.seed, self.palettes)
+        return photo_levels(task, pose, [depth], self.settings, self.palettes)
 
     def _searched(self, task: PoseTask, depth: Tensor | None) -> FrameCandidate:
         """Search the whole picture for the object, about as large as it was, and rotated by up to some 60°."""
@@ -370,7 +377,7 @@ class Tracker:
 
     def _task(self, name: str, picture: Tensor) -> PoseTask:
         task = PoseTask.from_arguments(
-            self.mesh, picture, self.camera, None, None, None, Unknowns(), float(self.pose.scale), ArgumentNames(target=name)
+            self.mesh, picture, self.camera, None, None, Unknowns(), float(self.pose.scale), ArgumentNames(images=name)
         )  # fmt: skip
         # The background counts as unknown, since a film shows more than one.
         task = replace(task, clutter=True, shots=[task.shots[0]._replace(background=None)])

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 
 from ..descent.objective import Objective
-from ..options import Parameter
+from ..parameter import Parameter
 from .alternatives import Alternatives, AxialRotation
 from .limbs import Values, loss_of
 

@@ -13,7 +13,7 @@ from ...check import as_tensor, check_finite, check_shape
 from ...rig.control import Control
 from ...rig.rig import Rig
 from ...rig.skinned import SkinDeformer
-from ..options import Parameter
+from ..parameter import Parameter
 
 F64 = torch.float64
 
@@ -26,15 +26,11 @@ class FreeParameters:
     fixed: dict[str, Tensor]  # all values at the start
     parameters: dict[str, Parameter]
     rows: dict[str, Tensor]  # rows that a parameter has, where not all
-    appearance: tuple[str, ...] = ()  # parameters of `look`
+    appearance: tuple[str, ...] = ()  # parameters of the appearance
 
     @staticmethod
     def from_arguments(
-        rig: Rig,
-        seek: Sequence[str] | None,
-        joints: Sequence[str] | None,
-        start: Mapping[str, Any],
-        appearance: Mapping[str, Parameter],
+        rig: Rig, seek: Sequence[str] | None, init: Mapping[str, Any], appearance: Mapping[str, Parameter]
     ) -> FreeParameters:
         """Check what is sought. Raises TypeError or ValueError."""
         place = {
@@ -47,31 +43,34 @@ class FreeParameters:
         if seek is None:
             seek = [name for name in rig.controls if not skinned or name not in ("joint_translations", "joint_scales")]
             seek += ["translation"] if skinned else [] if "angles" in rig.controls else ["translation", "orientation"]
-        for kind, names in (("seek", seek), ("start", start)):
+        of_joint = {
+            joint: name
+            for name, control in rig.controls.items()
+            if _turns(name, control)
+            for joint in control.names or ()
+        }
+        for kind, names, allowed in (("seek", seek, {**known, **of_joint}), ("init", init, known)):
             for name in names:
-                if name not in known:
-                    raise ValueError(f"{kind}: expected names among {', '.join(known)}, got {name!r}")
+                if name not in allowed:
+                    raise ValueError(f"{kind}: expected names among {', '.join(allowed)}, got {name!r}")
         fixed = {}
         for name, rest in known.items():
-            given, value = start.get(name), rest.clone()
+            given, value = init.get(name), rest.clone()
             if name in rig.controls:
                 value = (
                     rig.controls[name].within(value) if given is None else rig.clamped(**{name: given})[name].detach()
                 )
             elif given is not None:
-                value = as_tensor(f"start[{name!r}]", given, like=rest).detach().double()
-            check_shape(f"start[{name!r}]", value, tuple(rest.shape), fix="one pose")
-            check_finite(f"start[{name!r}]", value)
+                value = as_tensor(f"init[{name!r}]", given, like=rest).detach().double()
+            check_shape(f"init[{name!r}]", value, tuple(rest.shape), fix="one pose")
+            check_finite(f"init[{name!r}]", value)
             fixed[name] = value
-        if joints is not None and not [*joints]:
-            raise ValueError(
-                "joints: expected names of joints whose rotations are sought, got none; None is all of them"
-            )
         parameters, rows = {}, {}
-        for name in seek:
+        for name in dict.fromkeys(name if name in known else of_joint[name] for name in seek):
             value, control = fixed[name], rig.controls.get(name, Control(known[name]))
             low, high = control.low, control.high
-            if (control.rotates or name == "angles") and (chosen := _free(rig, name, control, joints)) is not None:
+            joints = None if name in seek else [joint for joint in seek if of_joint.get(joint) == name]
+            if _turns(name, control) and (chosen := _free(rig, name, control, joints)) is not None:
                 rows[name] = torch.tensor(chosen)
                 value, low, high = (None if x is None else x[chosen] for x in (value, low, high))
             assert value is not None
@@ -84,10 +83,6 @@ class FreeParameters:
             if not isinstance(parameter, Parameter):
                 raise TypeError(f"parameters[{name!r}]: expected a Parameter, got {type(parameter).__name__}")
             parameters[name] = parameter.checked(name)
-        if joints is not None and not rows:
-            raise ValueError(
-                f"joints: expected None where turns of joints are not sought, got {', '.join(map(str, joints))}"
-            )
         if not parameters:
             raise ValueError("seek: expected a name or more of what is sought, got none")
         return FreeParameters(rig, fixed, parameters, rows, tuple(appearance))
@@ -102,7 +97,7 @@ class FreeParameters:
         found = {}
         for name in self.parameters:
             control = self.rig.controls.get(name)
-            if control is not None and control.names and (control.rotates or name == "angles"):
+            if control is not None and control.names and _turns(name, control):
                 rows = self.rows.get(name)
                 found[name] = control.names if rows is None else tuple(control.names[k] for k in rows.tolist())
         return found
@@ -116,7 +111,7 @@ class FreeParameters:
         }
 
     def appearance_of(self, tensors: Mapping[str, Tensor], index: int | None = None) -> dict[str, Tensor]:
-        """Return the parameters of `look`, of one pose or of that place in a batch."""
+        """Return the parameters of the appearance, of one pose or of that place in a batch."""
         found = {}
         for name in self.appearance:
             value, own = tensors[name], self.parameters[name].value
@@ -132,6 +127,10 @@ class FreeParameters:
     def all(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
         """Return all values, as posed() takes them."""
         return {**self.fixed, **self.values(tensors)}
+
+
+def _turns(name: str, control: Control) -> bool:
+    return control.rotates or name == "angles"
 
 
 def _free(rig: Rig, name: str, control: Control, joints: Sequence[str] | None) -> list[int] | None:

@@ -10,17 +10,20 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...check import as_tensor
 from ...rig.rig import Rig
+from ..measured import Measured
 
 NONZERO_ANGLE = 1e-9  # radians
 KEYPOINT_WIDTH = 0.02  # Share of the picture's diagonal: larger distances count linearly.
 
 
 def keypoint_term(
-    rig: Rig, cameras: Sequence[Camera], keypoints: Mapping[str, Tensor], weight: float
+    rig: Rig, cameras: Sequence[Camera], given: Mapping[str, Tensor] | Measured
 ) -> Callable[[Mapping[str, Tensor]], Tensor]:
     """Return weight · mean of ρ(d² / σ²) over all visible keypoints, as a function of all values. d are distances in pixels, σ
     is KEYPOINT_WIDTH of the picture's diagonal, and ρ(x) = 2 √(1 + x) − 2 (Charbonnier et al. 1997), which pulls from afar and
     gives no wrong point more weight than others. Raises TypeError or ValueError."""
+    keypoints = given.values if isinstance(given, Measured) else given
+    weight = 1e-3 * (given.factor if isinstance(given, Measured) else 1.0)
     names = rig.deformer.names
     if not names:
         raise ValueError("keypoints: expected a rig with joints, got one without; give from_function(…, joints=…)")
@@ -28,10 +31,10 @@ def keypoint_term(
         got = type(keypoints).__name__ if not isinstance(keypoints, Mapping) else "none"
         raise TypeError(f"keypoints: expected pixels (B, 2) by the names of joints, got {got}; None is without them")
     rows, where = [], []
-    for name, given in keypoints.items():
+    for name, one in keypoints.items():
         if name not in names:
             raise ValueError(f"keypoints: expected joints among {', '.join(names)}, got {name!r}")
-        pixels = as_tensor(f"keypoints[{name!r}]", given, floating=True).detach().double()
+        pixels = as_tensor(f"keypoints[{name!r}]", one, floating=True).detach().double()
         pixels = pixels[None] if pixels.dim() == 1 else pixels
         if pixels.shape != (len(cameras), 2):
             raise ValueError(

@@ -16,7 +16,7 @@ from ...rig.rig import Rig
 from ...rig.rotations import roma
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
-from ..checkpoints import Checkpoint
+from ..checkpoints import CheckpointFile
 from ..descent.curvature import MAX_NUMBERS
 from ..descent.fit_scene import make_optimizer, reporter
 from ..descent.gauss_newton import GaussNewtonOptimizer
@@ -28,7 +28,8 @@ from ..descent.scene_builder import Built
 from ..ending import Ending
 from ..history import Record
 from ..losses import REGION
-from ..options import Options, Parameter
+from ..options import Settings
+from ..parameter import Parameter
 from ..placement import Coordinates
 from ..priors import Prior
 from ..views import Observation
@@ -59,14 +60,14 @@ class CoarseToFine:
     """The levels of one fit."""
 
     def __init__(
-        self, rig: Rig, free: FreeParameters, views: list[Observation], options: Options, priors: Sequence[Prior], annealed: bool,
-        points: Prior | None, coarsest: int, tries: int, look: Callable[..., Scene | Mesh],
+        self, rig: Rig, free: FreeParameters, views: list[Observation], options: Settings, priors: Sequence[Prior],
+        annealed: bool, points: Prior | None, tries: int, appearance: Callable[..., Scene | Mesh],
     ) -> None:  # fmt: skip
         self.rig, self.free, self.views, self.options = rig, free, views, options
         self.priors, self.annealed = priors, annealed
-        self.points, self.tries, self.look = points, tries, look
+        self.points, self.tries, self.appearance = points, tries, appearance
         full = min(min(view.camera.size) for view in views)
-        sizes = [coarsest]
+        sizes = [options.coarsest]
         while sizes[-1] * 1.4 < full:
             sizes.append(2 * sizes[-1])
         # The last level has more samples, and begins where all but axial rotations is right.
@@ -82,7 +83,7 @@ class CoarseToFine:
         values = self.free.start
         first = dict(values)
         given = {"start": self.free.fixed, "parameters": parameters, "tries": self.tries, "factors": self.factors}
-        checkpoint = Checkpoint.from_fit(self.options, self.views, given)
+        checkpoint = CheckpointFile.from_views(self.options.checkpoint, self.views, {**given, **self.options.of_steps})
         saved, level, history, seconds = checkpoint.read(), 0, [], 0.0
         if saved is not None:
             level, values, seconds = saved["level"], saved["values"], saved["seconds"]
@@ -145,9 +146,9 @@ class CoarseToFine:
         return built
 
     def _scene(self, posed: Scene | Mesh, values: Mapping[str, Tensor], views: Sequence[Observation]) -> Built:
-        posed = self.look(posed, **values)
+        posed = self.appearance(posed, **values)
         if not isinstance(posed, Mesh | Scene):
-            raise TypeError(f"look: expected it to return a Mesh or a Scene, got {type(posed).__name__}")
+            raise TypeError(f"appearance: expected it to return a Mesh or a Scene, got {type(posed).__name__}")
         scene = Scene([posed]) if isinstance(posed, Mesh) else posed
         masked = any(view.mask is not None for view in views)
         scene = scene.replace(background=None) if masked and scene.background is not None else scene
@@ -204,7 +205,7 @@ class CoarseToFine:
         return found
 
     def _searched(
-        self, objective: Objective, values: Mapping[str, Tensor], options: Options, name: str
+        self, objective: Objective, values: Mapping[str, Tensor], options: Settings, name: str
     ) -> dict[str, Tensor]:
         bar = tqdm(total=self.tries, desc="limbs drawn", disable=not options.progress, leave=False)
         try:
@@ -214,11 +215,11 @@ class CoarseToFine:
             bar.close()
 
     def _search(
-        self, objective: Objective, values: Mapping[str, Tensor], options: Options, name: str, count: int,
+        self, objective: Objective, values: Mapping[str, Tensor], options: Settings, name: str, count: int,
         report: Callable[[], Any] = lambda: None,
     ) -> LimbSearch:  # fmt: skip
         """Return the search whose descents take so many steps."""
-        few = dataclasses.replace(options, steps=count, tolerance=0.0, progress=False, callback=None)
+        few = dataclasses.replace(options, steps=count, loss_tolerance=0.0, progress=False, callback=None)
         control, rows = self.rig.controls[name], self.free.rows.get(name, torch.arange(len(values[name])))
         joints = self.free.joints.get(name, ())
         if not self.rig.deformer.parents:  # The rig does not say what hangs on what.
@@ -241,7 +242,7 @@ class CoarseToFine:
         )  # fmt: skip
 
     def _steps(
-        self, objective: Objective, values: Mapping[str, Tensor], options: Options, save: Callable[[dict[str, Any]], None],
+        self, objective: Objective, values: Mapping[str, Tensor], options: Settings, save: Callable[[dict[str, Any]], None],
         saved: dict[str, Any] | None, title: str, fine: bool,
     ) -> Descent:  # fmt: skip
         parameters = {

@@ -23,7 +23,7 @@ from ..descent.curvature import misfit, residuals
 from ..descent.objective import Objective
 from ..descent.region_loss import FINAL_STEP
 from ..edge_support import MIN_EDGE_SUPPORT
-from ..options import Parameter
+from ..parameter import Parameter
 from .alternatives import Alternatives
 from .joint_support import edge_support_by_joint
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
@@ -16,21 +16,24 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..descent.result import Fit
 from ..edge_support import MIN_EDGE_SUPPORT
-from ..history import Record
+from ..result import FitResult, delegated
 from .uncertainty import JointUncertainty
+
+if TYPE_CHECKING:
+    pass
 
 MISSED_REGION = 0.01  # A region of a larger share of a mask is a missed limb.
 SHARE_OF_MEDIAN = 0.85  # A joint in a wrong place shows a smaller share of edges, relative to the median joint.
 
 
 @dataclass(frozen=True, eq=False)
-class RigFit:
-    """The result of fit_rig().
+class RigFit(FitResult):
+    """The result of fit_rig(), a FitResult.
 
     values       all that posed() takes, by name: rig.posed(**values); rotations as rotation vectors
     fit          the numbers that were sought, loss, views and history
-    explained    by the name of each joint that was sought and that pictures can show, the share of its edges that they do, 0
-                 … 1
+    explained_joints  by the name of each joint that was sought and that pictures can show, the share of its edges that they
+                 do, 0 … 1
     left_out     the largest share of a mask's area in regions that the fit does not cover, or covers wrongly
     uncertainty  how exactly the pictures show each joint; None where that is unknown: of a rig whose controls have no names,
                  or one that PyTorch does not differentiate in forward mode
@@ -39,9 +42,13 @@ class RigFit:
     rig: Rig
     values: dict[str, Any]
     fit: Fit = field(repr=False)
-    explained: dict[str, float] = field(default_factory=dict, repr=False)
+    explained_joints: dict[str, float] = field(default_factory=dict, repr=False)
     uncertainty: JointUncertainty | None = field(default=None, repr=False)
     left_out: float = field(default=0.0, repr=False)
+
+    loss, explained, history, steps, seconds, interrupted, plot = delegated(
+        "fit", "loss explained history steps seconds interrupted plot"
+    )
 
     def posed(self) -> Scene | Mesh:
         return self.rig.posed(**self.values)
@@ -62,8 +69,8 @@ class RigFit:
         if not self.fit.converged:
             return self.fit.reason
         if self.missed:
-            worst = sorted(self.missed, key=lambda name: self.explained[name])[:3]
-            said = ", ".join(f"{self.explained[name]:.0%} at {name}" for name in worst)
+            worst = sorted(self.missed, key=lambda name: self.explained_joints[name])[:3]
+            said = ", ".join(f"{self.explained_joints[name]:.0%} at {name}" for name in worst)
             return (
                 f"edges not explained: the pictures show too few of the edges of {len(self.missed)} joints ({said}); start "
                 "nearer, give more tries or keypoints, or look for what covers them"
@@ -84,18 +91,10 @@ class RigFit:
     @property
     def missed(self) -> list[str]:
         """The joints of whose edges the pictures show too few: they lie in another place."""
-        if not self.explained:
+        if not self.explained_joints:
             return []
-        least = max(MIN_EDGE_SUPPORT, SHARE_OF_MEDIAN * statistics.median(self.explained.values()))
-        return [name for name, share in self.explained.items() if share < least]
-
-    @property
-    def loss(self) -> float:
-        return self.fit.loss
-
-    @property
-    def history(self) -> list[Record]:
-        return self.fit.history
+        least = max(MIN_EDGE_SUPPORT, SHARE_OF_MEDIAN * statistics.median(self.explained_joints.values()))
+        return [name for name, share in self.explained_joints.items() if share < least]
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write what Fit.save() writes, and pose.json, posed.glb and joints.json; return the names.
@@ -109,12 +108,9 @@ class RigFit:
         write_json(out / "pose.json", content)
         known = {} if self.uncertainty is None else self.uncertainty.degrees
         joints = {
-            name: {"explained": self.explained.get(name), "degrees": known.get(name)}
-            for name in {**known, **self.explained}
+            name: {"explained": self.explained_joints.get(name), "degrees": known.get(name)}
+            for name in {**known, **self.explained_joints}
         }
         write_json(out / "joints.json", joints)
         save_scene(out / "posed.glb", self.fit.scene.replace(background=None))
         return ["pose.json", "joints.json", "posed.glb", *self.fit.save(out, figures)]
-
-    def _repr_png_(self) -> bytes:
-        return self.fit._repr_png_()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,61 +12,96 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...check import check_int, check_positive
 from ...rig.rig import Rig
-from ..priors import near, towards
-from .fit_rig import fit_rig
+from ..checkpoints import Checkpoint
+from ..options import FitOptions, Settings
+from ..parameter import Parameter
+from ..priors import Prior, near, towards
+from .fit_rig import RIG_OPTIONS, Appearance, fit_rig
 from .result import RigFit
 
 # Share of the last frame's motion to start with: all of it would add up errors that no picture shows.
 MOTION_SHARE = 0.5
+OF_FRAME = ("images", "masks", "weights", "keypoints")
 
 
 def track_rig(
     rig: Rig,
-    cameras: Camera | Sequence[Camera],
     frames: Sequence[Mapping[str, Any]],
+    cameras: Camera | Sequence[Camera],
+    init: Mapping[str, Any] | None = None,
     *,
-    start: Mapping[str, Any] | None = None,
+    seek: Sequence[str] | None = None,
+    priors: Sequence[Prior] | None = None,
+    search: bool | int = True,
     smooth: float = 1e-5,
     again: int = 10,
-    **arguments: Any,
+    appearance: Appearance | tuple[Appearance, Mapping[str, Parameter]] | None = None,
+    options: FitOptions | None = None,
 ) -> Iterator[RigFit]:
     """Yield the pose in each picture of a sequence: each starts from an extrapolation of the last two, and stays near it.
 
-    frames     the arguments of fit_rig() for each moment: {"masks": …}, or {"images": …, "keypoints": …}
-    start      of the first pose; without one it is searched for
-    smooth     the weight of edgegrad.fit.priors.near()
-    again      largest number of draws of limbs in a frame that shows too few edges of one, as fit_rig() takes `tries` in the
-               first; a limb that is still missed is not drawn in the next frames
-    arguments  the others of fit_rig(); of a `checkpoint` each frame has a file of its own, with its number in the name
+    Parameters
+    ----------
+    rig, cameras, seek, priors, search, appearance
+        As of fit_rig(); `search` is that of the first frame.
+    frames : sequence of mapping
+        For each moment "images", "masks", "weights" and "keypoints", as fit_rig() takes them: {"masks": …}.
+    init : mapping, optional
+        Of the first pose, as of fit_rig(); without one it is searched for.
+    smooth : float, default 1e-5
+        The weight of edgegrad.fit.priors.near().
+    again : int, default 10
+        Largest number of draws of limbs in a frame that shows too few edges of one. A limb that is still missed is not drawn in
+        the next frames.
+    options : FitOptions, optional
+        As of fit_rig(). Of a checkpoint each frame has a file of its own, with its number in the name.
 
-    Raises what fit_rig() raises.
+    Raises
+    ------
+    TypeError, ValueError
+        An argument is wrong; the message names it.
     """
     check_positive("smooth", smooth, least=0.0, most=1e9)
     check_int("again", again, 0, 10**6)
+    given = FitOptions() if options is None else options
+    of_first = replace(given, checkpoint=_file(given.checkpoint, 0))
+    # One seed serves all frames, so that the draws of one that is resumed are those of the first time.
+    given = replace(given, seed=Settings.from_options(of_first, "track_rig", RIG_OPTIONS).seed)
     before: list[dict[str, Tensor]] = []
     missed: set[str] = set()
     for k, frame in enumerate(frames):
         if not isinstance(frame, Mapping):
             raise TypeError(f'frames[{k}]: expected arguments by name, as {{"masks": …}}, got {type(frame).__name__}')
-        given = {**arguments, **frame}
-        if given.get("checkpoint") is not None:
-            path = Path(given["checkpoint"])
-            given["checkpoint"] = path.with_name(f"{path.stem}-{k + 1:04d}{path.suffix}")
+        if unknown := [name for name in frame if name not in OF_FRAME]:
+            raise ValueError(f"frames[{k}]: expected names among {', '.join(OF_FRAME)}, got {unknown[0]!r}")
+        pictures = {"images": None, **frame}
+        own = replace(given, checkpoint=_file(given.checkpoint, k))
+        shared: dict[str, Any] = {"cameras": cameras, **pictures, "seek": seek, "appearance": appearance}
         if not before:
-            found = fit_rig(rig, cameras, start=start, **given)
+            found = fit_rig(rig, **shared, init=init, priors=priors, search=search, options=own)
         else:
             last = before[-1]
             ahead = last if len(before) < 2 else {n: v + MOTION_SHARE * (v - before[-2][n]) for n, v in last.items()}
             ahead = {n: rig.controls[n].within(v) if n in rig.controls else v for n, v in ahead.items()}
             still = towards({name: control.rest for name, control in rig.controls.items()})
-            terms = [near(ahead, smooth), *(given.get("priors") or [still])]
-            whole = {"coarsest": 48, **given, "priors": terms, "tries": 0}
-            found = fit_rig(rig, cameras, start=ahead, **whole)
-            if again and set(found.missed) - missed and not found.fit.interrupted:
+            terms = [near(ahead, smooth), *([still] if priors is None else priors)]
+            own = own if own.coarsest is not None else replace(own, coarsest=48)
+            found = fit_rig(rig, **shared, init=ahead, priors=terms, search=0, options=own)
+            if again and set(found.missed) - missed and not found.interrupted:
                 # A limb in a wrong place would stay there in later frames.
-                anew = {**whole, "tries": again, "checkpoint": None, "resume": False}
-                other = fit_rig(rig, cameras, start=found.values, **anew)
-                found = other if other.fit.interrupted or other.loss < found.loss else found
+                anew = replace(own, checkpoint=None)
+                other = fit_rig(rig, **shared, init=found.values, priors=terms, search=again, options=anew)
+                found = other if other.interrupted or other.loss < found.loss else found
         missed = set(found.missed)
         before = [*before[-1:], found.values]
         yield found
+
+
+def _file(checkpoint: Any, k: int) -> Checkpoint | None:
+    """Return the checkpoint of frame k. Only the first must be there to go on from."""
+    if checkpoint is None:
+        return None
+    whole = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
+    path = Path(whole.path)
+    path = path.with_name(f"{path.stem}-{k + 1:04d}{path.suffix}")
+    return replace(whole, path=path, resume=whole.resume and (k == 0 or path.exists()))

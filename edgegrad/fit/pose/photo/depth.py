@@ -69,7 +69,7 @@ def warn_of_units(scene: Scene, cameras: Sequence[Camera], depths: Sequence[Tens
         scale = 10.0**power if abs(math.log10(ratio) - power) < 0.15 else ratio
         warn(
             f"units of depth {scale:.2g}",
-            f"depth: expected distances in world units, those of the mesh and the camera, got {there:.3g} in the middle where "
+            f"depths: expected distances in world units, those of the mesh and the camera, got {there:.3g} in the middle where "
             f"the object is {where}, {here:.3g} away; so depth counts for nothing. If its units are others, multiply it by "
             f"{scale:.2g}",
         )

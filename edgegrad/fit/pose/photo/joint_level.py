@@ -19,6 +19,7 @@ from ....aovs import render_aovs
 from ....render import render
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
+from ...options import Settings
 from ...region import RADIUS, Windows, smoothed
 from ..gauss_newton import NormalEquations
 from ..inputs import without_colors
@@ -195,20 +196,12 @@ def _labelled(scenes: Sequence[Scene]) -> Scene:
 
 
 def joint_levels(
-    tasks: Sequence[PoseTask],
-    poses: Sequence[Pose],
-    depths: Sequence[Tensor | None],
-    max_size: int,
-    spp: int,
-    seed: int,
+    tasks: Sequence[PoseTask], poses: Sequence[Pose], depths: Sequence[Tensor | None], settings: Settings
 ) -> list[JointLevel]:
     """Return the levels from coarse to fine, of what surrounds the objects."""
     crops = [Crop.around(tasks[0], shot, poses[0]) for shot in tasks[0].shots]
     for task, pose in zip(tasks[1:], poses[1:], strict=True):
         own = [Crop.around(task, shot, pose) for shot in task.shots]
         crops = [crop.joined(other) for crop, other in zip(crops, own, strict=True)]
-    columns = [
-        photo_levels(task, pose, depths, max_size, spp, seed, crops=crops)
-        for task, pose in zip(tasks, poses, strict=True)
-    ]
+    columns = [photo_levels(task, pose, depths, settings, crops=crops) for task, pose in zip(tasks, poses, strict=True)]
     return [JointLevel(list(objects)) for objects in zip(*columns, strict=True)]

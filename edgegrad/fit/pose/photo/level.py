@@ -27,6 +27,7 @@ from ...contour_colors import (
     blur_losses,
 )
 from ...edge_support import edge_support
+from ...options import Settings
 from ...region import RADIUS, Palette, Windows, information, likelihood, palette, posterior, smoothed, surroundings
 from ..gauss_newton import NormalEquations
 from ..inputs import without_colors
@@ -288,7 +289,7 @@ def sharpest(seen: Sequence[PictureComparison]) -> float:
 
 
 def photo_levels(
-    task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int,
+    task: PoseTask, start: Pose, depths: Sequence[Tensor | None], settings: Settings,
     palettes: list[Palette] | None = None, crops: Sequence[Crop] | None = None,
 ) -> list[PhotoLevel]:  # fmt: skip
     """Return the levels from coarse to fine, of what surrounds the object at the start. `palettes` and `crops` of the
@@ -302,7 +303,7 @@ def photo_levels(
         shots.append(TargetView(camera, shot.target[rows, columns], None, weight))
         cut.append(None if depth is None else depth[rows, columns])
         across.append(crop.extent)
-    finest = [min(1.0, max_size / max(shot.camera.size)) for shot in shots]
+    finest = [min(1.0, settings.max_size / max(shot.camera.size)) for shot in shots]
     shorter = min(factor * min(shot.camera.size) for factor, shot in zip(finest, shots, strict=True))
     largest = max(factor * extent for factor, extent in zip(finest, across, strict=True))
     halvings = round(math.log2(max(1.0, min(largest / COARSEST_PHOTO, shorter / SMALLEST_PHOTO_SIDE))))
@@ -320,10 +321,10 @@ def photo_levels(
         blur = ALPHA_BLURS[k] if k < len(ALPHA_BLURS) else 0.0
         # Perspective shows in fine detail only: on the coarsest level the focal length would diverge.
         dofs = [entry for entry in task.dofs if entry < FOCAL_LENGTH] if k == 0 else task.dofs
-        pyramid_level = PyramidLevel(smaller, 0.0, float(2**n), spp, dofs)
+        pyramid_level = PyramidLevel(smaller, 0.0, float(2**n), settings.spp, dofs)
         few = min(harmonics, FEW_HARMONICS) if k == 0 else harmonics
         if palettes is None:
-            palettes = [palette(picture.outlined, seed) for picture in pictures]
+            palettes = [palette(picture.outlined, settings.seed) for picture in pictures]
         levels.append(PhotoLevel(task, pyramid_level, pictures, palettes, blur, few, k == len(halved) - 1))
     return levels
 

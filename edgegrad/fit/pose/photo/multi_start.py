@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
 
+from ...options import Settings
 from ..color_search import ColorSearch, distinct
 from ..pose import Pose
 from ..replay_log import ReplayLog
@@ -36,11 +38,11 @@ class MultiStartSearch:
 
     def __init__(
         self, task: PoseTask, start: Pose, starts: Callable[[Report], list[Pose]], depths: Sequence[Tensor | None],
-        max_size: int, seed: int, log: ReplayLog, search: Callable[[Pose, ReplayLog], ColorSearch | PhotoSearch],
+        settings: Settings, log: ReplayLog, search: Callable[[Pose, ReplayLog], ColorSearch | PhotoSearch],
     ) -> None:  # fmt: skip
         """`starts` makes the starts, and `search` refines one of them."""
         self.task, self.start, self.starts, self.depths = task, start, starts, depths
-        self.max_size, self.seed = max_size, seed
+        self.settings, self.seed = replace(settings, spp=RANKING_SPP), settings.seed
         self.log, self._search = log, search
         one = search(start, log)
         self.enough, self.planned = one.enough, one.planned
@@ -116,7 +118,7 @@ class MultiStartSearch:
     def _near(self, pose: Pose) -> tuple[float, Pose]:
         """Take a few steps on the coarsest level; return the share of the render's edges that the pictures show, and the
         pose."""
-        level = photo_levels(self.task, pose, self.depths, self.max_size, RANKING_SPP, self.seed)[0]
+        level = photo_levels(self.task, pose, self.depths, self.settings)[0]
         for _ in range(RANKING_STEPS):
             normal, _ = level.equations(pose, self.seed)
             move = level.step(normal)

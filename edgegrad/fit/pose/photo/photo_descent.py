@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ...options import Settings
 from ..color_search import norms_of
 from ..pose import Pose
 from ..replay_log import DescentState, ReplayLog
@@ -45,13 +46,12 @@ class PhotoDescent:
     """The state of a descent, which notes its steps, and refines and rates poses."""
 
     def __init__(
-        self, task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, steps: int,
-        tolerance: float, seed: int, log: ReplayLog | None = None,
+        self, task: PoseTask, start: Pose, depths: Sequence[Tensor | None], settings: Settings, log: ReplayLog | None = None
     ) -> None:  # fmt: skip
         self.task, self.start, self.depths = task, start, depths
         self.enough = enough_support(task)
-        self.levels = photo_levels(task, start, depths, max_size, spp, seed)
-        self.max_size, self.spp, self.steps, self.tolerance, self.seed = max_size, spp, steps, tolerance, seed
+        self.levels = photo_levels(task, start, depths, settings)
+        self.settings, self.seed = settings, settings.seed
         self.best, self.loss, self.converged, self.edge_support = start, math.nan, False, math.nan
         self.information: Tensor | None = None  # inverse covariance of the answer
         self.history: list[Step] = []
@@ -104,7 +104,7 @@ class PhotoDescent:
                 break
             if level.last and len(state.steps) > FULL_LENGTH_STEPS:
                 move = 0.5 * move  # Full steps would oscillate, as weights are solved anew at each.
-            far = float(move.abs().max()) >= self.tolerance * level.pyramid_level.coarseness
+            far = float(move.abs().max()) >= self.settings.step_tolerance * level.pyramid_level.coarseness
             short = not far or float(move @ normal.curvature @ move) < SHORT_STEP_NATS
             step = Step(level.size, loss, state.pose, True, norms_of(level.pyramid_level.dofs, normal.gradient))
             steps = (*state.steps, step)
@@ -120,7 +120,7 @@ class PhotoDescent:
 
     def _most(self, level: PhotoLevel) -> int:
         return most_steps(
-            self.steps, level.last, level.pyramid_level.coarseness == self.levels[0].pyramid_level.coarseness
+            self.settings.steps, level.last, level.pyramid_level.coarseness == self.levels[0].pyramid_level.coarseness
         )
 
     def _note(self, step: Step) -> None:

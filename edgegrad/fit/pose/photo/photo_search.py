@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from ...options import Settings
 from ..color_search import ColorSearch, distinct
 from ..pose import Pose, angle
 from ..replay_log import ReplayLog
@@ -46,11 +47,11 @@ class PhotoSearch(PhotoDescent):
     """The state of a search, with the attributes of ColorSearch."""
 
     def __init__(
-        self, task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, steps: int,
-        tolerance: float, seed: int, log: ReplayLog | None = None, further: bool = True,
+        self, task: PoseTask, start: Pose, depths: Sequence[Tensor | None], settings: Settings,
+        log: ReplayLog | None = None, further: bool = True,
     ) -> None:  # fmt: skip
         """`further`: try other starts where the refinement of the given one does not end well."""
-        super().__init__(task, start, depths, max_size, spp, steps, tolerance, seed, log)
+        super().__init__(task, start, depths, settings, log)
         self.further = further
         # Before a uniform background, unlit colours are compared first.
         self.colors_first = not task.clutter and "alpha" not in task.aovs and all(depth is None for depth in depths)
@@ -67,7 +68,7 @@ class PhotoSearch(PhotoDescent):
 
     def _colors_first(self) -> None:
         """Search by unlit colours, and by the terms of photographs where these do not fit."""
-        colors = self._by_colors(self.start, self.task.pyramid(self.start, self.max_size, self.spp), self.further)
+        colors = self._by_colors(self.start, self.task.pyramid(self.start, self.settings), self.further)
         self._adopt(colors)
         if colors.edge_support >= colors.enough or not self.further:
             self.enough = colors.enough
@@ -88,10 +89,10 @@ class PhotoSearch(PhotoDescent):
         nothing."""
         task, best = self.task, self._photograph()
         if best.edge_support >= self.enough and not task.colorless and self._is_unlit(best.pose):
-            colors = self._by_colors(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-2:], False)
+            colors = self._by_colors(best.pose, task.pyramid(best.pose, self.settings)[-2:], False)
             better = colors.converged and angle(colors.best.R, best.pose.R) < SAME_POSE_ANGLE
         elif best.edge_support < self.enough and not task.clutter and self.further:
-            colors = self._by_colors(self.start, task.pyramid(self.start, self.max_size, self.spp), True)
+            colors = self._by_colors(self.start, task.pyramid(self.start, self.settings), True)
             better = colors.converged
         else:
             return
@@ -162,7 +163,7 @@ class PhotoSearch(PhotoDescent):
     def likeliest(self, pose: Pose, short: bool) -> tuple[PhotoCandidate | None, list[Pose]]:
         """Compare a pose that was found otherwise with ambiguous ones; `short` as of its last step. Return the one that makes
         the pictures likelier, if there is one, and the others that these hardly separate from the answer."""
-        last = photo_levels(self.task, pose, self.depths, self.max_size, self.spp, self.seed)[-1]
+        last = photo_levels(self.task, pose, self.depths, self.settings)[-1]
         views = last.comparisons(pose, self.seed)
         last, weights = last.focused(views), occluder_weights(views)
         self.levels = [*self.levels[:-1], last]
@@ -301,7 +302,7 @@ class PhotoSearch(PhotoDescent):
     def _refine_surrounded(self, best: PhotoCandidate) -> PhotoCandidate:
         """Refine once more by the surroundings of the end, and without occluders, so that the result does not depend on the
         start."""
-        *_, coarser, last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)
+        *_, coarser, last = photo_levels(self.task, best.pose, self.depths, self.settings)
         last = last.focused(last.comparisons(best.pose, self.seed))
         before = len(self.history)
         weights = occluder_weights(last.comparisons(best.pose, self.seed)) or [
@@ -333,7 +334,7 @@ class PhotoSearch(PhotoDescent):
 
     def _by_colors(self, start: Pose, levels: list[PyramidLevel], further: bool) -> ColorSearch:
         """Search by unlit colours from a start, with its steps added to the history."""
-        search = ColorSearch(self.task, levels, start, self.steps, self.tolerance, self.seed, self.log, further)
+        search = ColorSearch(self.task, levels, start, self.settings, self.log, further)
         before = list(self.history)
 
         def after_step() -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...options import Settings
 from ..color_search import distinct, norms_of
 from ..pose import Pose
 from ..result import MIN_VISIBLE_SHARE, Step
@@ -36,13 +37,12 @@ class PosesSearch:
     """The state of a search; lists have an entry for each object. `best` poses are valid after each step."""
 
     def __init__(
-        self, tasks: Sequence[PoseTask], starts: Sequence[Pose], depths: Sequence[Tensor | None], max_size: int, spp: int,
-        steps: int, tolerance: float, seed: int, further: bool,
+        self, tasks: Sequence[PoseTask], starts: Sequence[Pose], depths: Sequence[Tensor | None], settings: Settings,
+        further: bool,
     ) -> None:  # fmt: skip
         self.tasks, self.depths = tasks, depths
-        self.max_size, self.spp, self.steps, self.tolerance, self.seed = max_size, spp, steps, tolerance, seed
-        self.further = further
-        self.levels = joint_levels(tasks, starts, depths, max_size, spp, seed)
+        self.settings, self.seed, self.further = settings, settings.seed, further
+        self.levels = joint_levels(tasks, starts, depths, settings)
         self.enough = [enough_support(task) for task in tasks]
         self.starts = list(starts)
         self.best, self.loss = list(starts), math.nan
@@ -109,10 +109,8 @@ class PosesSearch:
     def _resolve_ambiguity(self, k: int) -> bool:
         """Return whether another pose of one object makes the pictures likelier, and take it then. It is compared where no
         other object is before it, while all others stay where they are."""
-        task = without_fronts(self.tasks, self.best, k, self.spp, self.seed)
-        search = PhotoSearch(
-            task, self.starts[k], self.depths, self.max_size, self.spp, self.steps, self.tolerance, self.seed
-        )
+        task = without_fronts(self.tasks, self.best, k, self.settings.spp, self.seed)
+        search = PhotoSearch(task, self.starts[k], self.depths, self.settings)
         search.after_step = self.after_step
         found, self.ambiguous[k] = search.likeliest(self.best[k], self.short[k])
         if found is None:
@@ -125,7 +123,7 @@ class PosesSearch:
         """Take the last steps by the surroundings of the current poses, and without occluders, so that the end does not depend
         on the start. Where this loses an object, all stay where they were."""
         before = list(self.best), list(self.short), list(self.edge_support), list(self.visible)
-        last = joint_levels(self.tasks, self.best, self.depths, self.max_size, self.spp, self.seed)[-1]
+        last = joint_levels(self.tasks, self.best, self.depths, self.settings)[-1]
         level = last = last.focused(self.best, self.seed)
         for _ in range(LAST_LEVEL_ROUNDS):
             level = last.unoccluded(self.best, self.seed)
@@ -179,7 +177,9 @@ class PosesSearch:
                 dofs = level.objects[k].pyramid_level.dofs
                 own = slice(first, first := first + len(dofs))
                 step = move[own] * min(1.0, MAX_PHOTO_STEP / float(move[own].abs().max().clamp(min=1e-30)))
-                far = float(step.abs().max()) >= self.tolerance * level.objects[k].pyramid_level.coarseness
+                far = (
+                    float(step.abs().max()) >= self.settings.step_tolerance * level.objects[k].pyramid_level.coarseness
+                )
                 short[k] = not far or float(step @ normal.curvature[own, own] @ step) < SHORT_STEP_NATS
                 norms = norms_of(dofs, normal.gradient[own])
                 self.history[k].append(Step(level.size, loss, self.best[k], True, norms))
@@ -189,7 +189,7 @@ class PosesSearch:
 
     def _most(self, level: JointLevel) -> int:
         coarsest = level.objects[0].pyramid_level.coarseness == self.levels[0].objects[0].pyramid_level.coarseness
-        return most_steps(self.steps, level.last, coarsest)
+        return most_steps(self.settings.steps, level.last, coarsest)
 
     def _judge(self, level: JointLevel) -> None:
         self.edge_support = level.edge_support(self.best, self.seed)

@@ -1,0 +1,59 @@
+"""Tensors that a fit by descent finds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..check import as_tensor, check_finite, check_float, check_positive
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A tensor to find, and how it moves.
+
+    Parameters
+    ----------
+    lr : float
+        Learning rate: about how far each number moves in a step, in its own units.
+    value : Tensor, optional
+        Where the fit starts. By default it is the scene's tensor of this name.
+    low, high : float or Tensor, optional
+        Bounds, numbers or tensors that broadcast. By default there are none.
+    uniform : bool, default False
+        Whether all numbers of the tensor have one step size, as coordinates of one surface need, and not each its own.
+    """
+
+    lr: float
+    value: Tensor | None = None
+    low: float | Tensor | None = None
+    high: float | Tensor | None = None
+    uniform: bool = False
+
+    def checked(self, name: str) -> Parameter:
+        """Return a copy with a value of its own on the CPU. Raises TypeError or ValueError."""
+        check_positive(f"{name}: lr", self.lr, least=0.0, most=1e30)
+        if self.value is None:
+            raise ValueError(f"{name}: expected a value to start from, got None; give Parameter(lr, value)")
+        value = as_tensor(name, self.value, floating=True).detach().cpu().clone()
+        check_float(name, value)
+        check_finite(name, value)
+        if self.low is not None and self.high is not None:
+            low, high = torch.as_tensor(self.low), torch.as_tensor(self.high)
+            if bool((low > high).any()):
+                raise ValueError(f"{name}: expected low ≤ high, got {self.low} and {self.high}")
+        if not torch.equal(self.within(value), value):
+            raise ValueError(
+                f"{name}: expected a start within low and high, {self.low} and {self.high}, got {float(value.min()):g} to "
+                f"{float(value.max()):g}; clamp it first"
+            )
+        return replace(self, value=value)
+
+    def within(self, value: Tensor) -> Tensor:
+        low, high = (
+            b if b is None or isinstance(b, Tensor) else torch.as_tensor(b, dtype=value.dtype)
+            for b in (self.low, self.high)
+        )
+        return value if low is None and high is None else value.clamp(low, high)

@@ -1,0 +1,64 @@
+"""The base of the results of all fits."""
+
+from __future__ import annotations
+
+import io
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+from ..files.paths import PathLike
+from ..optional import DRAWING, require
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class FitResult:
+    """The base of all results. Each has these attributes, and under its own names what was found.
+
+    Attributes
+    ----------
+    converged, reason : bool, str
+        Whether further steps lead no further, and the pictures show what was found; and "converged", or in words what is missing.
+    loss, explained : float
+        The loss at the end, and the share, 0 … 1, of the render's edges that the pictures show too.
+    history : list
+        A record of each step, with its `loss` and the norms of its `gradient`.
+    steps, seconds, interrupted : int, float, bool
+        Number of steps, time, and whether KeyboardInterrupt ended the fit; the result is the best until then.
+    """
+
+    def plot(self, most: int = 4) -> Figure:
+        """Draw target, start, fit and difference of at most `most` pictures."""
+        raise NotImplementedError
+
+    def plot_history(self: Any) -> Figure:
+        """Draw the loss and the norm of each gradient over the steps."""
+        return require("edgegrad.fit.plots", *DRAWING).curves(self.history)
+
+    def save(self, folder: PathLike, figures: bool = True) -> list[str]:
+        """Write the result to a folder, which is made if missing, and return the names of the files. Each file is written whole
+        or not at all. Raises OSError, or at last ImportError if figures are asked for and matplotlib is missing."""
+        raise NotImplementedError
+
+    @property
+    def _can_draw(self) -> bool:
+        return True
+
+    def _repr_png_(self) -> bytes | None:
+        """Return plot() for a notebook, where there is something to draw."""
+        if not self._can_draw:
+            return None
+        file = io.BytesIO()
+        self.plot().savefig(file, format="png", dpi=100)
+        return file.getvalue()
+
+
+def delegated(part: str, names: str) -> list[Any]:
+    """Return properties that are those of the attribute `part`, by names apart by spaces."""
+    return [property(attrgetter(f"{part}.{name}")) for name in names.split()]
+
+
+def chosen(count: int, most: int) -> list[int]:
+    """Return at most so many numbers below `count`, evenly apart."""
+    return sorted({round(k * (count - 1) / max(1, min(most, count) - 1)) for k in range(min(most, count))})
