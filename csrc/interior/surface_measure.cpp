@@ -27,8 +27,8 @@ constexpr double occluded_near_hits = 1.0 / 8;
 // the same time (docs/tried.md).
 constexpr double colored = 0.5, textured = 4;
 
-// With indirect light, a sample has one path, which is noisy, and costs about as much as a sample on a secondary edge.
-// So there are as many of both (secondary/estimator.h).
+// Under indirect light a sample has one noisy path. It costs about as much as a sample on a secondary edge, and there
+// are as many of both (secondary/estimator.h).
 constexpr double more_if_indirect = 4;
 
 // A lit sample costs several times as much, so textures get no more lit samples than colours. On faces that are no
