@@ -27,7 +27,7 @@ from scipy import ndimage
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import FitOptions, Refinement, fit_shape, fit_texture, regularizers, visual_hull
+from edgegrad.fit import FitOptions, Refinement, fit_shape, fit_texture, regularizers
 from edgegrad.fit.descent.result import Fit
 from edgegrad.image import linear_to_srgb, srgb_to_linear
 
@@ -87,7 +87,7 @@ def _largest(mask: np.ndarray) -> np.ndarray:
 def shape(photos: list[Photo], steps: int = 150) -> Fit:
     """Fit the smallest surface that has the silhouettes, from the visual hull."""
     masks = [torch.maximum(p.mask, 1.0 - p.known) for p in photos]
-    start = visual_hull(masks, [p.camera for p in photos], resolution=64, faces=4000)
+    start = eg.shapes.visual_hull(masks, [p.camera for p in photos], resolution=64, faces=4000)
 
     def fit(mesh: eg.Mesh, photos: list[Photo], small: float, **how: Any) -> Fit:
         return fit_shape(

@@ -8,6 +8,7 @@ from .files.load import load_mesh, load_scene
 from .files.mask import read_mask
 from .files.save import save_mesh, save_scene
 from .live.view import viewer
+from .noise import noise
 from .plan import plan
 from .profile import profile
 from .render import jvp, render, render_batch, screen_gradient
@@ -35,6 +36,7 @@ __all__ = [
     "load_cameras",
     "load_mesh",
     "load_scene",
+    "noise",
     "plan",
     "points",
     "profile",

@@ -46,6 +46,10 @@ class Term:
     bytes: int = 0  # of memory that it takes, estimated
 
 
+# What noise costs: csrc/estimator/default_samples.h.
+_NOISE = "4 × spp halve the noise; see eg.noise()"
+
+
 class Plan(Mapping[str, Term]):
     """The terms of a render and its backward pass, by name: `plan["boundary"].on`. Prints as a table."""
 
@@ -82,7 +86,8 @@ class Plan(Mapping[str, Term]):
             (name, "on" if term.on else "off", _count(term.samples), memory.size(term.bytes), term.why)
             for name, term in self.items()
         ]
-        total = ("in all", "", _count(self.samples), memory.size(self.bytes), "")
+        gradient = any(self[name].on for name in ("interior", "boundary"))
+        total = ("in all", "", _count(self.samples), memory.size(self.bytes), _NOISE if gradient else "")
         return table([("term", "", "samples", "memory", "why"), *rows, total], "<<>><")
 
     __repr__ = __str__
@@ -140,7 +145,9 @@ def plan(
     return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})
 
 
-def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | None = None) -> dict[str, Term]:
+def _shaded_terms(
+    scene: Scene, request: Request, creases: object, lit: Scene | None = None, indirect: bool = False
+) -> dict[str, Term]:
     """Return the terms with a shader, of which nothing is asked before it runs: neither what it needs nor at which edges it may
     jump."""
     attributes = every_face(len(request.scene.faces)) if creases is True else None
@@ -148,7 +155,7 @@ def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | 
     moving = [name for name in required(request) if name in MOVING]
     # It is not known either whether a tensor of the shader's own requires a gradient.
     wanted = [*moving, "colors"] if torch.is_grad_enabled() else []
-    terms = {**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted, lit)}
+    terms = {**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted, lit, indirect)}
     rows = CURVE_BYTES * terms["boundary"].samples + SURFACE_BYTES * terms["interior"].samples
     terms["textures"] = Term(False, "left to the shader")
     terms["shader"] = Term(
@@ -167,7 +174,7 @@ def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | 
 
 def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighting) -> dict[str, Term]:
     """Return the terms with materials and lights, which are shaded at points of surfaces and curves, as by a shader."""
-    terms = _shaded_terms(scene, request, creases, scene)
+    terms = _shaded_terms(scene, request, creases, scene, lighting.bounces > 1)
     lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
     where = "lit" if scene.is_lit else "seen, with mipmaps"
     terms["textures"] = Term(False, f"looked up where they are {where}")
@@ -250,7 +257,8 @@ def _shadow_boundaries(scene: Scene, request: Request, lighting: Lighting) -> Te
         return Term(False, why or "nothing that casts, receives or gives light moves, nor the camera")
     many = sum(not light.punctual for light in lights)
     samples = request.cameras * many * _most_shadow_samples(request)
-    why = f"of {len(lights)} light{'s' * (len(lights) > 1)}: 24 samples a pixel of boundary"
+    each = core.SHADOW_SAMPLES_A_PIXEL * core.sample_growth(request.image.spp)
+    why = f"of {len(lights)} light{'s' * (len(lights) > 1)}: {each:g} samples a pixel of boundary"
     why += ", not counted here" + "; of those with an extent by the rays of the image" * (many > 0)
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
 
@@ -354,7 +362,9 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
     }
 
 
-def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None = None) -> dict[str, Term]:
+def _gradient_terms(
+    request: Request, wanted: Collection[str], lit: Scene | None = None, indirect: bool = False
+) -> dict[str, Term]:
     flat, camera, B = request.scene, request.camera, request.cameras
     work = WantedTerms.from_request(request, wanted)
     moves = any(name in wanted for name in MOVING)
@@ -368,7 +378,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
         flat.faces.new_zeros((*ones.shape[:-1], 2), dtype=torch.int32),
         flat.faces.new_ones((B, len(flat.faces)), dtype=torch.uint8),
     )
-    _, profiles = backward_kernel(ones, hits, request, wanted, dry=True, lit=lit)
+    _, profiles = backward_kernel(ones, hits, request, wanted, dry=True, lit=lit, indirect=indirect)
     counts = {name: int(sum(profile[name] for profile in profiles)) for name in COUNTS}
     surface, edge, silhouettes, creases, intersections, lens_boundary = (
         counts[name]

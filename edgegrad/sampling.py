@@ -31,7 +31,7 @@ class Sampling:
         Points drawn of each light that has an extent, for each point that is shaded.
     discontinuity_spacing : float, default 1.0
         Pixels between the lines along which discontinuities within faces are looked for: those that a shader declares, alpha
-        edges, and borders of nearest texels. Closer lines cost more and err less.
+        edges, and borders of nearest texels, at `spp=16`; more samples bring them closer. Closer lines cost more and err less.
     creases : "auto" or bool, default "auto"
         At which edges between two visible faces a shader may jump: "auto", where an attribute jumps that it asked for; True,
         at all; False, at none.

@@ -12,6 +12,7 @@ All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from .check import all_finite, values_visible
 from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
 from .kernel.request import Request
+from .library import core
 from .points.background import environments
 from .points.blend import Blended, let_through, transparent
 from .points.discontinuities import UNEQUAL
@@ -64,12 +66,14 @@ class ShadingTraits(NamedTuple):
     points: int = 1  # of a face in a pixel that are shaded
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
+    indirect: bool = False  # whether surfaces light each other
     # Whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright or changes.
     glossy: bool = False
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     # By which lines that look for discontinuities lie closer, for what is shaded next to them is noisy.
     closer: float = 1.0
+    noisy: bool = False  # whether points of lights, or paths, are drawn at random
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     discontinuity_margin: float = 0.0  # how far from a discontinuity its sides are shaded
 
@@ -134,7 +138,8 @@ def render_shaded(
         )
     radiance = shader if isinstance(shader, Radiance) else UserShader(shader)
     traits = traits or ShadingTraits(points_of_face(request.image.spp), blended=scene.blends)
-    with shaded_memory(request, textured=traits.lit and scene.textured_faces is not None):
+    textured = traits.lit and scene.textured_faces is not None
+    with shaded_memory(request, textured=textured, indirect=traits.indirect):
         images = [
             _Image(ImageContext(scene, request, k), radiance, creases, traits, watch).render()
             for k in range(request.cameras)
@@ -203,6 +208,7 @@ class _Image:
                 intrinsics=moves(context.intrinsics),
                 discontinuities=cut,
                 lit=context.surfaces.scene if self._traits.lit else None,
+                indirect=self._traits.indirect,
                 importance=_where_bright(image) if self._traits.glossy else None,
             )
         watch.count("surface_samples", len(surface.x))
@@ -216,8 +222,9 @@ class _Image:
             with watch.part("discontinuities"):
                 declare = self._radiance.declare if self._radiance.declares_discontinuities else self._shade
                 margin = self._traits.discontinuity_margin
+                spacing, shadings = self._grid
                 found = DiscontinuityTerms(
-                    context, self._kinds, self._shade, declare, POINTS_AT_ONCE, self._spacing, margin
+                    context, self._kinds, self._shade, declare, POINTS_AT_ONCE, spacing, margin, shadings
                 )
                 terms += found.found(watch)
         if visibility:
@@ -345,6 +352,18 @@ class _Image:
     @property
     def _spacing(self) -> float:
         return max(self._context.request.gradient.discontinuity_spacing / self._traits.closer, LEAST_SPACING)
+
+    @property
+    def _grid(self) -> tuple[float, int]:
+        """Return the spacing of the grid that finds declared discontinuities, and how often each crossing is shaded.
+
+        A grid has as many points as lines squared, so lines come closer by the square root of the growth alone. Where shading
+        is noisy, more shadings of each crossing make up for that.
+        """
+        growth, closer = core.sample_growth(self._context.request.image.spp), self._traits.closer
+        lines = max(closer, growth**0.5)
+        spacing = max(self._context.request.gradient.discontinuity_spacing / lines, LEAST_SPACING)
+        return spacing, math.ceil(growth * closer / lines) if self._traits.noisy else 1
 
     def _with_creases(self) -> Request:
         """Return the request for samples on curves, with colours that jump where the shader may."""

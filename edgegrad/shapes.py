@@ -1,7 +1,7 @@
-"""Meshes of simple shapes, and meshes of trimesh.
+"""Meshes of simple shapes, of silhouettes, and of trimesh.
 
-All have texture coordinates, and their fronts outside. Given `material=eg.Material(base_color=0.0, emission=…)` they are area
-lights. Positions are differentiable functions of the tensors that are given.
+Simple shapes have texture coordinates, and their fronts outside. Given `material=eg.Material(base_color=0.0, emission=…)` they
+are area lights. Positions are differentiable functions of the tensors that are given.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from torch import Tensor
 
 from .check import check_dtype, check_int, check_shape, values_visible
 from .files.save import from_trimesh, to_trimesh
+from .fit.hull import visual_hull
 from .scene.material import Material, numbers
 from .scene.mesh import Mesh
 
-__all__ = ["box", "disc", "from_trimesh", "grid", "rectangle", "sphere", "to_trimesh"]
+__all__ = ["box", "disc", "from_trimesh", "grid", "rectangle", "sphere", "to_trimesh", "visual_hull"]
 
 MOST_ROWS = 1 << 14  # of a grid's cells
 MOST_SEGMENTS = 1 << 20

@@ -40,7 +40,7 @@ TermMeasures<T> measure_terms(const BackwardView<T>& view, const Terms& terms, G
     if (terms.boundary) {
         if (!terms.interior()) facing = facing_of_faces(view);
         const Curves<T>& curves = out.curves.emplace(measure_curves(view, std::move(facing), terms.lens_boundary));
-        out.wanted.edge = profile.edge_wanted = curves.wanted(o);
+        out.wanted.edge = profile.edge_wanted = curves.wanted(o, view.image.spp);
         profile.silhouettes = curves.silhouettes, profile.creases = curves.creases;
         profile.intersections = curves.intersections, profile.lens_boundary = curves.lens_boundary;
         profile.curves = watch.lap();
@@ -62,7 +62,7 @@ template <class T>
 SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted,
                            ThreadTeam& team) {
     const int64_t pixels = int64_t(input.camera.width) * input.camera.height;
-    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, o.lit, team);
+    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, o, team);
     SampleCounts n = budget.share(wanted);
     if (o.surface_samples >= 0) n.surface = wanted.surface;
     if (o.edge_samples >= 0) n.edge = wanted.edge;

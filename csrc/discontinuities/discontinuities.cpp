@@ -14,6 +14,7 @@
 #include "core/sampler.h"
 #include "core/stopwatch.h"
 #include "discontinuities/discontinuity_source.h"
+#include "estimator/default_samples.h"
 
 namespace edgegrad {
 
@@ -45,8 +46,8 @@ struct LinedFace {
 
 static_assert(sizeof(LinedFace) * 3 <= lined_face_bytes);
 
-// A line may visit this minimum of texture cells, and this number per spacing of its length. Where texels are much
-// smaller than pixels some stand for all, so the size of the image bounds the time.
+// A line may visit this minimum of texture cells, and this number per spacing of its length, as lines lie at the usual
+// samples of the image. Where texels are much smaller than pixels some stand for all, so the image bounds the time.
 constexpr int fewest_cells = 32, cells_a_spacing = 2;
 
 template <class T>
@@ -97,7 +98,8 @@ class DiscontinuityLines {
     void add(int32_t face, const VisiblePolygon& polygon, std::vector<LinedFace>& to) const {
         const auto [low, high] = view_.camera.image_box(polygon.low, polygon.high);
         if (!(view_.importance.mean(low, high) > 0)) return;
-        double spacing = view_.options.discontinuity_spacing / view_.camera.stretch(polygon.low, polygon.high);
+        double spacing = view_.options.discontinuity_spacing /
+                         (sample_growth(view_.image.spp) * view_.camera.stretch(polygon.low, polygon.high));
         if (const int64_t hiding = view_.occlusion.hiding_pixels(low, high, polygon.nearest))
             spacing /= view_.occlusion.factor(occluded_face_lines, hiding, view_.image.spp);
         LinedFace lined{.face = face,
@@ -126,6 +128,7 @@ void add_discontinuities(const BackwardView<T>& view, const Accumulation& accumu
     profile.discontinuity[0] += watch.lap();
     if (view.options.dry || lines.count() == 0) return;
     const uint64_t seed = seed_of(view.options.seed, Stream::discontinuities);
+    const double growth = sample_growth(view.image.spp);
     view.scatter.add(lines.count(), to, profile.discontinuity, [&](int64_t first, int64_t last, LocalGradients& grad) {
         DiscontinuitySource<T> source(view);
         const std::unique_ptr<CurveAccumulation> to_chunk = accumulate_curves(view, accumulation, grad);
@@ -133,7 +136,7 @@ void add_discontinuities(const BackwardView<T>& view, const Accumulation& accumu
         DiscontinuityFinder<T> finder(view);
         lines.each(first, last, [&](const LinedFace& face, Vec2 a, Vec2 b, bool vertical, int64_t line) {
             finder.set(face.face);
-            const double spacings = std::min(length(b - a) / face.spacing, 1e6);
+            const double spacings = std::min(length(b - a) / (growth * face.spacing), 1e6);
             const int most = fewest_cells + int(cells_a_spacing * spacings);
             finder.find(a, b, vertical, most, hash(seed, uint64_t(line)),
                         [&](const DiscontinuityCrossing& crossing, double weight) {

@@ -8,6 +8,8 @@
 #include <vector>
 
 #include "core/parallel.h"
+#include "estimator/default_samples.h"
+#include "estimator/gradient_input.h"
 
 namespace edgegrad {
 
@@ -20,7 +22,11 @@ class SampleBudget {
    public:
     // `coverage` (H · W) belongs to the image, which cast `spp` rays in each pixel. Rays that hit nothing cost little.
     template <class T>
-    SampleBudget(const T* coverage, int64_t pixels, int spp, bool lit, ThreadTeam& team) : cost_(lit ? shaded : plain) {
+    SampleBudget(const T* coverage, int64_t pixels, int spp, const GradientOptions& o, ThreadTeam& team)
+        : cost_(o.indirect ? indirect
+                : o.lit    ? shaded
+                           : plain),
+          least_samples_(int64_t(usual_least_samples * sample_growth(spp))) {
         const auto covered = team.map_blocks(pixels, [&](int64_t first, int64_t last) {
             return std::count_if(coverage + first, coverage + last, [](T c) { return c > 0; });
         });
@@ -36,21 +42,23 @@ class SampleBudget {
         const double fair = rays_ * std::sqrt(edge) / (std::sqrt(edge) + std::sqrt(surface));
         const double of_edges = std::clamp(fair, rays_ - surface, std::max(edge, rays_ - surface));
         const double of_surfaces = rays_ - std::min(edge, of_edges);
-        return {std::max(std::min(wanted.surface, least_samples), int64_t(of_surfaces / cost_.surface)),
-                std::max(std::min(wanted.edge, least_samples), int64_t(of_edges / cost_.edge))};
+        return {std::max(std::min(wanted.surface, least_samples_), int64_t(of_surfaces / cost_.surface)),
+                std::max(std::min(wanted.edge, least_samples_), int64_t(of_edges / cost_.edge))};
     }
 
    private:
     // Cost is in rays of the image. A sample of the gradient is placed by a search, traced incoherently, decided in
-    // double precision and scattered. With lights, it is also shaded by each light that it sees (docs/tried.md).
+    // double precision and scattered. With lights, it is also shaded by each light that it sees (docs/tried.md). With
+    // indirect light, paths take most of the time of both.
     struct Cost {
         double surface, edge;
     };
-    static constexpr Cost plain{3.9, 7.0}, shaded{9, 18};
+    static constexpr Cost plain{3.9, 7.0}, shaded{9, 18}, indirect{2, 4};
     static constexpr double share_of_image = 1;
     // These samples take some milliseconds, so that small images and few rays lose nothing.
-    static constexpr int64_t least_samples = 1 << 14;
+    static constexpr double usual_least_samples = 1 << 14;
     const Cost cost_;
+    const int64_t least_samples_;
     double rays_ = 0;
 };
 

@@ -19,6 +19,7 @@ struct GradientOptions {
     bool discontinuities = true;  // whether discontinuities within faces move
     double discontinuity_spacing = 1;  // px between the lines that find them
     bool lit = false;                  // whether lights shade the samples, at several times the cost
+    bool indirect = false;             // whether light also comes to them by other surfaces
     bool dry = false;                  // whether to count the samples only
     bool controls = true;              // whether known integrals serve as control variates, which depend on the adjoint
     int pixel_spp = 0;  // if not zero, the interior term uses this number of samples per pixel only, for benchmarks

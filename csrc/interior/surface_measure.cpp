@@ -6,6 +6,7 @@
 
 #include "camera/polygon.h"
 #include "core/sampler.h"
+#include "estimator/default_samples.h"
 #include "estimator/vertex_image.h"
 #include "interior/control.h"
 #include "interior/face_lanes.h"
@@ -21,9 +22,14 @@ namespace {
 constexpr OcclusionHint::HiddenFactor occluded_face{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
 constexpr double occluded_near_hits = 1.0 / 8;
 
-// Default samples are per unit of (area + longest side · 1 px), for interpolated colours and for textures. They are
-// chosen with those at edges: a smaller error of either would cost the same time (docs/tried.md).
+// Default samples are per unit of (area + longest side · 1 px), for interpolated colours and for textures, at the usual
+// samples of the image (default_samples.h). They are chosen with those at edges: a smaller error of either would cost
+// the same time (docs/tried.md).
 constexpr double colored = 0.5, textured = 4;
+
+// Under indirect light a sample has one noisy path. It costs about as much as a sample on a secondary edge, and there
+// are as many of both (secondary/estimator.h).
+constexpr double more_if_indirect = 4;
 
 // A lit sample costs several times as much, so textures get no more lit samples than colours. On faces that are no
 // slivers they are better placed in pixels, one in each, because neighbours' samples complement one another (sobol.h).
@@ -54,6 +60,12 @@ constexpr double most_unhit = 4;
 // most two thirds of the longest side away from the nearest corner.
 constexpr double longest_near_corners = 1.5 * OcclusionHint::reach;
 static_assert(longest_near_corners < 2 * OcclusionHint::tile);
+
+// Returns the factor on default samples.
+template <class T>
+double growth_of(const BackwardView<T>& view) {
+    return sample_growth(view.image.spp) * (view.options.indirect ? more_if_indirect : 1);
+}
 
 // MeasuredChunk measures the faces of one chunk.
 template <class T>
@@ -174,7 +186,7 @@ class MeasuredChunk {
     }
 
     // Returns the samples per unit of a face.
-    double rate(int64_t f) const { return is_textured(view_.scene, f) ? textured : colored; }
+    double rate(int64_t f) const { return growth_ * (is_textured(view_.scene, f) ? textured : colored); }
     // Returns whether lights shade the face and it has a texture.
     bool is_detailed(int64_t f) const { return view_.detailed && view_.detailed[f]; }
 
@@ -327,7 +339,8 @@ class MeasuredChunk {
     PixelMask& mask_;
     LocalGradients& grad_;
     const int C_;
-    const double rough_;                                                 // for faces without a control
+    const double rough_;  // for faces without a control
+    const double growth_ = growth_of(view_);
     const double rounding_ = 16 * view_.camera.rounding_of_positions();  // rounding of a wedge, over the longer side
     double total_ = 0, of_pixels_ = 0;
     VisiblePolygon polygon_;
@@ -378,12 +391,15 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     for (int64_t k = 0; k < chunks; ++k) out.total += total[k], out.of_pixels += of_pixels[k];
     if (out.of_pixels > 0) out.pixels = mask.pixels();
     if (view.detailed) {
-        const double each = out.scale(o.surface_samples) * lit_pixel;
+        const double each = out.scale(o.surface_samples) * growth_of(view) * lit_pixel;
         out.pixel_spp = int(std::clamp(std::round(each), 1.0, 0x1p20)), out.pixel_share = std::min(each, 1.0);
         thin_out(out.pixels, out.pixel_share, to_unit(seed_of(o.seed, Stream::surface_pixel_choice)));
-    } else if (!out.pixels.empty())
-        out.pixel_spp = int(std::clamp(
-            std::round(out.scale(o.surface_samples) * out.of_pixels / double(out.pixels.size())), 1.0, 0x1p20));
+    } else if (!out.pixels.empty()) {
+        // Default samples are rounded at the usual samples of the image, so that they grow with these.
+        const double growth = o.surface_samples >= 0 ? 1 : growth_of(view);
+        const double each = out.scale(o.surface_samples) * out.of_pixels / double(out.pixels.size());
+        out.pixel_spp = int(std::min(std::round(growth * std::max(std::round(each / growth), 1.0)), 0x1p20));
+    }
     return out;
 }
 

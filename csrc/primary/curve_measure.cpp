@@ -5,6 +5,7 @@
 #include <memory>
 #include <optional>
 
+#include "estimator/default_samples.h"
 #include "primary/crease_control.h"
 #include "primary/crease_faces.h"
 #include "primary/crease_visibility.h"
@@ -16,8 +17,9 @@ namespace edgegrad {
 
 namespace {
 
-// Returns the default samples per pixel of curve; see surface_measure.cpp. A lit sample costs three times as much, and
-// most of the error is that of faces. A quarter of the samples adds a tenth at most (docs/tried.md).
+// Returns the default samples per pixel of curve at the usual samples of the image; see surface_measure.cpp. A lit
+// sample costs three times as much, and most of the error is that of faces. A quarter of the samples adds a tenth at
+// most (docs/tried.md).
 double samples_per_pixel(bool lit) { return lit ? 6 : 24; }
 
 // An error counts relative to the whole gradient. Controls have none, so the more they cover, the fewer samples the
@@ -290,12 +292,12 @@ Curves<T>::Curves(const BackwardView<T>& view, Array<int8_t> facing)
                   view.team)) {}
 
 template <class T>
-int64_t Curves<T>::wanted(const GradientOptions& o) const {
+int64_t Curves<T>::wanted(const GradientOptions& o, int spp) const {
     if (!(pixels > 0)) return 0;
     if (o.edge_samples >= 0) return o.edge_samples;
     const double rest = squares > 0 ? std::clamp(std::sqrt(unknown / squares), least_rest, 1.0) : 1;
     const double all = samples_per_pixel(o.lit) * pixels;
-    return int64_t(std::ceil(std::max(rest * all, std::min(all, least_samples))));
+    return int64_t(std::ceil(sample_growth(spp) * std::max(rest * all, std::min(all, least_samples))));
 }
 
 template <class T>

@@ -61,8 +61,8 @@ struct Curves : CurvesFound {
     }
     int64_t arcs() const { return lens_boundary_curve ? int64_t(lens_boundary_curve->arcs.size()) : 0; }
 
-    // Returns the number of samples: the one in `o`, if not −1, or the default.
-    int64_t wanted(const GradientOptions& o) const;
+    // Returns the number of samples: the one in `o`, if not −1, or the default for an image of `spp` samples per pixel.
+    int64_t wanted(const GradientOptions& o, int spp) const;
 
     // Adds the segments of clear creases that share pixels with another curve, if either has samples. `all` adds all.
     void add_segments(const BackwardView<T>& view, const Systematic& samples, bool all);

@@ -251,24 +251,16 @@ NB_MODULE(_core, m) {
              "face_attributes"_a.noconvert(), "alpha"_a, "barycentrics"_a, "uv"_a, "unit"_a);
     nb::class_<ImageOptions>(m, "ImageOptions").def(nb::new_(&make_image_options), "spp"_a, "filter"_a, "seed"_a);
     nb::class_<GradientOptions>(m, "GradientOptions")
-        .def(
-            nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,
-                        bool boundary, bool intrinsics, bool discontinuities, double discontinuity_spacing, bool lit, bool dry) {
-                return GradientOptions{surface_samples,
-                                       edge_samples,
-                                       seed,
-                                       interior_geometry,
-                                       boundary,
-                                       intrinsics,
-                                       discontinuities,
-                                       discontinuity_spacing,
-                                       lit,
-                                       dry,
-                                       !dry};
-            }),
-            "seed"_a, nb::kw_only(), "surface_samples"_a = -1, "edge_samples"_a = -1, "interior_geometry"_a = true,
-            "boundary"_a = true, "intrinsics"_a = true, "discontinuities"_a = true, "discontinuity_spacing"_a = 1.0,
-            "lit"_a = false, "dry"_a = false);
+        .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,
+                         bool boundary, bool intrinsics, bool discontinuities, double discontinuity_spacing, bool lit,
+                         bool indirect, bool dry) {
+                 return GradientOptions{
+                     surface_samples, edge_samples,          seed, interior_geometry, boundary, intrinsics,
+                     discontinuities, discontinuity_spacing, lit,  indirect,          dry,      !dry};
+             }),
+             "seed"_a, nb::kw_only(), "surface_samples"_a = -1, "edge_samples"_a = -1, "interior_geometry"_a = true,
+             "boundary"_a = true, "intrinsics"_a = true, "discontinuities"_a = true, "discontinuity_spacing"_a = 1.0,
+             "lit"_a = false, "indirect"_a = false, "dry"_a = false);
     m.attr("WRAPS") = nb::make_tuple(wrap_names[0], wrap_names[1], wrap_names[2]);
     m.attr("TEXTURE_FILTERS") = nb::make_tuple(texture_filter_names[0], texture_filter_names[1]);
     std::vector<std::string> slots;

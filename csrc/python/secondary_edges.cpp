@@ -111,6 +111,9 @@ template void bind_scene_secondary_edges(nb::class_<SceneArrays<float>>&);
 template void bind_scene_secondary_edges(nb::class_<SceneArrays<double>>&);
 
 void bind_secondary_edges(nb::module_& m) {
+    m.def("sample_growth", &sample_growth, "spp"_a);
+    m.attr("USUAL_SPP") = int(usual_spp);
+    m.attr("SHADOW_SAMPLES_A_PIXEL") = shadow_samples_a_pixel;
     m.def(
         "default_secondary_samples",
         [](int64_t width, int64_t height, int spp) { return default_secondary_samples(width, height, spp); }, "width"_a,

@@ -22,17 +22,23 @@
 #include "boundary/accumulation.h"
 #include "boundary/curve_samples.h"
 #include "core/systematic.h"
+#include "estimator/default_samples.h"
 #include "estimator/view.h"
 
 namespace edgegrad {
 
-constexpr int64_t fewest_secondary_samples = 256, most_secondary_samples = 1 << 18;
+// This is the default per pixel of a point light's shadow boundary, at the usual samples of the image.
+constexpr double shadow_samples_a_pixel = 24;
+
+// Returns the minimum of the default number of samples.
+inline int64_t fewest_secondary_samples(int spp) { return int64_t(256 * sample_growth(spp)); }
 
 // Returns the default number of samples for an image of this size and samples per pixel; for shadow boundaries, the
 // maximum. A sample casts an incoherent ray from the light and one from the camera, so rays are limited to an eighth of
 // the image's.
 inline int64_t default_secondary_samples(int64_t width, int64_t height, int spp) {
-    return std::clamp(width * height * spp / 8, fewest_secondary_samples, most_secondary_samples);
+    const auto most = int64_t((1 << 18) * sample_growth(spp));
+    return std::clamp(width * height * spp / 8, fewest_secondary_samples(spp), most);
 }
 template <class T>
 int64_t default_secondary_samples(const BackwardView<T>& view) {

@@ -18,8 +18,6 @@ namespace edgegrad {
 
 namespace {
 
-constexpr double samples_a_pixel = 24;  // samples per pixel of a point light's shadow boundary
-
 // Returns what a visible pilot finds: the image area that the boundary sweeps as the edge moves, times the light there.
 // Where light grazes a face, that area is large for little length.
 template <class T>
@@ -56,8 +54,9 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
         [&](const auto& source, const auto& sample) { return pilot_at(view, light, source, sample); });
     const auto number = [&] {
         if (samples >= 0) return samples;
-        const int64_t wanted = light.extended ? most : int64_t(std::min(samples_a_pixel * sampler.length(), 1e15));
-        return std::clamp(wanted, fewest_secondary_samples, most);
+        const double along = shadow_samples_a_pixel * sample_growth(view.image.spp) * sampler.length();
+        const int64_t wanted = light.extended ? most : int64_t(std::min(along, 1e15));
+        return std::clamp(wanted, fewest_secondary_samples(view.image.spp), most);
     };
     record_secondary(view, sampler, receiver, number, to);
 }

@@ -3,7 +3,6 @@ from .checkpoints import Checkpoint
 from .descent.fit_scene import fit_scene
 from .descent.fit_shape import Refinement, fit_shape
 from .descent.fit_texture import fit_texture
-from .hull import visual_hull
 from .measured import Measured
 from .options import FitOptions
 from .parameter import Parameter
@@ -19,5 +18,4 @@ from .rig.track_rig import track_rig
 __all__ = [
     "Checkpoint", "FitOptions", "Measured", "Parameter", "PoseParameter", "Refinement", "calibrate", "fit_camera", "fit_pose",
     "fit_poses", "fit_rig", "fit_scene", "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track", "track_rig",
-    "visual_hull",
 ]  # fmt: skip

@@ -123,9 +123,11 @@ def backward_kernel(
     *,
     dry: bool = False,
     lit: Scene | None = None,
+    indirect: bool = False,
 ) -> tuple[dict[str, Tensor], list[Profile]]:
     """Return the gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts
-    samples, as for a scene that is `lit`, whose textures the request does not hold.
+    samples, as for a scene that is `lit`, whose textures the request does not hold, and whose surfaces light each other if
+    `indirect`.
 
     `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
@@ -141,7 +143,7 @@ def backward_kernel(
                     camera=kernel_camera(request.camera, b, "distortion" in wanted),
                     channels=kernel_channels(request, b),
                     image=image,
-                    options=_gradient_options(request, wanted, b, dry, lit is not None),
+                    options=_gradient_options(request, wanted, b, dry, lit is not None, indirect),
                     threads=threads(),
                     adjoint=images[b].numpy(),
                     hits=kernel_hits(hits, b),
@@ -215,7 +217,12 @@ def screen_gradient_kernel(adjoint: Tensor, hits: HitBuffers, request: Request) 
 
 
 def _gradient_options(
-    request: Request, wanted: Collection[str], camera: int, dry: bool = False, lit: bool = False
+    request: Request,
+    wanted: Collection[str],
+    camera: int,
+    dry: bool = False,
+    lit: bool = False,
+    indirect: bool = False,
 ) -> Any:
     options, terms = request.gradient, WantedTerms.from_request(request, wanted)
     return core.GradientOptions(
@@ -227,6 +234,7 @@ def _gradient_options(
         discontinuities=terms.discontinuities,
         discontinuity_spacing=options.discontinuity_spacing,
         lit=lit,
+        indirect=indirect,
         dry=dry,
     )
 

@@ -103,11 +103,13 @@ class Lighting(NamedTuple):
             points=points,
             blended=scene.blends,
             lit=True,
+            indirect=self.bounces > 1,
             glossy=scene.is_glossy,
             keeps_little=fused,
             gives_derivatives=additive,
             additive=additive,
             closer=CLOSER_STEPS if self.bounces > 1 else 1.0,
+            noisy=extended or self.bounces > 1,
             discontinuity_margin=NEXT_TO_TEXELS,
         )
         lit = _LitRadiance(

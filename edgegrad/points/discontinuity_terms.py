@@ -40,6 +40,7 @@ class DiscontinuityTerms(NamedTuple):
     # How far from a discontinuity its sides are shaded, in units of its function: more than 0 for shaders that may look
     # for themselves on which side they are.
     margin: float = 0.0
+    shadings: int = 1  # of each crossing, of which the mean counts
 
     def found(self, watch: Watch) -> list[SplatTerm]:
         crossings = self._crossings()
@@ -75,18 +76,21 @@ class DiscontinuityTerms(NamedTuple):
     def _jumps(self, found: Crossings, rays: RayRecords) -> tuple[Tensor, Tensor]:
         """Return L₊ − L₋ (M, C) and the weight over |∇ₓs| (M,), without derivatives."""
         context = self.context
-        seed = context.seeds("discontinuities", len(found.x))
+        seeds = context.seeds("discontinuities", self.shadings * len(found.x)).reshape(-1, self.shadings)
         gradient = torch.cat([self._by_place(found, rays, part) for part in self._parts(found)])
         with torch.no_grad():
             jumps = []
             for part in self._parts(found):
                 face, b, x = found.face[part], found.b[part], found.x[part]
                 aside = self._aside(found, rays, part, gradient[part]) if self.margin else torch.zeros_like(b)
-                before, after = (
-                    self.shade(context.fixed_hits(face, b + shift, x, seed[part], Discontinuities(states[part])))
-                    for states, shift in ((found.before, -aside), (found.after, aside))
-                )
-                jumps.append((after - before).detach())
+                sums = []
+                for seed in seeds[part].unbind(1):
+                    before, after = (
+                        self.shade(context.fixed_hits(face, b + shift, x, seed, Discontinuities(states[part])))
+                        for states, shift in ((found.before, -aside), (found.after, aside))
+                    )
+                    sums.append((after - before).detach())
+                jumps.append(torch.stack(sums).mean(0) if len(sums) > 1 else sums[0])
             jump = torch.cat(jumps) * torch.where(context.here(found.rises), 1.0, -1.0).to(context.dtype)[:, None]
             # |n_x| / |∇s|, and none where s has no direction.
             length = gradient.norm(dim=1)

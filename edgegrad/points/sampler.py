@@ -44,7 +44,7 @@ from .records import (
 
 
 def shaded_memory(
-    request: Request, gradient: bool | None = None, textured: bool = False
+    request: Request, gradient: bool | None = None, textured: bool = False, indirect: bool = False
 ) -> AbstractContextManager[None]:
     """Raise MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails.
 
@@ -54,12 +54,19 @@ def shaded_memory(
     pixels = request.camera.height * request.camera.width
     needs = core.image_bytes(size, request.cameras)
     if torch.is_grad_enabled() if gradient is None else gradient:
-        # By default about half a sample a pixel of surface, one where it is lit and has a texture, and some at edges.
-        default = pixels if textured else pixels // 2
+        # By default about half a sample a pixel of surface, one where it is lit and has a texture, and some at edges; four
+        # times as many inside where surfaces light each other.
+        growth = core.sample_growth(request.image.spp)
+        default = int(growth * (4 if indirect else 1) * (pixels if textured else pixels // 2))
         surface = options.surface_samples if options.surface_samples >= 0 else default
-        edge = options.edge_samples if options.edge_samples >= 0 else pixels // 8
+        edge = options.edge_samples if options.edge_samples >= 0 else int(growth * pixels) // 8
         needs["samples"] = request.cameras * (SURFACE_BYTES * surface + CURVE_BYTES * edge)
-    return memory.room("render with a shader", needs, lambda: lower(request) + ", or what the shader keeps of a point")
+    return memory.room("render with a shader", needs, lambda: _lower(request))
+
+
+def _lower(request: Request) -> str:
+    samples = f"the samples per pixel ({request.image.spp}), with which those of the gradient grow"
+    return f"{lower(request)}, {samples}, or what the shader keeps of a point"
 
 
 def size_of_values(request: Request) -> Any:
@@ -188,11 +195,13 @@ class Sampler:
         intrinsics: bool = False,
         discontinuities: bool = False,
         lit: Scene | None = None,
+        indirect: bool = False,
         importance: Tensor | None = None,
     ) -> tuple[SurfaceRecords, CurveRecords]:
         """Return samples of the gradient; call it after pixel_hits(). The scene of `request` has colours that differ at creases.
 
-        lit     the scene whose lights shade them
+        lit         the scene whose lights shade them
+        indirect    whether its surfaces light each other
         importance  (H, W), above zero: how much they are to look at each pixel; None: the same everywhere
         """
         of_pixels = () if importance is None else (importance.to(self._hits.coverage.dtype),)
@@ -212,6 +221,7 @@ class Sampler:
                     discontinuities=discontinuities,
                     discontinuity_spacing=options.discontinuity_spacing,
                     lit=lit is not None,
+                    indirect=indirect,
                 ),
                 least=self._least,
                 threads=threads(),

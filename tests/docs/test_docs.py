@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import io
 import pkgutil
+import json
 import re
 from fnmatch import fnmatch
 from functools import cache
@@ -30,6 +31,7 @@ import edgegrad.fit
 import edgegrad.points
 import edgegrad.raster
 import edgegrad.rig
+from edgegrad.fit.descent.result import Fit
 from edgegrad.fit.pose.result import PoseFit
 
 pytestmark = pytest.mark.unsanitized
@@ -89,15 +91,29 @@ def test_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = edgegrad.render_aovs(model, camera, ["image", "alpha"], spp=64, seed=0)
     edgegrad.write_image("photo.png", shown["image"])
     edgegrad.write_image("mask.png", edgegrad.image.srgb_to_linear(shown["alpha"]))
+    frames = []
+    for k, eye in enumerate([(0, 0, 3), (3, 0, 0.5), (0, 3, 0.4)]):
+        view = edgegrad.Camera.look_at(eye, target=(0, 0, 0), up=(0.1, 1, 0.1), fov_y=60, size=(32, 32))
+        mask = edgegrad.render_aovs(model, view, ["alpha"], spp=64, seed=0)["alpha"]
+        edgegrad.write_image(f"mask_{k}.png", edgegrad.image.srgb_to_linear(mask))
+        to_opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+        pose = torch.linalg.inv(view.world_to_camera) @ to_opengl
+        frames.append({"file_path": f"mask_{k}.png", "transform_matrix": pose.tolist()})
+    lens = {"fl_x": float(view.K[0, 0]), "fl_y": float(view.K[1, 1]), "cx": 16, "cy": 16, "w": 32, "h": 32}
+    Path("transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     names: dict[str, object] = {}
     text = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
     blocks = [source for kind, source in FENCE.findall(text) if kind == "python"]
-    assert len(blocks) == 3
+    assert len(blocks) == 4
+    fits = []
     for source in blocks:
-        exec(compile(source.replace("range(200)", "range(3)"), "README.md", "exec"), names)
-    found, sun = (names[name] for name in ("fit", "sun"))
-    assert isinstance(found, PoseFit) and isinstance(sun, torch.Tensor)
-    assert found.loss < 1e-3 and sun.grad is not None and sun.grad.abs().max() > 0
+        quick = source.replace("range(200)", "range(3)").replace("steps=200", "steps=8, progress=False")
+        exec(compile(quick, "README.md", "exec"), names)
+        fits.append(names["fit"])
+    (pose, shape, *_), sun = fits, names["sun"]
+    assert isinstance(pose, PoseFit) and isinstance(shape, Fit) and isinstance(sun, torch.Tensor)
+    assert pose.loss < 1e-3 and sun.grad is not None and sun.grad.abs().max() > 0
+    assert len(shape.mesh.faces) > len(names["sphere"].faces) and Path("shape.glb").is_file()
 
 
 def test_equations_are_typeset() -> None:

@@ -32,9 +32,11 @@ def relative_error(a: Tensor, b: Tensor) -> float:
     return float((a - b).norm() / b.norm())
 
 
-def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = True) -> tuple[int, int]:
+def sample_counts(
+    surface: int, edge: int, adjoint: Tensor, boundary: bool = True, spp: int = 16, **light: bool
+) -> tuple[int, int]:
     """Return how many samples the kernel says it drew for the triangle's vertices."""
-    # All pixels covered by many samples, so that no budget binds; nothing is occluded.
+    # All pixels covered, and so few samples that no budget binds; nothing is occluded.
     hits = HitBuffers(
         torch.ones(1, SIZE, SIZE, dtype=F64),
         torch.full((1, SIZE, SIZE), torch.inf),
@@ -44,8 +46,8 @@ def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = Tru
     profile = kernel_scene(flatten(TRIANGLE)).backward(
         kernel_camera(pack_camera(CAMERA)),
         kernel_channels(make_request(TRIANGLE, CAMERA)),
-        core.ImageOptions(spp=1 << 20, filter="box", seed=0),
-        core.GradientOptions(seed=0, surface_samples=surface, edge_samples=edge, boundary=boundary),
+        core.ImageOptions(spp=spp, filter="box", seed=0),
+        core.GradientOptions(seed=0, surface_samples=surface, edge_samples=edge, boundary=boundary, **light),
         threads=2,
         adjoint=adjoint.contiguous().numpy(),
         hits=kernel_hits(hits),
@@ -70,6 +72,25 @@ def test_sample_counts():
     noise = torch.randn(ADJOINT.shape, generator=torch.Generator().manual_seed(0), dtype=F64)
     surface, edge = sample_counts(-1, -1, noise)
     assert 2 * expected[0] < surface <= 5 * expected[0] + 5 and edge == expected[1]
+
+
+def test_sample_counts_grow_with_those_of_the_image():
+    """In proportion from 16 a pixel on; below, they stay. Numbers that one gives stay as well."""
+    smooth = torch.ones_like(ADJOINT)
+    surface, edge = sample_counts(-1, -1, smooth)
+    for spp in (64, 100, 4096):
+        more = sample_counts(-1, -1, smooth, spp=spp)
+        assert abs(more[0] - spp / 16 * surface) <= spp / 16 and abs(more[1] - spp / 16 * edge) <= spp / 16
+        assert sample_counts(123, 45, ADJOINT, spp=spp) == (123, 45)
+    for spp in (1, 4):
+        assert sample_counts(-1, -1, smooth, spp=spp) == (surface, edge)
+
+
+def test_sample_counts_where_surfaces_light_each_other():
+    """Four times as many inside faces as with direct light, for each has a noisy path."""
+    smooth = torch.ones_like(ADJOINT)
+    direct, indirect = (sample_counts(-1, -1, smooth, lit=True, indirect=on) for on in (False, True))
+    assert abs(indirect[0] - 4 * direct[0]) <= 4 and indirect[1] == direct[1]
 
 
 def test_more_samples_are_better():

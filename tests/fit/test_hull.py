@@ -8,7 +8,7 @@ from quiet_fits import arranged
 from small_scenes import QUIET, ball
 
 import edgegrad as eg
-from edgegrad.fit import fit_texture, regularizers, visual_hull
+from edgegrad.fit import fit_texture, regularizers
 
 gpytoolbox = pytest.importorskip("gpytoolbox")
 
@@ -48,14 +48,14 @@ def holes(mesh):
 def test_the_hull_of_a_ring_has_its_hole():
     ring = torus()
     cameras = around(ring, 16)
-    hull = visual_hull(silhouettes(ring, cameras), cameras, 48)
+    hull = eg.shapes.visual_hull(silhouettes(ring, cameras), cameras, 48)
     assert holes(hull) == 1 and len(gpytoolbox.boundary_edges(hull.faces.numpy())) == 0
     assert 0.97 < volume(hull) / volume(ring) < 1.2  # outwards; a hull holds the body, but for its cells
     for a, b in zip(hull.verts.aminmax(dim=0), ring.verts.aminmax(dim=0), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0.08)
     for alpha, mask in zip(silhouettes(hull, cameras), silhouettes(ring, cameras), strict=True):
         assert float(torch.minimum(alpha, mask).sum() / torch.maximum(alpha, mask).sum()) > 0.95
-    even = visual_hull(silhouettes(ring, cameras), cameras, 48, faces=1200)
+    even = eg.shapes.visual_hull(silhouettes(ring, cameras), cameras, 48, faces=1200)
     assert 800 < len(even.faces) < 1600 and holes(even) == 1
     assert float(regularizers.edge_length(even.verts, even.faces)) < 0.1
 
@@ -66,7 +66,7 @@ def test_orthographic_cameras_and_a_box_of_ones_own():
     cameras = [eg.Camera.orthographic(eye, (0, 0, 0), (0.3, 0.5, 0.8), height=3.0, size=(64, 80)) for eye in eyes]
     masks = silhouettes(egg, cameras)
     box = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.5, 1.0]])
-    for hull in (visual_hull(masks, cameras, 40), visual_hull(masks, cameras, 40, bounds=box)):
+    for hull in (eg.shapes.visual_hull(masks, cameras, 40), eg.shapes.visual_hull(masks, cameras, 40, bounds=box)):
         assert 0.97 < volume(hull) / volume(egg) < 1.25
         torch.testing.assert_close(hull.verts.amax(0), egg.verts.amax(0), rtol=0, atol=0.06)
 
@@ -80,7 +80,7 @@ def test_an_object_that_goes_on_beyond_an_image():
     ]  # the middle is at 32
     masks = silhouettes(egg, near)
     assert all(bool((mask[:, -1] > 0.5).any()) for mask in masks[::3])
-    hull = visual_hull(masks, near, 40)
+    hull = eg.shapes.visual_hull(masks, near, 40)
     assert 0.97 < volume(hull) / volume(egg) < 1.2
 
 
@@ -92,7 +92,7 @@ def test_small_pieces_are_left_out():
     both = eg.Scene([egg, eg.Mesh(dot, ball(1).faces)])
     specks = [eg.render_aovs(both, camera, ["alpha"], spp=16, seed=0)["alpha"] for camera in cameras]
     assert sum(float((a - b).abs().sum()) for a, b in zip(masks, specks, strict=True)) > 2.0
-    assert holes(visual_hull(specks, cameras, 40)) == 0  # one piece
+    assert holes(eg.shapes.visual_hull(specks, cameras, 40)) == 0  # one piece
 
 
 def test_hull_errors_name_the_argument():
@@ -103,14 +103,14 @@ def test_hull_errors_name_the_argument():
     corner[1:4, 1:4] = 1.0
     side = [eg.Camera.orthographic((x, 0, 4.0), (x, 0, 0), height=3.0, size=(32, 32)) for x in (0.0, 0.3)]
     for call, error, message in (
-        (lambda: visual_hull(masks[0], cameras[0]), ValueError, "cameras: expected at least two, got 1"),
-        (lambda: visual_hull(masks[:2], cameras), ValueError, "masks: expected 4, one for each camera, got 2"),
-        (lambda: visual_hull([None, *masks[1:]], cameras), ValueError, "expected pictures or masks"),
-        (lambda: visual_hull(masks, cameras, resolution=2), ValueError, "resolution: expected an int from 4"),
-        (lambda: visual_hull(masks, cameras, bounds=torch.zeros(2, 3)), ValueError, "bounds: .* without volume"),
-        (lambda: visual_hull(masks, cameras, faces=0), ValueError, "faces: expected"),
-        (lambda: visual_hull(silhouettes(egg, side), side), ValueError, "cameras: expected some that look in different"),
-        (lambda: visual_hull([corner, corner.flip(0, 1), *masks[2:]], cameras), ValueError,
+        (lambda: eg.shapes.visual_hull(masks[0], cameras[0]), ValueError, "cameras: expected at least two, got 1"),
+        (lambda: eg.shapes.visual_hull(masks[:2], cameras), ValueError, "masks: expected 4, one for each camera, got 2"),
+        (lambda: eg.shapes.visual_hull([None, *masks[1:]], cameras), ValueError, "expected pictures or masks"),
+        (lambda: eg.shapes.visual_hull(masks, cameras, resolution=2), ValueError, "resolution: expected an int from 4"),
+        (lambda: eg.shapes.visual_hull(masks, cameras, bounds=torch.zeros(2, 3)), ValueError, "bounds: .* without volume"),
+        (lambda: eg.shapes.visual_hull(masks, cameras, faces=0), ValueError, "faces: expected"),
+        (lambda: eg.shapes.visual_hull(silhouettes(egg, side), side), ValueError, "cameras: expected some that look in"),
+        (lambda: eg.shapes.visual_hull([corner, corner.flip(0, 1), *masks[2:]], cameras), ValueError,
          "masks: expected silhouettes of one object, got some that have no body in common"),
     ):  # fmt: skip
         with pytest.raises(error, match=message):

@@ -152,14 +152,15 @@ def test_meshes_with_mipmaps_have_gradients():
     def loss(mesh: eg.Mesh, seed: int) -> Tensor:
         return (weights * eg.render(mesh, camera, spp=256, seed=seed, sampling=eg.Sampling(surface=4000))).sum()
 
-    rows = []
-    for seed in range(24):
-        texture, t = mesh.texture.clone().requires_grad_(), torch.zeros((), dtype=F64, requires_grad=True)  # pyright: ignore
+    rows, h, count = [], 2.0, 24
+    for seed in range(count):
+        # At evenly spaced places, whose mean the difference is: what crosses the image's border changes with the place.
+        place = torch.tensor(h * ((2 * seed + 1) / count - 1), dtype=F64)
+        texture, t = mesh.texture.clone().requires_grad_(), place.requires_grad_()  # pyright: ignore
         moved = mesh.replace(verts=mesh.verts + t * shift, texture=texture, filter="mipmap")
         value = loss(moved, seed)
         by_texture, by_t = torch.autograd.grad(value, [texture, t])
         value, along = value.detach(), (by_texture * texture.detach()).sum()
-        h = 2.0
         ahead, back = (
             loss(mesh.replace(verts=mesh.verts + s * h * shift, filter="mipmap"), seed).detach() for s in (1, -1)
         )

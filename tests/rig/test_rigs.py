@@ -13,6 +13,7 @@ from rig_checks import check, malformed, primitive
 from rig_files import SAMPLES, Sample, rigged_simple, simple_morph, simple_skin, walk
 
 import edgegrad as eg
+from edgegrad.rig.skin import Skin
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -61,7 +62,7 @@ def small(dtype: torch.dtype = torch.float64) -> eg.rig.Rig:
     joints = eg.rig.Joints(
         ["a", "b", "c"], [-1, 0, 1], torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]), torch.zeros(3, 3)
     )
-    skin = eg.rig.Skin(
+    skin = Skin(
         torch.arange(3), torch.linalg.inv(joints.world()), torch.rand(7, 3, generator=g) + 0.1, 0,
         torch.randn(2, 7, 3, generator=g), torch.randn(2, 7, 3, generator=g),
     )  # fmt: skip
@@ -245,7 +246,7 @@ def test_weights_are_normalised_with_a_warning(tmp_path) -> None:
 
 def test_bad_arguments() -> None:
     rig = small()
-    skin = eg.rig.Skin(torch.tensor([0]), torch.eye(4)[None], torch.ones(7, 1), 0, torch.zeros(1, 6, 3))
+    skin = Skin(torch.tensor([0]), torch.eye(4)[None], torch.ones(7, 1), 0, torch.zeros(1, 6, 3))
     for error, message, call in (
         (ValueError, "rotations: expected shape", lambda: rig.posed(torch.zeros(4, 3))),
         (ValueError, "rotations: expected rotations, got matrices", lambda: rig.posed(torch.ones(3, 3, 3))),
@@ -293,7 +294,7 @@ def two_bars() -> eg.rig.Rig:
         torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0.9], [0, 0, 0]]),
     )  # fmt: skip
     inverse = torch.linalg.inv(one.joints.world())
-    skins = [eg.rig.Skin(torch.tensor(rows), inverse, skin.weights) for rows in ([0, 1], [2, 3])]
+    skins = [Skin(torch.tensor(rows), inverse, skin.weights) for rows in ([0, 1], [2, 3])]
     return eg.rig.Rig.from_arrays(eg.Scene(meshes), joints, skins)
 
 
