@@ -118,20 +118,14 @@ def noise(
 
     Parameters
     ----------
-    scene : Scene or Mesh
-    camera : Camera
-        One camera, or a batch.
+    scene, camera, spp, seed
+        As of render(). The seed makes the estimate repeatable.
     loss : callable
         Function of the image that returns a scalar, as in the user's loop.
-    spp : int, default 16
-        Samples per pixel.
-    seed : int, optional
-        Makes the estimate repeatable; by default torch's generator draws it.
     target : float, default 0.05
         Wanted noise, relative to the gradient.
     by : mapping of str to Tensor, optional
-        Tensors, by any names, that scene and camera are computed from: a pose, say. By default all tensors of scene and
-        camera that require a gradient.
+        Tensors, by any names, that these are computed from: a pose, say. By default all of them that require a gradient.
     seeds : int, default 2
         Gradients that are compared. More of them make the estimate surer, above all by tensors of few numbers.
     **options
@@ -155,14 +149,11 @@ def noise(
 
     Examples
     --------
-    >>> import torch
     >>> import edgegrad as eg
-    >>> verts = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]], requires_grad=True)
-    >>> mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=torch.eye(3))
-    >>> camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=50, size=(32, 32))
-    >>> found = eg.noise(mesh, camera, lambda image: image.square().mean(), seed=0)
-    >>> found.noise["verts"] < 0.05, found.spp_for(0.05)
-    (True, 16)
+    >>> box, camera = eg.shapes.box(), eg.Camera.look_at((2, 2, 4), (0, 0, 0), size=(32, 32))
+    >>> moving = box.replace(verts=box.verts.requires_grad_())
+    >>> eg.noise(moving, camera, lambda image: image.square().mean(), seed=0).spp_for(0.2)
+    16
     """
     check_options("noise", options)
     if not callable(loss):

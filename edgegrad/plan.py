@@ -100,14 +100,12 @@ def plan(
 
     Samples of the gradient are counted for a loss that is nowhere zero and an image that sees every face: where the adjoint is
     zero none are taken, and fewer on faces that no sample of the image hits. Nothing is rendered; the ray structure and the
-    edges are built, and render() then finds them.
+    edges are built, and render() then finds them. It raises what render() raises.
 
     Parameters
     ----------
-    scene, camera, spp
-        As of render().
-    seed : int, default 0
-        As of render(), but fixed by default, so that a plan does not change what torch's generator draws next.
+    scene, camera, spp, seed
+        As of render(); but the seed is 0 by default, so that a plan does not change what torch's generator draws next.
     **options
         Other arguments of render().
 
@@ -116,18 +114,12 @@ def plan(
     Plan
         Mapping from the name of a term to a Term; prints as a table.
 
-    Raises
-    ------
-    TypeError, ValueError, MemoryError
-        What render() raises.
-
     Examples
     --------
     >>> import edgegrad as eg
-    >>> box, camera = eg.shapes.box(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(64, 64))
-    >>> plan = eg.plan(box.replace(verts=box.verts.requires_grad_()), camera)
-    >>> plan["boundary"].on, plan.samples > 64 * 64
-    (True, True)
+    >>> plan = eg.plan(eg.shapes.box(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(64, 64)))
+    >>> plan["image"].samples
+    65536
     """
     check_options("plan", options)
     scene = as_scene(scene)

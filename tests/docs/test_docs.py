@@ -10,8 +10,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
-import pkgutil
 import json
+import pkgutil
 import re
 from fnmatch import fnmatch
 from functools import cache
