@@ -67,8 +67,8 @@ def bake(
 ) -> Tensor:
     """Return a texture (h, w, C) for a mesh, of what another surface has where the two lie on each other.
 
-    It is for `mesh.replace(texture=…)`: row 0 on top. It has no gradient. Nearest points and margins need SciPy (`pip install
-    'edgegrad[fit]'`), else ImportError; TypeError and ValueError name a wrong argument.
+    It is for `mesh.replace(texture=…)`: row 0 on top. It has no gradient. Nearest points and margins need SciPy
+    (`pip install 'edgegrad[fit]'`), else ImportError; TypeError and ValueError name a wrong argument.
 
     Parameters
     ----------

@@ -108,12 +108,12 @@ def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
 def save_mesh(path: PathLike, mesh: Mesh) -> None:
     """Write a mesh as PLY, OBJ, GLB, STL or OFF by the name's ending. Missing folders are made.
 
-    A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as `load_scene(path,
-    lit=True)` reads them: factors and vertex colours in full, textures in 8 bit (colour as sRGB), clipped to 0 … 1. Metallic,
-    roughness and emission of vertices become their mean, because glTF has none. A Lambertian material is one without a
-    highlight (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an OBJ also a texture, repeated or clamped,
-    which is written next to it with its .mtl; STL and OFF hold the shape alone. Positions in PLY, STL and GLB are float32;
-    those in OBJ and OFF have all digits of the mesh's type. A warning names what is left out, rounded or clipped.
+    A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as
+    `load_scene(path, lit=True)` reads them: factors and vertex colours in full, textures in 8 bit (colour as sRGB), clipped to
+    0 … 1. Metallic, roughness and emission of vertices become their mean, because glTF has none. A Lambertian material is one
+    without a highlight (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an OBJ also a texture, repeated or
+    clamped, which is written next to it with its .mtl; STL and OFF hold the shape alone. Positions in PLY, STL and GLB are
+    float32; those in OBJ and OFF have all digits of the mesh's type. A warning names what is left out, rounded or clipped.
 
     Parameters
     ----------

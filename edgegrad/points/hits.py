@@ -37,12 +37,11 @@ class Hits:
 
     Examples
     --------
-    >>> import torch, edgegrad as eg
-    >>> def checkers(hits):
-    ...     odd = hits.floor(4 * hits.position[:, :2]).sum(1) % 2 > 0.5
-    ...     return torch.where(odd[:, None], 0.8, 0.2) * hits.normal.abs()
+    >>> import edgegrad as eg
+    >>> def two_halves(hits):
+    ...     return hits.where(hits.position[:, 0], hits.normal.abs(), 0.2)
     >>> camera = eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(8, 8))
-    >>> eg.render(eg.shapes.box(), camera, shader=checkers).shape
+    >>> eg.render(eg.shapes.box(), camera, shader=two_halves).shape
     torch.Size([8, 8, 3])
     """
 

@@ -14,6 +14,8 @@ import torch
 
 import edgegrad
 
+pytestmark = pytest.mark.unsanitized
+
 MOST_LINES = 40
 MODULES = (
     "edgegrad", "edgegrad.bop", "edgegrad.bop.errors", "edgegrad.bop.files", "edgegrad.fit", "edgegrad.fit.losses",
@@ -43,6 +45,7 @@ def public() -> Iterator[tuple[str, object]]:
 
 
 def own(thing: object, module: str) -> bool:
+    """Return whether a module without __all__ made it."""
     return callable(thing) and getattr(thing, "__module__", None) == module
 
 
