@@ -103,8 +103,7 @@ class Evaluation:
         return "\n".join(lines)
 
     def to_json(self) -> str:
-        """Return JSON with recalls, by BOP's names, of all and of each object, and each estimate's errors in mm, pixels and
-        degrees."""
+        """Return JSON with recalls, by BOP's names, of all and each object, and estimates' errors in mm, pixels and degrees."""
         rows = [
             {
                 "scene_id": row.estimate.scene_id, "im_id": row.estimate.im_id, "obj_id": row.estimate.obj_id,

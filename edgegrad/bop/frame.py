@@ -77,8 +77,10 @@ class Frame:
         return read_image(self._file(("rgb", "gray"), f"{self.im_id:06d}"), channels=3)
 
     def depth(self) -> Tensor:
-        """Return (H, W) float64 along the optical axis in mm, 0 where nothing was measured. Raises FileNotFoundError or
-        ValueError."""
+        """Return (H, W) float64 along the optical axis in mm, 0 where nothing was measured.
+
+        Raises FileNotFoundError or ValueError.
+        """
         path = self._file(("depth",), f"{self.im_id:06d}")
         color, _, largest = read_stored(path)
         if largest is None or color.shape[-1] != 1:

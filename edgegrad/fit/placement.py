@@ -33,7 +33,7 @@ class Pose(NamedTuple):
 
     @property
     def matrix(self) -> Tensor:
-        """The (4, 4) matrix for column vectors."""
+        """Return the (4, 4) matrix for column vectors."""
         return rigid(self.scale * self.R, self.t)
 
     @property
@@ -153,7 +153,7 @@ class Placement:
 
     @property
     def coordinates(self) -> dict[str, Parameter]:
-        """The coordinates as parameters, by the names that gradients have in histories."""
+        """Return the coordinates as parameters, by the names that gradients have in histories."""
         rates = {"rotation": self.parameter.rotation, "shift": self.parameter.shift}
         found = {name: Parameter(rate, torch.zeros(3, dtype=torch.float64)) for name, rate in rates.items()}
         if self.parameter.scale is not None:

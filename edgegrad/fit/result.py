@@ -37,8 +37,11 @@ class FitResult:
         return require("edgegrad.fit.plots", *DRAWING).curves(self.history)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """Write the result to a folder, which is made if missing, and return the names of the files. Each file is written whole
-        or not at all. Raises OSError, or at last ImportError if figures are asked for and matplotlib is missing."""
+        """Write the result to a folder, which is made if missing, and return the names of the files.
+
+        Each file is written whole or not at all. Raises OSError, or at last ImportError if figures are asked for and
+        matplotlib is missing.
+        """
         raise NotImplementedError
 
     @property

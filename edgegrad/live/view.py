@@ -102,16 +102,17 @@ class Viewer:
 
     @property
     def url(self) -> str | None:
-        """The page's address; None for a figure."""
+        """Return the page's address; None for a figure."""
         return self._display.url
 
     @property
     def stopped(self) -> bool:
-        """Whether Stop was pressed in a loop of one's own. A fit that it ends resets it."""
+        """Return whether Stop was pressed in a loop of one's own. A fit that it ends resets it."""
         return self._stop.is_set()
 
     @property
     def paused(self) -> bool:
+        """Return whether the fit waits."""
         return not self._go.is_set()
 
     def __call__(self, fit: Shown) -> None:

@@ -117,10 +117,10 @@ class Animation:
         return max((float(channel.times[-1]) for channel in self.channels), default=0.0)
 
     def at(self, t: float | Tensor) -> dict[str, Tensor]:
-        """Return what moves at a time in seconds, as rig.posed(**…) takes it; at times (B,) a batch. Differentiable by the
-        time.
+        """Return what moves at a time in seconds, as rig.posed(**…) takes it; at times (B,) a batch.
 
-        Before the first key and after the last one, it rests at theirs; take t % duration for a loop.
+        It is differentiable by the time. Before the first key and after the last one, it rests at theirs; take t % duration
+        for a loop.
         """
         time = as_tensor("t", t, floating=True).double()
         check_shape("t", time, (), ("B",))

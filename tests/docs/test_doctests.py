@@ -11,6 +11,7 @@ from types import ModuleType
 
 import pytest
 import torch
+from doc_pages import FOLDER
 
 import edgegrad
 
@@ -78,12 +79,15 @@ def test_docstrings_have_the_sections_of_numpydoc(path: str) -> None:
         assert SECTION.search(text), "it has arguments, and neither Parameters nor Returns"
 
 
-@pytest.mark.parametrize("path", [path for path, thing in PUBLIC.items() if inspect.isclass(thing)])
-def test_docstrings_of_methods_begin_with_one_line(path: str) -> None:
-    for name, method in methods(PUBLIC[path]):
-        text = inspect.getdoc(method) or ""
-        assert "\n" not in text.split("\n\n")[0], name
-        assert text[0].isupper() and len(text.splitlines()) <= MOST_LINES, name
+def test_summaries_of_the_reference_are_one_line() -> None:
+    reference = "".join(page.read_text(encoding="utf-8") for page in (FOLDER / "api").glob("*.md"))
+    for path in re.findall(r"^\.\. auto(?:class|function):: (\S+)$", reference, re.MULTILINE):
+        module, _, name = path.rpartition(".")
+        thing = getattr(importlib.import_module(module), name)
+        for member, value in ((path, thing), *methods(thing)):
+            text = inspect.getdoc(value) or ""
+            assert "\n" not in text.split("\n\n")[0], f"{path}: {member}"
+            assert text[0].isupper() and len(text.splitlines()) <= MOST_LINES, f"{path}: {member}"
 
 
 def examples() -> Iterator[tuple[str, object]]:

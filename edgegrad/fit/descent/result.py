@@ -66,26 +66,30 @@ class Fit(FitResult):
 
     @property
     def steps(self) -> int:
+        """Return the number of steps."""
         return len(self.history)
 
     @property
     def converged(self) -> bool:
-        """Whether further steps lead no further and the pictures show enough of the render's edges."""
+        """Return whether further steps lead no further and the pictures show enough of the render's edges."""
         return self.ending is Ending.FLAT and self.explained >= MIN_EDGE_SUPPORT
 
     @property
     def interrupted(self) -> bool:
+        """Return whether the fit was interrupted."""
         return self.ending is Ending.INTERRUPTED
 
     @property
     def mesh(self) -> Mesh:
-        """The scene's first mesh."""
+        """Return the scene's first mesh."""
         return self.scene.meshes[0]
 
     @property
     def reason(self) -> str:
-        """The ending in words: "converged", "edges not explained: …", "loss still falling: …", "steps ran out: …" or
-        "interrupted"."""
+        """Return the ending in words.
+
+        It is "converged", "edges not explained: …", "loss still falling: …", "steps ran out: …" or "interrupted".
+        """
         return reason_of(self.ending, self.explained)
 
     def render(self, index: int = 0, spp: int = 64, seed: int = 0) -> Tensor:

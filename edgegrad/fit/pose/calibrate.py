@@ -68,37 +68,37 @@ class Calibration(FitResult):
 
     @property
     def cameras(self) -> list[Camera]:
-        """The camera of each picture, at its place."""
+        """Return the camera of each picture, at its place."""
         return [fit.camera for fit in self.fits]
 
     @property
     def camera(self) -> Camera:
-        """The first camera; all have its K and distortion."""
+        """Return the first camera; all have its K and distortion."""
         return self.fits[0].camera
 
     @property
     def uncertainty(self) -> CameraUncertainty | None:
-        """The uncertainty of the first camera, whose lens is that of all."""
+        """Return the uncertainty of the first camera, whose lens is that of all."""
         return self.fits[0].uncertainty
 
     @property
     def loss(self) -> float:
-        """The mean loss over the pictures."""
+        """Return the mean loss over the pictures."""
         return sum(fit.loss for fit in self.fits) / len(self.fits)
 
     @property
     def explained(self) -> float:
-        """The least share over the pictures, 0 … 1, of the render's edges that a picture shows, too."""
+        """Return the least share over the pictures, 0 … 1, of the render's edges that a picture shows, too."""
         return min(fit.explained for fit in self.fits)
 
     @property
     def steps(self) -> int:
-        """The number of steps that moved all numbers at once."""
+        """Return the number of steps that moved all numbers at once."""
         return len(self.history)
 
     @property
     def converged(self) -> bool:
-        """Whether further steps lead no further, the pictures show the render's edges, and all that was sought is known."""
+        """Return whether further steps lead no further, pictures show the render's edges, and all that was sought is known."""
         return self.reason == "converged"
 
     @property
@@ -107,7 +107,7 @@ class Calibration(FitResult):
 
     @property
     def reason(self) -> str:
-        """ "converged", or what kept the fit from that, in words.
+        """Return "converged", or what kept the fit from that, in words.
 
         These are "images[2]: edges not explained: …", "not known: …" with numbers that the pictures hardly show, "steps ran
         out: …" and "interrupted".

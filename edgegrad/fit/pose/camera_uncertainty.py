@@ -41,11 +41,10 @@ class CameraUncertainty(Uncertainty):
 
     @property
     def unknown(self) -> str:
-        """Numbers known less exactly than to 5°, or 5 % of the scene's size with the lens as it was found; empty where all
-        are known.
+        """Return what is known less exactly than to 5°, or 5 % of the scene's size with the lens as it was found.
 
-        A number of the lens is named where its deviation moves a corner of the image by more than 3 % of its distance from
-        the principal point, or where a guess says as much as the pictures.
+        It is empty where all are known. A number of the lens is named where its deviation moves a corner of the image by more
+        than 3 % of its distance from the principal point, or where a guess says as much as the pictures.
         """
         assert self.at_lens is not None
         pose = Uncertainty(self.at_lens, self.size, self.free, most=self.most).unknown
@@ -53,7 +52,7 @@ class CameraUncertainty(Uncertainty):
 
     @property
     def words(self) -> str:
-        """The standard deviations of the pose, and of each number of the lens that was sought."""
+        """Return the standard deviations of the pose, and of each number of the lens that was sought."""
         parts = [super().words]
         if self.principal.any():
             parts.append("principal point ±{:.2g}, ±{:.2g} px".format(*self.principal.tolist()))

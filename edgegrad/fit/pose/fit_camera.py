@@ -43,8 +43,7 @@ TENSOR_OF = {
 
 @dataclass(frozen=True, eq=False)
 class CameraFit(FitResult):
-    """The result of fit_camera(), a FitResult: the cameras, and the search for them, in which the scene moved before cameras at
-    rest.
+    """The result of fit_camera(), a FitResult: the cameras, and the search, in which the scene moved before cameras at rest.
 
     `history` has a Record of each step: the loss, comparable within one level of the image pyramid; the cameras, float64, by
     the names that fit_scene() has for them ("cameras.0.world_to_camera", and "cameras.0.K" and "cameras.0.distortion" where
@@ -66,7 +65,7 @@ class CameraFit(FitResult):
 
     @property
     def camera(self) -> Camera:
-        """The first camera."""
+        """Return the first camera."""
         return self.cameras[0]
 
     @property
@@ -75,15 +74,18 @@ class CameraFit(FitResult):
 
     @property
     def reason(self) -> str:
-        """The reason as PoseFit has it, or "not known: …" with the numbers of pose and lens that the pictures hardly show."""
+        """Return the reason as PoseFit has it, or "not known: …" with numbers of pose and lens that the pictures hardly show."""
         known = self.uncertainty
         if known is None or not known.unknown:
             return self.search.reason
         return reason_with(replace(self.search, uncertainty=None, converged=True).reason, known)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """Write history.json, camera.json for load_camera (of several cameras camera-0.json and so on) and what PoseFit.save
-        writes; return the names. Raises OSError, or at last ImportError when matplotlib or pillow is missing."""
+        """Write the result to a folder, and return the names of the files. Raises OSError, ImportError.
+
+        They are history.json, camera.json for load_camera (of several cameras camera-0.json and so on) and what PoseFit.save
+        writes. ImportError comes at last, when matplotlib or pillow is missing.
+        """
         Path(folder).mkdir(parents=True, exist_ok=True)
         several = len(self.cameras) > 1
         own = [f"camera-{i}.json" if several else "camera.json" for i in range(len(self.cameras))]

@@ -83,7 +83,7 @@ class PoseFit(FitResult):
 
     @property
     def reason(self) -> str:
-        """ "converged", or what kept the fit from that, in words.
+        """Return "converged", or what kept the fit from that, in words.
 
         These are "edges not explained: …", "hidden: …", "in one place: …", "ambiguous: …", "directions unknown: …", "steps
         ran out: …" and "interrupted".
@@ -102,8 +102,10 @@ class PoseFit(FitResult):
         return f"directions unknown: {self.uncertainty.unknown}; {fix}"
 
     def plot(self, most: int = 4) -> Figure:
-        """Draw target | start | fit | difference, a row for each of at most so many pictures; with a mask all over black, as
-        they were compared."""
+        """Draw target | start | fit | difference, a row for each of at most so many pictures.
+
+        With a mask they are all over black, as they were compared.
+        """
         return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(self, most=most)
 
     def plot_history(self) -> Figure:
@@ -131,8 +133,7 @@ class PoseFit(FitResult):
         return self.task is not None and bool(self.history)
 
     def to_json(self) -> str:
-        """Return JSON text with the pose, `mesh_to_world` 4 × 4 by rows for column vectors, the camera, and figures of the
-        fit."""
+        """Return JSON text with the pose, `mesh_to_world` 4 × 4 by rows for column vectors, the camera, and figures."""
         camera = self.camera
         content = {
             "mesh_to_world": self.matrix.tolist(), "scale": self.scale,

@@ -51,22 +51,22 @@ class Uncertainty:
 
     @property
     def degrees(self) -> float:
-        """The deviation of the rotation about the axis about which it is known least."""
+        """Return the deviation of the rotation about the axis about which it is known least."""
         return math.degrees(float(self._rotation[0]))
 
     @property
     def axis(self) -> Tensor:
-        """The axis (3,) of this rotation, in the world, of length 1."""
+        """Return the axis (3,) of this rotation, in the world, of length 1."""
         return self._rotation[1]
 
     @property
     def shift(self) -> float:
-        """The deviation of the centre along the direction in which it is known least, world units."""
+        """Return the deviation of the centre along the direction in which it is known least, world units."""
         return float(_widest(self.covariance[3:, 3:])[0])
 
     @property
     def direction(self) -> Tensor:
-        """The direction (3,) of this shift, in the world, of length 1."""
+        """Return the direction (3,) of this shift, in the world, of length 1."""
         return _widest(self.covariance[3:, 3:])[1]
 
     @property
@@ -94,8 +94,10 @@ class Uncertainty:
 
     @property
     def unknown(self) -> str:
-        """Numbers known less exactly than to `most` degrees, 5 % of the object's size, or 3 % of the focal length, in words;
-        empty where all are known."""
+        """Return what is known less exactly than to `most` degrees, 5 % of the object's size, or 3 % of the focal length.
+
+        It is in words, and empty where all are known.
+        """
         parts = []
         if self.degrees > self.most:
             parts.append(f"rotation about {_named(self.axis)} known to ±{self.degrees:.0f}° only")

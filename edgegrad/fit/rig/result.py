@@ -54,21 +54,22 @@ class RigFit(FitResult):
     )
 
     def posed(self) -> Scene | Mesh:
+        """Return the rig's meshes in the pose that was found."""
         return self.rig.posed(**self.values)
 
     @property
     def bones(self) -> Tensor | None:
-        """The bones, see Rig.bones()."""
+        """Return the bones, see Rig.bones()."""
         return self.rig.bones(self.values)
 
     @property
     def converged(self) -> bool:
-        """Whether Fit.converged holds, and the pictures show each joint of the fit, and how it is rotated."""
+        """Return whether Fit.converged holds, and the pictures show each joint of the fit, and how it is rotated."""
         return self.fit.converged and not self.missed and self.left_out < MISSED_REGION and not self._unknown
 
     @property
     def reason(self) -> str:
-        """ "converged", or what kept the fit from that, in words; see Fit.reason."""
+        """Return "converged", or what kept the fit from that, in words; see Fit.reason."""
         if not self.fit.converged:
             return self.fit.reason
         if self.missed:
@@ -93,7 +94,7 @@ class RigFit(FitResult):
 
     @property
     def missed(self) -> list[str]:
-        """The joints of whose edges the pictures show too few: they lie in another place."""
+        """Return the joints of whose edges the pictures show too few: they lie in another place."""
         if not self.explained_joints:
             return []
         least = max(MIN_EDGE_SUPPORT, SHARE_OF_MEDIAN * statistics.median(self.explained_joints.values()))

@@ -41,7 +41,7 @@ class JointUncertainty:
 
     @property
     def unknown(self) -> str:
-        """The joints that are known less exactly than to 5°, in words, the worst first; empty where there are none."""
+        """Return the joints that are known less exactly than to 5°, in words, the worst first; empty where there are none."""
         worst = sorted(
             (name for name, d in self.degrees.items() if d > MAX_JOINT_DEGREES), key=lambda name: -self.degrees[name]
         )
