@@ -14,6 +14,7 @@ from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
+from edgegrad.fit.options import DESCENT_OPTIONS, POSE_OPTIONS, UNUSED, Settings
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
 from edgegrad.fit.pose.photo.depth import warn_of_units
@@ -301,3 +302,16 @@ def test_pictures_of_a_texture_have_its_channels():
     mesh = eg.Mesh(verts, faces, texture=torch.rand(4, 4, 3), uvs=corners, uv_faces=faces)
     with pytest.raises(ValueError, match="images: expected 3 channels like the mesh's texture, got 4"):
         fit_texture(mesh, torch.rand(16, 16, 4), camera(16), options=quiet(steps=1))
+
+
+@pytest.mark.parametrize("used", [POSE_OPTIONS, DESCENT_OPTIONS, ("max_size", "spp")])
+def test_options_that_a_fit_does_not_use_are_refused(used):
+    values = dict.fromkeys(UNUSED, 8) | dict.fromkeys(("step_tolerance", "loss_tolerance"), 0.5)
+    values |= {"loss": "l1", "mask_loss": "l1", "method": "adam", "callback": print, "checkpoint": "fit.pt"}
+    for name, value in (values | {"sampling": eg.Sampling(), "shadows": True}).items():
+        given = FitOptions(seed=0, **{name: value})
+        if name in used:
+            Settings.from_options(given, "this", used)
+        else:
+            with pytest.raises(ValueError, match=rf"options\.{name}: this .*; leave it out"):
+                Settings.from_options(given, "this", used)
