@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
@@ -15,6 +14,7 @@ from ...scene.scene import Scene
 from ..checkpoints import CheckpointFile
 from ..history import Record
 from ..losses import REGION
+from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..parameter import Parameter
 from ..placement import Coordinates, Placement, PoseParameter
@@ -72,6 +72,7 @@ def reporter(
     return progress
 
 
+@in_full_precision
 def fit_scene(
     scene: Scene | Mesh | Callable[[Values], Any],
     images: Images | None,
@@ -133,8 +134,6 @@ def make_optimizer(parameters: Mapping[str, Parameter], options: Settings) -> Op
     return {"adam": AdamOptimizer, "gauss-newton": GaussNewtonOptimizer}[options.method](parameters, options)
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def fit_views(
     build: Build,
     views: list[Observation],

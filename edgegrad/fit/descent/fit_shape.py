@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
@@ -19,6 +18,7 @@ from ..history import Record
 from ..laplacian import LaplacianSolver
 from ..losses import REGION
 from ..measured import Measured
+from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..parameter import Parameter
 from ..placement import Coordinates
@@ -65,6 +65,7 @@ class Refinement:
             check_positive_int("refinement.faces", self.faces)
 
 
+@in_full_precision
 def fit_shape(
     mesh: Mesh,
     images: Images | None,
@@ -141,8 +142,6 @@ class _ShapeFit:
         self.views, self.options, self.how, self.appearance = views, options, how, appearance
         self.masked, self.regularizer = masked, regularizer
 
-    @torch.inference_mode(False)
-    @torch.enable_grad()
     def run(self, mesh: Mesh) -> Fit:
         start, level, history, seconds = mesh, 0, [], 0.0
         given = {"mesh": mesh, "refinement": self.how, **self.options.of_steps}

@@ -27,6 +27,7 @@ from ..by_camera import one_for_each
 from ..checkpoints import Checkpoint
 from ..ending import Ending
 from ..history import Record, history_rows, number_or_none
+from ..modes import in_full_precision
 from ..options import MIN_PICTURE_SIDE, POSE_OPTIONS, FitOptions, Settings
 from ..result import FitResult, chosen
 from ..views import Images, cameras_of, check_image
@@ -176,6 +177,7 @@ class Calibration(FitResult):
         return all(fit.search.history for fit in self.fits)
 
 
+@in_full_precision
 def calibrate(
     mesh: Mesh | Scene,
     images: Images | None,
@@ -265,8 +267,6 @@ def _file(checkpoint: Checkpoint | PathLike | None, k: int) -> Checkpoint | None
     return replace(whole, path=path, resume=whole.resume and (k == 0 or Path(path).exists()))
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def _adjust(fits: list[CameraFit], given: list[Camera], settings: Settings, began: float) -> Calibration:
     """Refine all poses and the lens together, from the fits of single pictures."""
     searches, history = [fit.search for fit in fits], list[Record]()

@@ -20,6 +20,7 @@ from ...files.paths import PathLike, write_json
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..history import Record, history_rows
+from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..result import FitResult, delegated
 from ..views import Images, cameras_of
@@ -115,6 +116,7 @@ class CameraFit(FitResult):
         return Record(number, step.loss, {name: math.sqrt(square) for name, square in squares.items()}, values)
 
 
+@in_full_precision
 def fit_camera(
     scene: Mesh | Scene,
     images: Images | None,
@@ -176,8 +178,6 @@ def fit_camera(
     return fitted(found) if found.interrupted else finished(found, given, settings)
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def finished(search: PoseFit, cameras: Sequence[Camera], settings: Settings) -> CameraFit:
     """Finish a search by some steps of all numbers at once, and add their uncertainty."""
     began, task = time.perf_counter(), search.task

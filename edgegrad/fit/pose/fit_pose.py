@@ -25,6 +25,7 @@ from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
 from ..by_camera import numbered, one_for_each
 from ..checkpoints import CheckpointFile, traits
+from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..row_order import MIN_IOU_GAIN, warn_of_flipped_rows
 from ..views import Images, cameras_of
@@ -45,8 +46,7 @@ MOST_STARTS = 1000
 Search = bool | int | Literal["global"]
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
+@in_full_precision
 def fit_pose(
     mesh: Mesh | Scene,
     images: Images | None,
@@ -108,8 +108,6 @@ def fit_pose(
     )
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def search_pose(
     mesh: Mesh | Scene, images: object, cameras: object, masks: object, init: object, lens: Unknowns, weights: object,
     depths: object, names: ArgumentNames, settings: Settings, search: Search = True, symmetries: Symmetries | None = None,

@@ -16,6 +16,7 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
 from ..by_camera import numbered, one_for_each
+from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
 from .fit_pose import ambiguity, depth_images, symmetries_of
@@ -31,8 +32,7 @@ INSIDE = 64  # Number of vertices of a mesh that are tested for lying in another
 INNER_SCALE = 0.9  # At the end, they are tested at this share of their distance from their mean.
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
+@in_full_precision
 def fit_poses(
     meshes: Sequence[Mesh | Scene],
     images: Images,

@@ -76,8 +76,6 @@ class CoarseToFine:
         if options.loss == REGION:
             self.tried = self.tried[-1:]  # Coarse contours show little.
 
-    @torch.inference_mode(False)
-    @torch.enable_grad()
     def run(self) -> RigFit:
         parameters = self.free.parameters
         values = self.free.start
