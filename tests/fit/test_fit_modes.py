@@ -1,4 +1,4 @@
-"""Fits run with gradients and in full precision, whatever modes of torch they are called in."""
+"""Fits run in full precision, whatever modes of torch they are called in, and whatever their callbacks do."""
 
 from contextlib import contextmanager
 
@@ -7,7 +7,8 @@ import torch
 from brackets import START, bracket, camera, picture, silhouette
 from quiet_fits import quiet
 
-from edgegrad.fit import fit_pose, fit_scene
+import edgegrad as eg
+from edgegrad.fit import fit_pose, fit_poses, fit_scene
 
 
 @contextmanager
@@ -51,3 +52,37 @@ def test_colours_are_the_same_in_all_modes(mode):
     expected = found()["face_colors"]
     with MODES[mode]():
         assert torch.allclose(found()["face_colors"], expected)
+
+
+def test_a_callback_may_change_what_it_gets():
+    view, mesh = camera(24), bracket()
+    image = picture(view)
+
+    def pose(fit):
+        for tensor in (fit.R, fit.t, fit.camera.K, fit.cameras[0].world_to_camera):
+            tensor.mul_(2.0)
+
+    def found(callback):
+        options = quiet(steps=2, spp=4, callback=callback)
+        return fit_pose(mesh, image, view, init=START, search=False, options=options).matrix
+
+    assert torch.equal(found(pose), found(None))
+
+    def several(callback):
+        options = quiet(steps=2, spp=4, callback=callback)
+        return fit_poses([mesh], image, view, init=[START], search=False, options=options)[0].matrix
+
+    assert torch.equal(several(lambda fits: pose(fits[0])), several(None))
+
+    def scene(progress):
+        progress.scene.meshes[0].verts.mul_(2.0)
+        progress.cameras[0].K.mul_(2.0)
+        progress.values["background"].mul_(2.0)
+
+    def colour(callback):
+        start, options = eg.Scene([mesh], torch.zeros(3)), quiet(steps=3, spp=4, callback=callback)
+        return fit_scene(start, image, view, {"background": 0.03}, options=options)
+
+    changed, kept = colour(scene), colour(None)
+    assert torch.equal(changed.values["background"], kept.values["background"])
+    assert torch.equal(changed.history[1].values["background"], kept.history[1].values["background"])

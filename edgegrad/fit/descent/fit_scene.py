@@ -11,6 +11,7 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ...scene.tree import map_tensors
 from ..checkpoints import CheckpointFile
 from ..history import Record
 from ..losses import REGION
@@ -54,8 +55,9 @@ class Progress(Record):
 
     @cached_property
     def _built(self) -> Built:
-        # The next step changes the values in place.
-        return build_detached(self._build, {name: value.detach().clone() for name, value in self._values.items()})
+        # The next step changes the values in place, and the callback may change all that it gets.
+        built = build_detached(self._build, {name: value.detach().clone() for name, value in self._values.items()})
+        return map_tensors(built, Tensor.clone)
 
 
 def reporter(
@@ -65,6 +67,7 @@ def reporter(
     """Return a function that makes a Progress of a step's record and the tensors after it."""
 
     def progress(record: Record, values: Values) -> Progress:
+        record = record._replace(values={name: value.clone() for name, value in record.values.items()})
         made = Progress(*(record if coordinates is None else coordinates.recorded(record)))
         made.views, made._values, made._build, made._bones = views, values, build, bones
         return made

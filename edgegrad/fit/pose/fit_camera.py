@@ -19,6 +19,7 @@ from ...files.cameras import save_camera
 from ...files.paths import PathLike, write_json
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ...scene.tree import map_tensors
 from ..history import Record, history_rows
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
@@ -203,13 +204,13 @@ def ended(
 ) -> CameraFit:  # fmt: skip
     """Return a fit whose search reached another pose and lens at last, with the covariance of the entries of a step there."""
     task, known = source.task, CameraUncertainty.from_covariance(source, pose, covariance)
-    lenses = [task.lens(one, pose) for one in cameras]
+    lenses = [map_tensors(task.lens(one, pose), Tensor.clone) for one in cameras]
     last = search.history[-1]
     history = search.history if pose is last.pose else [*search.history, Step(source.level.size, loss, pose, True, {})]
     right = rests and explained >= search.enough and not search.conflict and not known.unknown
     found = replace(
-        search, R=pose.R, t=pose.t, scale=float(pose.scale), camera=lenses[0], cameras=lenses, loss=loss, explained=explained,
-        history=history, steps=len(history), uncertainty=known, converged=right,
+        search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=lenses[0], cameras=lenses, loss=loss,
+        explained=explained, history=history, steps=len(history), uncertainty=known, converged=right,
     )  # fmt: skip
     return fitted(found, known)
 

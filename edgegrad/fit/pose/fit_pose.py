@@ -23,6 +23,7 @@ from ...check import as_tensor, check_flag, check_float, check_int, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
+from ...scene.tree import map_tensors
 from ..by_camera import numbered, one_for_each
 from ..checkpoints import CheckpointFile, traits
 from ..modes import in_full_precision
@@ -163,17 +164,17 @@ def search_pose(
         if settings.checkpoint is not None:
             file.write({"replay_log": log.state(), "seconds": seconds()})
 
-    def result() -> PoseFit:
+    def result() -> PoseFit:  # A callback may change its tensors in place.
         best: Pose = state.best if symmetries is None else state.best.closest(symmetries, start)
         history = list(state.history)
-        cameras = [task.lens(one, best) for one in given_cameras]
+        cameras = [map_tensors(task.lens(one, best), Tensor.clone) for one in given_cameras]
         known = None
         if state.information is not None:
             known = Uncertainty.from_information(task, best, state.information, task.dofs, symmetries)
         conflict = ambiguity(best, state.ambiguous, symmetries, task)
         sure = state.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
-            best.R, best.t, float(best.scale), cameras[0], state.loss, len(history), seconds(), sure, interrupted,
+            best.R.clone(), best.t.clone(), float(best.scale), cameras[0], state.loss, len(history), seconds(), sure, interrupted,
             state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough,
         )  # fmt: skip
 

@@ -15,6 +15,7 @@ from ...check import as_tensor, check_flag, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
+from ...scene.tree import map_tensors
 from ..by_camera import numbered, one_for_each
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
@@ -107,7 +108,7 @@ def fit_poses(
     state = PosesSearch(tasks, starts, measured, settings, check_flag("search", search))
     interrupted = False
 
-    def results() -> list[PoseFit]:
+    def results() -> list[PoseFit]:  # A callback may change their tensors in place.
         found = []
         for k, task in enumerate(tasks):
             own = known_symmetries[k]
@@ -120,9 +121,10 @@ def fit_poses(
             conflict = _conflict(tasks, state.best, k) if information is not None else ""
             conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
             sure = state.converged[k] and not interrupted and not conflict and not unknown
+            seen = [map_tensors(one, Tensor.clone) for one in views]
             found.append(PoseFit(
-                best.R, best.t, float(best.scale), views[0], state.loss, len(history), time.perf_counter() - began,
-                sure, interrupted, state.edge_support[k], history, task, views, known, state.visible[k], conflict,
+                best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), time.perf_counter() - began,
+                sure, interrupted, state.edge_support[k], history, task, seen, known, state.visible[k], conflict,
                 state.needed[k],
             ))  # fmt: skip
         return found
