@@ -29,7 +29,7 @@ from ..ending import Ending
 from ..history import Record, history_rows, number_or_none
 from ..modes import in_full_precision
 from ..options import MIN_PICTURE_SIDE, POSE_OPTIONS, FitOptions, Settings
-from ..result import FitResult, chosen
+from ..result import FitResult, chosen, made_folder
 from ..views import Images, cameras_of, check_image
 from .bundle_adjustment import Adjustment, adjust_bundle, poses_of
 from .camera_uncertainty import CameraUncertainty
@@ -142,8 +142,7 @@ class Calibration(FitResult):
 
         Each file is written whole or not at all. Raises OSError, or at last ImportError when matplotlib is missing.
         """
-        out = Path(folder)
-        out.mkdir(parents=True, exist_ok=True)
+        out = made_folder(folder)
         written = ["calibration.json", "history.json"]
         write_json(out / "calibration.json", self._summary())
         write_json(out / "history.json", history_rows(self.history))

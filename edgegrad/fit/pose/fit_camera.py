@@ -23,7 +23,7 @@ from ...scene.tree import map_tensors
 from ..history import Record, history_rows
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
-from ..result import FitResult, delegated
+from ..result import FitResult, delegated, made_folder
 from ..views import Images, cameras_of
 from .bundle_adjustment import MAX_ADJUST_STEPS, adjust_bundle
 from .camera_uncertainty import CameraUncertainty
@@ -88,11 +88,11 @@ class CameraFit(FitResult):
         They are history.json, camera.json for load_camera (of several cameras camera-0.json and so on) and what PoseFit.save
         writes. ImportError comes at last, when matplotlib or pillow is missing.
         """
-        Path(folder).mkdir(parents=True, exist_ok=True)
+        out = made_folder(folder)
         several = len(self.cameras) > 1
         own = [f"camera-{i}.json" if several else "camera.json" for i in range(len(self.cameras))]
         for name, camera in zip(own, self.cameras, strict=True):
-            save_camera(Path(folder) / name, camera)
+            save_camera(out / name, camera)
         own.append(self.write_history(folder))
         return [*own, *self.search.save(folder, figures)]
 
