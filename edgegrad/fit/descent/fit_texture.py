@@ -43,8 +43,11 @@ def fit_texture(
     ----------
     mesh : Mesh
         With texture coordinates, as unwrap() makes them. Its texture, if it has one, is where the fit starts.
-    images, cameras, masks, weights, regularizer
+    images, cameras, weights, regularizer
         As of fit_scene().
+    masks : Tensor or sequence of Tensor, optional
+        (H, W) each, 1 on the mesh and 0 elsewhere. Outside of them pictures are compared over black, so they must show the
+        whole mesh: what hides a part of it belongs into `weights`, as 0.
     size : int or (int, int), default 512
         Texels on a side, or (h, w).
     lr : float, default 0.05

@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...camera.camera import Camera
-from ...check import as_tensor, check_flag, check_float, check_int, check_shape
+from ...check import as_int, as_tensor, check_flag, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
@@ -44,6 +44,7 @@ from .task import PoseTask, Unknowns
 from .uncertainty import MAX_SHIFT, Uncertainty
 
 MOST_STARTS = 1000
+SEARCHES = f'True, False, a number of starts from 2 to {MOST_STARTS}, or "global"'
 Search = bool | int | Literal["global"]
 
 
@@ -263,7 +264,7 @@ def _check_search(search: object, init: object, cameras: Sequence[Camera], name:
     """Raise TypeError or ValueError for a search that does not go with the other arguments."""
     if isinstance(search, str):
         if search != "global":
-            raise ValueError(f'search: expected True, False, a number of starts or "global", got {search!r}')
+            raise ValueError(f"search: expected {SEARCHES}, got {search!r}")
         if init is not None:
             raise ValueError(
                 f'search: expected a number with {name}, got "global", which searches for the object in the whole picture; '
@@ -274,7 +275,12 @@ def _check_search(search: object, init: object, cameras: Sequence[Camera], name:
                 f'search: expected a perspective or orthographic camera for "global", got a {cameras[0].projection}; give {name}'
             )
     elif not isinstance(search, bool):
-        check_int("search", search, 2, MOST_STARTS)
+        try:
+            number = as_int("search", search)
+        except TypeError:
+            raise TypeError(f"search: expected {SEARCHES}, got {type(search).__name__} ({search!r})") from None
+        if not 2 <= number <= MOST_STARTS:
+            raise ValueError(f"search: expected {SEARCHES}, got {number}")
 
 
 def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -> Symmetries | None:
