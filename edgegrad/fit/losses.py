@@ -170,7 +170,7 @@ def loss_of(name: str, loss: str | Loss) -> Loss:
     if not isinstance(loss, str):
         raise TypeError(f"{name}: expected a name or a function of image, target and weight, got {type(loss).__name__}")
     if loss not in LOSSES:
-        known = ", ".join([*LOSSES, REGION] if name == "loss" else LOSSES)
+        known = ", ".join([*LOSSES, REGION] if name == "options.loss" else LOSSES)
         raise ValueError(f"{name}: expected one of {known}, or a function, got {loss!r}")
     return LOSSES[loss]
 
