@@ -59,7 +59,13 @@ def test_a_callback_may_change_what_it_gets():
     image = picture(view)
 
     def pose(fit):
-        for tensor in (fit.R, fit.t, fit.camera.K, fit.cameras[0].world_to_camera):
+        for tensor in (
+            fit.R,
+            fit.t,
+            fit.camera.K,
+            fit.cameras[0].world_to_camera,
+            *(step.pose.R for step in fit.history),
+        ):
             tensor.mul_(2.0)
 
     def found(callback):

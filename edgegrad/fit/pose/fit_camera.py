@@ -31,7 +31,7 @@ from .fit_pose import search_pose
 from .inputs import ArgumentNames
 from .loss_model import ColorLoss, LossSource, loss_source
 from .pose import Pose
-from .result import PoseFit, Step
+from .result import PoseFit, Step, with_own_history
 from .task import STEP_PARTS, Unknowns
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ def ended(
         search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=lenses[0], cameras=lenses, loss=loss,
         explained=explained, history=history, steps=len(history), uncertainty=known, converged=right,
     )  # fmt: skip
-    return fitted(found, known)
+    return fitted(with_own_history(found), known)
 
 
 def fitted(search: PoseFit, uncertainty: CameraUncertainty | None = None) -> CameraFit:

@@ -39,7 +39,7 @@ from .photo.multi_start import MultiStartSearch, Report, around, everywhere
 from .photo.photo_search import SAME_POSE_ANGLE, PhotoSearch
 from .pose import Pose, angle, pose_from_matrix
 from .replay_log import ReplayLog
-from .result import PoseFit
+from .result import PoseFit, with_own_history
 from .task import PoseTask, Unknowns
 from .uncertainty import MAX_SHIFT, Uncertainty
 
@@ -189,7 +189,7 @@ def search_pose(
             bar.total = None  # The number of later steps is not known.
         bar.update()
         if settings.callback is not None:
-            settings.callback(result())
+            settings.callback(with_own_history(result()))
         if settings.checkpoint is not None and log.steps % settings.checkpoint.every == 0:
             keep()
 

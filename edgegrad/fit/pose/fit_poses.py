@@ -25,7 +25,7 @@ from .inputs import ArgumentNames, check_in_front, check_seen
 from .photo.depth import warn_of_units
 from .photo.poses_search import PosesSearch
 from .pose import Pose, pose_from_matrix
-from .result import PoseFit
+from .result import PoseFit, with_own_history
 from .task import PoseTask, Unknowns
 from .uncertainty import Uncertainty
 
@@ -137,7 +137,7 @@ def fit_poses(
         )
         bar.update()
         if settings.callback is not None:
-            settings.callback(results())
+            settings.callback([with_own_history(one) for one in results()])
 
     state.after_step = after_step
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -167,6 +167,12 @@ class PoseFit(FitResult):
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
         flags = bool(data["converged"]), bool(data["interrupted"])
         return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags, share, uncertainty=known)
+
+
+def with_own_history(fit: PoseFit) -> PoseFit:
+    """Return the fit with copies of its history's poses: a fit that goes on needs them, and a callback may change them."""
+    steps = [step._replace(pose=Pose(*(part.clone() for part in step.pose))) for step in fit.history]
+    return replace(fit, history=steps)
 
 
 def pose_from_json(text: str) -> Pose:
