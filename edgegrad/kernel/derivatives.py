@@ -14,7 +14,6 @@ def transformed() -> bool:
     return functorch.peek_interpreter_stack() is not None
 
 
-@torch.compiler.assume_constant_result
 def _compiles_wrongly() -> bool:
     """Return, as torch.compile traces, whether it would take derivatives for zero: it does not trace those of an operator but
     for one torch.func.grad, or torch.vmap, alone."""
@@ -22,6 +21,10 @@ def _compiles_wrongly() -> bool:
     kinds = [level.key() for level in functorch.get_interpreter_stack() or ()]
     kind = functorch.TransformType
     return kind.Jvp in kinds or (kind.Grad in kinds and len(kinds) > 1)
+
+
+# torch.compiler.assume_constant_result() does the same, and imports the compiler.
+setattr(_compiles_wrongly, "_dynamo_marked_constant", True)  # noqa: B010  no attribute that type checkers know
 
 
 def check_compiled() -> None:
