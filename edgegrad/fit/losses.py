@@ -170,7 +170,7 @@ def loss_of(name: str, loss: str | Loss) -> Loss:
     if not isinstance(loss, str):
         raise TypeError(f"{name}: expected a name or a function of image, target and weight, got {type(loss).__name__}")
     if loss not in LOSSES:
-        known = ", ".join([*LOSSES, REGION] if name == "loss" else LOSSES)
+        known = ", ".join([*LOSSES, REGION] if name == "options.loss" else LOSSES)
         raise ValueError(f"{name}: expected one of {known}, or a function, got {loss!r}")
     return LOSSES[loss]
 
@@ -188,6 +188,11 @@ def _checked(name: str, loss: Loss) -> Loss:
         if not isinstance(found, Tensor) or found.numel() != 1:
             got = f"shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
             raise ValueError(f"{name}: expected a function that gives a tensor of one number, got {got}; take its mean")
+        if image.requires_grad and torch.is_grad_enabled() and not found.requires_grad:
+            raise ValueError(
+                f"{name}: expected a number with a gradient by the image, got one that does not depend on it; compute it with "
+                "torch from `image`, without detach(), item(), NumPy or no_grad()"
+            )
         return found.reshape(())
 
     return checked

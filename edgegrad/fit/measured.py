@@ -166,7 +166,7 @@ def _pixel_width(name: str, pictures: Mapping[int, tuple[Tensor, Tensor]], camer
         camera, seen = cameras[i], value[weight[..., 0] > 0]
         if not len(seen):
             continue
-        away = torch.ones(1)
+        away = torch.ones(1, dtype=torch.float32)
         if camera.projection != "orthographic":
             if name == "positions":
                 pose = camera.world_to_camera.float()

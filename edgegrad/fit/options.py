@@ -47,7 +47,8 @@ class FitOptions:
     Parameters
     ----------
     steps : int
-        Largest number of steps; of fits on several levels, on each.
+        Largest number of steps. A fit on several levels takes up to so many on each level, which may run again, and each search
+        or restart takes as many again.
     step_tolerance : float
         Poses and cameras: a step is short below this, in radians, sizes of the object, and logarithms of scale and focal
         length.

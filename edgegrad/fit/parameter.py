@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_finite, check_float, check_positive
+from ..check import as_tensor, check_finite, check_flag, check_float, check_positive
 
 
 @dataclass(frozen=True)
@@ -37,19 +37,20 @@ class Parameter:
         check_positive(f"{name}: lr", self.lr, least=0.0, most=1e30)
         if self.value is None:
             raise ValueError(f"{name}: expected a value to start from, got None; give Parameter(lr, value)")
-        value = as_tensor(name, self.value, floating=True).detach().cpu().clone()
+        value = as_tensor(f"{name}: value", self.value, like=torch.empty(0, dtype=torch.float32)).detach().cpu().clone()
         check_float(name, value)
         check_finite(name, value)
-        if self.low is not None and self.high is not None:
-            low, high = torch.as_tensor(self.low), torch.as_tensor(self.high)
-            if bool((low > high).any()):
-                raise ValueError(f"{name}: expected low ≤ high, got {self.low} and {self.high}")
-        if not torch.equal(self.within(value), value):
+        check_flag(f"{name}: uniform", self.uniform)
+        low, high = (_bound(f"{name}: {end}", getattr(self, end), value) for end in ("low", "high"))
+        if low is not None and high is not None and bool((low > high).any()):
+            raise ValueError(f"{name}: expected low ≤ high, got {self.low} and {self.high}")
+        found = replace(self, value=value, low=low, high=high)
+        if not torch.equal(found.within(value), value):
             raise ValueError(
                 f"{name}: expected a start within low and high, {self.low} and {self.high}, got {float(value.min()):g} to "
                 f"{float(value.max()):g}; clamp it first"
             )
-        return replace(self, value=value)
+        return found
 
     def within(self, value: Tensor) -> Tensor:
         low, high = (
@@ -57,3 +58,21 @@ class Parameter:
             for b in (self.low, self.high)
         )
         return value if low is None and high is None else value.clamp(low, high)
+
+
+def _bound(name: str, given: object, value: Tensor) -> Tensor | None:
+    """Return a bound of a value as a tensor that broadcasts to it. Raises TypeError or ValueError."""
+    if given is None:
+        return None
+    bound = as_tensor(name, given, like=value).detach().cpu().to(value.dtype)
+    if bool(bound.isnan().any()):
+        raise ValueError(f"{name}: expected a number, got NaN; leave it out where there is no bound")
+    try:
+        fits = torch.broadcast_shapes(bound.shape, value.shape) == value.shape
+    except RuntimeError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"{name}: expected a number or a shape that broadcasts to {tuple(value.shape)}, got shape {tuple(bound.shape)}"
+        )
+    return bound

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..camera.poses import check_rotation, rigid, rotation
-from ..check import check_finite, check_positive, check_shape
+from ..check import as_tensor, check_finite, check_positive, check_shape
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..scene.symmetries import Symmetries
@@ -130,7 +130,10 @@ def _checked(name: str, init: Any) -> Pose:
         return Pose(torch.eye(3, dtype=f64), torch.zeros(3, dtype=f64))
     if not isinstance(init, tuple) or not 2 <= len(init) <= 6:
         return pose_from_matrix(f"{name}: init", getattr(init, "matrix", init))
-    R, t, scale = (torch.as_tensor(x).detach().cpu().to(f64, copy=True) for x in Pose(*init)[:3])
+    R, t, scale = (
+        as_tensor(f"{name}: {part}", x).detach().cpu().to(f64, copy=True)
+        for part, x in zip(("R", "t", "scale"), Pose(*init), strict=False)
+    )
     for part, value, shape in (("R", R, (3, 3)), ("t", t, (3,)), ("scale", scale, ())):
         check_shape(f"{name}: {part}", value, shape)
         check_finite(f"{name}: {part}", value)

@@ -70,7 +70,7 @@ class Palette:
         self.colors = colors
         self._table: Tensor | None = None
         if colors.shape[1] == 3:
-            middle = (torch.arange(self.CELLS) + 0.5) / self.CELLS
+            middle = (torch.arange(self.CELLS, dtype=torch.float32) + 0.5) / self.CELLS
             self._table = self._nearest(torch.cartesian_prod(middle, middle, middle))
 
     def labels(self, display: Tensor) -> Tensor:
@@ -114,7 +114,7 @@ class Windows:
         h, w = size
         cell = max(1.0, radius / CELLS)
         self.shape = math.ceil(h / cell), math.ceil(w / cell)
-        rows, columns = (torch.arange(h) / cell).long(), (torch.arange(w) / cell).long()
+        rows, columns = ((torch.arange(n, dtype=torch.float32) / cell).long() for n in size)
         self.size = h, w
         self.count = len(colors)
         self._index = label * (self.shape[0] * self.shape[1]) + (rows[:, None] * self.shape[1] + columns).flatten()
@@ -123,7 +123,7 @@ class Windows:
 
     def frequencies(self, share: Tensor) -> Tensor:
         """Return the frequency (h, w) of each pixel's colour in its window, among what `share` (h, w) weights."""
-        counted = torch.zeros(self.count * self.shape[0] * self.shape[1])
+        counted = torch.zeros(self.count * self.shape[0] * self.shape[1], dtype=torch.float32)
         counted.index_add_(0, self._index, share.flatten())
         rows = self._kernel.T @ counted.reshape(self.count, -1)
         windows = smoothed(rows.reshape(self.count, *self.shape), self.WIDTH)
@@ -132,7 +132,7 @@ class Windows:
 
     def present(self, share: Tensor) -> Tensor:
         """Return 1 where a pixel's window has any weight of `share` (h, w), 0 where it has hardly a pixel, as (h, w)."""
-        cells = torch.zeros(self.shape[0] * self.shape[1])
+        cells = torch.zeros(self.shape[0] * self.shape[1], dtype=torch.float32)
         cell = self._index % (self.shape[0] * self.shape[1])
         cells.index_add_(0, cell, share.flatten())
         windows = smoothed(cells.reshape(1, *self.shape), self.WIDTH).flatten()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..files.paths import PathLike
@@ -65,3 +67,19 @@ def delegated(part: str, names: str) -> list[Any]:
 def chosen(count: int, most: int) -> list[int]:
     """Return at most so many numbers below `count`, evenly apart."""
     return sorted({round(k * (count - 1) / max(1, min(most, count) - 1)) for k in range(min(most, count))})
+
+
+def made_folder(folder: object) -> Path:
+    """Return the path of a folder, which is made if missing. Raises TypeError or OSError."""
+    if not isinstance(folder, (str, os.PathLike)):
+        raise TypeError(f"folder: expected a path, got {type(folder).__name__}; give the folder to write to")
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise FileExistsError(
+            f"folder: expected a folder, got a file of that name, {path}; give another name, or remove the file"
+        ) from None
+    except OSError as error:
+        raise OSError(f"folder: expected a folder to write to, got {path} ({error.strerror})") from error
+    return path

@@ -158,7 +158,7 @@ def region_views(views: Sequence[Observation]) -> list[Observation]:
 def _counted(measured: dict[str, Measurement], mask: Tensor | None, weight: Tensor | None) -> dict[str, Measurement]:
     """Multiply measurements by the weights of the view's pixels, and drop those where the mask is not full: a depth there may
     be the object's, that of what lies behind, or between."""
-    count = torch.ones(()) if weight is None else weight
+    count = torch.ones((), dtype=torch.float32) if weight is None else weight
     count = count if mask is None else count * (mask > FULL)
     return {name: replace(one, weight=one.weight * count) for name, one in measured.items()}
 

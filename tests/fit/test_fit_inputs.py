@@ -315,3 +315,11 @@ def test_options_that_a_fit_does_not_use_are_refused(used):
         else:
             with pytest.raises(ValueError, match=rf"options\.{name}: this .*; leave it out"):
                 Settings.from_options(given, "this", used)
+
+
+@pytest.mark.parametrize("search", [None, 0, 1, 10**6])
+def test_a_search_that_is_none_is_named(taken, search):
+    view, image = taken
+    message = r"search: expected True, False, a number of starts from 2 to 1000, or .global., got "
+    with pytest.raises((TypeError, ValueError), match=message):
+        fit_pose(bracket(), image, view, search=search)

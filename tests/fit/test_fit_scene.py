@@ -3,6 +3,7 @@
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
 from brackets import BACKGROUND, bracket
@@ -55,7 +56,7 @@ def test_finds_named_tensors_each_at_its_rate():
     assert fit.converged and fit.reason == "converged" and fit.explained > 0.95
     torch.testing.assert_close(fit.values["background"], BACKGROUND, atol=0.01, rtol=0)
     assert float((fit.mesh.face_colors - mesh.face_colors).abs().median()) < 0.02
-    assert seen == fit.history and fit.steps == len(seen) < 250
+    assert [record.loss for record in seen] == [record.loss for record in fit.history] and fit.steps == len(seen) < 250
     assert set(seen[0].gradient) == {"meshes.0.face_colors", "background"} and min(seen[0].gradient.values()) > 0
     assert torch.equal(seen[0].values["background"], torch.zeros(3)) and seen[-1].rate < seen[0].rate == 1.0
     assert fit.loss < 0.01 * seen[0].loss
@@ -295,6 +296,45 @@ def test_saves_the_materials_it_found(tmp_path):
         ({"weights": torch.zeros(2, 32, 32)}, ValueError, "weights: expected numbers above 0 somewhere"),
         ({"masks": torch.zeros(2, 32, 32)}, ValueError, "masks: expected numbers above 0 somewhere"),
         ({"parameters": {"background": Parameter(0.1, high=0.01)}}, ValueError, "background: expected a start within"),
+        ({"parameters": {"cameras.0.world_to_camera": 0.1}}, ValueError, "expected 'cameras.0.pose' to move a camera"),
+        ({"parameters": {0: 0.1}}, TypeError, "parameters: expected names of what is sought as str, got int (0)"),
+        ({"parameters": {"background": Parameter(0.1, 1.0)}}, ValueError, "background: expected shape (3,), got ()"),
+        (
+            {"parameters": {"background": Parameter(0.1, [0.1, 0.2])}},
+            ValueError,
+            "background: expected shape (3,), got (2,)",
+        ),
+        ({"parameters": {"background": Parameter(0.1, "0")}}, TypeError, "background: value: expected a tensor, array"),
+        ({"parameters": {"background": Parameter(0.1, [math.nan] * 3)}}, ValueError, "background: "),
+        ({"parameters": {"background": Parameter("0")}}, TypeError, "background: lr: expected a number, got str"),
+        (
+            {"parameters": {"background": Parameter(0.1, low="0")}},
+            TypeError,
+            "background: low: expected a tensor, array",
+        ),
+        (
+            {"parameters": {"background": Parameter(0.1, high=math.nan)}},
+            ValueError,
+            "background: high: expected a number",
+        ),
+        (
+            {"parameters": {"background": Parameter(0.1, low=[0.0, 0.0])}},
+            ValueError,
+            "background: low: expected a number or",
+        ),
+        (
+            {
+                "scene": lambda values: eg.Scene([bracket()], values["background"].detach()),
+                "parameters": {"background": Parameter(0.1, BACKGROUND)},
+            },
+            ValueError,
+            "scene: expected a function whose scene depends on the parameters background",
+        ),
+        (
+            {"loss": lambda image, target, weight: (image - target).detach().square().mean()},
+            ValueError,
+            "options.loss: expected a number with a gradient by the image",
+        ),
     ],
 )
 def test_errors_name_the_argument(change, error, message):
@@ -308,6 +348,40 @@ def test_errors_name_the_argument(change, error, message):
             **{**arranged(**arguments), **(change if "options" in change else arranged(**{**arguments, **change}))}
         )
     assert message in str(caught.value)
+
+
+def test_numbers_and_lists_are_values_and_bounds():
+    cameras = views(1, 16)
+    target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
+    wanted = {"background": Parameter(0.1, [0.0, 0.0, 0.0], low=0, high=np.full(3, 0.15))}
+    fit = fit_scene(eg.Scene([bracket()], BACKGROUND), target, cameras, wanted, **arranged(steps=5, **QUIET))
+    assert float(fit.values["background"].min()) > 0.0 and float(fit.values["background"].max()) <= 0.151
+
+
+def test_views_that_do_not_show_what_is_sought_change_nothing():
+    cameras = views(2, 16)
+    target = pictures(bracket(), cameras)
+    fit = fit_scene(bracket(), target, cameras, {"cameras.0.K": 1e-3}, **arranged(views_per_step=1, steps=4, **QUIET))
+    assert fit.steps == 4
+
+
+def test_unknown_names_are_not_answered_with_what_cannot_be_sought():
+    cameras = views(1, 16)
+    with pytest.raises(ValueError, match=r"cameras\.0\.K") as caught:
+        fit_scene(bracket(), torch.zeros(16, 16, 3), cameras, {"cameras.0.k": 0.1})
+    assert "world_to_camera" not in str(caught.value)
+
+
+def test_a_folder_that_is_a_file_is_named(tmp_path):
+    cameras = views(1, 16)
+    fit = fit_scene(bracket(), pictures(bracket(), cameras), cameras, {"verts": 1e-3}, **arranged(steps=1, **QUIET))
+    (tmp_path / "file.glb").write_text("")
+    with pytest.raises(FileExistsError, match="folder: expected a folder, got a file of that name"):
+        fit.save(tmp_path / "file.glb")
+    with pytest.raises(OSError, match="folder: expected a folder to write to"):
+        fit.save(tmp_path / "file.glb" / "out")
+    with pytest.raises(TypeError, match="folder: expected a path, got NoneType"):
+        fit.save(None)
 
 
 def test_the_best_values_are_not_those_of_the_easiest_views():

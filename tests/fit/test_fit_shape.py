@@ -75,3 +75,11 @@ def test_a_shape_resumes_on_a_later_level(tmp_path):
     whole = fit_shape(ball(1), None, cameras, **arranged(**options))
     assert again.steps == whole.steps == 12
     torch.testing.assert_close(again.mesh.verts, whole.mesh.verts, rtol=0, atol=1e-6)
+
+
+def test_colours_without_an_appearance_are_named():
+    cameras, masks = egg_views()
+    mesh = ball(1).replace(face_colors=torch.full((len(ball(1).faces), 1), 0.5))
+    images = [mask.reshape(*mask.shape[:2], 1).expand(-1, -1, 3) for mask in masks]
+    with pytest.warns(UserWarning, match="mesh: expected bare vertices and faces, got colours.*appearance="):
+        fit_shape(mesh, images, cameras, refinement=Refinement(levels=1), **arranged(steps=1, **QUIET))

@@ -223,8 +223,8 @@ def check_pointwise(objective: Objective) -> None:
     if objective.regions is not None:
         return
     generator = torch.Generator().manual_seed(0)
-    target = torch.rand(1, 16, 16, 3, generator=generator)
-    r = 0.2 * (0.1 + torch.rand(target.shape, generator=generator))
+    target = torch.rand(1, 16, 16, 3, generator=generator, dtype=torch.float32)
+    r = 0.2 * (0.1 + torch.rand(target.shape, generator=generator, dtype=torch.float32))
     some = (torch.rand(16, 16, generator=generator) < 0.5)[..., None].expand_as(target)
     for option, name in (("loss", "image"), ("mask_loss", "alpha")):
         if not any(name in view.aovs for view in objective.views):

@@ -6,15 +6,16 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ...scene.tree import map_tensors
 from ..checkpoints import CheckpointFile
 from ..history import Record
 from ..losses import REGION
+from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..parameter import Parameter
 from ..placement import Coordinates, Placement, PoseParameter
@@ -54,8 +55,9 @@ class Progress(Record):
 
     @cached_property
     def _built(self) -> Built:
-        # The next step changes the values in place.
-        return build_detached(self._build, {name: value.detach().clone() for name, value in self._values.items()})
+        # The next step changes the values in place, and the callback may change all that it gets.
+        built = build_detached(self._build, {name: value.detach().clone() for name, value in self._values.items()})
+        return map_tensors(built, Tensor.clone)
 
 
 def reporter(
@@ -65,6 +67,7 @@ def reporter(
     """Return a function that makes a Progress of a step's record and the tensors after it."""
 
     def progress(record: Record, values: Values) -> Progress:
+        record = record._replace(values={name: value.clone() for name, value in record.values.items()})
         made = Progress(*(record if coordinates is None else coordinates.recorded(record)))
         made.views, made._values, made._build, made._bones = views, values, build, bones
         return made
@@ -72,6 +75,7 @@ def reporter(
     return progress
 
 
+@in_full_precision
 def fit_scene(
     scene: Scene | Mesh | Callable[[Values], Any],
     images: Images | None,
@@ -133,8 +137,6 @@ def make_optimizer(parameters: Mapping[str, Parameter], options: Settings) -> Op
     return {"adam": AdamOptimizer, "gauss-newton": GaussNewtonOptimizer}[options.method](parameters, options)
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def fit_views(
     build: Build,
     views: list[Observation],

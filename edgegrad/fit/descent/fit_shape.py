@@ -6,19 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ...warnings import warn
 from ..checkpoints import CheckpointFile
 from ..ending import Ending
 from ..history import Record
 from ..laplacian import LaplacianSolver
 from ..losses import REGION
 from ..measured import Measured
+from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..parameter import Parameter
 from ..placement import Coordinates
@@ -65,6 +66,7 @@ class Refinement:
             check_positive_int("refinement.faces", self.faces)
 
 
+@in_full_precision
 def fit_shape(
     mesh: Mesh,
     images: Images | None,
@@ -127,6 +129,13 @@ def fit_shape(
     views = views_of(cameras, images, masks, weights, measured)
     if settings.loss == REGION:
         views = region_views(views)
+    compared = settings.loss != REGION and any(view.image is not None for view in views)
+    if compared and appearance is None and mesh.channels is not None:
+        warn(
+            "colours of fit_shape",
+            "mesh: expected bare vertices and faces, got colours, which fit_shape leaves out; make what is rendered of each mesh "
+            "by appearance=, as a function of it, or give masks in place of images",
+        )
     bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())
     return _ShapeFit(views, settings, how, appearance or (lambda mesh: mesh), masks is not None, regularizer).run(bare)
 
@@ -141,8 +150,6 @@ class _ShapeFit:
         self.views, self.options, self.how, self.appearance = views, options, how, appearance
         self.masked, self.regularizer = masked, regularizer
 
-    @torch.inference_mode(False)
-    @torch.enable_grad()
     def run(self, mesh: Mesh) -> Fit:
         start, level, history, seconds = mesh, 0, [], 0.0
         given = {"mesh": mesh, "refinement": self.how, **self.options.of_steps}
@@ -192,7 +199,7 @@ class _ShapeFit:
         def build(values: Mapping[str, Tensor]) -> tuple[Scene, list[Camera]]:
             return self.scene(mesh.replace(verts=smooth(values["verts"]))), [view.camera for view in views]
 
-        objective = Objective(build, views, self.options, self.regularizer)
+        objective = Objective(build, views, self.options, self.regularizer, builder="appearance")
         first = smooth.to_differential(mesh.verts)
         if level == 0 and saved is None:
             objective.check({"verts": first})

@@ -13,6 +13,7 @@ from ...check import check_positive, check_positive_int
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..losses import REGION
+from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..parameter import Parameter
 from ..views import Images, views_of
@@ -22,6 +23,7 @@ from .result import Fit
 COARSEST_TEXELS = 4  # on a side
 
 
+@in_full_precision
 def fit_texture(
     mesh: Mesh,
     images: Images,
@@ -41,8 +43,11 @@ def fit_texture(
     ----------
     mesh : Mesh
         With texture coordinates, as unwrap() makes them. Its texture, if it has one, is where the fit starts.
-    images, cameras, masks, weights, regularizer
+    images, cameras, weights, regularizer
         As of fit_scene().
+    masks : Tensor or sequence of Tensor, optional
+        (H, W) each, 1 on the mesh and 0 elsewhere. Outside of them pictures are compared over black, so they must show the
+        whole mesh: what hides a part of it belongs into `weights`, as 0.
     size : int or (int, int), default 512
         Texels on a side, or (h, w).
     lr : float, default 0.05
@@ -94,7 +99,9 @@ def fit_texture(
             f"images: expected {shape.texture.shape[-1]} channels like the mesh's texture, got {C}; read them with "
             f"read_image(path, channels={shape.texture.shape[-1]}), and give their alpha as masks"
         )
-    first = torch.full((h, w, C), 0.5) if shape.texture is None else resampled(shape.texture, (h, w))
+    first = (
+        torch.full((h, w, C), 0.5, dtype=torch.float32) if shape.texture is None else resampled(shape.texture, (h, w))
+    )
     behind = None if masks is not None else background
 
     def build(values: dict[str, Tensor]) -> tuple[Scene, list[Camera]]:
@@ -106,7 +113,9 @@ def fit_texture(
     sizes = [(h, w)]
     while min(sizes[-1]) > COARSEST_TEXELS:
         sizes.append((max(1, sizes[-1][0] // 2), max(1, sizes[-1][1] // 2)))
-    levels = {f"level{k}": Parameter(lr / len(sizes), torch.zeros(*s, C)) for k, s in enumerate(sizes)}
+    levels = {
+        f"level{k}": Parameter(lr / len(sizes), torch.zeros(*s, C, dtype=torch.float32)) for k, s in enumerate(sizes)
+    }
     given = {"mesh": shape, "size": (h, w), "lr": lr, "background": behind}
     return fit_views(build, views, levels, settings, given, regularizer)
 

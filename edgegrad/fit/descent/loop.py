@@ -87,6 +87,8 @@ class Optimizer:
             value.copy_(self.parameters[name].within(values[name]))
 
     def gradients(self, loss: Tensor) -> dict[str, Tensor | None]:
+        if not loss.requires_grad:  # None of the step's views shows what is sought.
+            return dict.fromkeys(self.values)
         found = torch.autograd.grad(loss, list(self.values.values()), allow_unused=True)
         return dict(zip(self.values, found, strict=True))
 

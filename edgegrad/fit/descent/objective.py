@@ -11,6 +11,7 @@ from torch import Tensor
 from ...aovs import render_aovs
 from ...camera.camera import Camera
 from ...scene.scene import Scene
+from ...scene.tree import tensors_in
 from ..losses import REGION, loss_of
 from ..measured import measured_loss
 from ..options import Settings
@@ -27,12 +28,12 @@ class Objective:
     def __init__(
         self, build: Callable[[Tensors], Built], views: list[Observation], options: Settings,
         regularizer: Callable[[Scene], Tensor] | None = None, prior: Callable[[Tensors], Tensor] | None = None,
-        build_batch: Callable[[Tensors], Sequence[Built]] | None = None,
+        build_batch: Callable[[Tensors], Sequence[Built]] | None = None, builder: str = "scene",
     ) -> None:  # fmt: skip
         """`regularizer` of the scene and `prior` of the tensors are added to the loss. `build_batch` is `build` for a batch of
-        values, where that is faster."""
+        values, where that is faster. `builder` is the user's argument that makes the scene."""
         self.build, self.views, self.options, self.regularizer, self.prior = build, views, options, regularizer, prior
-        self.build_batch = build_batch
+        self.build_batch, self.builder = build_batch, builder
         self.losses = {"alpha": loss_of("options.mask_loss", options.mask_loss)}
         self.regions = RegionLoss(views, options.seed) if options.loss == REGION else None
         if options.loss != REGION:
@@ -40,6 +41,7 @@ class Objective:
 
     def __call__(self, tensors: Tensors, step: int) -> Tensor:
         scene, cameras = self.build(tensors)
+        self._check_graph(tensors, (scene, cameras))
         picks = self.picks(step)
         total = torch.zeros((), dtype=torch.float64)
         for group, renders in self.renders(scene, cameras, picks, self.options.spp, self.seed(step)):
@@ -52,6 +54,15 @@ class Objective:
                 total = total + self.measured_group_loss(name, group, renders) / len(picks)
         total = total if self.regularizer is None else total + self.regularizer(scene)
         return total if self.prior is None else total + self.prior(tensors)
+
+    def _check_graph(self, tensors: Tensors, built: Built) -> None:
+        """Check that the scene or its cameras have a gradient where the tensors have one. Raises ValueError."""
+        sought = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors.values())
+        if sought and not any(tensor.requires_grad for tensor in tensors_in(built)):
+            raise ValueError(
+                f"{self.builder}: expected a function whose scene depends on the parameters {', '.join(tensors)}, got one that "
+                "depends on none; compute it with torch from what it is given, without detach(), item(), NumPy or no_grad()"
+            )
 
     def residual(self, tensors: Tensors) -> float:
         """Return the loss of pictures and masks over the part of it that the noise of the render's samples makes."""

@@ -45,13 +45,13 @@ class RegionLoss:
         self.labels = [own.labels(display) for display, own in zip(self.displays, self.palettes, strict=True)]
         most = max((float(view.weight.max()) for view in views if view.weight is not None), default=1.0)
         self.weights = [None if view.weight is None else view.weight[..., 0] / most for view in views]
-        self.near = [torch.zeros(view.camera.size) for view in views]
-        self.posteriors = [torch.full(view.camera.size, 0.5) for view in views]
+        self.near = [torch.zeros(view.camera.size, dtype=torch.float32) for view in views]
+        self.posteriors = [torch.full(view.camera.size, 0.5, dtype=torch.float32) for view in views]
         self.sides: list[ContourColors | None] = [None for _ in views]
         self.blur = LEAST_BLUR
         self.narrows = False  # whether alpha is blurred more than at later steps
         self._losses = [
-            torch.zeros(len(CONTOUR_BLURS)) for _ in views
+            torch.zeros(len(CONTOUR_BLURS), dtype=torch.float32) for _ in views
         ]  # of each view's contour, for each of CONTOUR_BLURS
 
     def renew(self, index: int, alpha: Tensor, step: int = FINAL_STEP) -> None:

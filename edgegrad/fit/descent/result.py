@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -25,7 +24,7 @@ from ..ending import Ending, reason_of
 from ..history import Record, history_rows, number_or_none
 from ..measured import comparable
 from ..placement import Coordinates, Pose
-from ..result import FitResult, chosen
+from ..result import FitResult, chosen, made_folder
 from ..views import Observation
 from .loop import Descent
 from .objective import Objective
@@ -126,8 +125,7 @@ class Fit(FitResult):
 
         Each file is written whole or not at all. Raises OSError, or at last ImportError if matplotlib is missing.
         """
-        out = Path(folder)
-        out.mkdir(parents=True, exist_ok=True)
+        out = made_folder(folder)
         written = ["fit.json", "values.pt", "history.json"]
         write_json(out / "fit.json", self._summary())
         with replacing(out / "values.pt") as temporary:

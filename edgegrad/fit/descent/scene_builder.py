@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...camera.poses import rigid
+from ...check import as_tensor, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors, named_tensors, with_named
@@ -27,7 +29,11 @@ class SceneTensors:
 
     def __init__(self, start: Scene | Mesh, cameras: list[Camera]) -> None:
         found = dict(named_tensors(start)) | {f"cameras.{name}": tensor for name, tensor in named_tensors(cameras)}
-        self.tensors = {name: tensor for name, tensor in found.items() if tensor.is_floating_point()}
+        found = {name: tensor for name, tensor in found.items() if tensor.is_floating_point()}
+        # Numbers of a matrix that move apart from one another are soon no rotation.
+        fixed = [name for name in found if name.startswith("cameras.") and name.endswith(".world_to_camera")]
+        self.tensors = {name: tensor for name, tensor in found.items() if name not in fixed}
+        self.posed = {name: name.replace("world_to_camera", "pose") for name in fixed}  # what to seek in their place
         meshes = {"": start} if isinstance(start, Mesh) else {f"meshes.{i}.": m for i, m in enumerate(start.meshes)}
         self.movable = {f"{name}pose": mesh for name, mesh in meshes.items()}
         self.movable |= {f"cameras.{i}.pose": start for i in range(len(cameras))}
@@ -105,6 +111,16 @@ def checked_parameters(parameters: object, known: SceneTensors | None) -> dict[s
         raise ValueError("parameters: expected a name or more of what is sought, got none; nothing would change")
     found: dict[str, Parameter | Placement] = {}
     for name, given in parameters.items():
+        if not isinstance(name, str):
+            raise TypeError(
+                f"parameters: expected names of what is sought as str, got {type(name).__name__} ({name!r})"
+            )
+        if known is not None and name in known.posed:
+            pose = known.posed[name]
+            raise ValueError(
+                f"parameters: expected {pose!r} to move a camera, got {name!r}, whose numbers would not stay a rotation; give "
+                f"{{{pose!r}: PoseParameter()}}"
+            )
         if isinstance(given, PoseParameter):
             found[name] = _placement(name, given, known)
             continue
@@ -123,10 +139,9 @@ def checked_parameters(parameters: object, known: SceneTensors | None) -> dict[s
                     f"parameters: expected names among {', '.join(names)}, got {name!r}{suggestion(name, names)}"
                 )
             value = known.tensors[name]
-            if parameter.value is None:
-                parameter = Parameter(parameter.lr, value, parameter.low, parameter.high, parameter.uniform)
-            elif parameter.value.shape != value.shape:
-                raise ValueError(f"{name}: expected shape {tuple(value.shape)}, got {tuple(parameter.value.shape)}")
+            own = value if parameter.value is None else as_tensor(f"{name}: value", parameter.value, like=value)
+            check_shape(name, own, tuple(value.shape), fix="the shape of the scene's tensor")
+            parameter = replace(parameter, value=own)
         found[name] = parameter.checked(name)
     return found
 

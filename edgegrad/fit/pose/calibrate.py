@@ -27,8 +27,9 @@ from ..by_camera import one_for_each
 from ..checkpoints import Checkpoint
 from ..ending import Ending
 from ..history import Record, history_rows, number_or_none
+from ..modes import in_full_precision
 from ..options import MIN_PICTURE_SIDE, POSE_OPTIONS, FitOptions, Settings
-from ..result import FitResult, chosen
+from ..result import FitResult, chosen, made_folder
 from ..views import Images, cameras_of, check_image
 from .bundle_adjustment import Adjustment, adjust_bundle, poses_of
 from .camera_uncertainty import CameraUncertainty
@@ -141,8 +142,7 @@ class Calibration(FitResult):
 
         Each file is written whole or not at all. Raises OSError, or at last ImportError when matplotlib is missing.
         """
-        out = Path(folder)
-        out.mkdir(parents=True, exist_ok=True)
+        out = made_folder(folder)
         written = ["calibration.json", "history.json"]
         write_json(out / "calibration.json", self._summary())
         write_json(out / "history.json", history_rows(self.history))
@@ -176,6 +176,7 @@ class Calibration(FitResult):
         return all(fit.search.history for fit in self.fits)
 
 
+@in_full_precision
 def calibrate(
     mesh: Mesh | Scene,
     images: Images | None,
@@ -265,8 +266,6 @@ def _file(checkpoint: Checkpoint | PathLike | None, k: int) -> Checkpoint | None
     return replace(whole, path=path, resume=whole.resume and (k == 0 or Path(path).exists()))
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def _adjust(fits: list[CameraFit], given: list[Camera], settings: Settings, began: float) -> Calibration:
     """Refine all poses and the lens together, from the fits of single pictures."""
     searches, history = [fit.search for fit in fits], list[Record]()

@@ -19,9 +19,11 @@ from ...files.cameras import save_camera
 from ...files.paths import PathLike, write_json
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ...scene.tree import map_tensors
 from ..history import Record, history_rows
+from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
-from ..result import FitResult, delegated
+from ..result import FitResult, delegated, made_folder
 from ..views import Images, cameras_of
 from .bundle_adjustment import MAX_ADJUST_STEPS, adjust_bundle
 from .camera_uncertainty import CameraUncertainty
@@ -86,11 +88,11 @@ class CameraFit(FitResult):
         They are history.json, camera.json for load_camera (of several cameras camera-0.json and so on) and what PoseFit.save
         writes. ImportError comes at last, when matplotlib or pillow is missing.
         """
-        Path(folder).mkdir(parents=True, exist_ok=True)
+        out = made_folder(folder)
         several = len(self.cameras) > 1
         own = [f"camera-{i}.json" if several else "camera.json" for i in range(len(self.cameras))]
         for name, camera in zip(own, self.cameras, strict=True):
-            save_camera(Path(folder) / name, camera)
+            save_camera(out / name, camera)
         own.append(self.write_history(folder))
         return [*own, *self.search.save(folder, figures)]
 
@@ -115,6 +117,7 @@ class CameraFit(FitResult):
         return Record(number, step.loss, {name: math.sqrt(square) for name, square in squares.items()}, values)
 
 
+@in_full_precision
 def fit_camera(
     scene: Mesh | Scene,
     images: Images | None,
@@ -176,8 +179,6 @@ def fit_camera(
     return fitted(found) if found.interrupted else finished(found, given, settings)
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def finished(search: PoseFit, cameras: Sequence[Camera], settings: Settings) -> CameraFit:
     """Finish a search by some steps of all numbers at once, and add their uncertainty."""
     began, task = time.perf_counter(), search.task
@@ -203,13 +204,13 @@ def ended(
 ) -> CameraFit:  # fmt: skip
     """Return a fit whose search reached another pose and lens at last, with the covariance of the entries of a step there."""
     task, known = source.task, CameraUncertainty.from_covariance(source, pose, covariance)
-    lenses = [task.lens(one, pose) for one in cameras]
+    lenses = [map_tensors(task.lens(one, pose), Tensor.clone) for one in cameras]
     last = search.history[-1]
     history = search.history if pose is last.pose else [*search.history, Step(source.level.size, loss, pose, True, {})]
     right = rests and explained >= search.enough and not search.conflict and not known.unknown
     found = replace(
-        search, R=pose.R, t=pose.t, scale=float(pose.scale), camera=lenses[0], cameras=lenses, loss=loss, explained=explained,
-        history=history, steps=len(history), uncertainty=known, converged=right,
+        search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=lenses[0], cameras=lenses, loss=loss,
+        explained=explained, history=history, steps=len(history), uncertainty=known, converged=right,
     )  # fmt: skip
     return fitted(found, known)
 

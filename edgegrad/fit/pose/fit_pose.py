@@ -19,12 +19,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...camera.camera import Camera
-from ...check import as_tensor, check_flag, check_float, check_int, check_shape
+from ...check import as_int, as_tensor, check_flag, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
+from ...scene.tree import map_tensors
 from ..by_camera import numbered, one_for_each
 from ..checkpoints import CheckpointFile, traits
+from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..row_order import MIN_IOU_GAIN, warn_of_flipped_rows
 from ..views import Images, cameras_of
@@ -42,11 +44,11 @@ from .task import PoseTask, Unknowns
 from .uncertainty import MAX_SHIFT, Uncertainty
 
 MOST_STARTS = 1000
+SEARCHES = f'True, False, a number of starts from 2 to {MOST_STARTS}, or "global"'
 Search = bool | int | Literal["global"]
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
+@in_full_precision
 def fit_pose(
     mesh: Mesh | Scene,
     images: Images | None,
@@ -108,8 +110,6 @@ def fit_pose(
     )
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
 def search_pose(
     mesh: Mesh | Scene, images: object, cameras: object, masks: object, init: object, lens: Unknowns, weights: object,
     depths: object, names: ArgumentNames, settings: Settings, search: Search = True, symmetries: Symmetries | None = None,
@@ -165,17 +165,17 @@ def search_pose(
         if settings.checkpoint is not None:
             file.write({"replay_log": log.state(), "seconds": seconds()})
 
-    def result() -> PoseFit:
+    def result() -> PoseFit:  # A callback may change its tensors in place.
         best: Pose = state.best if symmetries is None else state.best.closest(symmetries, start)
         history = list(state.history)
-        cameras = [task.lens(one, best) for one in given_cameras]
+        cameras = [map_tensors(task.lens(one, best), Tensor.clone) for one in given_cameras]
         known = None
         if state.information is not None:
             known = Uncertainty.from_information(task, best, state.information, task.dofs, symmetries)
         conflict = ambiguity(best, state.ambiguous, symmetries, task)
         sure = state.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
-            best.R, best.t, float(best.scale), cameras[0], state.loss, len(history), seconds(), sure, interrupted,
+            best.R.clone(), best.t.clone(), float(best.scale), cameras[0], state.loss, len(history), seconds(), sure, interrupted,
             state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough,
         )  # fmt: skip
 
@@ -264,7 +264,7 @@ def _check_search(search: object, init: object, cameras: Sequence[Camera], name:
     """Raise TypeError or ValueError for a search that does not go with the other arguments."""
     if isinstance(search, str):
         if search != "global":
-            raise ValueError(f'search: expected True, False, a number of starts or "global", got {search!r}')
+            raise ValueError(f"search: expected {SEARCHES}, got {search!r}")
         if init is not None:
             raise ValueError(
                 f'search: expected a number with {name}, got "global", which searches for the object in the whole picture; '
@@ -275,7 +275,12 @@ def _check_search(search: object, init: object, cameras: Sequence[Camera], name:
                 f'search: expected a perspective or orthographic camera for "global", got a {cameras[0].projection}; give {name}'
             )
     elif not isinstance(search, bool):
-        check_int("search", search, 2, MOST_STARTS)
+        try:
+            number = as_int("search", search)
+        except TypeError:
+            raise TypeError(f"search: expected {SEARCHES}, got {type(search).__name__} ({search!r})") from None
+        if not 2 <= number <= MOST_STARTS:
+            raise ValueError(f"search: expected {SEARCHES}, got {number}")
 
 
 def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -> Symmetries | None:

@@ -15,7 +15,9 @@ from ...check import as_tensor, check_flag, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
+from ...scene.tree import map_tensors
 from ..by_camera import numbered, one_for_each
+from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
 from .fit_pose import ambiguity, depth_images, symmetries_of
@@ -31,8 +33,7 @@ INSIDE = 64  # Number of vertices of a mesh that are tested for lying in another
 INNER_SCALE = 0.9  # At the end, they are tested at this share of their distance from their mean.
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
+@in_full_precision
 def fit_poses(
     meshes: Sequence[Mesh | Scene],
     images: Images,
@@ -107,7 +108,7 @@ def fit_poses(
     state = PosesSearch(tasks, starts, measured, settings, check_flag("search", search))
     interrupted = False
 
-    def results() -> list[PoseFit]:
+    def results() -> list[PoseFit]:  # A callback may change their tensors in place.
         found = []
         for k, task in enumerate(tasks):
             own = known_symmetries[k]
@@ -120,9 +121,10 @@ def fit_poses(
             conflict = _conflict(tasks, state.best, k) if information is not None else ""
             conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
             sure = state.converged[k] and not interrupted and not conflict and not unknown
+            seen = [map_tensors(one, Tensor.clone) for one in views]
             found.append(PoseFit(
-                best.R, best.t, float(best.scale), views[0], state.loss, len(history), time.perf_counter() - began,
-                sure, interrupted, state.edge_support[k], history, task, views, known, state.visible[k], conflict,
+                best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), time.perf_counter() - began,
+                sure, interrupted, state.edge_support[k], history, task, seen, known, state.visible[k], conflict,
                 state.needed[k],
             ))  # fmt: skip
         return found

@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -19,7 +18,7 @@ from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..ending import Ending, reason_of
 from ..history import number_or_none
-from ..result import FitResult
+from ..result import FitResult, made_folder
 from .pose import Pose, pose_from_matrix
 from .uncertainty import MAX_FOCAL, Uncertainty
 
@@ -117,8 +116,7 @@ class PoseFit(FitResult):
         The folder is made where it is missing, and each file is written whole or not at all. A fit that took no step writes
         pose.json alone. Raises OSError, or ImportError once pose.json is written when matplotlib or pillow is missing.
         """
-        out = Path(folder)
-        out.mkdir(parents=True, exist_ok=True)
+        out = made_folder(folder)
         write_text(out / "pose.json", self.to_json() + "\n")
         if not self.history or not figures:
             return ["pose.json"]

@@ -210,5 +210,5 @@ class Comparison:
 
     def _open(self, shot: TargetView, c: float) -> Tensor:
         """Return the weight of uncovered shares in the residual of a picture."""
-        count = torch.ones(()) if shot.weight is None else shot.weight
+        count = torch.ones((), dtype=torch.float32) if shot.weight is None else shot.weight
         return count.sqrt() * math.sqrt(COVERAGE_REWARD) * c

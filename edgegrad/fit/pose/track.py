@@ -22,6 +22,7 @@ from ...files.image import read_image
 from ...files.paths import PathLike
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..modes import in_full_precision
 from ..options import FitOptions, Settings
 from ..region import Palette, palette
 from ..views import check_image
@@ -203,8 +204,7 @@ class Tracker:
         self.covered = 0.0  # share in the last picture
         self.light = LightHistory()
 
-    @torch.inference_mode(False)
-    @torch.enable_grad()
+    @in_full_precision
     def follow(self, index: int, frame: object, measured: object) -> TrackedPose:
         """Return the pose in the next picture. Raises TypeError, ValueError or OSError."""
         name = f"frames[{index}]"

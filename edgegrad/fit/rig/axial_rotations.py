@@ -54,7 +54,9 @@ def _along(
     if min(losses) >= loss_of(objective, values, CHOICE_SEEDS):
         return None
     found = starts[losses.index(min(losses))]
-    decreases = torch.tensor([loss_of(objective, values, [k]) - loss_of(objective, found, [k]) for k in TEST_SEEDS])
+    decreases = torch.tensor(
+        [loss_of(objective, values, [k]) - loss_of(objective, found, [k]) for k in TEST_SEEDS], dtype=torch.float32
+    )
     return (
         found if float(decreases.mean()) > MIN_Z_SCORE * float(decreases.std()) / math.sqrt(len(TEST_SEEDS)) else None
     )

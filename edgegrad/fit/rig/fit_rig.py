@@ -14,6 +14,7 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..losses import REGION
 from ..measured import Measured
+from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..parameter import Parameter
 from ..priors import Prior, checked_priors, towards
@@ -29,6 +30,7 @@ RIG_OPTIONS = (*DESCENT_OPTIONS, "coarsest")
 Appearance = Callable[..., Scene | Mesh]
 
 
+@in_full_precision
 def fit_rig(
     rig: Rig,
     images: Images | None,

@@ -76,8 +76,6 @@ class CoarseToFine:
         if options.loss == REGION:
             self.tried = self.tried[-1:]  # Coarse contours show little.
 
-    @torch.inference_mode(False)
-    @torch.enable_grad()
     def run(self) -> RigFit:
         parameters = self.free.parameters
         values = self.free.start
@@ -177,7 +175,8 @@ class CoarseToFine:
         fine = level == len(self.factors) - 1
         spp = LAST_SPP_FACTOR * spp if fine else spp
         options = dataclasses.replace(self.options, spp=spp, steps=steps)
-        objective = Objective(build, views, options, prior=prior, build_batch=self.many(views))
+        batch = self.many(views)
+        objective = Objective(build, views, options, prior=prior, build_batch=batch, builder="appearance")
         if fresh and level == 0:
             objective.check(values)
         title = f"level {level + 1} of {len(self.factors)}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -16,7 +15,7 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..descent.result import Fit
 from ..edge_support import MIN_EDGE_SUPPORT
-from ..result import FitResult, delegated
+from ..result import FitResult, delegated, made_folder
 from .uncertainty import JointUncertainty
 
 if TYPE_CHECKING:
@@ -106,8 +105,7 @@ class RigFit(FitResult):
         pose.json has all values by name, as lists, posed.glb the meshes so posed, and joints.json how much of each joint's
         edges the pictures show, and to how many degrees it is known. Raises OSError, or at last ImportError.
         """
-        out = Path(folder)
-        out.mkdir(parents=True, exist_ok=True)
+        out = made_folder(folder)
         content = {name: value.tolist() for name, value in self.values.items()}
         write_json(out / "pose.json", content)
         known = {} if self.uncertainty is None else self.uncertainty.degrees

@@ -131,7 +131,7 @@ class JointLevel:
 
     def unoccluded(self, poses: Sequence[Pose], seed: int) -> JointLevel:
         """Return the level without what covers the objects and is none of them."""
-        weights = [torch.ones(picture.size) for picture in self.objects[0].pictures]
+        weights = [torch.ones(picture.size, dtype=torch.float32) for picture in self.objects[0].pictures]
         for view in self.comparisons(poses, seed):
             if (own := occluder_weights(view)) is not None:
                 weights = [torch.minimum(a, b) for a, b in zip(weights, own, strict=True)]
@@ -157,7 +157,7 @@ class JointLevel:
         """Return the contour term of each object. Where two of them meet, each has half the weight."""
         blur = self.objects[0].blur_of_contours
         sides = [one.sides(blur) for one in seen]
-        count = torch.zeros(seen[0].picture.size)
+        count = torch.zeros(seen[0].picture.size, dtype=torch.float32)
         for one, side in zip(seen, sides, strict=True):
             count[one.box] += side.band
         return [

@@ -281,7 +281,7 @@ class PhotoLevel:
 
 def sharpest(seen: Sequence[PictureComparison]) -> float:
     """Return the one of CONTOUR_BLURS, in pixels, with which the pictures' contours are likeliest."""
-    losses = torch.zeros(len(CONTOUR_BLURS))
+    losses = torch.zeros(len(CONTOUR_BLURS), dtype=torch.float32)
     for one in seen:
         part = one.part
         losses += blur_losses(one.sides(max(CONTOUR_BLURS)), part.outlined, part.weight, one.alpha[one.box])

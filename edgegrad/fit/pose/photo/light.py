@@ -125,7 +125,7 @@ class FittedLight:
         turned = surface.motion.of_directions(n.double()).float()
         slopes_of_light = _x_first(harmonics_jvp(n, turned))[..., : self.coefficients.shape[1]]
         color = surface.channels["image"].float()[inside].T
-        curvature, gradient = torch.zeros(D, D), torch.zeros(D)
+        curvature, gradient = torch.zeros(D, D, dtype=torch.float32), torch.zeros(D, dtype=torch.float32)
         for c, light in enumerate(self.coefficients):
             moved = x * self._slopes[0, c] + y * self._slopes[1, c]
             J = torch.cat([(color[c] * (slopes_of_light @ light) - moved) * self._scale[c], self._basis[c]])

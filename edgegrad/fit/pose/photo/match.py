@@ -58,7 +58,9 @@ class Matches:
         positions, pixels = (x.repeat_interleave(k, 0) for x in (self.positions, self.pixels))
         sides = None if self.sides is None else self.sides.repeat_interleave(k, 0)
         rotations = (turns @ self.rotations[:, None]).flatten(0, 1)
-        return Matches(rotations, positions, pixels, torch.full((len(rotations),), -math.inf), sides)
+        return Matches(
+            rotations, positions, pixels, torch.full((len(rotations),), -math.inf, dtype=torch.float32), sides
+        )
 
     def distinct(self, most: int, turned: float, spacing: float, sized: float) -> Matches:
         """Return the best matches, the best first, that differ from one another. Of two whose angle is below `turned` radians,
@@ -156,7 +158,7 @@ class Mips:
             if found is None:
                 found = seen.new_empty(len(positions), *seen.shape[1:])
             found[rows] = seen
-        return torch.empty(0) if found is None else found
+        return torch.empty(0, dtype=torch.float32) if found is None else found
 
 
 def matches(task: PoseTask, seed: int, report: Callable[[str], object]) -> list[Pose]:
@@ -242,12 +244,11 @@ def _in_mask(views: TemplateViews, mips: Mips) -> Matches:
     """Match each view to the middle of the mask, at equal areas."""
     mask = mips.picture[..., -1]
     mass = mask.sum()
-    H, W = mips.size
-    rows, columns = torch.arange(H) + 0.5, torch.arange(W) + 0.5
+    rows, columns = (torch.arange(n, dtype=torch.float32) + 0.5 for n in mips.size)
     middle = torch.stack([(mask.sum(0) * columns).sum(), (mask.sum(1) * rows).sum()]) / mass.clamp(min=1e-3)
     T = views.alpha.shape[-1]
     area = views.alpha.sum((1, 2)).clamp(min=1.0)
-    grid = torch.arange(T) + 0.5
+    grid = torch.arange(T, dtype=torch.float32) + 0.5
     offset = torch.stack([(views.alpha.sum(1) * grid).sum(1), (views.alpha.sum(2) * grid).sum(1)], -1) / area[:, None]
     ratio = (mass.clamp(min=1e-3) / area).sqrt()  # pixels of the picture in one of the view
     positions = (middle + (0.5 * T - offset) * ratio[:, None]).double()

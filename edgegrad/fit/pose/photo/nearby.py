@@ -58,12 +58,11 @@ def nearby(task: PoseTask, start: Pose, seed: int) -> list[tuple[Pose, int]]:
     pixels = across(task, task.shots[0].camera, depth)
     sides = torch.tensor([EVERYWHERE, *range(OCCLUDER_SIDES)])
     n = len(sides)
-    here = Matches(
-        R.expand(n, 3, 3), position.expand(n, 2), torch.full((n,), pixels, dtype=torch.float64), torch.zeros(n), sides
-    )
+    pixels_of, scores = torch.full((n,), pixels, dtype=torch.float64), torch.zeros(n, dtype=torch.float32)
+    here = Matches(R.expand(n, 3, 3), position.expand(n, 2), pixels_of, scores, sides)
 
     def kept(found: Matches, one: Round) -> Matches:
-        turned = torch.tensor([angle(R, other) for other in found.rotations])
+        turned = torch.tensor([angle(R, other) for other in found.rotations], dtype=torch.float32)
         near = turned < MAX_TURN
         near &= (found.positions - position).norm(dim=1) < MAX_OFFSET * pixels
         near &= (found.pixels / pixels).log().abs() < math.log(MAX_ENLARGEMENT)

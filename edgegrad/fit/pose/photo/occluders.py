@@ -41,10 +41,11 @@ def at_one_side(alpha: Tensor, side: int, share: float = LEFT_OUT) -> Tensor:
     elsewhere; all 1 for EVERYWHERE."""
     h, w = alpha.shape
     angle = 2.0 * math.pi * side / OCCLUDER_SIDES
-    along = torch.arange(w) * math.cos(angle) + torch.arange(h)[:, None] * math.sin(angle)
+    rows, columns = (torch.arange(n, dtype=torch.float32) for n in (h, w))
+    along = columns * math.cos(angle) + rows[:, None] * math.sin(angle)
     inside = along[alpha > 0.5]
     if side == EVERYWHERE or not len(inside):
-        return torch.ones(h, w)
+        return torch.ones(h, w, dtype=torch.float32)
     return (along > inside.quantile(share)).float()
 
 
@@ -86,7 +87,7 @@ def occluder_weights(views: list[PictureComparison]) -> list[Tensor] | None:
     colours, or too little of them is seen."""
     found = []
     for seen in views:
-        lit, weight = seen.lit, torch.ones(seen.picture.size)
+        lit, weight = seen.lit, torch.ones(seen.picture.size, dtype=torch.float32)
         for _ in range(LIGHT_ALTERNATIONS):
             if lit is None:
                 return None

@@ -306,7 +306,7 @@ class PhotoSearch(PhotoDescent):
         last = last.focused(last.comparisons(best.pose, self.seed))
         before = len(self.history)
         weights = occluder_weights(last.comparisons(best.pose, self.seed)) or [
-            torch.ones(picture.size) for picture in last.pictures
+            torch.ones(picture.size, dtype=torch.float32) for picture in last.pictures
         ]
         # On the last level steps are small and may stop early. From nearer, those of the level before lead on by colours inside.
         levels = [last] * LAST_LEVEL_ROUNDS if self.task.colorless else [coarser, *[last] * LAST_LEVEL_ROUNDS]

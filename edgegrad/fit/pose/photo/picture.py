@@ -34,7 +34,7 @@ class Picture:
         radiance, mask = area_mean(shot.target, size), None
         if masked:
             radiance, mask = radiance[..., :-1], radiance[..., -1].clamp(0.0, 1.0)
-        weight = torch.ones(size) if shot.weight is None else area_mean(shot.weight, size)[..., 0]
+        weight = torch.ones(size, dtype=torch.float32) if shot.weight is None else area_mean(shot.weight, size)[..., 0]
         noise = PIXEL_NOISE if mask is None else mask_noise(shot.target[..., -1], size[0] / shot.target.shape[0])
         nearest = None if depth is None else F.interpolate(depth[None, None], size, mode="nearest-exact")[0, 0]
         return Picture(

@@ -64,7 +64,7 @@ class TemplateViews:
         alpha = seen["alpha"].float()
         normals = F.normalize(seen["normal"].float(), dim=-1, eps=1e-6)
         channels = task.shots[0].target.shape[-1] - ("alpha" in task.aovs and not task.clutter)
-        colors = torch.ones(*alpha.shape[:3], channels)
+        colors = torch.ones(*alpha.shape[:3], channels, dtype=torch.float32)
         if not shape_only:
             colors = linear_to_srgb((seen["image"].float() / alpha.clamp(min=1e-3)).clamp(0.0, 1.0))
         return TemplateViews(rotations, pixels, alpha[..., 0], colors, normals)
