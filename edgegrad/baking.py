@@ -130,8 +130,8 @@ def bake(
 
 def bake_pictures(
     mesh: Mesh,
-    cameras: Sequence[Camera],
     images: Sequence[Tensor],
+    cameras: Sequence[Camera],
     size: int | tuple[int, int] = 512,
     *,
     masks: Sequence[Tensor] | None = None,
@@ -146,9 +146,9 @@ def bake_pictures(
     ----------
     mesh : Mesh
         With texture coordinates that do not overlap, as unwrap() makes them.
-    cameras : sequence of Camera, one for each picture
     images : sequence of (H, W, C)
         Linear radiance.
+    cameras : sequence of Camera, one for each picture
     size : int or (h, w), default 512
         Texels.
     masks : sequence of (H, W) or (H, W, 1)
@@ -157,6 +157,9 @@ def bake_pictures(
     _check_mesh(mesh)
     if isinstance(cameras, Camera):
         raise TypeError("cameras: expected a list of cameras, one for each picture, got a Camera; use [camera]")
+    for k, camera in enumerate(cameras):
+        if not isinstance(camera, Camera):
+            raise TypeError(f"cameras[{k}]: expected a Camera, got {type(camera).__name__}; images come before cameras")
     if len(cameras) != len(images) or not len(cameras):
         raise ValueError(
             f"images: expected one for each of {len(cameras)} cameras, and at least one, got {len(images)}"

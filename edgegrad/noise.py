@@ -37,7 +37,7 @@ class NoiseEstimate:
     ----------
     noise : dict of str to float
         Relative noise of the gradient by each tensor: the root mean square deviation of one gradient from its mean, over
-        the norm of the mean. Above 1 it is a lower bound.
+        the norm of the mean. Above 1 it is a lower bound; NaN where the gradient is zero.
     uncertainty : dict of str to float
         Relative standard error of each of these numbers, as if the parts of a gradient were independent.
     image : float
@@ -83,7 +83,8 @@ class NoiseEstimate:
         wanted = self.target if target is None else check_positive("target", target, least=1e-6, most=1e6)
         if tensor is not None and tensor not in self.noise:
             raise KeyError(f"tensor: expected one of {', '.join(self.noise)}, got {tensor!r}")
-        most = max(self.noise.values()) if tensor is None else self.noise[tensor]
+        bounds = {name: noise * (1 + self.uncertainty[name]) for name, noise in self.noise.items() if noise >= 0}
+        most = max(bounds.values()) if tensor is None else bounds.get(tensor, 0.0)
         if most <= wanted:
             return self.spp
         # Samples of the gradient grow from the usual number on (csrc/estimator/default_samples.h).
@@ -92,6 +93,9 @@ class NoiseEstimate:
     def __str__(self) -> str:
         rows = [("gradient by", "noise", "±", f"spp for {_percent(self.target)}")]
         for name, noise in self.noise.items():
+            if math.isnan(noise):
+                rows.append((name, "no gradient", "", ""))
+                continue
             more = "≥ " if noise > 1 else ""
             spp = f"{'' if noise <= self.target else '≥ ' if noise > 1 else '≤ '}{self.spp_for(tensor=name):,}"
             rows.append((name, more + _percent(noise), _percent(noise * self.uncertainty[name]), spp))
@@ -111,7 +115,7 @@ def noise(
     *,
     target: float = 0.05,
     by: Mapping[str, Tensor] | None = None,
-    seeds: int = 2,
+    seeds: int = 8,
     **options: Unpack[RenderOptions],
 ) -> NoiseEstimate:
     """Estimate how noisy the gradient of a loss is, and which `spp` would lower that to a wanted noise.
@@ -126,8 +130,8 @@ def noise(
         Wanted noise, relative to the gradient.
     by : mapping of str to Tensor, optional
         Tensors, by any names, that these are computed from: a pose, say. By default all of them that require a gradient.
-    seeds : int, default 2
-        Gradients that are compared. More of them make the estimate surer, above all by tensors of few numbers.
+    seeds : int, default 8
+        Gradients that are compared. Two are enough by tensors of many numbers; by few, more make the estimate surer.
     **options
         Other arguments of render(). A seed in `sampling` is ignored, as gradients would share it.
 
@@ -144,8 +148,8 @@ def noise(
     Notes
     -----
     With n gradients of mean m, the variance is σ² = Σ ‖g − m‖² / (n − 1). The mean's own noise adds σ² / n to ‖m‖², which is
-    subtracted. Noise falls as 1/√spp or faster, so a bound by 1/√spp is safe. In a squared loss the noise of the image counts
-    too. Losses that are not quadratic add a bias, which this does not see.
+    subtracted. Noise falls as 1/√spp or faster; bounds add the standard error of σ. Rare large values, as of smooth surfaces
+    that light one another, escape it. In a squared loss the noise of the image counts too; other losses add a bias.
 
     Examples
     --------
@@ -192,6 +196,10 @@ def noise(
     with torch.no_grad():
         render(scene, camera, spp, own, **options)
     alone = time.perf_counter() - begin
+    if not any(bool(grad.any()) for grads in found for grad in grads):
+        raise ValueError(
+            f"loss: expected one that changes with {', '.join(wanted)}, got gradients of zero; does the image show them?"
+        )
     estimates = {name: _estimate(values) for name, values in zip(wanted, zip(*found, strict=True), strict=True)}
     return NoiseEstimate(
         noise={name: relative for name, (relative, _) in estimates.items()},
@@ -252,7 +260,7 @@ def _estimate(values: Sequence[Tensor]) -> tuple[float, float]:
     squares = (all_ - mean).square().sum(0) / (n - 1)
     variance, size = float(squares.sum()), float(mean.square().sum())
     if variance == 0:
-        return 0.0, 0.0
+        return (0.0 if size > 0 else math.nan), 0.0
     relative = math.sqrt(variance / max(size - variance / n, LEAST_SIGNAL * size))
     # Of n values of a normal distribution, the mean of the squared variance is (n + 1) / (n − 1) times its square.
     independent = variance**2 / float(squares.square().sum()) * (n + 1) / (n - 1)

@@ -159,6 +159,8 @@ def _shaded_terms(
     )
     if creases == "auto" and terms["boundary"].on:
         terms["creases"] = Term(False, "where what the shader asks for jumps; not counted here")
+    if lit is None and not terms["discontinuities"].on:
+        terms["discontinuities"] = Term(False, "where the shader declares some; not counted here")
     for name in ("colors", "uvs", "texels", "vertex_attributes", "face_attributes"):
         terms.pop(f"{label(name)} gradient", None)
     return terms

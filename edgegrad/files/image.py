@@ -191,7 +191,8 @@ def write_image(path: PathLike, img: Tensor) -> None:
 
     PNG, JPEG, BMP and TIFF are clipped to 0 … 1, sRGB, 8 bit, rounded to nearest, with up to 4 channels (of 2 and 4 the last
     is alpha, not gamma-corrected; JPEG holds 1 or 3). HDR is linear with 3 channels. EXR is linear float32 with any number.
-    The file appears whole or not at all; an existing one is replaced, and missing folders are made.
+    The file appears whole or not at all; an existing one is replaced, and missing folders are made. Masks, which read_mask()
+    takes as they are, are written as eg.image.srgb_to_linear(mask); depths as EXR.
 
     Parameters
     ----------
@@ -253,7 +254,7 @@ def write_image(path: PathLike, img: Tensor) -> None:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
             raise OSError(f"{path}: cannot write a {suffix} file ({oiio.geterror()})")
-        done = output.open(str(temporary), spec) and output.write_image(pixels)
+        done = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels))
         reason = _reason(output)
         if not (output.close() and done):
             raise OSError(f"{path}: cannot write the image ({reason})")

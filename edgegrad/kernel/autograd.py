@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from . import operators  # noqa: F401  defines the operators
+from .derivatives import check_compiled
 from .request import POSITIONS, SLOTS, Request, join, others_of, tensors_of
 
 FIRST_ORDER = (
@@ -21,6 +22,7 @@ FIRST_ORDER = (
 def render_image(request: Request, batched: bool) -> Tensor:
     """Return the image (B, H, W, C), or (H, W, C) unless `batched`, as a function of the request's tensors."""
     packed = request.pack()
+    check_compiled()
     if not torch.compiler.is_compiling():
         image, *_ = _RenderEager.apply(batched, *packed)
     elif any(tensor.requires_grad for tensor in tensors_of(packed)):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..camera.camera import Camera
 from ..check import values_visible
+from ..kernel.derivatives import check_compiled
 from ..kernel.first_order import Tensors, apply
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request, make_request
@@ -39,6 +40,7 @@ def lit_image(
     if not torch.compiler.is_compiling():
         moving = tuple(k for k, tensor in enumerate(tensors) if tensor.is_floating_point())
         return apply(_LitImageOperation(recipe, numbers, moving), tensors)[0]
+    check_compiled()
     size = (*(() if camera.batch is None else (request.cameras,)), *camera.size, scene.channels)
     return torch.ops.edgegrad.lit(tensors, recipe, numbers, size, _dtype(scene))
 

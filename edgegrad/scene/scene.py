@@ -115,7 +115,8 @@ class Scene:
                     raise ValueError(
                         f"lights[{i}]: expected a light, got a Mesh without emission; give it material=eg.Material(emission=…)"
                     )
-                meshes = (*meshes, light)
+                if not any(light is mesh for mesh in meshes):  # one that is both counts once
+                    meshes = (*meshes, light)
             elif isinstance(light, Light) and not isinstance(light, MeshLight):
                 if not dataclasses.is_dataclass(light):
                     raise TypeError(

@@ -121,6 +121,12 @@ def test_colours_of_a_tiff_are_not_multiplied_by_alpha(tmp_path, dtype, planes):
     np.testing.assert_allclose(read_image(tmp_path / "a.tif")[..., 0].numpy(), curve(0.25), atol=4e-3)
 
 
+def test_an_exr_of_channels_first(tmp_path):
+    values = torch.rand(3, 4, 5).permute(1, 2, 0)
+    write_image(tmp_path / "a.exr", values)
+    assert torch.equal(read_image(tmp_path / "a.exr"), values)
+
+
 def test_an_exr_stays_multiplied_and_alpha_alone_is_an_image(tmp_path):
     values = torch.tensor([[[0.5, 0.0, 0.0, 0.5], [0.1, 0.2, 0.3, 0.0]]])
     write_image(tmp_path / "a.exr", values)

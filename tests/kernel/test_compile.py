@@ -176,3 +176,29 @@ def test_compile_inductor(compiled):
         return eg.render(MESH.replace(verts=verts).transformed(t=t), CAMERA, 4, seed=0)
 
     compiled(function, [leaf(MESH.verts), leaf(torch.zeros(3, dtype=F64))], backend="inductor")
+
+
+TRANSFORMED: dict[str, Callable[[Callable[[Tensor], Tensor], Tensor], Tensor]] = {
+    "forward mode": lambda f, v: torch.func.jvp(f, (v,), (torch.ones_like(v),))[1],
+    "gradient of vmap": lambda f, v: torch.func.grad(lambda x: torch.vmap(f)(x[None]).sum())(v),
+    "vmap of gradients": lambda f, v: torch.vmap(torch.func.grad(lambda x: f(x).square().sum()))(v[None]),
+}
+
+
+@pytest.mark.parametrize("name", TRANSFORMED)
+def test_transforms_that_compile_would_take_for_zero_are_refused_or_run_as_they_are(name: str):
+    """torch.compile traces no derivative of an operator within forward mode or nested transforms: it would be zero."""
+
+    def image(verts: Tensor) -> Tensor:
+        return eg.render(MESH.replace(verts=verts), CAMERA, 4, seed=0)
+
+    def function(verts: Tensor) -> Tensor:
+        return TRANSFORMED[name](image, verts)
+
+    torch._dynamo.reset()
+    with pytest.raises(Exception, match=r"torch\.compile: expected no forward mode"):
+        torch.compile(function, fullgraph=True, backend="aot_eager")(MESH.verts)
+    torch._dynamo.reset()
+    expected, found = function(MESH.verts), torch.compile(function, backend="aot_eager")(MESH.verts)
+    assert bool(expected.any()) and torch.allclose(found, expected)
+    torch._dynamo.reset()

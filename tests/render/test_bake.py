@@ -129,10 +129,10 @@ def test_pictures_give_the_texture_back() -> None:
     shown = ball.replace(texture=truth)
     images = [eg.render(shown, camera, spp=16, seed=0) for camera in cameras]
     masks = [eg.render_aovs(shown, camera, ["alpha"], seed=0)["alpha"] for camera in cameras]
-    found = eg.textures.bake_pictures(ball, cameras, images, 64, masks=masks)
+    found = eg.textures.bake_pictures(ball, images, cameras, 64, masks=masks)
     used = eg.textures.bake(ball, lambda points: torch.ones(len(points.face), 1), 64, margin=0)[..., 0] > 0
     assert (found - truth)[used].abs().mean() < 0.02
-    one = eg.textures.bake_pictures(ball, cameras[:1], images[:1], 64)
+    one = eg.textures.bake_pictures(ball, images[:1], cameras[:1], 64)
     position = eg.textures.bake(ball, lambda points: points.position, 64)
     front = used & (position[..., 0] > 0.6)
     assert (one - truth)[front].abs().mean() < 0.02 < (one - truth)[used & ~front].abs().mean()
@@ -165,26 +165,31 @@ def test_wrong_arguments() -> None:
             "unit square, got some from 0.5 to 1.5",
         ),
         (lambda: eg.textures.bake(mesh.replace(uvs=mesh.uvs * 0.1), plain, 1), ValueError, "give a larger size"),
-        (lambda: eg.textures.bake_pictures(mesh, camera, [image]), TypeError, "cameras: expected a list"),
+        (lambda: eg.textures.bake_pictures(mesh, [image], camera), TypeError, "cameras: expected a list"),
         (
-            lambda: eg.textures.bake_pictures(mesh, [camera], [image.byte()]),
+            lambda: eg.textures.bake_pictures(mesh, [camera], [image]),
+            TypeError,
+            r"cameras\[0\]: expected a Camera, got Tensor",
+        ),
+        (
+            lambda: eg.textures.bake_pictures(mesh, [image.byte()], [camera]),
             TypeError,
             r"images\[0\]: .* srgb_to_linear",
         ),
         (
-            lambda: eg.textures.bake_pictures(mesh, [camera], [image * torch.nan]),
+            lambda: eg.textures.bake_pictures(mesh, [image * torch.nan], [camera]),
             ValueError,
             r"images\[0\]: expected finite",
         ),
-        (lambda: eg.textures.bake_pictures(mesh, ["a"], ["a.png"]), TypeError, "use read_image"),
-        (lambda: eg.textures.bake_pictures(mesh, [camera], []), ValueError, "images: expected one for each"),
-        (lambda: eg.textures.bake_pictures(mesh, [camera], [image[1:]]), ValueError, r"images\[0\]: expected shape"),
+        (lambda: eg.textures.bake_pictures(mesh, ["a.png"], [camera]), TypeError, "use read_image"),
+        (lambda: eg.textures.bake_pictures(mesh, [], [camera]), ValueError, "images: expected one for each"),
+        (lambda: eg.textures.bake_pictures(mesh, [image[1:]], [camera]), ValueError, r"images\[0\]: expected shape"),
         (
-            lambda: eg.textures.bake_pictures(mesh, [camera], [image], masks=[image]),
+            lambda: eg.textures.bake_pictures(mesh, [image], [camera], masks=[image]),
             ValueError,
             r"masks\[0\]: expected shape",
         ),
-        (lambda: eg.textures.bake_pictures(mesh, [away], [image], 4), ValueError, "cameras: expected some that see"),
+        (lambda: eg.textures.bake_pictures(mesh, [image], [away], 4), ValueError, "cameras: expected some that see"),
     ):
         with pytest.raises(error, match=words):
             call()  # pyright: ignore[reportArgumentType]
@@ -208,7 +213,7 @@ def test_faces_on_the_same_texels_are_told() -> None:
     camera = eg.Camera.look_at((0.5, 0.5, 2), (0.5, 0.5, 0), (0, 1, 0), 40.0, (8, 8))
     with pytest.warns(UserWarning, match=r"mesh: 16 of 16 texels"):
         eg.textures.bake_pictures(
-            eg.Mesh(own.verts, twice, uvs=own.uvs, uv_faces=twice), [camera], [torch.ones(8, 8, 3)], 4
+            eg.Mesh(own.verts, twice, uvs=own.uvs, uv_faces=twice), [torch.ones(8, 8, 3)], [camera], 4
         )
 
 

@@ -58,7 +58,7 @@ def test_noise_is_that_of_many_gradients(name):
     scene = before_cameras(NOISE_SCENES["faces"]()) if name == "batch" else NOISE_SCENES[name]()
     truth = relative_noise(gradients(scene, 4, range(64)))
     found = [
-        eg.noise(scene.scene, scene.camera, scene.loss, 4, seed, by={"verts": scene.leaf}, **scene.options)
+        eg.noise(scene.scene, scene.camera, scene.loss, 4, seed, by={"verts": scene.leaf}, seeds=2, **scene.options)
         for seed in range(12)
     ]
     estimate = math.sqrt(sum(each.noise["verts"] ** 2 for each in found) / len(found))
@@ -80,13 +80,14 @@ def test_noise_counts_that_of_the_image_in_a_squared_loss():
 def test_spp_for_a_noise():
     scene = NOISE_SCENES["area light"]()
     found = eg.noise(scene.scene, scene.camera, scene.loss, 16, seed=0, target=0.001)
-    noise = found.noise["meshes.0.verts"]
+    noise = found.noise["meshes.0.verts"] * (1 + found.uncertainty["meshes.0.verts"])
     assert found.spp_for() == found.spp_for(0.001) == math.ceil(16 * (noise / 0.001) ** 2)
     assert found.spp_for(1.1 * noise) == 16  # nothing to gain
     more = eg.noise(scene.scene, scene.camera, scene.loss, found.spp_for(noise / 3), seed=1)
-    assert more.noise["meshes.0.verts"] < 1.2 * noise / 3  # an upper bound, but for the error of both estimates
+    assert more.noise["meshes.0.verts"] < 1.1 * noise / 3
     few = eg.noise(scene.scene, scene.camera, scene.loss, 4, seed=0)  # below 16 the gradient's samples do not grow
-    assert few.spp_for(0.001) == math.ceil(16 * (few.noise["meshes.0.verts"] / 0.001) ** 2)
+    bound = few.noise["meshes.0.verts"] * (1 + few.uncertainty["meshes.0.verts"])
+    assert few.spp_for(0.001) == math.ceil(16 * (bound / 0.001) ** 2)
     with pytest.raises(KeyError, match=r"tensor: expected one of meshes\.0\.verts, got 'colors'"):
         found.spp_for(0.1, "colors")
     with pytest.raises(ValueError, match="target: expected"):
@@ -112,7 +113,8 @@ def test_noise_above_the_gradient_is_a_lower_bound():
     """Of two gradients that are nothing but noise."""
     estimate = noise_of([torch.tensor([1.0, 0.0]), torch.tensor([-1.0, 0.1])])
     assert 1 < estimate[0] < math.inf
-    assert noise_of([torch.zeros(3), torch.zeros(3)]) == (0.0, 0.0)
+    assert noise_of([torch.ones(3), torch.ones(3)]) == (0.0, 0.0)
+    assert math.isnan(noise_of([torch.zeros(3), torch.zeros(3)])[0])
 
 
 def test_noise_takes_seeds_as_render_does():
@@ -165,3 +167,14 @@ def test_nothing_requires_a_gradient():
     still = eg.Scene([scene.scene.meshes[0].replace(verts=scene.leaf.detach())])
     with pytest.raises(ValueError, match="scene: expected a tensor of the scene or of the camera that requires"):
         eg.noise(still, scene.camera, scene.loss)
+
+
+def test_no_gradient_is_not_a_perfect_one():
+    scene, other = NOISE_SCENES["faces"](), torch.zeros(3, requires_grad=True)
+    found = eg.noise(
+        scene.scene, scene.camera, scene.loss, 4, 0, by={"verts": scene.leaf, "other": other}, **scene.options
+    )
+    assert math.isnan(found.noise["other"]) and "no gradient" in str(found)
+    assert found.spp_for(1e-3, "verts") == found.spp_for(1e-3) > 16 and found.spp_for(1e-3, "other") == 4
+    with pytest.raises(ValueError, match="loss: expected one that changes with other, got gradients of zero"):
+        eg.noise(scene.scene, scene.camera, scene.loss, 4, 0, by={"other": other}, **scene.options)

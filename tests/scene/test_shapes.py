@@ -99,6 +99,12 @@ def test_positions_have_derivatives() -> None:
     assert torch.autograd.gradcheck(lambda c, u: eg.shapes.disc(c, u, V, 5).verts, (center, size))
 
 
+def test_a_light_that_is_a_mesh_too_counts_once() -> None:
+    lamp = eg.shapes.rectangle(material=eg.Material(emission=1.0))
+    assert len(eg.Scene([lamp], lights=[lamp]).meshes) == 1
+    assert len(eg.Scene([lamp], lights=[lamp.replace()]).meshes) == 2
+
+
 def test_with_emission_they_are_lights() -> None:
     lamp = eg.shapes.disc(material=eg.Material(base_color=0.0, emission=3.0), dtype=F64)
     camera = eg.Camera.look_at((0.0, 0.0, 4.0), (0.0, 0.0, 0.0), fov_y=20.0, size=(4, 4))
