@@ -87,7 +87,7 @@ def test_the_page_pauses_goes_on_and_stops_a_running_fit(browser):
             viewer(record)
 
         def run():
-            options = {"steps": 10**6, "tolerance": 0.0, "spp": 4, "progress": False, "callback": callback}
+            options = {"steps": 10**6, "loss_tolerance": 0.0, "spp": 4, "progress": False, "callback": callback}
             found.append(fit_scene(mesh, picture(at), at, {"face_colors": Parameter(0.002)}, **arranged(**options)))
 
         opened(browser, viewer)
