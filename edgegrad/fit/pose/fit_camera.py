@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -33,9 +32,6 @@ from .loss_model import ColorLoss, LossSource, loss_source
 from .pose import Pose
 from .result import PoseFit, Step, with_own_history
 from .task import STEP_PARTS, Unknowns
-
-if TYPE_CHECKING:
-    pass
 
 # Each part of a step moves one tensor of a camera.
 TENSOR_OF = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
@@ -17,9 +17,6 @@ from ..descent.result import Fit
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..result import FitResult, delegated, made_folder
 from .uncertainty import JointUncertainty
-
-if TYPE_CHECKING:
-    pass
 
 MISSED_REGION = 0.01  # A region of a larger share of a mask is a missed limb.
 SHARE_OF_MEDIAN = 0.85  # A joint in a wrong place shows a smaller share of edges, relative to the median joint.
