@@ -1,0 +1,1 @@
+"""Optimisers: damped Gauss-Newton and Adam. They know no images, cameras or meshes."""
