@@ -31,8 +31,8 @@ from torch.nn.parallel import DistributedDataParallel
 import edgegrad as eg
 from edgegrad.fit import Checkpoint
 from edgegrad.fit.checkpoints import CheckpointFile
-from edgegrad.fit.descent.adam import Adam
 from edgegrad.fit.laplacian import LaplacianSolver
+from edgegrad.optim.adam import Adam
 
 
 class Task(NamedTuple):

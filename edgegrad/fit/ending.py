@@ -2,18 +2,8 @@
 
 from __future__ import annotations
 
-from enum import Enum
-
+from ..optim.history import Ending
 from .edge_support import MIN_EDGE_SUPPORT
-
-
-class Ending(Enum):
-    """Why a fit took no more steps."""
-
-    FLAT = "the steps led no further"
-    STEPS = "steps ran out"
-    FALLING = "loss still falling"
-    INTERRUPTED = "interrupted"
 
 
 def reason_of(

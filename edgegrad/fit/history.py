@@ -1,22 +1,12 @@
-"""The steps of a fit by descent, as they are kept and as JSON holds them."""
+"""The steps of a fit by descent, as JSON holds them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-from torch import Tensor
-
-
-class Record(NamedTuple):
-    """One step of a fit by descent."""
-
-    step: int
-    loss: float  # of this step's views and samples, with the regularizer
-    gradient: dict[str, float]  # norm of the gradient by each parameter
-    values: dict[str, Tensor]  # of parameters of up to 64 numbers, before the step
-    rate: float = 1.0  # factor of the learning rates
+from ..optim.history import Record
 
 
 def history_rows(history: Sequence[Record]) -> list[dict[str, Any]]:

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from ..camera.poses import check_rotation, rigid, rotation
 from ..check import as_tensor, check_finite, check_positive, check_shape
+from ..optim.history import Record
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..scene.symmetries import Symmetries
-from .history import Record
 from .parameter import Parameter
 
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from .history import Record
+from ..optim.history import Record
 from .views import displayed
 
 INK = "#303030"

@@ -14,15 +14,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
+from .loop import Loop, nothing, run
+
 Point = TypeVar("Point")
 Rows = Sequence[int]
+EMPTY = torch.empty(0)
 
 NOISE_MEMORY = 0.7  # weight of the noise of earlier steps in its running mean
 LARGEST_CUT = 1.0 / 3.0  # of λ in one step, and the factor 2 of the first raise: both as Nielsen has them
@@ -38,6 +41,7 @@ class Model(NamedTuple):
     cost: Tensor  # (N, S), by S sets of samples
     gradient: Tensor | Callable[[Rows], Tensor]  # (N, n)
     curvature: Tensor | Callable[[Rows], Tensor]  # (N, n, n), positive semi-definite
+    slack: Tensor | None = None  # (N,), by how much noise that all sets of samples share may raise a cost
 
 
 class Problem(Generic[Point]):
@@ -74,8 +78,8 @@ class LevenbergMarquardtSettings:
     # λ stays between these. Steps are full ones below the former; a descent that exceeds the latter rests.
     least_damping: float = 1e-4
     most_damping: float = 1e4
-    # Added damping, relative to the largest entry of H. It keeps numbers at rest that the cost does not depend on. Half or
-    # twice as much moves only numbers whose curvature is as small.
+    # Added damping, relative to the largest entry of H. It keeps numbers at rest that the cost does not depend on, and must be
+    # above 0 where H may be singular. Half or twice as much moves only numbers whose curvature is as small.
     unseen_damping: float = 1e-4
     # Largest entry of a step. A smaller radius takes more steps, a larger one leaves the region where the model holds.
     trust_radius: float = math.inf
@@ -85,8 +89,8 @@ class LevenbergMarquardtSettings:
     shortest_step: float = 0.0
     # By so many standard deviations of its noise a cost may rise. With half as many, noise alone takes every sixth step back.
     noise_deviations: float = 2.0
-    # A descent rests after so many steps in which the cost fell no further than by noise and tolerance. None: it has no such
-    # rest, and its result is the last accepted point in place of a mean. Twice as many halve the variance of the mean.
+    # A descent of a noisy cost rests after so many steps in which it fell no further than by noise and tolerance. None: it
+    # goes on. Twice as many halve the variance of the mean of the points.
     settled_steps: int | None = None
     tolerance: float = 0.0  # Share of the cost, or of its decrease so far, that does not count as a fall.
 
@@ -112,18 +116,17 @@ class Descent(Generic[Point]):
     steps: int = 0  # evaluations
     accepted: int = 0
     rest: Rest | None = None
-    cost: Tensor = field(default_factory=lambda: torch.empty(0))  # (S,) at the point
-    gradient: Tensor = field(default_factory=lambda: torch.empty(0))  # (n,)
-    curvature: Tensor = field(default_factory=lambda: torch.empty(0))  # (n, n)
-    step: Tensor = field(default_factory=lambda: torch.empty(0))  # (n,), the next one
+    cost: Tensor = EMPTY  # (S,) at the point
+    slack: float = 0.0  # of the cost there, by the model
+    gradient: Tensor = EMPTY  # (n,)
+    curvature: Tensor = EMPTY  # (n, n)
+    step: Tensor = EMPTY  # (n,), the next one
     predicted: float = 0.0  # decrease of the cost by it
     first: float = math.nan  # mean cost of the start
     noise: float = 0.0  # variance of the mean difference of costs, averaged over steps
-    lowest: Tensor = field(default_factory=lambda: torch.empty(0))  # (S,), costs that a fall is counted from
+    lowest: Tensor = EMPTY  # (S,), costs that a fall is counted from
     settled: int = 0  # accepted steps since the last fall
-    path: list[Tensor] = field(
-        default_factory=list
-    )  # (n,) each, places of these steps, from the point of the last fall
+    path: tuple[Tensor, ...] = ()  # (n,) each, places of these steps, from the point of the last fall
 
     @property
     def mean_cost(self) -> float:
@@ -160,6 +163,21 @@ class LevenbergMarquardt(Generic[Point]):
         return [descent for descent in self.descents if descent.rest is None]
 
     @property
+    def resting(self) -> bool:
+        """Whether all descents rest."""
+        return not self.active
+
+    @property
+    def steps(self) -> int:
+        """The number of calls of advance()."""
+        return max((descent.steps for descent in self.descents), default=0)
+
+    @property
+    def loss(self) -> float:
+        """The least cost."""
+        return min((descent.mean_cost for descent in self.descents), default=math.inf)
+
+    @property
     def points(self) -> list[Point]:
         """The results so far, one for each start: the last accepted point, or a mean of several where costs are noisy."""
         return [
@@ -192,6 +210,7 @@ class LevenbergMarquardt(Generic[Point]):
             if bool(here.isfinite().all() and gradient.isfinite().all() and curvature.isfinite().all()):
                 self._follow(active[k], candidates[k], cost[k], here)
                 active[k].gradient, active[k].curvature = gradient, curvature
+                active[k].slack = 0.0 if model.slack is None else float(model.slack[row])
                 taken.append(k)
         for k, descent in enumerate(active):
             descent.steps += 1
@@ -205,15 +224,11 @@ class LevenbergMarquardt(Generic[Point]):
 
     def state(self) -> dict[str, Any]:
         """Return what further steps depend on. Points are in it as they are."""
-        fields = ({**vars(descent), "rest": descent.rest and descent.rest.name} for descent in self.descents)
-        return {"descents": [{**one, "path": [*one["path"]]} for one in fields]}
+        return {"descents": [{**vars(one), "rest": one.rest and one.rest.name} for one in self.descents]}
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Go on from a state."""
-        self.descents = [
-            Descent(**{**one, "rest": None if one["rest"] is None else Rest[one["rest"]], "path": [*one["path"]]})
-            for one in state["descents"]
-        ]
+        self.descents = [Descent(**{**one, "rest": one["rest"] and Rest[one["rest"]]}) for one in state["descents"]]
 
     def _falls(self, descent: Descent[Point], cost: Tensor) -> bool:
         """Return whether a candidate's cost (S,) is finite and no higher than noise makes it."""
@@ -226,7 +241,8 @@ class LevenbergMarquardt(Generic[Point]):
 
     def _slack(self, descent: Descent[Point], fall: Tensor) -> float:
         """Return by how much noise may raise a cost, with the differences (S,) of costs by their sets of samples."""
-        return self.settings.noise_deviations * math.sqrt(max(descent.noise, _variance_of_mean(fall)))
+        sampled = self.settings.noise_deviations * math.sqrt(max(descent.noise, _variance_of_mean(fall)))
+        return max(sampled, descent.slack)
 
     def _derivatives(
         self, descents: Sequence[Descent[Point]], model: Model, rows: Rows
@@ -261,18 +277,18 @@ class LevenbergMarquardt(Generic[Point]):
 
     def _settle(self, descent: Descent[Point], cost: Tensor) -> None:
         """Count the steps since the cost last fell. A slow descent falls in several steps together."""
-        if self.settings.settled_steps is None:
+        if len(cost) < 2:  # There is no noise.
             return
         fall = descent.lowest - cost
         now = float(cost.mean())
         share = self.settings.tolerance * min(abs(now), abs(descent.first - now))
         if float(fall.mean()) > max(self._slack(descent, fall), share) or self.problem.provisional:
-            descent.settled, descent.lowest, descent.path = 0, cost, []
+            descent.settled, descent.lowest, descent.path = 0, cost, ()
             return
         descent.settled += 1
         before = descent.path[-1] if descent.path else torch.zeros_like(descent.step)
-        descent.path.append(before + descent.step)
-        if descent.settled > self.settings.settled_steps:
+        descent.path = (*descent.path, before + descent.step)
+        if self.settings.settled_steps is not None and descent.settled > self.settings.settled_steps:
             descent.rest = Rest.SETTLED
 
     def _take_back(self, descent: Descent[Point]) -> None:
@@ -314,16 +330,12 @@ class LevenbergMarquardt(Generic[Point]):
 
 def minimise(
     problem: Problem[Point], starts: Sequence[Point], settings: LevenbergMarquardtSettings | None = None,
-    after_step: Callable[[LevenbergMarquardt[Point]], Any] = lambda descents: None,
+    after_step: Callable[[LevenbergMarquardt[Point]], Any] = nothing,
 ) -> LevenbergMarquardt[Point]:  # fmt: skip
     """Run the descents until all rest. `after_step` is called after each step. Ctrl-C ends them with what they have found."""
     descents = LevenbergMarquardt(problem, starts, settings)
-    try:
-        while descents.active:
-            descents.advance()
-            after_step(descents)
-    except KeyboardInterrupt:
-        descents.interrupted = True
+    loop = Loop(descents.settings.steps, after_step=lambda: after_step(descents))
+    descents.interrupted = run(descents, loop).interrupted
     return descents
 
 

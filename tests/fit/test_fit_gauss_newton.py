@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from brackets import BACKGROUND, bracket, camera, rotation
@@ -11,9 +9,7 @@ from quiet_fits import arranged
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, PoseParameter, fit_scene, losses
-from edgegrad.fit.descent import gauss_newton
 from edgegrad.fit.descent.curvature import curvature, weights_of
-from edgegrad.fit.descent.gauss_newton import GaussNewtonOptimizer
 from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.descent.scene_builder import builder
 from edgegrad.fit.options import Settings
@@ -114,84 +110,6 @@ def test_curvature_of_a_regularizer():
     H = curved(lambda made: made.background[0] ** 2 - made.background[1] ** 2)
     torch.testing.assert_close(H, torch.diag(torch.tensor([2.0, 0.0, 0.0], dtype=F64)), rtol=0, atol=1e-6)
     assert not curved(lambda made: made.meshes[0].verts.square().mean()).any()
-
-
-# -- the steps --------------------------------------------------------------------------------------------------------
-
-
-class Valley:
-    """A loss of two numbers without a picture. It falls to 0 at (1, −2) and is no parabola far from there."""
-
-    def renews(self, step):
-        return False
-
-    def narrows(self):
-        return False
-
-    def __call__(self, values, step):
-        noise = 1e-4 * float(torch.randn((), generator=torch.Generator().manual_seed(step)))
-        return losses.robust(values["x"][None, None], self.bottom[None, None], None, 1.0, 0.0) + noise
-
-    bottom = torch.tensor([1.0, -2.0], dtype=F64)
-
-
-@pytest.fixture
-def valley(monkeypatch):
-    def made(curvature, start=(5.0, 5.0), lr=1.0, **bounds):
-        monkeypatch.setattr(gauss_newton, "curvature", lambda *_: curvature * torch.eye(2, dtype=F64))
-        monkeypatch.setattr(gauss_newton, "check_pointwise", lambda objective: None)
-        x = Parameter(lr, torch.tensor(start, dtype=F64), **bounds)
-        return GaussNewtonOptimizer({"x": x}, Settings()), Valley()
-
-    return made
-
-
-def test_a_step_that_raises_the_loss_is_taken_back(valley):
-    """The curvature is far too small, so each step would land far beyond the minimum."""
-    optimizer, objective = valley(0.003, start=(3.0, 0.0))
-    start = math.log1p(2.0)
-    for _ in range(40):
-        optimizer.advance(objective)
-        assert optimizer.loss < start + 0.01  # of each accepted point
-    assert max(record.loss for record in optimizer.history) > start + 0.1  # of some that were not
-    assert optimizer.accepted < optimizer.step - 3
-    assert float((optimizer.best["x"] - objective.bottom).norm()) < 0.3
-
-
-def test_a_right_curvature_needs_few_steps_and_then_ends(valley):
-    optimizer, objective = valley(0.5, start=(1.6, -2.5))
-    for _ in range(60):
-        optimizer.advance(objective)
-        if optimizer.flat:
-            break
-    assert optimizer.flat and optimizer.step < 30
-    assert float((optimizer.best["x"] - objective.bottom).norm()) < 0.05
-
-
-def test_no_number_moves_by_more_than_ten_rates(valley):
-    optimizer, objective = valley(1e-6, lr=0.01)
-    optimizer.advance(objective)
-    assert float((optimizer.values["x"].detach() - 5.0).abs().max()) == pytest.approx(0.1)
-
-
-def test_bounds_hold_and_the_others_go_on(valley):
-    optimizer, objective = valley(0.5, start=(1.6, -1.0), low=torch.tensor([1.3, -9.0], dtype=F64))
-    for _ in range(60):
-        optimizer.advance(objective)
-        assert float(optimizer.values["x"].detach()[0]) >= 1.3
-        if optimizer.flat:
-            break
-    assert float(optimizer.best["x"][0]) == pytest.approx(1.3)
-    assert float(optimizer.best["x"][1]) == pytest.approx(-2.0, abs=0.05)
-
-
-def test_a_step_to_a_nan_loss_is_taken_back(valley):
-    optimizer, objective = valley(0.5, start=(1.6, -2.5))
-    optimizer.advance(objective)
-    here = optimizer.here.clone()
-    objective.bottom = objective.bottom * math.nan
-    optimizer.advance(objective)
-    assert torch.equal(optimizer.here, here) and torch.isfinite(optimizer.values["x"]).all()
 
 
 def test_is_far_quicker_than_adam_by_steps():

@@ -12,28 +12,8 @@ from small_scenes import QUIET, pictures, views
 
 import edgegrad as eg
 from edgegrad.fit import Checkpoint, Parameter, fit_scene, losses
-from edgegrad.fit.descent.adam import Adam
 from edgegrad.fit.ending import Ending
 from edgegrad.fit.laplacian import LaplacianSolver
-
-
-def test_steps_equal_those_of_torch_adam():
-    start = torch.randn(5, 3, generator=torch.Generator().manual_seed(0)).double()
-    mine, theirs = (start.clone().requires_grad_() for _ in range(2))
-    ours, torchs = Adam({"x": mine}, {"x": 0.1}), torch.optim.Adam([theirs], lr=0.1)
-    for _ in range(5):
-        ours.step({"x": torch.autograd.grad(mine.pow(4).sum(), mine)[0]})
-        torchs.zero_grad()
-        theirs.pow(4).sum().backward()
-        torchs.step()
-    torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-5)  # ε is relative here
-
-
-def test_uniform_steps_keep_the_gradients_direction():
-    x = torch.zeros(4, 3, dtype=torch.float64)
-    gradient = torch.randn(4, 3, generator=torch.Generator().manual_seed(0)).double()
-    Adam({"x": x}, {"x": 0.1}, uniform={"x"}).step({"x": gradient})
-    torch.testing.assert_close(x, -0.1 * gradient / gradient.abs().max())
 
 
 def test_smooth_coordinates_have_their_gradient():

@@ -121,7 +121,7 @@ class Rotations(LeastSquares):
         for R in points:
             self.residuals = lambda v, R=R: (rotation(v) @ R @ self.a - self.b).flatten()
             models.append(super().model([torch.zeros(3, dtype=F64)]))
-        return Model(*(torch.cat(parts) for parts in zip(*models, strict=True)))
+        return Model(*(torch.cat(parts) for parts in zip(*(model[:3] for model in models), strict=True)))
 
     def moved(self, points: Sequence[Tensor], steps: Tensor) -> list[Tensor]:
         return [rotation(step) @ R for R, step in zip(points, steps, strict=True)]
@@ -229,7 +229,7 @@ class Noisy(LeastSquares):
         self.generator = torch.Generator().manual_seed(seed)
 
     def model(self, points: Sequence[Tensor]) -> Model:
-        cost, gradient, curvature = super().model(points)
+        cost, gradient, curvature, _ = super().model(points)
         assert isinstance(gradient, Tensor)
         tilt = torch.tensor([[0.05, -0.03], [-0.04, 0.05]], dtype=F64)  # of the samples of each set
         noise = torch.stack([tilt @ torch.sin(40.0 * x) for x in points])

@@ -32,15 +32,9 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
     detached = {name: value.detach() for name, value in tensors.items()}
     n = sum(value.numel() for value in detached.values())
     total = torch.zeros(n, n, dtype=torch.float64)
-    for name, group, render, slopes in derivatives(objective, detached, step):
-        if objective.regions is None:
-            weight = weights_of(objective, name, group, render)
-        else:
-            weight = objective.regions.curvature(group, render)
-            slopes = [objective.regions.blurred(J) for J in slopes]
-        for w, J in zip(weight / len(objective.picks(step)), slopes, strict=True):
-            rows = J.reshape(n, -1) * w.sqrt().flatten()
-            total += (rows @ rows.T).double()
+    for rows, weight, _ in _weighted(objective, detached, step):
+        rows = rows * weight.sqrt()
+        total += (rows @ rows.T).double()
     if (regularizer := objective.regularizer) is not None:
         total += _of_term(lambda tensors: regularizer(objective.build(tensors)[0]), detached)
     if objective.prior is not None:
@@ -51,49 +45,44 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
 def scores(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> tuple[Tensor, Tensor]:
     """Return the curvature (n, n) of the pictures alone, and Σ s sᵀ (n, n) over the scores s = w r J of all pixels."""
     detached = {name: value.detach() for name, value in tensors.items()}
-    n, count = sum(value.numel() for value in detached.values()), len(objective.picks(step))
+    n = sum(value.numel() for value in detached.values())
     H, S = (torch.zeros(n, n, dtype=torch.float64) for _ in range(2))
+    for rows, weight, score in _weighted(objective, detached, step):
+        H += ((rows * weight) @ rows.T).double()
+        S += ((rows * score) @ (rows * score).T).double()
+    return H, S
+
+
+def _weighted(
+    objective: Objective, detached: Mapping[str, Tensor], step: int
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
+    """Yield for each view and channel the derivatives J (n, P), the weights w (P,), and the factors w r (P,) of the scores."""
+    count = len(objective.picks(step))
     for name, group, render, slopes in derivatives(objective, detached, step):
         regions = objective.regions
         if regions is None:
             weight = weights_of(objective, name, group, render)
-            off = (render - torch.stack([objective.views[i].wanted[name] for i in group])) * weight
+            score = (render - torch.stack([objective.views[i].wanted[name] for i in group])) * weight
         else:
             weight = regions.curvature(group, render)
             slopes = [regions.blurred(J) for J in slopes]
             # The mean of a log likelihood's squared score is its curvature.
-            off = (weight * regions.shares(group)).sqrt()
-        for w, s, J in zip(weight / count, off / count, slopes, strict=True):
-            rows = J.reshape(n, -1)
-            H += ((rows * w.flatten()) @ rows.T).double()
-            rows = rows * s.flatten()
-            S += (rows @ rows.T).double()
-    return H, S
+            score = (weight * regions.shares(group)).sqrt()
+        for w, s, J in zip(weight / count, score / count, slopes, strict=True):
+            yield J.flatten(1), w.flatten(), s.flatten()
 
 
 def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
     """Return Σ |J| |r| / Σ |J| for each number, in the tensors' shapes: how far pixels are from their pictures where it moves
     them. It is large for what lies in a wrong place, also where the slope of the loss is zero."""
-    detached = {name: value.detach() for name, value in tensors.items()}
-    n = sum(value.numel() for value in detached.values())
-    off, all = torch.zeros(n, dtype=torch.float64), torch.full((n,), 1e-30, dtype=torch.float64)
-    for name, group, render, slopes in derivatives(objective, detached, step):
-        for i, image, J in zip(group, render, slopes, strict=True):
-            if (wanted := objective.views[i].wanted.get(name)) is not None:
-                rows = J.abs().reshape(n, -1)
-                off += (rows @ (image - wanted).abs().flatten()).double()
-                all += rows.sum(1).double()
-    return _by_name(off / all, detached)
+    return _ratio(objective, tensors, step, lambda x: x.abs(), lambda name, i, image: torch.ones_like(image))
 
 
 def residuals(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
     """Return Σ J² r² / Σ J² n² for each number, in the tensors' shapes, with the noise n² of the render's samples. It is about
     1 for what lies where the pictures have it."""
-    detached = {name: value.detach() for name, value in tensors.items()}
-    n = sum(value.numel() for value in detached.values())
-    off, noise = (torch.full((n,), 1e-30, dtype=torch.float64) for _ in range(2))
     with torch.no_grad():
-        scene, cameras = objective.build(detached)
+        scene, cameras = objective.build(tensors)
         picks = objective.picks(step)
         renders = objective.renders(scene, cameras, picks, objective.options.spp, objective.seed(step + 1))
         again = {
@@ -102,18 +91,27 @@ def residuals(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
             for name, images in channels.items()
             for i, image in zip(group, images, strict=True)
         }
+    noise = lambda name, i, image: 0.5 * (image - again[name, i]).square()  # noqa: E731
+    return _ratio(objective, tensors, step, torch.square, noise)
+
+
+def _ratio(
+    objective: Objective, tensors: Mapping[str, Tensor], step: int, size: Callable[[Tensor], Tensor],
+    of: Callable[[str, int, Tensor], Tensor],
+) -> dict[str, Tensor]:  # fmt: skip
+    """Return the mean size of differences from the pictures, relative to `of` (name, view, image), for each number. Pixels
+    count by the size of their derivative."""
+    detached = {name: value.detach() for name, value in tensors.items()}
+    n = sum(value.numel() for value in detached.values())
+    off, all = (torch.full((n,), 1e-30, dtype=torch.float64) for _ in range(2))
     for name, group, render, slopes in derivatives(objective, detached, step):
         for i, image, J in zip(group, render, slopes, strict=True):
             if (wanted := objective.views[i].wanted.get(name)) is not None:
-                rows = J.square().reshape(n, -1)
-                off += (rows @ (image - wanted).square().flatten()).double()
-                noise += (rows @ (0.5 * (image - again[name, i]).square()).flatten()).double()
-    return _by_name(off / noise, detached)
-
-
-def _by_name(numbers: Tensor, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    parts = numbers.split([value.numel() for value in tensors.values()])
-    return {name: part.reshape(value.shape) for (name, value), part in zip(tensors.items(), parts, strict=True)}
+                rows = size(J).reshape(n, -1)
+                off += (rows @ size(image - wanted).flatten()).double()
+                all += (rows @ of(name, i, image).flatten()).double()
+    parts = (off / all).split([value.numel() for value in detached.values()])
+    return {name: part.reshape(value.shape) for (name, value), part in zip(detached.items(), parts, strict=True)}
 
 
 def derivatives(

@@ -9,11 +9,11 @@ from typing import Any
 from torch import Tensor
 
 from ...camera.camera import Camera
+from ...optim.history import Record
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
 from ..checkpoints import CheckpointFile
-from ..history import Record
 from ..losses import REGION
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
@@ -21,9 +21,7 @@ from ..parameter import Parameter
 from ..placement import Coordinates, Placement, PoseParameter
 from ..row_order import check_mask_rows
 from ..views import Images, Observation, region_views, views_of
-from .adam_steps import AdamOptimizer
-from .gauss_newton import GaussNewtonOptimizer
-from .loop import Optimizer, descend
+from .descend import descend_views
 from .objective import Objective
 from .result import Fit, make_fit
 from .scene_builder import Build, Built, Values, build_detached, builder, checked_parameters
@@ -132,11 +130,6 @@ def fit_scene(
     return fit_views(build, views, wanted, settings, {"scene": scene, "parameters": wanted}, regularizer)
 
 
-def make_optimizer(parameters: Mapping[str, Parameter], options: Settings) -> Optimizer:
-    """Return the optimizer that `options.method` names. Raises ValueError where it cannot serve."""
-    return {"adam": AdamOptimizer, "gauss-newton": GaussNewtonOptimizer}[options.method](parameters, options)
-
-
 def fit_views(
     build: Build,
     views: list[Observation],
@@ -159,6 +152,6 @@ def fit_views(
     check_mask_rows(views, start, cameras)
     objective = Objective(whole, views, options, regularizer)
     objective.check({n: p.value for n, p in coordinates.parameters.items() if p.value is not None})
-    optimizer = make_optimizer(coordinates.parameters, options)
-    descent = descend(optimizer, objective, checkpoint.write, saved, report=reporter(whole, views, coordinates))
+    report = reporter(whole, views, coordinates)
+    descent = descend_views(objective, coordinates.parameters, checkpoint.write, saved, report=report)
     return make_fit(objective, descent, start, coordinates)

@@ -10,12 +10,11 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
+from ...optim.tensors import Descent
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...warnings import warn
 from ..checkpoints import CheckpointFile
-from ..ending import Ending
-from ..history import Record
 from ..laplacian import LaplacianSolver
 from ..losses import REGION
 from ..measured import Measured
@@ -26,8 +25,8 @@ from ..placement import Coordinates
 from ..remeshing import count_nonmanifold_edges, remeshed
 from ..row_order import check_mask_rows
 from ..views import Images, Observation, region_views, views_of
-from .fit_scene import make_optimizer, reporter
-from .loop import Descent, descend
+from .descend import Save, descend_levels, descend_views
+from .fit_scene import reporter
 from .objective import Objective
 from .result import Fit, make_fit
 
@@ -151,44 +150,32 @@ class _ShapeFit:
         self.masked, self.regularizer = masked, regularizer
 
     def run(self, mesh: Mesh) -> Fit:
-        start, level, history, seconds = mesh, 0, [], 0.0
         given = {"mesh": mesh, "refinement": self.how, **self.options.of_steps}
         checkpoint = CheckpointFile.from_views(self.options.checkpoint, self.views, given)
-        saved = checkpoint.read()
         last = self.how.faces or len(mesh.faces) * 4 ** (self.how.levels - 1)
-        if saved is not None:
-            level, mesh = saved["level"], Mesh(saved["verts"], saved["faces"])
-            history, seconds = [Record(*record) for record in saved["history"]], saved["seconds"]
-        else:
-            check_mask_rows(self.views, self.scene(mesh), [view.camera for view in self.views])
-        while True:
-            stage = {
-                "level": level, "verts": mesh.verts, "faces": mesh.faces,
-                "history": [tuple(record) for record in history], "seconds": seconds,
-            }  # fmt: skip
 
-            def save(loop: dict[str, Any], stage: dict[str, Any] = stage) -> None:
-                checkpoint.write({**stage, "loop": loop})
+        def finer(values: dict[str, Tensor], level: int) -> dict[str, Tensor]:
+            made = remeshed(_mesh_of(values), round(last / 4 ** (self.how.levels - 1 - level)))
+            return {"verts": made.verts, "faces": made.faces}
 
-            found = self.descend(mesh, level, save, None if saved is None else saved["loop"])
-            saved, mesh = None, mesh.replace(verts=found.values["verts"])
-            history += [record._replace(step=len(history) + k) for k, record in enumerate(found.history)]
-            seconds += found.seconds
-            if found.ending is Ending.INTERRUPTED or level == self.how.levels - 1:
-                break
-            level += 1
-            mesh = remeshed(mesh, round(last / 4 ** (self.how.levels - 1 - level)))
-        whole = Descent({"verts": mesh.verts}, history, seconds, found.ending)
+        whole = descend_levels(
+            checkpoint, {"verts": mesh.verts, "faces": mesh.faces}, self.how.levels, self.descend, finer
+        )
+        found = _mesh_of(whole.values)
 
         def build(values: Mapping[str, Tensor]) -> tuple[Scene, list[Camera]]:
-            return self.scene(mesh.replace(verts=values["verts"])), [view.camera for view in self.views]
+            return self.scene(found.replace(verts=values["verts"])), [view.camera for view in self.views]
 
-        return make_fit(Objective(build, self.views, self.options), whole, self.scene(start), Coordinates({}))
+        whole = whole._replace(values={"verts": found.verts})
+        return make_fit(Objective(build, self.views, self.options), whole, self.scene(mesh), Coordinates({}))
 
     def descend(
-        self, mesh: Mesh, level: int, save: Callable[[dict[str, Any]], None], saved: dict[str, Any] | None
-    ) -> Descent:
-        """Run one level from `mesh` and return the best vertices as its values."""
+        self, values: dict[str, Tensor], level: int, save: Save, saved: Mapping[str, Any] | None
+    ) -> Descent:  # fmt: skip
+        """Run one level from a mesh's `verts` and `faces`, and return the best as its values."""
+        mesh = _mesh_of(values)
+        if level == 0 and saved is None:
+            check_mask_rows(self.views, self.scene(mesh), [view.camera for view in self.views])
         smooth = LaplacianSolver(mesh.faces, len(mesh.verts), self.how.smoothness)
         smallest = min(min(view.camera.size) for view in self.views)
         factor = min(1.0, max(0.5 ** (self.how.levels - 1 - level), MIN_PIXELS / smallest))
@@ -205,10 +192,14 @@ class _ShapeFit:
             objective.check({"verts": first})
         parameters = {"verts": Parameter(rate, first, uniform=True)}
         title = f"level {level + 1} of {self.how.levels}"
-        found = descend(make_optimizer(parameters, self.options), objective, save, saved, title, reporter(build, views))
-        return found._replace(values={"verts": smooth(found.values["verts"])})
+        found = descend_views(objective, parameters, save, saved, title, reporter(build, views))
+        return found._replace(values={"verts": smooth(found.values["verts"]), "faces": mesh.faces})
 
     def scene(self, mesh: Mesh) -> Scene:
         made = self.appearance(mesh)
         scene = made if isinstance(made, Scene) else Scene([made])
         return scene.replace(background=None) if self.masked and scene.background is not None else scene
+
+
+def _mesh_of(values: Mapping[str, Tensor]) -> Mesh:
+    return Mesh(values["verts"], values["faces"])

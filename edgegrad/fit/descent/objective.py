@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...aovs import render_aovs
 from ...camera.camera import Camera
+from ...optim.tensors import Objective as TensorObjective
 from ...scene.scene import Scene
 from ...scene.tree import tensors_in
 from ..losses import REGION, loss_of
@@ -22,7 +23,7 @@ from .scene_builder import Built, build_detached
 Tensors = Mapping[str, Tensor]
 
 
-class Objective:
+class Objective(TensorObjective):
     """The loss of some of the views at a step, with samples of its own, as a function of tensors."""
 
     def __init__(
@@ -36,6 +37,7 @@ class Objective:
         self.build_batch, self.builder = build_batch, builder
         self.losses = {"alpha": loss_of("options.mask_loss", options.mask_loss)}
         self.regions = RegionLoss(views, options.seed) if options.loss == REGION else None
+        self.renewal_steps = None if self.regions is None else RENEWAL_STEPS
         if options.loss != REGION:
             self.losses["image"] = loss_of("options.loss", options.loss)
 
@@ -45,15 +47,22 @@ class Objective:
         picks = self.picks(step)
         total = torch.zeros((), dtype=torch.float64)
         for group, renders in self.renders(scene, cameras, picks, self.options.spp, self.seed(step)):
-            first = self.views[group[0]]
-            if self.regions is not None:
-                total = total + self.regions.loss(group, renders["alpha"]) / len(picks)
-            for name in first.wanted:
-                total = total + self.group_loss(name, group, renders[name]) / len(picks)
-            for name in first.measured:
-                total = total + self.measured_group_loss(name, group, renders) / len(picks)
+            total = total + self.views_loss(group, renders) / len(picks)
         total = total if self.regularizer is None else total + self.regularizer(scene)
         return total if self.prior is None else total + self.prior(tensors)
+
+    def views_loss(self, group: Sequence[int], renders: Tensors) -> Tensor:
+        """Return the sum of these views' losses in all channels, rendered as (B, H, W, c)."""
+        first, total = self.views[group[0]], torch.zeros((), dtype=torch.float64)
+        if self.regions is not None:
+            total = total + self.regions.loss(group, renders["alpha"])
+        for name in first.wanted:
+            total = total + self.group_loss(name, group, renders[name])
+        for name in first.measured:
+            given = [self.views[i].measured[name] for i in group]
+            loss = measured_loss(renders[name], renders["alpha"], given, first.mask is None)
+            total = total + len(group) * loss.double()
+        return total
 
     def _check_graph(self, tensors: Tensors, built: Built) -> None:
         """Check that the scene or its cameras have a gradient where the tensors have one. Raises ValueError."""
@@ -76,6 +85,12 @@ class Objective:
                 loss += 0.5 * sum(float(self.group_loss(name, group, one[name])) for one in (first, second))
         return loss / max(noise, 1e-30)
 
+    def with_options(self, options: Settings) -> Objective:
+        """Return the same loss with other options of its descents."""
+        found = copy.copy(self)
+        found.options = options
+        return found
+
     def reparametrized(self, whole: Callable[[Tensors], Tensors]) -> Objective:
         """Return the same loss as a function of fewer tensors, from which `whole` makes all."""
         build, prior, build_batch = self.build, self.prior, self.build_batch
@@ -85,20 +100,13 @@ class Objective:
         found.build_batch = None if build_batch is None else lambda tensors: build_batch(whole(tensors))
         return found
 
-    def renews(self, step: int) -> bool:
-        """Whether a step begins with renew()."""
-        return self.regions is not None and step % RENEWAL_STEPS == 0
-
-    def narrows(self) -> bool:
-        """Whether the loss has a blur that later steps do not have."""
-        return self.regions is not None and self.regions.narrows
-
     def renew(self, tensors: Tensors, step: int) -> None:
         """Compute what the loss holds fixed between steps at these values."""
         if self.regions is None:
             return
         for i, alpha in enumerate(self._alphas(tensors, self.options.spp, self.seed(step))):
             self.regions.renew(i, alpha, step)
+        self.provisional = self.regions.narrows
 
     def check(self, tensors: Tensors) -> None:
         """Check the start, and that the loss depends on all tensors. Raises ValueError."""
@@ -139,12 +147,6 @@ class Objective:
     def _weight(self, name: str, group: Sequence[int]) -> Tensor | None:
         weights = [weight for i in group if (weight := self.views[i].weights[name]) is not None]
         return torch.stack(weights) if weights else None
-
-    def measured_group_loss(self, name: str, group: Sequence[int], renders: Tensors) -> Tensor:
-        """Return the sum of these views' losses in a measured channel, from renders (B, H, W, c) of all channels."""
-        given = [self.views[i].measured[name] for i in group]
-        covers = self.views[group[0]].mask is None
-        return len(group) * measured_loss(renders[name], renders["alpha"], given, covers).double()
 
     def seed(self, step: int) -> int:
         return (self.options.seed + 7919 * step) % 2**32

@@ -15,18 +15,19 @@ from ...files.cameras import save_camera
 from ...files.image import write_image
 from ...files.paths import PathLike, replacing, write_figures, write_json
 from ...files.save import save_mesh
+from ...optim.history import Ending, Record
+from ...optim.tensors import Descent
 from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..contour_colors import draw_contour
 from ..edge_support import MIN_EDGE_SUPPORT, edge_support
-from ..ending import Ending, reason_of
-from ..history import Record, history_rows, number_or_none
+from ..ending import reason_of
+from ..history import history_rows, number_or_none
 from ..measured import comparable
 from ..placement import Coordinates, Pose
 from ..result import FitResult, chosen, made_folder
 from ..views import Observation
-from .loop import Descent
 from .objective import Objective
 from .region_loss import FINAL_STEP
 from .scene_builder import build_detached
@@ -168,25 +169,22 @@ def make_fit(objective: Objective, descent: Descent, start: Scene, coordinates: 
     """Judge the best values of a descent over all views with many samples, and return the result."""
     views, options = objective.views, objective.options
     scene, cameras = build_detached(objective.build, descent.values)
-    loss, pairs = 0.0, []
+    loss, pairs, alphas = 0.0, [], list[Tensor]()
     spp = max(options.spp, RESULT_SPP)
     objective.renew(descent.values, FINAL_STEP)
-    alphas: list[Tensor] = []
     with torch.no_grad():
         for i, view in enumerate(views):
-            renders = [next(objective.renders(scene, cameras, [i], spp, (options.seed + k) % 2**32))[1] for k in (1, 2)]
+            first, second = (
+                next(objective.renders(scene, cameras, [i], spp, (options.seed + k) % 2**32))[1] for k in (1, 2)
+            )
+            mean = {name: 0.5 * (image + second[name]) for name, image in first.items()}
+            loss += float(objective.views_loss([i], mean)) / len(views)
             if objective.regions is not None:
-                alphas.append(0.5 * (renders[0]["alpha"][0] + renders[1]["alpha"][0]))
-                loss += float(objective.regions.loss([i], alphas[-1][None])) / len(views)
-            for name, target in view.wanted.items():
-                first, second = (found[name][0] for found in renders)
-                loss += float(objective.group_loss(name, [i], 0.5 * (first + second)[None])) / len(views)
-                pairs.append((first, second, target, view.weight))
+                alphas.append(mean["alpha"][0])
+            targets = {name: (target, view.weight) for name, target in view.wanted.items()}
             for name, given in view.measured.items():
-                means = {key: 0.5 * (renders[0][key] + renders[1][key]) for key in (name, "alpha")}
-                loss += float(objective.measured_group_loss(name, [i], means)) / len(views)
-                target, weight = comparable(means[name][0], means["alpha"][0], given)
-                pairs.append((renders[0][name][0], renders[1][name][0], target, weight))
+                targets[name] = comparable(mean[name][0], mean["alpha"][0], given)
+            pairs += [(first[name][0], second[name][0], *target) for name, target in targets.items()]
     share = edge_support(pairs) if objective.regions is None else objective.regions.edge_support(alphas)
     history = [coordinates.recorded(record) for record in descent.history]
     return Fit(

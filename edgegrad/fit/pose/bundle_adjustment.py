@@ -1,43 +1,45 @@
 """Joint refinement of poses and of the lens that all pictures share.
 
 Each place has a quadratic model of its loss by its pose and the lens (loss_model.py). The sum of these models is one by all
-poses and the lens; a Gauss-Newton step solves it (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000). The models may
-be of different lenses, as from fits of single pictures: the step then finds the lens on which they agree best.
+poses and the lens, whose damped Gauss-Newton steps lead to the most likely ones (Triggs et al., Bundle Adjustment: A Modern
+Synthesis, 2000). Fits of single pictures have lenses of their own; a step of all their models finds the lens on which they
+agree best.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ...optim.levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtSettings, Model, Problem, Rest, minimise
+from ...optim.loop import nothing
 from .loss_model import LossModel, LossSource
 from .pose import Pose
 from .task import FOCAL_LENGTH
 from .uncertainty import PRIOR_DEVIATION
 
 MAX_ADJUST_STEPS = 12
-SHORT_STEP_DEVIATIONS = (
-    0.5  # Mean step in standard deviations that counts as short: noise of the renders moves steps as far.
-)
-MAX_POSE_MOVE = 0.1  # Longest move of a pose in one step, in radians or object sizes.
-RETRY_DAMPING = (
-    1e-3  # Relative to the curvature's diagonal, after a rejected step; each further rejection multiplies it by ten.
-)
+# Poses move by at most 0.1 radians or object sizes in one step. The damping is that of steps that are taken back.
+ADJUST = LevenbergMarquardtSettings(start_damping=1e-3, least_damping=1e-6, unseen_damping=0.0, trust_radius=0.1)
+# Mean step in standard deviations that counts as short: noise of the renders moves steps as far.
+SHORT_STEP_DEVIATIONS = 0.5
+LENS_UNIT = 10.0  # of the numbers of the lens in steps, which may move so many times as far as those of a pose
+Poses = tuple[Pose, ...]
 
 
 class Adjustment(NamedTuple):
     """Poses at one lens, and the covariance of all numbers."""
 
-    poses: list[Pose]
+    poses: Poses
     covariance: Tensor  # (n, n), of the entries of all poses, place by place, and then of the lens
     loss: float
     evidence: list[LossModel]
-    short: bool  # The last step was short.
-    agreed: bool  # All poses have the same lens.
+    short: bool = False  # The last step was short.
 
     def covariance_of(self, k: int, source: LossSource) -> Tensor:
         """Return the covariance (m, m) of one place's pose and the lens, in the order of the entries that its task seeks."""
@@ -56,96 +58,109 @@ def lens_of(source: LossSource, pose: Pose) -> Tensor:
     return found[[entry - FOCAL_LENGTH for entry in source.task.dofs if entry >= FOCAL_LENGTH]]
 
 
+class Bundle(Problem[Poses]):
+    """Poses of all places and the lens as one descent. Its cost is in units of the noise of the pictures, so that a standard
+    deviation costs ½. A prior of PRIOR_DEVIATION holds moves of poses, and the lens at the given one."""
+
+    def __init__(self, sources: Sequence[LossSource]) -> None:
+        self.sources = sources
+        counts = [len(poses_of(source)) for source in sources]
+        n = sum(counts) + len(sources[0].task.dofs) - counts[0]
+        self.rows = _rows(counts, n)  # where the entries of each place are among all numbers
+        self.units = torch.ones(n, dtype=torch.float64)
+        self.units[sum(counts) :] = LENS_UNIT
+        self.noise: float | None = None  # of the first poses
+        self.last: Adjustment | None = None  # what was evaluated last
+
+    def model(self, points: Sequence[Poses]) -> Model:
+        (poses,) = points
+        evidence = [source.at(pose) for source, pose in zip(self.sources, poses, strict=True)]
+        self.last = self._adjustment(poses, evidence)
+        self.noise = self.noise or _noise(evidence)
+        H = self._sum([one.curvature for one in evidence]) + self._prior(self.noise)
+        gradient = self._sum([one.gradient for one in evidence])
+        lens = lens_of(self.sources[0], poses[0])
+        gradient[len(gradient) - len(lens) :] += self.noise / PRIOR_DEVIATION**2 * lens
+        prior = 0.5 / PRIOR_DEVIATION**2 * float(lens.square().sum())
+        cost = sum(one.loss / one.per_loss for one in evidence) / self.noise + prior
+        slack = sum(one.slack / one.per_loss for one in evidence) / self.noise
+        return Model(
+            torch.tensor([[cost]], dtype=torch.float64), (gradient * self.units / self.noise)[None],
+            (H * self.units * self.units[:, None] / self.noise)[None], torch.tensor([slack], dtype=torch.float64),
+        )  # fmt: skip
+
+    def moved(self, points: Sequence[Poses], steps: Tensor) -> list[Poses]:
+        moves = [[move[own] for own in self.rows] for move in steps * self.units]
+        return [self._moved(poses, parts) for poses, parts in zip(points, moves, strict=True)]
+
+    def agreed(self, poses: Sequence[Pose]) -> Poses:
+        """Return the most likely poses at a common lens, by the models at poses with lenses of their own. Each picture alone may
+        have a lower loss with its own."""
+        lenses = [lens_of(source, pose) for source, pose in zip(self.sources, poses, strict=True)]
+        if all(lens.numel() == 0 or float((lens - lenses[0]).abs().max()) < 1e-9 for lens in lenses):
+            return tuple(poses)
+        evidence = [source.at(pose) for source, pose in zip(self.sources, poses, strict=True)]
+        self.noise = _noise(evidence)
+        # Poses count from where they are, the lens from the given one.
+        here = [
+            torch.cat([lens.new_zeros(len(own) - len(lens)), lens]) for own, lens in zip(self.rows, lenses, strict=True)
+        ]
+        slopes = [one.gradient - one.curvature @ x for one, x in zip(evidence, here, strict=True)]
+        H = self._sum([one.curvature for one in evidence]) + self._prior(self.noise)
+        end = -torch.linalg.solve(H, self._sum(slopes))
+        return self._moved(poses, [end[own] - x for own, x in zip(self.rows, here, strict=True)])
+
+    def _moved(self, poses: Sequence[Pose], moves: Sequence[Tensor]) -> Poses:
+        places = zip(self.sources, poses, moves, strict=True)
+        return tuple(source.task.moved(pose, source.task.dofs, move) for source, pose, move in places)
+
+    def _sum(self, parts: Sequence[Tensor]) -> Tensor:
+        """Return the sum, by all numbers, of vectors (m,) or matrices (m, m) by the numbers of each place."""
+        total = torch.zeros((len(self.units),) * parts[0].dim(), dtype=torch.float64)
+        for own, part in zip(self.rows, parts, strict=True):
+            total[torch.meshgrid([own] * part.dim(), indexing="ij")] += part
+        return total
+
+    def _prior(self, noise: float) -> Tensor:
+        """Return the curvature of the prior: one more pixel of the same noise, which shows each number to within
+        PRIOR_DEVIATION."""
+        return torch.eye(len(self.units), dtype=torch.float64) * noise / PRIOR_DEVIATION**2
+
+    def _adjustment(self, poses: Poses, evidence: list[LossModel]) -> Adjustment:
+        """Return the poses with the covariance of all numbers."""
+        noise = _noise(evidence)
+        prior = self._prior(noise)
+        inverse = torch.linalg.inv(self._sum([one.curvature for one in evidence]) + prior)
+        covariance = inverse @ (self._sum([one.scores for one in evidence]) + noise * prior) @ inverse
+        return Adjustment(poses, covariance, sum(one.loss for one in evidence), evidence)
+
+
 def adjust_bundle(
     sources: Sequence[LossSource], poses: Sequence[Pose], most: int = MAX_ADJUST_STEPS,
-    after_step: Callable[[Adjustment], None] | None = None,
+    after_step: Callable[[Adjustment], Any] = nothing,
 ) -> Adjustment:  # fmt: skip
-    """Return the most likely poses and lens near the given ones. `after_step` is called before each step with the
+    """Return the most likely poses and lens near the given ones, after at most so many steps. `after_step` is called with the
     best so far."""
-    best = _model(sources, list(poses))
-    damping = 0.0
-    for _ in range(most):
-        if after_step is not None:
-            after_step(best)
-        moves = _step(sources, best, damping)
-        if best.agreed and _is_still(sources, best, moves):
-            return best._replace(short=True)
-        there = [
-            source.task.moved(pose, source.task.dofs, move)
-            for source, pose, move in zip(sources, best.poses, moves, strict=True)
-        ]
-        found = _model(sources, there)
-        slack = sum(evidence.slack for evidence in best.evidence)
-        # Each picture alone may have a lower loss with a lens of its own, so the first common lens is always accepted.
-        if not best.agreed or found.loss <= best.loss + slack:
-            best, damping = found, 0.0 if damping <= RETRY_DAMPING else 0.1 * damping
-        else:
-            damping = max(RETRY_DAMPING, 10.0 * damping)
-    return best
+    bundle, best = Bundle(sources), []
 
+    def note(descents: LevenbergMarquardt[Poses]) -> None:
+        if bundle.last is not None and descents.descents[0].point is bundle.last.poses:
+            best[:] = [bundle.last]
+        after_step(best[0])
 
-def _model(sources: Sequence[LossSource], poses: list[Pose]) -> Adjustment:
-    """Return the sum of the models of all places."""
-    evidence = [source.at(pose) for source, pose in zip(sources, poses, strict=True)]
-    rows, n = _places(sources)
-    H, S = torch.zeros(n, n, dtype=torch.float64), torch.zeros(n, n, dtype=torch.float64)
-    for own, one in zip(rows, evidence, strict=True):
-        H[own[:, None], own] += one.curvature
-        S[own[:, None], own] += one.scores
-    # The prior is one more pixel of the same noise, which shows each number to within PRIOR_DEVIATION.
-    noise = _noise(evidence)
-    prior = torch.eye(n, dtype=torch.float64) * noise / PRIOR_DEVIATION**2
-    inverse = torch.linalg.inv(H + prior)
-    covariance = inverse @ (S + noise * prior) @ inverse
-    lenses = torch.stack([lens_of(source, pose) for source, pose in zip(sources, poses, strict=True)])
-    agreed = bool((lenses - lenses[0]).abs().max() < 1e-9) if lenses.numel() else True
-    return Adjustment(poses, covariance, sum(one.loss for one in evidence), evidence, False, agreed)
-
-
-def _step(sources: Sequence[LossSource], model: Adjustment, damping: float) -> list[Tensor]:
-    """Return the moves (m,) of each place, by the entries that its task seeks."""
-    rows, n = _places(sources)
-    A, b = torch.zeros(n, n, dtype=torch.float64), torch.zeros(n, dtype=torch.float64)
-    lenses = [lens_of(source, pose) for source, pose in zip(sources, model.poses, strict=True)]
-    for own, one, lens in zip(rows, model.evidence, lenses, strict=True):
-        H = one.curvature + damping * torch.diag(one.curvature.diagonal())
-        # Poses count from where they are, the lens from the given one.
-        here = torch.cat([lens.new_zeros(len(own) - len(lens)), lens])
-        A[own[:, None], own] += H
-        b[own] += H @ here - one.gradient
-    x = torch.linalg.solve(A + torch.eye(n, dtype=torch.float64) * _noise(model.evidence) / PRIOR_DEVIATION**2, b)
-    moves = []
-    for own, lens in zip(rows, lenses, strict=True):
-        move = x[own]
-        move[len(own) - len(lens) :] -= lens
-        moves.append(move)
-    longest = max(
-        (float(m[: len(m) - len(lens)].abs().max()) for m, lens in zip(moves, lenses, strict=True)), default=0.0
-    )
-    shorter = min(1.0, MAX_POSE_MOVE / max(longest, 1e-300)) if model.agreed else 1.0
-    return [shorter * move for move in moves]
-
-
-def _is_still(sources: Sequence[LossSource], model: Adjustment, moves: Sequence[Tensor]) -> bool:
-    """Return whether a step is short by the covariance of what it moves."""
-    rows, n = _places(sources)
-    whole = torch.zeros(n, dtype=torch.float64)
-    for own, move in zip(rows, moves, strict=True):
-        whole[own] = move
-    return float(whole @ torch.linalg.solve(model.covariance, whole)) <= SHORT_STEP_DEVIATIONS**2 * n
+    # The expected decrease of the cost by a step is half its square in standard deviations.
+    short = 0.5 * SHORT_STEP_DEVIATIONS**2 * len(bundle.units)
+    settings = replace(ADJUST, steps=most + 1, least_gain=short)
+    found = minimise(bundle, [bundle.agreed(poses)], settings, note)
+    if found.interrupted:
+        raise KeyboardInterrupt
+    return best[0]._replace(short=found.descents[0].rest is Rest.SHORT)
 
 
 def _noise(evidence: Sequence[LossModel]) -> float:
     """Return the ratio of the covariance of the loss's gradient to the loss's curvature."""
     curvature = sum(float(one.curvature.trace()) for one in evidence)
     return sum(float(one.scores.trace()) for one in evidence) / max(curvature, 1e-300) or math.ulp(0.0)
-
-
-def _places(sources: Sequence[LossSource]) -> tuple[list[Tensor], int]:
-    """Return where the entries of each place are among all numbers, and how many numbers there are."""
-    counts = [len(poses_of(source)) for source in sources]
-    n = sum(counts) + len(sources[0].task.dofs) - counts[0]
-    return _rows(counts, n), n
 
 
 def _rows(counts: Sequence[int], n: int) -> list[Tensor]:

@@ -11,6 +11,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...aovs import render_aovs
+from ...optim.history import Ending
+from ...optim.tensors import Descent
 from ...rig.function import FunctionDeformer
 from ...rig.rig import Rig
 from ...rig.rotations import roma
@@ -18,15 +20,12 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import CheckpointFile
 from ..descent.curvature import MAX_NUMBERS
-from ..descent.fit_scene import make_optimizer, reporter
-from ..descent.gauss_newton import GaussNewtonOptimizer
-from ..descent.loop import Descent, descend
+from ..descent.descend import GAUSS_NEWTON, Save, continued, descend_levels, descend_views
+from ..descent.fit_scene import reporter
 from ..descent.objective import Objective
 from ..descent.region_loss import FINAL_STEP
 from ..descent.result import RESULT_SPP, make_fit
 from ..descent.scene_builder import Built
-from ..ending import Ending
-from ..history import Record
 from ..losses import REGION
 from ..options import Settings
 from ..parameter import Parameter
@@ -48,7 +47,8 @@ REGION_COST = 4  # A try by regions takes so many times as long, so there are so
 LAST_SPP_FACTOR = 4  # factor of samples on the last level, where axial rotations of limbs show little
 # With a residual loss below this, in units of its noise, these two dampings, relative to the largest curvature, make steps go
 # far where pictures show little: shared axial rotations arrive before the loss, which hardly shows them, seems at rest.
-NEARLY_FITTED, HARDLY_SEEN, NEAR_DAMPING = 10.0, 1e-6, 1e-4
+NEARLY_FITTED = 10.0
+NEARLY_FITTED_SETTINGS = dataclasses.replace(GAUSS_NEWTON, unseen_damping=1e-6, start_damping=1e-4)
 PRIOR_GROWTH = 3.0  # A prior's weight grows by this power of how much coarser the pictures are.
 # The default prior's weight at the pictures' own size, where it would otherwise outweigh what shows axial rotations.
 ANNEALED_WEIGHT = 0.1
@@ -77,32 +77,17 @@ class CoarseToFine:
             self.tried = self.tried[-1:]  # Coarse contours show little.
 
     def run(self) -> RigFit:
-        parameters = self.free.parameters
-        values = self.free.start
-        first = dict(values)
-        given = {"start": self.free.fixed, "parameters": parameters, "tries": self.tries, "factors": self.factors}
+        first = self.free.start
+        given = {
+            "start": self.free.fixed, "parameters": self.free.parameters, "tries": self.tries, "factors": self.factors,
+        }  # fmt: skip
         checkpoint = CheckpointFile.from_views(self.options.checkpoint, self.views, {**given, **self.options.of_steps})
-        saved, level, history, seconds = checkpoint.read(), 0, [], 0.0
-        if saved is not None:
-            level, values, seconds = saved["level"], saved["values"], saved["seconds"]
-            history = [Record(*record) for record in saved["history"]]
-        while True:
-            stage = {"level": level, "values": values, "history": [tuple(r) for r in history], "seconds": seconds}
-
-            def save(loop: dict[str, Any], stage: dict[str, Any] = stage) -> None:
-                checkpoint.write({**stage, "loop": loop})
-
-            found = self.descend(values, level, save, None if saved is None else saved["loop"], saved is None)
-            saved, values = None, found.values
-            history += [record._replace(step=len(history) + k) for k, record in enumerate(found.history)]
-            seconds += found.seconds
-            if found.ending is Ending.INTERRUPTED or level == len(self.factors) - 1:
-                break
-            level += 1
+        found = descend_levels(checkpoint, first, len(self.factors), self.descend)
+        values = found.values
         objective = Objective(self.build(self.views), self.views, self.options, build_batch=self.many(self.views))
         with torch.no_grad():
             start, _ = objective.build(first)
-        fit = make_fit(objective, Descent(values, history, seconds, found.ending), start, Coordinates({}))
+        fit = make_fit(objective, found, start, Coordinates({}))
         found_values = {name: value.detach() for name, value in self.free.all(values).items()}
         with torch.no_grad():
             alphas = [render_aovs(fit.scene, view.camera, ["alpha"], spp=16, seed=0)["alpha"] for view in self.views]
@@ -153,8 +138,7 @@ class CoarseToFine:
         return scene, [view.camera for view in views]
 
     def descend(
-        self, values: Mapping[str, Tensor], level: int, save: Callable[[dict[str, Any]], None], saved: dict[str, Any] | None,
-        fresh: bool,
+        self, values: dict[str, Tensor], level: int, save: Save, saved: Mapping[str, Any] | None
     ) -> Descent:  # fmt: skip
         """Run one level; the best values are in the result's."""
         factor = self.factors[level]
@@ -177,10 +161,10 @@ class CoarseToFine:
         options = dataclasses.replace(self.options, spp=spp, steps=steps)
         batch = self.many(views)
         objective = Objective(build, views, options, prior=prior, build_batch=batch, builder="appearance")
-        if fresh and level == 0:
+        if level == 0 and saved is None:
             objective.check(values)
         title = f"level {level + 1} of {len(self.factors)}"
-        found = self._steps(objective, values, options, save, saved, title, fine)
+        found = self._steps(objective, values, save, saved, title, fine)
         name = next((n for n in ("rotations", "angles") if n in values and n in self.free.joints), None)
         interrupted = found.ending is Ending.INTERRUPTED
         if level in self.tried and self.tries and name is not None and saved is None and not interrupted:
@@ -198,9 +182,8 @@ class CoarseToFine:
                 return found._replace(ending=Ending.INTERRUPTED)
             if values is found.values:
                 return found
-            more = self._steps(objective, values, options, save, None, title, fine)
-            later = [record._replace(step=len(found.history) + k) for k, record in enumerate(more.history)]
-            found = more._replace(history=found.history + later, seconds=found.seconds + more.seconds)
+            more = self._steps(objective, values, save, None, title, fine)
+            found = more._replace(history=continued(found.history, more.history), seconds=found.seconds + more.seconds)
         return found
 
     def _searched(
@@ -229,7 +212,7 @@ class CoarseToFine:
             groups = [Limb(list(range(k, len(values[name])))) for k in range(len(values[name]))]
 
         def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
-            found = descend(make_optimizer(parameters, few), objective, lambda state: None)
+            found = descend_views(objective.with_options(few), parameters)
             if found.ending is Ending.INTERRUPTED:
                 raise KeyboardInterrupt
             return found.values
@@ -241,20 +224,16 @@ class CoarseToFine:
         )  # fmt: skip
 
     def _steps(
-        self, objective: Objective, values: Mapping[str, Tensor], options: Settings, save: Callable[[dict[str, Any]], None],
-        saved: dict[str, Any] | None, title: str, fine: bool,
+        self, objective: Objective, values: Mapping[str, Tensor], save: Save,
+        saved: Mapping[str, Any] | None, title: str, fine: bool,
     ) -> Descent:  # fmt: skip
         parameters = {
             name: dataclasses.replace(p, value=p.within(values[name])) for name, p in self.free.parameters.items()
         }
-        optimiser = make_optimizer(parameters, options)
         near = objective.regions is None and fine and objective.residual(values) < NEARLY_FITTED
-        if isinstance(optimiser, GaussNewtonOptimizer) and near:
-            optimiser.unseen_damping, optimiser.damping = HARDLY_SEEN, NEAR_DAMPING
-        return descend(
-            optimiser, objective, save, saved, title,
-            reporter(objective.build, objective.views, bones=self.bones),
-        )  # fmt: skip
+        settings = NEARLY_FITTED_SETTINGS if near else GAUSS_NEWTON
+        report = reporter(objective.build, objective.views, bones=self.bones)
+        return descend_views(objective, parameters, save, saved, title, report, settings)
 
     @torch.no_grad()
     def bones(self, tensors: Mapping[str, Tensor]) -> Tensor | None:

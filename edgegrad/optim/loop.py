@@ -1,0 +1,85 @@
+"""The loop that all optimisers share: it advances them until they rest, and keeps a state to go on from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from tqdm import tqdm
+
+
+class Optimizer(Protocol):
+    """What run() advances: it takes steps until they lead no further. Its state is all that they depend on, in tensors and plain
+    values."""
+
+    @property
+    def steps(self) -> int: ...
+    @property
+    def resting(self) -> bool: ...
+    @property
+    def loss(self) -> float: ...
+    def advance(self) -> Any: ...
+    def state(self) -> dict[str, Any]: ...
+    def load(self, state: Mapping[str, Any]) -> None: ...
+
+
+def nothing(*_: Any) -> None:
+    """Do nothing after a step, or with a state."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """How run() runs.
+
+    steps       largest number of steps
+    after_step  called after each step
+    save        called with a state every `every` steps and at the end; the state has the seconds so far
+    saved       such a state to go on from; None: begin anew
+    title       of the bar on standard error; None: there is none
+    """
+
+    steps: int
+    after_step: Callable[[], Any] = nothing
+    save: Callable[[dict[str, Any]], Any] = nothing
+    every: int | None = None
+    saved: Mapping[str, Any] | None = None
+    title: str | None = None
+
+
+class Run(NamedTuple):
+    """How run() ended."""
+
+    seconds: float  # those before a saved state included
+    interrupted: bool
+
+
+def run(optimizer: Optimizer, loop: Loop) -> Run:
+    """Take steps until the optimizer rests or the steps run out. Ctrl-C ends the loop with what the optimizer has."""
+    began, interrupted = time.perf_counter(), False
+    if loop.saved is not None:
+        optimizer.load(loop.saved)
+        began -= loop.saved["seconds"]
+
+    def keep() -> float:
+        seconds = time.perf_counter() - began
+        loop.save({**optimizer.state(), "seconds": seconds})
+        return seconds
+
+    bar = tqdm(
+        total=loop.steps, initial=optimizer.steps, desc=loop.title, unit="step", disable=loop.title is None, leave=False
+    )
+    try:
+        while optimizer.steps < loop.steps and not optimizer.resting:
+            optimizer.advance()
+            bar.set_postfix_str(f"loss {optimizer.loss:.3e}", refresh=False)
+            bar.update()
+            loop.after_step()
+            if loop.every is not None and optimizer.steps % loop.every == 0:
+                keep()
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        bar.close()
+    return Run(keep(), interrupted)

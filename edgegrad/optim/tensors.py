@@ -1,0 +1,140 @@
+"""Descents in named tensors: what Adam and Levenberg-Marquardt share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from .history import Ending, Record
+from .loop import Loop, run
+
+MAX_RECORDED = 64  # numbers of a parameter whose values the history holds
+Tensors = Mapping[str, Tensor]
+
+
+class Parameter(Protocol):
+    """A tensor to find: its learning rate, where it starts, whether all its numbers have one step size, and its bounds."""
+
+    @property
+    def lr(self) -> float: ...
+    @property
+    def value(self) -> Tensor | None: ...
+    @property
+    def uniform(self) -> bool: ...
+    def within(self, value: Tensor) -> Tensor: ...
+
+
+class Objective:
+    """A loss of named tensors, by samples of its own in each step."""
+
+    renewal_steps: int | None = None  # from one renew() to the next; None: nothing is held fixed
+    provisional: bool = False  # whether later steps have another loss, at which alone a descent may rest
+
+    def __call__(self, tensors: Tensors, step: int) -> Tensor:
+        """Return the loss."""
+        raise NotImplementedError
+
+    def renew(self, tensors: Tensors, step: int) -> None:
+        """Compute what the loss holds fixed between steps at these values."""
+
+
+class TensorDescent:
+    """The state of a descent: its tensors, the best ones so far, and whether steps still lead down."""
+
+    saved: ClassVar[tuple[str, ...]] = ("best", "steps", "resting", "renewed")  # attributes in checkpoints
+
+    def __init__(self, objective: Objective, parameters: Mapping[str, Parameter]) -> None:
+        self.objective, self.parameters = objective, parameters
+        self.values = {name: p.value.clone().requires_grad_() for name, p in parameters.items() if p.value is not None}
+        self.best = detached(self.values)
+        self.history: list[Record] = []
+        self.steps, self.resting = 0, False
+        self.renewed: tuple[int, dict[str, Tensor]] | None = None  # step and values of the objective's last renewal
+
+    def advance(self) -> None:
+        """Take one step, and add a record of the point where it began."""
+        raise NotImplementedError
+
+    @property
+    def loss(self) -> float:
+        """The loss of the last record."""
+        return self.history[-1].loss
+
+    @property
+    def falling(self) -> bool:
+        """Whether more steps would lower the loss."""
+        raise NotImplementedError
+
+    def ending(self, interrupted: bool) -> Ending:
+        if interrupted:
+            return Ending.INTERRUPTED
+        return Ending.FLAT if self.resting else Ending.FALLING if self.falling else Ending.STEPS
+
+    def renew(self, values: Tensors) -> bool:
+        """Renew what the objective holds fixed, if it is due. Return whether losses stop being comparable by that."""
+        period, last = self.objective.renewal_steps, self.renewed
+        if period is None or (last is not None and self.steps < last[0] + period):
+            return False
+        self.renewed = self.steps, detached(values)
+        self.objective.renew(self.renewed[1], self.steps)
+        return True
+
+    @torch.no_grad()
+    def set(self, values: Tensors) -> None:
+        """Take these values, clamped to their bounds."""
+        for name, value in self.values.items():
+            value.copy_(self.parameters[name].within(values[name]))
+
+    def record(self, loss: float, norms: dict[str, float], rate: float = 1.0) -> None:
+        """Add a record of the present values to the history, and count the step."""
+        small = {n: v.detach().clone() for n, v in self.values.items() if v.numel() <= MAX_RECORDED}
+        self.history.append(Record(self.steps, loss, norms, small, rate))
+        self.steps += 1
+
+    def state(self) -> dict[str, Any]:
+        own = {name: getattr(self, name) for name in self.saved}
+        return {**own, "values": detached(self.values), "history": [tuple(record) for record in self.history]}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        for name in self.saved:
+            setattr(self, name, state[name])
+        self.history = [Record(*record) for record in state["history"]]
+        self.set(state["values"])
+        if self.renewed is not None:
+            self.objective.renew(self.renewed[1], self.renewed[0])
+
+
+class Descent(NamedTuple):
+    """The result of descend()."""
+
+    values: dict[str, Tensor]  # the best
+    history: list[Record]
+    seconds: float
+    ending: Ending
+
+
+def descend(
+    descent: TensorDescent, loop: Loop, after_step: Callable[[Record, dict[str, Tensor]], Any] | None = None
+) -> Descent:
+    """Run a descent. `after_step` gets each step's record, and the tensors after it."""
+    if after_step is not None:
+        loop = replace(loop, after_step=lambda: after_step(descent.history[-1], descent.values))
+    seconds, interrupted = run(descent, loop)
+    return Descent(descent.best, descent.history, seconds, descent.ending(interrupted))
+
+
+def gradients_of(loss: Tensor, values: Tensors) -> dict[str, Tensor | None]:
+    """Return the gradients by name, None by tensors on which the loss does not depend."""
+    if not loss.requires_grad:  # None of the step's samples show what is sought.
+        return dict.fromkeys(values)
+    found = torch.autograd.grad(loss, list(values.values()), allow_unused=True)
+    return dict(zip(values, found, strict=True))
+
+
+def detached(values: Tensors) -> dict[str, Tensor]:
+    """Return copies without gradients."""
+    return {name: value.detach().clone() for name, value in values.items()}
