@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .convergence import ConvergenceMonitor
+from .convergence import Settling
 from .tensors import Objective, Parameter, TensorDescent, detached, gradients_of
 
 BETAS = 0.9, 0.999  # decay of the means of gradients and of their squares, as the paper has them
@@ -73,80 +73,88 @@ class AdamSettings:
     tolerance: float = 0.01
     patience: int = 40
     # Factor of the rates at a cut, and number of cuts before the end. The last rates are 0.3³ of the first, and so is the
-    # spread of the values about the minimum. Half as many cuts end a third sooner, with three times the spread.
+    # spread of the values about the minimum.
     cut: float = 0.3
     cuts: int = 3
-    # Weight of earlier losses in the mean by which the best values are chosen: over some ten steps, for losses are noisy.
-    smoothing: float = 0.9
-    # Steps until the mean of losses is compared, where each loss is of a part of the data: the first may happen to be least.
-    warm_up: int = 0
+    # Losses are compared of the mean values over a fourth of the patience. Rates are cut after two means without a fall.
+    windows: int = 4
+    settled_windows: int = 2
+    # By so many standard deviations of its noise a loss must fall.
+    noise_deviations: float = 2.0
 
 
 class AdamDescent(TensorDescent):
-    """Descent by Adam. About a minimum steps go to and fro, so the result is the mean of the values after the last cut."""
+    """Descent by Adam. About a minimum steps go to and fro, so the result is a mean of the values since the loss last fell."""
 
-    saved = (*TensorDescent.saved, "cuts", "since", "smooth", "least", "total")
+    saved = (*TensorDescent.saved, "cuts", "good", "total", "summed", "mean", "means")
 
     def __init__(self, objective: Objective, parameters: Mapping[str, Parameter], settings: AdamSettings) -> None:
         super().__init__(objective, parameters)
         self.settings = settings
         rates = {name: p.lr for name, p in parameters.items()}
         self.adam = Adam(self.values, rates, {name for name, p in parameters.items() if p.uniform})
-        self.monitor = ConvergenceMonitor(self.values)
-        self.cuts = self.since = 0  # `since` is the step of the last cut
-        self.smooth, self.least = 0.0, math.inf
-        self.total: dict[str, Tensor] = {}  # sums of the values since the last cut
+        self.settling = Settling()
+        self.cuts = 0
+        self.good = detached(self.values)  # where the loss last fell
+        self.total: dict[str, Tensor] = {}  # sums of the values of some steps since the last comparison
+        self.summed = 0  # of how many
+        self.mean, self.means = self.good, 0  # the mean of so many means since the loss last fell
+
+    @property
+    def best(self) -> dict[str, Tensor]:
+        """The present values while the loss falls, and the mean of those since it last fell afterwards."""
+        return self.mean if self.settling.settled else detached(self.values)
 
     @property
     def falling(self) -> bool:
-        """Whether as many more steps as the patience are predicted to lower the loss by more than tolerance and noise."""
-        return self.monitor.is_ready and self._leads_down
-
-    @property
-    def _leads_down(self) -> bool:
-        tolerance, patience = self.settings.tolerance, self.settings.patience
-        return self.monitor.predicted_decrease(patience) > self.monitor.least_decrease(tolerance, patience)
+        return self.settling.points > 1 and self.settling.settled == 0
 
     def advance(self) -> None:
-        if self.renew(self.values):
-            self.monitor.split_losses()
-            self.least = math.inf
-        settings = self.settings
+        settings, window = self.settings, max(1, self.settings.patience // self.settings.windows)
+        renewed = self.renew(self.values)
+        if not self.settling.points:
+            self._compare(self.good)
+        elif renewed:
+            self.settling.rebase(self.settling.lowest, self.compared(self.good))
         loss = self.objective(self.values, self.steps)
         gradients = gradients_of(loss, self.values)
         norms = {name: 0.0 if g is None else float(g.norm()) for name, g in gradients.items()}
         self.record(float(loss.detach()), norms, settings.cut**self.cuts)
         if not math.isfinite(self.loss + sum(norms.values())):
-            # The step went too far: go back to the best values, with shorter steps.
+            # The step went too far: go back to where the loss last fell, with shorter steps.
             self._cut()
             self.adam.forget()
-            self.set(self.best)
+            self.set(self.good)
             return
-        self.monitor.end_step(self.loss, gradients)
-        self.smooth = settings.smoothing * self.smooth + (1.0 - settings.smoothing) * self.loss
-        mean = self.smooth / (1.0 - settings.smoothing ** len(self.history))
-        if mean <= self.least or len(self.history) <= settings.warm_up:
-            self.least, self.best = mean, detached(self.values)
-        self.total = {n: v.detach() + self.total.get(n, 0.0) for n, v in self.values.items()}
-        self.monitor.begin_step()
+        self.total = {n: v.detach() + (self.total[n] if self.summed else 0.0) for n, v in self.values.items()}
+        self.summed += 1
         self.adam.step(gradients)
         self.set(self.values)
-        if settings.tolerance > 0.0 and not self._leads_down:
-            self._cut()
+        if self.summed == window:
+            self._compare({name: total / window for name, total in self.total.items()})
+            self.summed = 0
+            if settings.tolerance > 0.0 and self.settling.settled >= settings.settled_windows:
+                self._cut()
+
+    def _compare(self, mean: dict[str, Tensor]) -> None:
+        """Note whether the loss of the mean of some values is lower than before."""
+        settings = self.settings
+        self.settling.add(self.compared(mean), settings.noise_deviations, settings.tolerance / settings.windows)
+        if self.settling.settled == 0:
+            self.good = mean
+        self.means = self.means + 1 if self.settling.settled > 1 else 1
+        self.mean = {name: value.lerp(mean[name], 1.0 / self.means) for name, value in self.mean.items()}
 
     def _cut(self) -> None:
         self.resting = self.cuts == self.settings.cuts
-        count = self.steps - self.since
-        if self.resting and self.total:
-            self.best = {name: total / count for name, total in self.total.items()}
-        self.cuts, self.since, self.total = self.cuts + 1, self.steps, {}
-        self.monitor.reset()
-        self.adam.shorten(self.settings.cut)
+        if not self.resting:
+            self.cuts, self.summed, self.settling.settled = self.cuts + 1, 0, 0
+            self.adam.shorten(self.settings.cut)
 
     def state(self) -> dict[str, Any]:
-        return {**super().state(), "adam": self.adam.state(), "monitor": self.monitor.state()}
+        return {**super().state(), "adam": self.adam.state(), "settling": dict(vars(self.settling))}
 
     def load(self, state: Mapping[str, Any]) -> None:
         super().load(state)
         self.adam.load(state["adam"])
-        self.monitor.load(state["monitor"])
+        self.settling = Settling(**state["settling"])

@@ -12,7 +12,6 @@ from torch import Tensor
 from .levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtSettings, Model, Problem, Rows
 from .tensors import Objective, Parameter, TensorDescent, Tensors, detached, gradients_of
 
-COMPARISON_STEPS = 2**20, 2**21  # seeds of the losses that are compared: steps that no fit reaches
 Curvature = Callable[[Tensors, int], Tensor]
 
 
@@ -27,7 +26,12 @@ class GaussNewtonDescent(TensorDescent):
         """`curvature` (n, n) of the objective by all numbers, one tensor after the other, at values and a step."""
         super().__init__(objective, parameters)
         self.problem = _TensorProblem(self, curvature)
-        self.descents = LevenbergMarquardt(self.problem, [self.best], settings)
+        self.descents = LevenbergMarquardt(self.problem, [detached(self.values)], settings)
+
+    @property
+    def best(self) -> dict[str, Tensor]:
+        """The last accepted values, or the mean of several about the minimum."""
+        return self.descents.points[0]
 
     @property
     def falling(self) -> bool:
@@ -45,7 +49,7 @@ class GaussNewtonDescent(TensorDescent):
         self.set(self.problem.candidate)
         self.record(self.problem.cost, norms)
         self.set(descent.point)
-        (self.best,), self.resting = self.descents.points, descent.rest is not None
+        self.resting = descent.rest is not None
 
     def state(self) -> dict[str, Any]:
         return {**super().state(), "descents": self.descents.state()}
@@ -74,8 +78,7 @@ class _TensorProblem(Problem[dict[str, Tensor]]):
     def model(self, points: Sequence[dict[str, Tensor]]) -> Model:
         (values,) = points
         step = self.descent.steps
-        with torch.no_grad():
-            cost = torch.stack([self.objective(values, at).double() for at in COMPARISON_STEPS])
+        cost = self.descent.compared(values)
         self.candidate, self.cost = values, float(cost.mean())
 
         def gradient(rows: Rows) -> Tensor:

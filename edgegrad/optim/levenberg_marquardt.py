@@ -21,13 +21,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from .convergence import EMPTY, Settling
 from .loop import Loop, nothing, run
 
 Point = TypeVar("Point")
 Rows = Sequence[int]
-EMPTY = torch.empty(0)
 
-NOISE_MEMORY = 0.7  # weight of the noise of earlier steps in its running mean
 LARGEST_CUT = 1.0 / 3.0  # of λ in one step, and the factor 2 of the first raise: both as Nielsen has them
 
 
@@ -106,8 +105,8 @@ class Rest(Enum):
     STEPS = "steps ran out"
 
 
-@dataclass
-class Descent(Generic[Point]):
+@dataclass(kw_only=True)
+class Descent(Settling, Generic[Point]):
     """One descent: its last accepted point with the model there, and the next step."""
 
     point: Point
@@ -116,17 +115,12 @@ class Descent(Generic[Point]):
     steps: int = 0  # evaluations
     accepted: int = 0
     rest: Rest | None = None
-    cost: Tensor = EMPTY  # (S,) at the point
-    slack: float = 0.0  # of the cost there, by the model
+    shared_slack: float = 0.0  # of the cost at the point, by the model
     gradient: Tensor = EMPTY  # (n,)
     curvature: Tensor = EMPTY  # (n, n)
     step: Tensor = EMPTY  # (n,), the next one
     predicted: float = 0.0  # decrease of the cost by it
-    first: float = math.nan  # mean cost of the start
-    noise: float = 0.0  # variance of the mean difference of costs, averaged over steps
-    lowest: Tensor = EMPTY  # (S,), costs that a fall is counted from
-    settled: int = 0  # accepted steps since the last fall
-    path: tuple[Tensor, ...] = ()  # (n,) each, places of these steps, from the point of the last fall
+    path: tuple[Tensor, ...] = ()  # (n,) each, where steps since the last fall led, from the point of that
 
     @property
     def mean_cost(self) -> float:
@@ -154,7 +148,7 @@ class LevenbergMarquardt(Generic[Point]):
     ) -> None:
         self.problem = problem
         self.settings = settings or LevenbergMarquardtSettings()
-        self.descents = [Descent(start, self.settings.start_damping) for start in starts]
+        self.descents = [Descent(point=start, damping=self.settings.start_damping) for start in starts]
         self.interrupted = False
 
     @property
@@ -210,7 +204,7 @@ class LevenbergMarquardt(Generic[Point]):
             if bool(here.isfinite().all() and gradient.isfinite().all() and curvature.isfinite().all()):
                 self._follow(active[k], candidates[k], cost[k], here)
                 active[k].gradient, active[k].curvature = gradient, curvature
-                active[k].slack = 0.0 if model.slack is None else float(model.slack[row])
+                active[k].shared_slack = 0.0 if model.slack is None else float(model.slack[row])
                 taken.append(k)
         for k, descent in enumerate(active):
             descent.steps += 1
@@ -241,8 +235,7 @@ class LevenbergMarquardt(Generic[Point]):
 
     def _slack(self, descent: Descent[Point], fall: Tensor) -> float:
         """Return by how much noise may raise a cost, with the differences (S,) of costs by their sets of samples."""
-        sampled = self.settings.noise_deviations * math.sqrt(max(descent.noise, _variance_of_mean(fall)))
-        return max(sampled, descent.slack)
+        return max(descent.slack(fall, self.settings.noise_deviations), descent.shared_slack)
 
     def _derivatives(
         self, descents: Sequence[Descent[Point]], model: Model, rows: Rows
@@ -260,36 +253,23 @@ class LevenbergMarquardt(Generic[Point]):
     def _follow(self, descent: Descent[Point], point: Point, cost: Tensor, renewed: Tensor) -> None:
         """Take a step to a point with this cost, and that after the problem's renewal: adapt the damping to the gain, and note
         whether the cost still falls."""
+        settings = self.settings
         if descent.accepted:
             fall = descent.cost - cost
             slack, mean = self._slack(descent, fall), float(fall.mean())
             gain = mean / descent.predicted if mean > slack and descent.predicted > 0.0 else 1.0
             factor = max(LARGEST_CUT, 1.0 - (2.0 * gain - 1.0) ** 3)
-            descent.damping = max(descent.damping * factor, self.settings.least_damping)
-            square, memory = _variance_of_mean(fall), NOISE_MEMORY if descent.accepted > 1 else 0.0
-            descent.noise = memory * descent.noise + (1.0 - memory) * square
-            self._settle(descent, cost)
-        else:
-            descent.first, descent.lowest = float(cost.mean()), cost
-        descent.point, descent.cost, descent.raised = point, renewed, 2.0
-        descent.lowest, descent.first = descent.lowest + renewed - cost, descent.first + float((renewed - cost).mean())
-        descent.accepted += 1
-
-    def _settle(self, descent: Descent[Point], cost: Tensor) -> None:
-        """Count the steps since the cost last fell. A slow descent falls in several steps together."""
-        if len(cost) < 2:  # There is no noise.
-            return
-        fall = descent.lowest - cost
-        now = float(cost.mean())
-        share = self.settings.tolerance * min(abs(now), abs(descent.first - now))
-        if float(fall.mean()) > max(self._slack(descent, fall), share) or self.problem.provisional:
-            descent.settled, descent.lowest, descent.path = 0, cost, ()
-            return
-        descent.settled += 1
+            descent.damping = max(descent.damping * factor, settings.least_damping)
+        descent.add(cost, settings.noise_deviations, settings.tolerance)
+        if self.problem.provisional or len(cost) < 2:  # Without noise, the lengths of steps alone say when to rest.
+            descent.settled, descent.lowest = 0, cost
         before = descent.path[-1] if descent.path else torch.zeros_like(descent.step)
-        descent.path = (*descent.path, before + descent.step)
-        if self.settings.settled_steps is not None and descent.settled > self.settings.settled_steps:
+        descent.path = (*descent.path, before + descent.step) if descent.settled else ()
+        if settings.settled_steps is not None and descent.settled > settings.settled_steps:
             descent.rest = Rest.SETTLED
+        descent.rebase(cost, renewed)
+        descent.point, descent.raised = point, 2.0
+        descent.accepted += 1
 
     def _take_back(self, descent: Descent[Point]) -> None:
         if not descent.accepted:
@@ -344,10 +324,6 @@ def _rows_of(values: Tensor | Callable[[Rows], Tensor], rows: Rows) -> Tensor:
         return torch.empty(0, dtype=torch.float64)
     found = values[list(rows)] if isinstance(values, Tensor) else values(rows)
     return found.detach().double()
-
-
-def _variance_of_mean(differences: Tensor) -> float:
-    return float(differences.var() / len(differences)) if len(differences) > 1 else 0.0
 
 
 def _decrease(descent: Descent[Any], step: Tensor) -> float:

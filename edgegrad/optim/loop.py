@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 
 class Optimizer(Protocol):
-    """What run() advances: it takes steps until they lead no further. Its state is all that they depend on, in tensors and plain
+    """An optimiser takes steps until they lead no further. Its state is all that they depend on, in tensors and plain
     values."""
 
     @property

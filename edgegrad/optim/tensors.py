@@ -12,6 +12,7 @@ from torch import Tensor
 from .history import Ending, Record
 from .loop import Loop, run
 
+COMPARISON_STEP = 2**20  # The first that gives losses which are compared their samples: no descent reaches it.
 MAX_RECORDED = 64  # numbers of a parameter whose values the history holds
 Tensors = Mapping[str, Tensor]
 
@@ -32,6 +33,7 @@ class Objective:
     """A loss of named tensors, by samples of its own in each step."""
 
     renewal_steps: int | None = None  # from one renew() to the next; None: nothing is held fixed
+    sample_sets: int = 2  # by which losses are compared
     provisional: bool = False  # whether later steps have another loss, at which alone a descent may rest
 
     def __call__(self, tensors: Tensors, step: int) -> Tensor:
@@ -45,18 +47,22 @@ class Objective:
 class TensorDescent:
     """The state of a descent: its tensors, the best ones so far, and whether steps still lead down."""
 
-    saved: ClassVar[tuple[str, ...]] = ("best", "steps", "resting", "renewed")  # attributes in checkpoints
+    saved: ClassVar[tuple[str, ...]] = ("steps", "resting", "renewed")  # attributes in checkpoints
 
     def __init__(self, objective: Objective, parameters: Mapping[str, Parameter]) -> None:
         self.objective, self.parameters = objective, parameters
         self.values = {name: p.value.clone().requires_grad_() for name, p in parameters.items() if p.value is not None}
-        self.best = detached(self.values)
         self.history: list[Record] = []
         self.steps, self.resting = 0, False
         self.renewed: tuple[int, dict[str, Tensor]] | None = None  # step and values of the objective's last renewal
 
     def advance(self) -> None:
         """Take one step, and add a record of the point where it began."""
+        raise NotImplementedError
+
+    @property
+    def best(self) -> dict[str, Tensor]:
+        """The result so far."""
         raise NotImplementedError
 
     @property
@@ -89,6 +95,12 @@ class TensorDescent:
         for name, value in self.values.items():
             value.copy_(self.parameters[name].within(values[name]))
 
+    @torch.no_grad()
+    def compared(self, values: Tensors) -> Tensor:
+        """Return losses (S,) by the same samples at all values."""
+        sets = range(self.objective.sample_sets)
+        return torch.stack([self.objective(values, COMPARISON_STEP + k).double() for k in sets])
+
     def record(self, loss: float, norms: dict[str, float], rate: float = 1.0) -> None:
         """Add a record of the present values to the history, and count the step."""
         small = {n: v.detach().clone() for n, v in self.values.items() if v.numel() <= MAX_RECORDED}
@@ -108,7 +120,7 @@ class TensorDescent:
             self.objective.renew(self.renewed[1], self.renewed[0])
 
 
-class Descent(NamedTuple):
+class DescentResult(NamedTuple):
     """The result of descend()."""
 
     values: dict[str, Tensor]  # the best
@@ -119,12 +131,12 @@ class Descent(NamedTuple):
 
 def descend(
     descent: TensorDescent, loop: Loop, after_step: Callable[[Record, dict[str, Tensor]], Any] | None = None
-) -> Descent:
+) -> DescentResult:
     """Run a descent. `after_step` gets each step's record, and the tensors after it."""
     if after_step is not None:
         loop = replace(loop, after_step=lambda: after_step(descent.history[-1], descent.values))
     seconds, interrupted = run(descent, loop)
-    return Descent(descent.best, descent.history, seconds, descent.ending(interrupted))
+    return DescentResult(descent.best, descent.history, seconds, descent.ending(interrupted))
 
 
 def gradients_of(loss: Tensor, values: Tensors) -> dict[str, Tensor | None]:

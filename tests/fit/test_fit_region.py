@@ -16,7 +16,7 @@ import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import Checkpoint, Parameter, PoseParameter, Refinement, fit_scene, fit_shape, fit_texture, losses
 from edgegrad.fit.contour_colors import CONTOUR_BLURS, ContourColors
-from edgegrad.fit.descent.region_loss import RENEWAL_STEPS, RegionLoss
+from edgegrad.fit.descent.region_loss import RegionLoss
 from edgegrad.fit.placement import Pose
 from edgegrad.fit.region import OUTLIERS, Palette, smoothed
 from edgegrad.fit.views import region_views, views_of
@@ -134,8 +134,8 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
 
     for step, blur in (
         (0, 3.0),
-        (RENEWAL_STEPS, 1.8),
-        (5 * RENEWAL_STEPS, sharp),
+        (regions.settings.renewal_steps, 1.8),
+        (5 * regions.settings.renewal_steps, sharp),
     ):  # the contour counts where alpha is sharp
         regions.renew(0, alpha, step)
         soft = smoothed(moving[None, ..., 0], blur)[0].double()

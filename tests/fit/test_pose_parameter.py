@@ -73,7 +73,7 @@ def test_a_function_gets_a_pose_in_the_type_of_the_object():
         scene, target(camera(16)), camera(16), {"place": PoseParameter(START, mesh)}, **arranged(steps=2, **QUIET)
     )
     assert all(isinstance(pose, Pose) and pose.R.dtype == pose.t.dtype == torch.float32 for pose in seen)
-    assert seen[1].R.requires_grad and fit.mesh.verts.dtype == torch.float32
+    assert any(pose.R.requires_grad for pose in seen) and fit.mesh.verts.dtype == torch.float32
     assert fit.values["place"].shape == (4, 4) and fit.values["place"].dtype == F64
     assert torch.equal(fit.poses["place"].matrix, fit.values["place"])
 

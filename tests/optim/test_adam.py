@@ -14,7 +14,7 @@ from edgegrad.fit import Parameter
 from edgegrad.optim.adam import Adam, AdamDescent, AdamSettings
 from edgegrad.optim.history import Ending
 from edgegrad.optim.loop import Loop
-from edgegrad.optim.tensors import Descent, Objective, Tensors, descend
+from edgegrad.optim.tensors import DescentResult, Objective, Tensors, descend
 
 
 def test_steps_equal_those_of_torch_adam() -> None:
@@ -50,18 +50,18 @@ class Bowl(Objective):
         return found * math.nan if step == self.broken else found
 
 
-def bowl(loop: Loop, objective: Bowl | None = None, **settings: Any) -> Descent:
+def bowl(loop: Loop, objective: Bowl | None = None, **settings: Any) -> DescentResult:
     x = Parameter(0.05, torch.zeros(3, dtype=torch.float64))
     return descend(AdamDescent(objective or Bowl(), {"x": x}, AdamSettings(**settings)), loop)
 
 
-def off(found: Descent) -> float:
+def off(found: DescentResult) -> float:
     return float((found.values["x"] - torch.tensor([1.0, -2.0, 0.5])).norm())
 
 
 def test_a_noisy_descent_ends_flat_and_its_mean_is_near_the_minimum() -> None:
     found = bowl(Loop(2000))
-    assert found.ending is Ending.FLAT and len(found.history) < 500 and off(found) < 0.1
+    assert found.ending is Ending.FLAT and len(found.history) < 300 and off(found) < 0.2
     assert min(record.rate for record in found.history) == pytest.approx(0.3**3)
 
 

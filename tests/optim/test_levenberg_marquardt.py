@@ -205,6 +205,17 @@ def test_a_cost_that_rises_along_its_gradient_rests_damped() -> None:
     assert found.points[0].equal(vector(5.0, 4.0))
 
 
+@pytest.mark.parametrize(("slack", "accepted"), [(0.0, False), (1e6, True)])
+def test_a_cost_may_rise_by_the_slack_of_its_model(slack: float, accepted: bool) -> None:
+    class Slack(LeastSquares):
+        def model(self, points: Sequence[Tensor]) -> Model:
+            return super().model(points)._replace(slack=torch.full((len(points),), slack, dtype=F64))
+
+    descents = LevenbergMarquardt(Slack(linear, scale=-1.0), [vector(5.0, 4.0)])
+    descents.advance()
+    assert descents.advance() == [accepted]
+
+
 class Bounded(LeastSquares):
     """The second number stays above zero."""
 

@@ -14,7 +14,7 @@ from ...optim.gauss_newton import GaussNewtonDescent
 from ...optim.history import Ending, Record
 from ...optim.levenberg_marquardt import LevenbergMarquardtSettings
 from ...optim.loop import Loop, nothing
-from ...optim.tensors import Descent, TensorDescent, descend
+from ...optim.tensors import DescentResult, TensorDescent, descend
 from ..checkpoints import CheckpointFile
 from ..losses import REGION
 from ..options import Settings
@@ -23,11 +23,10 @@ from .curvature import MAX_NUMBERS, check_pointwise, curvature
 from .objective import Objective
 
 # No number moves by more than ten learning rates in a step.
-GAUSS_NEWTON = LevenbergMarquardtSettings(trust_radius=10.0, settled_steps=7)
+GAUSS_NEWTON = LevenbergMarquardtSettings(trust_radius=10.0, settled_steps=6)
 # The first λ by regions, whose start may be far (Nielsen's τ): colours are those of a wrong place.
 REGION_DAMPING = 1.0
 Save = Callable[[dict[str, Any]], Any]
-WARM_UP = 10  # steps of few views until their losses are averaged enough to be compared
 
 
 def descend_views(
@@ -38,7 +37,7 @@ def descend_views(
     title: str = "fit",
     report: Callable[[Record, dict[str, Tensor]], Record] = lambda record, values: record,
     gauss_newton: LevenbergMarquardtSettings = GAUSS_NEWTON,
-) -> Descent:
+) -> DescentResult:
     """Descend from the parameters' values as the objective's options say.
 
     save, saved  get the descent's state every few steps, and give such a state to go on from
@@ -59,9 +58,9 @@ def descend_levels(
     checkpoint: CheckpointFile,
     values: dict[str, Tensor],
     count: int,
-    descend_level: Callable[[dict[str, Tensor], int, Save, Mapping[str, Any] | None], Descent],
+    descend_level: Callable[[dict[str, Tensor], int, Save, Mapping[str, Any] | None], DescentResult],
     between: Callable[[dict[str, Tensor], int], dict[str, Tensor]] = lambda values, level: values,
-) -> Descent:
+) -> DescentResult:
     """Descend on so many levels, each from where the one before ended.
 
     descend_level  of values, level, and the arguments `save` and `saved` of descend_views()
@@ -79,7 +78,7 @@ def descend_levels(
         history = continued(history, found.history)
         seconds += found.seconds
         if found.ending is Ending.INTERRUPTED or level == count - 1:
-            return Descent(values, history, seconds, found.ending)
+            return DescentResult(values, history, seconds, found.ending)
         level += 1
         values = between(values, level)
 
@@ -97,9 +96,7 @@ def _optimizer(
     objective: Objective, parameters: Mapping[str, Parameter], options: Settings, gauss_newton: LevenbergMarquardtSettings
 ) -> TensorDescent:  # fmt: skip
     if options.method == "adam":
-        warm_up = 0 if options.views_per_step is None else WARM_UP
-        settings = AdamSettings(options.loss_tolerance, options.patience, warm_up=warm_up)
-        return AdamDescent(objective, parameters, settings)
+        return AdamDescent(objective, parameters, AdamSettings(options.loss_tolerance, options.patience))
     if (count := sum(p.value.numel() for p in parameters.values() if p.value is not None)) > MAX_NUMBERS:
         raise ValueError(
             f'options.method: expected at most {MAX_NUMBERS} numbers to be sought by "gauss-newton", got {count}; '

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
-from ...optim.tensors import Descent
+from ...optim.tensors import DescentResult
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...warnings import warn
@@ -171,7 +171,7 @@ class _ShapeFit:
 
     def descend(
         self, values: dict[str, Tensor], level: int, save: Save, saved: Mapping[str, Any] | None
-    ) -> Descent:  # fmt: skip
+    ) -> DescentResult:  # fmt: skip
         """Run one level from a mesh's `verts` and `faces`, and return the best as its values."""
         mesh = _mesh_of(values)
         if level == 0 and saved is None:

@@ -17,9 +17,10 @@ from ..losses import REGION, loss_of
 from ..measured import measured_loss
 from ..options import Settings
 from ..views import Observation, batch_groups
-from .region_loss import RENEWAL_STEPS, RegionLoss
+from .region_loss import RegionLoss
 from .scene_builder import Built, build_detached
 
+SETS_OF_VIEWS = 4  # of samples, by which losses of some views are compared
 Tensors = Mapping[str, Tensor]
 
 
@@ -37,7 +38,9 @@ class Objective(TensorObjective):
         self.build_batch, self.builder = build_batch, builder
         self.losses = {"alpha": loss_of("options.mask_loss", options.mask_loss)}
         self.regions = RegionLoss(views, options.seed) if options.loss == REGION else None
-        self.renewal_steps = None if self.regions is None else RENEWAL_STEPS
+        self.renewal_steps = None if self.regions is None else self.regions.settings.renewal_steps
+        # Some views say less of a step than all.
+        self.sample_sets = 2 if options.views_per_step is None else SETS_OF_VIEWS
         if options.loss != REGION:
             self.losses["image"] = loss_of("options.loss", options.loss)
 

@@ -12,6 +12,7 @@ Alpha is blurred, widely at first, so that a step reaches far. The contour term 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,20 +24,29 @@ from ..region import RADIUS, Windows, likelihood, palette, posterior, slope, smo
 from ..views import Observation, has_levels, white_level
 
 FINAL_STEP = 2**20  # a step at which alpha is as sharp as pictures are
-RENEWAL_STEPS = 3  # from one renewal to the next
-LEAST_BLUR = 0.7  # pixels, of alpha, until the pictures show their own blur
-START_BLUR, NARROWING = 3.0, 0.6  # pixels at the start, and the factor from one renewal to the next
-SURENESS_BLUR = 2.5  # pixels, of the band in which colours next to the contour are judged
-# Of colours next to right contours: wrong ones on edges of clutter reach 0.69, right ones 0.70 … 0.81.
-MIN_SURENESS = 0.695
 MIN_COLOUR_RANGE = 1.5 / 255.0  # sRGB values: pixels that differ by no more are of one colour in eight bits
 MIN_BACKGROUND = 0.02  # share of background among the pixels near the object
+
+
+@dataclass(frozen=True)
+class RegionSettings:
+    """How the loss of regions changes along a descent, and how contours are judged by it. Lengths are in pixels."""
+
+    renewal_steps: int = 3  # from one renewal of colours and blur to the next
+    start_blur: float = 3.0  # of alpha at the start: a wider one reaches farther and shows less of the shape
+    narrowing: float = 0.6  # factor of the blur from one renewal to the next
+    least_blur: float = 0.7  # of alpha, until the pictures show their own blur
+    sureness_blur: float = 2.5  # of the band in which colours next to the contour are judged
+    # How surely colours must separate the two sides of a right contour. Wrong ones on edges of clutter reach 0.69, right ones
+    # 0.70 … 0.81, so a change by a tenth takes wrong contours for right ones, or right ones for wrong.
+    min_sureness: float = 0.695
 
 
 class RegionLoss:
     """The colours of some views' pictures, and the loss of silhouettes by them."""
 
-    def __init__(self, views: Sequence[Observation], seed: int) -> None:
+    def __init__(self, views: Sequence[Observation], seed: int, settings: RegionSettings | None = None) -> None:
+        self.settings = settings or RegionSettings()
         pictures = [view.image for view in views if view.image is not None]
         whites = [1.0 if has_levels(picture) else white_level(picture.flatten(0, 1)) for picture in pictures]
         shown = [picture / white for picture, white in zip(pictures, whites, strict=True)]
@@ -48,7 +58,7 @@ class RegionLoss:
         self.near = [torch.zeros(view.camera.size, dtype=torch.float32) for view in views]
         self.posteriors = [torch.full(view.camera.size, 0.5, dtype=torch.float32) for view in views]
         self.sides: list[ContourColors | None] = [None for _ in views]
-        self.blur = LEAST_BLUR
+        self.blur = self.settings.least_blur
         self.narrows = False  # whether alpha is blurred more than at later steps
         self._losses = [
             torch.zeros(len(CONTOUR_BLURS), dtype=torch.float32) for _ in views
@@ -56,8 +66,9 @@ class RegionLoss:
 
     def renew(self, index: int, alpha: Tensor, step: int = FINAL_STEP) -> None:
         """Take posterior and colours from a view's silhouette alpha (H, W, 1) at a step; keep the last ones if it is empty."""
-        wide = START_BLUR * NARROWING ** (step // RENEWAL_STEPS)
-        self.narrows = wide > LEAST_BLUR
+        settings = self.settings
+        wide = settings.start_blur * settings.narrowing ** (step // settings.renewal_steps)
+        self.narrows = wide > settings.least_blur
         share = alpha[..., 0].detach().float()
         near, extent = self.around(index, share)
         if extent > 0.0 and bool((near > 0.0).any()):
@@ -69,7 +80,9 @@ class RegionLoss:
             self.sides[index] = sides
             self._losses[index] = blur_losses(sides, self.displays[index], near, share)
         known = torch.stack(self._losses).sum(0)
-        self.blur = wide if self.narrows else CONTOUR_BLURS[int(known.argmin())] if bool(known.any()) else LEAST_BLUR
+        self.blur = (
+            wide if self.narrows else CONTOUR_BLURS[int(known.argmin())] if bool(known.any()) else settings.least_blur
+        )
 
     def around(self, index: int, alpha: Tensor) -> tuple[Tensor, float]:
         """Return weights (H, W) of the pixels near the object, and its extent in pixels, 0 if it is not seen."""
@@ -110,19 +123,22 @@ class RegionLoss:
     def edge_support(self, alphas: Sequence[Tensor], within: Sequence[Tensor] | None = None) -> float:
         """Return how much of the contour the pictures show, 0 … 1, from the alphas (H, W, 1) of the last renewal. It is the
         smaller of two shares: that of the contour's edges, and how surely colours separate its two sides. The latter is the
-        mean of 2P − 1 inside and 1 − 2P outside, scaled so that MIN_SURENESS is just enough. `within` (H, W) masks pixels."""
+        mean of 2P − 1 inside and 1 − 2P outside, scaled so that `min_sureness` is just enough. `within` (H, W) masks pixels."""
         parts, sureness, length = [], 0.0, 0.0
         for k, alpha in enumerate(alphas):
             share = alpha[..., 0].float()
             near = self.around(k, share)[0]
             near = near if within is None else near * within[k]
             parts.append((self.displays[k], share, near))
-            soft = smoothed(share[None], SURENESS_BLUR)[0]
+            soft = smoothed(share[None], self.settings.sureness_blur)[0]
             band = ((soft > PURE) & (soft < 1.0 - PURE)) * near
             sure = 2.0 * self.posteriors[k] - 1.0
             sureness += float((band * torch.where(share > 0.5, sure, -sure)).sum())
             length += float(band.sum())
-        return max(0.0, min(MIN_EDGE_SUPPORT / MIN_SURENESS * sureness / max(length, 1e-30), contour_support(parts)))
+        return max(
+            0.0,
+            min(MIN_EDGE_SUPPORT / self.settings.min_sureness * sureness / max(length, 1e-30), contour_support(parts)),
+        )
 
     def check(self, alphas: Sequence[Tensor]) -> None:
         """Check that the silhouettes of the start leave pixels of the pictures around them, of more than one colour. Raises

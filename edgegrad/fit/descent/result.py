@@ -16,7 +16,7 @@ from ...files.image import write_image
 from ...files.paths import PathLike, replacing, write_figures, write_json
 from ...files.save import save_mesh
 from ...optim.history import Ending, Record
-from ...optim.tensors import Descent
+from ...optim.tensors import DescentResult
 from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -165,7 +165,7 @@ def _render(scene: Scene, camera: Camera, view: Observation, spp: int, seed: int
         return render_aovs(scene, camera, view.aovs[:1], spp=spp, seed=seed)[view.aovs[0]]
 
 
-def make_fit(objective: Objective, descent: Descent, start: Scene, coordinates: Coordinates) -> Fit:
+def make_fit(objective: Objective, descent: DescentResult, start: Scene, coordinates: Coordinates) -> Fit:
     """Judge the best values of a descent over all views with many samples, and return the result."""
     views, options = objective.views, objective.options
     scene, cameras = build_detached(objective.build, descent.values)

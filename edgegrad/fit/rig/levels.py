@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ...aovs import render_aovs
 from ...optim.history import Ending
-from ...optim.tensors import Descent
+from ...optim.tensors import DescentResult
 from ...rig.function import FunctionDeformer
 from ...rig.rig import Rig
 from ...rig.rotations import roma
@@ -139,7 +139,7 @@ class CoarseToFine:
 
     def descend(
         self, values: dict[str, Tensor], level: int, save: Save, saved: Mapping[str, Any] | None
-    ) -> Descent:  # fmt: skip
+    ) -> DescentResult:  # fmt: skip
         """Run one level; the best values are in the result's."""
         factor = self.factors[level]
         views = [view.resized(factor) for view in self.views]
@@ -226,7 +226,7 @@ class CoarseToFine:
     def _steps(
         self, objective: Objective, values: Mapping[str, Tensor], save: Save,
         saved: Mapping[str, Any] | None, title: str, fine: bool,
-    ) -> Descent:  # fmt: skip
+    ) -> DescentResult:  # fmt: skip
         parameters = {
             name: dataclasses.replace(p, value=p.within(values[name])) for name, p in self.free.parameters.items()
         }
