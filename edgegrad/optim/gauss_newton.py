@@ -65,10 +65,8 @@ class _TensorProblem(Problem[dict[str, Tensor]]):
     def __init__(self, descent: GaussNewtonDescent, curvature: Curvature) -> None:
         self.descent, self.objective, self.curvature = descent, descent.objective, curvature
         self.like = detached(descent.values)
-        self.rates = torch.cat([
-            torch.full((value.numel(),), descent.parameters[name].lr, dtype=torch.float64)
-            for name, value in self.like.items()
-        ])  # fmt: skip
+        rates = [torch.full((v.numel(),), descent.parameters[n].lr, dtype=torch.float64) for n, v in self.like.items()]
+        self.rates = torch.cat(rates).clamp(min=1e-150)  # A rate of 0 holds a number fixed.
         self.candidate, self.cost = self.like, math.nan  # the last one, and its mean cost
 
     @property

@@ -70,6 +70,20 @@ def test_no_number_moves_by_more_than_ten_rates() -> None:
     assert float((descent.values["x"].detach() - 5.0).abs().max()) == pytest.approx(0.1)
 
 
+def test_a_rate_of_zero_holds_a_tensor_fixed() -> None:
+    one, two = (torch.tensor([x], dtype=F64) for x in (1.6, -2.5))
+
+    class Apart(Valley):
+        def __call__(self, tensors: Any, step: int) -> Tensor:
+            return super().__call__({"x": torch.cat([tensors["one"], tensors["two"]])}, step)
+
+    parameters = {"one": Parameter(0.0, one), "two": Parameter(1.0, two)}
+    descent = GaussNewtonDescent(Apart(), lambda values, step: 0.5 * torch.eye(2, dtype=F64), parameters, SETTINGS)
+    found = descend(descent, Loop(60))
+    assert torch.equal(found.values["one"], one)
+    assert float(found.values["two"]) == pytest.approx(-2.0, abs=0.05)
+
+
 def test_bounds_hold_and_the_others_go_on() -> None:
     descent = valley(0.5, start=(1.6, -1.0), low=torch.tensor([1.3, -9.0], dtype=F64))
     found = descend(descent, Loop(60))
