@@ -22,7 +22,7 @@ from .parameter import Parameter
 from .placement import Placement
 from .views import Observation
 
-FORMAT = 10
+FORMAT = 11
 
 
 @dataclass(frozen=True)
