@@ -17,7 +17,6 @@ from ...optim.loop import Loop, nothing
 from ...optim.tensors import DescentResult, TensorDescent, descend
 from ..checkpoints import CheckpointFile
 from ..losses import REGION
-from ..options import Settings
 from ..parameter import Parameter
 from .curvature import MAX_NUMBERS, check_pointwise, curvature
 from .objective import Objective
@@ -51,7 +50,7 @@ def descend_views(
     )  # fmt: skip
     callback = options.callback
     after_step = None if callback is None else lambda record, values: callback(report(record, values))
-    return descend(_optimizer(objective, parameters, options, gauss_newton), loop, after_step)
+    return descend(_optimizer(objective, parameters, gauss_newton), loop, after_step)
 
 
 def descend_levels(
@@ -93,8 +92,9 @@ def continued(history: Sequence[Record], later: Sequence[Record]) -> list[Record
 
 
 def _optimizer(
-    objective: Objective, parameters: Mapping[str, Parameter], options: Settings, gauss_newton: LevenbergMarquardtSettings
-) -> TensorDescent:  # fmt: skip
+    objective: Objective, parameters: Mapping[str, Parameter], gauss_newton: LevenbergMarquardtSettings
+) -> TensorDescent:
+    options = objective.options
     if options.method == "adam":
         return AdamDescent(objective, parameters, AdamSettings(options.loss_tolerance, options.patience))
     if (count := sum(p.value.numel() for p in parameters.values() if p.value is not None)) > MAX_NUMBERS:

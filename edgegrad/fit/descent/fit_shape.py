@@ -29,6 +29,7 @@ from .descend import Save, descend_levels, descend_views
 from .fit_scene import reporter
 from .objective import Objective
 from .result import Fit, make_fit
+from .scene_builder import whole_scene
 
 SMOOTHNESS = 4.0  # λ of I + λ L
 MIN_PIXELS = 64  # on the shorter side of pictures of coarse levels
@@ -196,9 +197,7 @@ class _ShapeFit:
         return found._replace(values={"verts": smooth(found.values["verts"]), "faces": mesh.faces})
 
     def scene(self, mesh: Mesh) -> Scene:
-        made = self.appearance(mesh)
-        scene = made if isinstance(made, Scene) else Scene([made])
-        return scene.replace(background=None) if self.masked and scene.background is not None else scene
+        return whole_scene(self.appearance(mesh), self.masked)
 
 
 def _mesh_of(values: Mapping[str, Tensor]) -> Mesh:

@@ -41,7 +41,8 @@ class RegionSettings:
     start_blur: float = 3.0  # of alpha: a wider one reaches farther and shows less of the shape; half loses the fourth
     narrowing: float = 0.6  # factor of the blur from one renewal to the next
     least_blur: float = 0.7  # of alpha, until the pictures show their own blur
-    sureness_blur: float = 2.5  # of the band in which colours next to the contour are judged; half doubts two right ones
+    # Of the band in which colours next to the contour are judged: half of it doubts two right ones.
+    sureness_blur: float = 2.5
     # How surely colours must separate the two sides of a right contour. Wrong ones on edges of clutter reach 0.69, right ones
     # 0.70 … 0.81, so a change by a tenth takes wrong contours for right ones, or right ones for wrong.
     min_sureness: float = 0.695

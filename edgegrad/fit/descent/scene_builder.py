@@ -41,11 +41,6 @@ class SceneTensors:
 
 def builder(scene: object, cameras: list[Camera], drop_background: bool) -> tuple[Build, SceneTensors | None]:
     """Return a function from values to scene and cameras, and what may be sought; None if the scene is a function."""
-
-    def ready(scene: Scene | Mesh) -> Scene:
-        whole = Scene([scene]) if isinstance(scene, Mesh) else scene
-        return whole.replace(background=None) if drop_background and whole.background is not None else whole
-
     if isinstance(scene, Scene | Mesh):
         start = map_tensors(scene, lambda tensor: tensor.detach().cpu().clone())
 
@@ -56,7 +51,7 @@ def builder(scene: object, cameras: list[Camera], drop_background: bool) -> tupl
             inside = {name: value for name, value in tensors.items() if not name.startswith(prefix)}
             outside = {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
             there, seen = _moved(with_named(start, inside), list(with_named(cameras, outside)), poses)
-            return ready(there), seen
+            return whole_scene(there, drop_background), seen
 
         return replaced, SceneTensors(start, cameras)
     if not callable(scene):
@@ -70,9 +65,15 @@ def builder(scene: object, cameras: list[Camera], drop_background: bool) -> tupl
         seen = [seen] if isinstance(seen, Camera) else list(seen)
         if len(seen) != len(cameras):
             raise ValueError(f"scene: expected a function that makes {len(cameras)} cameras, got {len(seen)}")
-        return ready(whole), seen
+        return whole_scene(whole, drop_background), seen
 
     return made, None
+
+
+def whole_scene(made: Scene | Mesh, drop_background: bool) -> Scene:
+    """Return a scene, or that of a mesh, which masks compare without its background."""
+    scene = Scene([made]) if isinstance(made, Mesh) else made
+    return scene.replace(background=None) if drop_background and scene.background is not None else scene
 
 
 def _moved(scene: Scene | Mesh, cameras: list[Camera], poses: Mapping[str, Pose]) -> tuple[Scene | Mesh, list[Camera]]:

@@ -25,7 +25,7 @@ from ..descent.fit_scene import reporter
 from ..descent.objective import Objective
 from ..descent.region_loss import FINAL_STEP
 from ..descent.result import RESULT_SPP, make_fit
-from ..descent.scene_builder import Built
+from ..descent.scene_builder import Built, whole_scene
 from ..losses import REGION
 from ..options import Settings
 from ..parameter import Parameter
@@ -132,10 +132,8 @@ class CoarseToFine:
         posed = self.appearance(posed, **values)
         if not isinstance(posed, Mesh | Scene):
             raise TypeError(f"appearance: expected it to return a Mesh or a Scene, got {type(posed).__name__}")
-        scene = Scene([posed]) if isinstance(posed, Mesh) else posed
         masked = any(view.mask is not None for view in views)
-        scene = scene.replace(background=None) if masked and scene.background is not None else scene
-        return scene, [view.camera for view in views]
+        return whole_scene(posed, masked), [view.camera for view in views]
 
     def descend(
         self, values: dict[str, Tensor], level: int, save: Save, saved: Mapping[str, Any] | None
