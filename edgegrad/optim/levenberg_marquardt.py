@@ -317,7 +317,7 @@ def minimise(
     """Run the descents until all rest. `after_step` is called after each step. Ctrl-C ends them with what they have found."""
     descents = LevenbergMarquardt(problem, starts, settings)
     loop = Loop(descents.settings.steps, after_step=lambda: after_step(descents))
-    descents.interrupted = run(descents, loop).interrupted
+    _, descents.interrupted = run(descents, loop)
     return descents
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
@@ -48,15 +48,9 @@ class Loop:
     title: str | None = None
 
 
-class Run(NamedTuple):
-    """How run() ended."""
-
-    seconds: float  # those before a saved state included
-    interrupted: bool
-
-
-def run(optimizer: Optimizer, loop: Loop) -> Run:
-    """Take steps until the optimizer rests or the steps run out. Ctrl-C ends the loop with what the optimizer has."""
+def run(optimizer: Optimizer, loop: Loop) -> tuple[float, bool]:
+    """Take steps until the optimizer rests or the steps run out. Ctrl-C ends the loop with what the optimizer has. Return the
+    seconds, those before a saved state included, and whether Ctrl-C ended it."""
     began, interrupted = time.perf_counter(), False
     if loop.saved is not None:
         optimizer.load(loop.saved)
@@ -82,4 +76,4 @@ def run(optimizer: Optimizer, loop: Loop) -> Run:
         interrupted = True
     finally:
         bar.close()
-    return Run(keep(), interrupted)
+    return keep(), interrupted
