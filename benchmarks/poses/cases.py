@@ -25,7 +25,7 @@ import edgegrad as eg
 from edgegrad.camera.poses import rotation
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 
-from .objects import Sources, clutter, crop
+from .objects import REPORTED, Sources, clutter, crop
 
 SIDES = 192, 321  # pixels of the picture's height and of its width
 FIELD = 30.0, 55.0  # degrees of the shorter side
@@ -90,7 +90,7 @@ class Case:
         """Return the silhouette (H, W) at a pose, seen by the case's camera or another one."""
         placed = self.mesh.transformed(pose.R.float(), pose.t.float())
         bare = eg.Mesh(placed.verts, placed.faces)
-        return eg.render_aovs(bare, camera or self.camera, ["alpha"], 16)["alpha"][..., 0]
+        return eg.render_aovs(bare, camera or self.camera, ["alpha"], 16, seed=0)["alpha"][..., 0]
 
     def perturbed(self, pose: Placed, degrees: float, shift: float, rng: np.random.Generator) -> Placed:
         """Return the pose rotated by an angle and shifted by a length, both in random directions."""
@@ -150,7 +150,7 @@ def drawn(kind: str, recipe: Recipe, seed: int, sources: Sources) -> list[Case]:
     number = recipe.count + recipe.others
     names = (sources.names(0) if recipe.fixed else [names[k % len(names)] for k in range(number)])[:number]
     meshes = [sources.mesh(name, seed, rng) for name in names]
-    photographs = sources.photographs(0 if recipe.fixed else seed)
+    photographs = sources.photographs(REPORTED if recipe.fixed else seed)
     if recipe.boards:
         photographs = [clutter(k) for k in rng.integers(1 << 30, size=2).tolist()]
     camera = _camera(recipe, rng)
@@ -162,7 +162,7 @@ def drawn(kind: str, recipe: Recipe, seed: int, sources: Sources) -> list[Case]:
     image = _lit([*placed, *shade], camera, behind, lights)
     if not recipe.fixed:
         image = image * torch.from_numpy(2.0 ** rng.uniform(-1.0, 1.0) * rng.uniform(0.8, 1.2, 3)).float()
-    alpha = eg.render_aovs(eg.Mesh(placed[0].verts, placed[0].faces), camera, ["alpha"], 16)["alpha"]
+    alpha = eg.render_aovs(eg.Mesh(placed[0].verts, placed[0].faces), camera, ["alpha"], 16, seed=0)["alpha"]
     if recipe.covered:
         image = _covered(image, alpha, cover, rng)
     wear = (0.7, 0.0, 85) if recipe.fixed else (rng.uniform(*BLUR), rng.uniform(*NOISE), int(rng.integers(*QUALITY)))
@@ -243,8 +243,8 @@ def _shares(meshes: Sequence[eg.Mesh], camera: eg.Camera) -> list[float]:
     labels = torch.eye(len(meshes))
     bare = [eg.Mesh(mesh.verts, mesh.faces) for mesh in meshes]
     painted = [mesh.replace(colors=label.expand(len(mesh.verts), -1)) for mesh, label in zip(bare, labels, strict=True)]
-    seen = eg.render(eg.Scene(painted), camera, 4).sum((0, 1))
-    alone = [float(eg.render_aovs(mesh, camera, ["alpha"], 4)["alpha"].sum()) for mesh in bare]
+    seen = eg.render(eg.Scene(painted), camera, 4, seed=0).sum((0, 1))
+    alone = [float(eg.render_aovs(mesh, camera, ["alpha"], 4, seed=0)["alpha"].sum()) for mesh in bare]
     return [float(one) / whole for one, whole in zip(seen, alone, strict=True)]
 
 
@@ -273,7 +273,7 @@ def _lit(meshes: Sequence[eg.Mesh], camera: eg.Camera, behind: Tensor, lights: S
     """Return an image (H, W, 3) of matte meshes with the shadows they cast on themselves and on one another."""
     scene = eg.Scene([mesh.replace(material=eg.Material()) for mesh in meshes], background=behind, lights=list(lights))
     with torch.no_grad():
-        return eg.render(scene, camera, spp=64, sampling=eg.Sampling(lights=2))
+        return eg.render(scene, camera, spp=64, seed=0, sampling=eg.Sampling(lights=2))
 
 
 def _covered(image: Tensor, alpha: Tensor, cover: Tensor, rng: np.random.Generator) -> Tensor:
