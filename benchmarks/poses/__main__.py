@@ -117,4 +117,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except (OSError, ValueError, ImportError) as wrong:
+        raise SystemExit(f"python -m benchmarks.poses: error: {wrong}") from None

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
+import signal
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,13 +50,18 @@ class Job:
 def run(jobs: Sequence[Job], processes: int) -> Iterator[list[Record]]:
     """Yield the records of each job as it ends."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with ProcessPoolExecutor(processes, context, initializer=_begin) as pool:
         waiting = [pool.submit(measured, job) for job in jobs]
         try:
-            for future in waiting:
+            for future in as_completed(waiting):
                 yield future.result()
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _begin() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that keeps the results.
+    torch.set_num_threads(1)
 
 
 def measured(job: Job) -> list[Record]:

@@ -135,7 +135,7 @@ def test_matches_come_closer_than_views_are_apart() -> None:
 def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the object is covered, so the right side has to be left out."""
     monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.NEARBY_ROTATIONS", 24)
-    case = drawn("covered", Recipe(only="stone", covered=True, boards=True), 4, Sources())[0]
+    case = drawn("covered", Recipe(only="stone", covered=True, boards=True), 8, Sources())[0]
     task = task_of(case.picture, case.camera, case.mesh)
     assert case.start is not None
     start = pose_from_matrix("init", case.start.matrix)
