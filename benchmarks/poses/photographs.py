@@ -1,4 +1,15 @@
-"""Real photographs with meshes, cameras and poses, from a folder of the layout that photos.py describes."""
+"""Real photographs with meshes, cameras and poses, from a folder, whose cameras are OpenCV's (x right, y down, z forward,
+pixels, X_cam = R X + t):
+
+    squirrel/frame.png, squirrel_demo_low.obj (mm, without colours), camera_and_init.json: K, cam_R_model_init,
+        cam_t_model_init_mm, mesh_centre_to_subtract_mm
+    gelatin_box/000001-color.png, 000001-depth.png (16 bits, 0.1 mm), 009_gelatin_box_textured.gltf (m),
+        009_gelatin_box_tex1024.png, reference.json: {"009_gelatin_box": K, cam_R_mesh, cam_t_mesh_m}
+    cracker_box/image_rgb.png, 003_cracker_box_textured.gltf (m), 003_cracker_box_tex1024.png, reference.json: K, a start
+        cam_R_bop, cam_t_bop_m, and gltf_to_bop_R, gltf_to_bop_t_m
+    bottle/_sequence/color_camera_image_200.png, …_201.png, depth_camera_image_200.png, …_201.png, depth_camera.yaml (of M3T),
+        bottle/_body/schauma.obj (m), reference.json: K, {"schauma": cam_R_body, cam_t_body_m, geometry_offset_z_m}
+"""
 
 from __future__ import annotations
 
@@ -15,17 +26,11 @@ from torch import Tensor
 
 import edgegrad as eg
 
-from .photo_cases import Case, Placed
+from .cases import Case, Placed
+from .objects import textured
 
 JUMP = 0.02  # of the depth: neighbours that are farther apart do not lie on one surface
 WHOLE = 0.99  # share of a pixel that depth must cover
-
-
-def photographs(folder: Path) -> list[Tensor]:
-    """Return those photographs that are there, (H, W, 3), linear."""
-    names = ("squirrel/frame.png", "cracker_box/image_rgb.png", "gelatin_box/000001-color.png",
-             "bottle/_sequence/color_camera_image_200.png")  # fmt: skip
-    return [eg.read_image(folder / name, channels=3) for name in names if (folder / name).exists()]
 
 
 def squirrel(folder: Path) -> Case:
@@ -103,12 +108,7 @@ def _case(name: str, mesh: eg.Mesh, picture: Path, K: Any, truth: Placed, depth:
     image = eg.read_image(picture, channels=3)
     H, W = image.shape[:2]
     camera = eg.Camera.from_opencv(torch.eye(3), torch.zeros(3), torch.tensor(K), (H, W))
-    return Case(name, mesh, image, camera, truth, depth, real=True)
-
-
-def textured(mesh: Path, texture: Path) -> eg.Mesh:
-    """Return the mesh with a texture that its file does not name."""
-    return eg.load_mesh(mesh, materials=False).replace(texture=eg.read_image(texture, channels=3))
+    return Case(name, mesh, image, camera, truth, depth=depth, real=True)
 
 
 def _integers(path: Path) -> Tensor:

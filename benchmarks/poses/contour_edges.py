@@ -1,9 +1,7 @@
 """How far a render's contour is from the edges of a photograph, by nothing that a fit compares.
 
 Along normals to the contour the photograph is read where its colours change most: a maximum of the Gaussian derivative (Canny
-1986), refined by a parabola. The sides of a box are lines that are fitted to such points robustly (RANSAC, Fischler and Bolles
-1981), and its corners are where lines of neighbouring sides meet, in the photograph as in the render: so it makes no difference
-that corners of a scan are round.
+1986), refined by a parabola.
 """
 
 from __future__ import annotations
@@ -20,10 +18,6 @@ from edgegrad.files.image import linear_to_srgb
 SIGMA = 1.0  # pixels, of the derivative
 STEP = 0.1  # pixels along a normal
 STRONG = 0.03  # sRGB values a pixel: weaker edges are not counted
-CORNER = 4.0  # pixels that a polygon of the contour may leave out
-ENDS = 0.12  # of a side, at each end, where corners are round
-ON_LINE = 0.75  # pixels
-LINES = 500  # that are tried for a side
 
 
 @dataclass(frozen=True)
@@ -82,64 +76,3 @@ def _outline(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     x, y = points.T
     area = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
     return points, normals if area > 0.0 else -normals
-
-
-@dataclass(frozen=True)
-class Corners:
-    """Where the sides of a box's silhouette meet, (n, 2), pixels."""
-
-    render: np.ndarray
-    photograph: np.ndarray  # NaN where a side is not found
-    shown: np.ndarray  # (n,) of each side, the share of its points that are on a line of the photograph
-
-    @property
-    def apart(self) -> np.ndarray:
-        """(n,) pixels."""
-        return np.linalg.norm(self.render - self.photograph, axis=1)
-
-
-def corners(picture: Tensor, alpha: Tensor, reach: float) -> Corners:
-    """Of a box whose silhouette is alpha (H, W), in a photograph (H, W, 3), linear."""
-    profile = across(picture, alpha, reach)
-    rows, offsets, _ = profile.maxima()
-    candidates = profile.points[rows] + offsets[:, None] * profile.normals[rows]
-    polygon = measure.approximate_polygon(np.r_[profile.points, profile.points[:1]], CORNER)[:-1]
-    at = [int(np.linalg.norm(profile.points - corner, axis=1).argmin()) for corner in polygon]
-    own, seen, shown = [], [], []
-    for first, last in zip(at, [*at[1:], at[0] + len(profile.points)], strict=True):
-        inset = round(ENDS * (last - first))
-        side = np.arange(first + inset, last - inset) % len(profile.points)
-        own.append(_line(profile.points[side]))
-        line, share = _ransac(candidates[np.isin(rows, side)], len(side))
-        seen.append(line)
-        shown.append(share)
-    return Corners(_met(own), _met(seen), np.array(shown))
-
-
-def _line(points: np.ndarray) -> np.ndarray:
-    """Return a line (3,) through points: normal and offset."""
-    middle = points.mean(0)
-    normal = np.linalg.svd(points - middle)[2][1]
-    return np.r_[normal, -normal @ middle]
-
-
-def _ransac(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
-    """Return the line through most of the points, and the share of `count` that lies on it."""
-    rng = np.random.default_rng(0)
-    line, best = np.full(3, np.nan), np.zeros(len(points), bool)
-    for _ in range(LINES if len(points) > 1 else 0):
-        tried = _line(points[rng.choice(len(points), 2, replace=False)])
-        on = np.abs(points @ tried[:2] + tried[2]) < ON_LINE
-        best = on if on.sum() > best.sum() else best
-    if best.sum() < 5:
-        return line, 0.0
-    for _ in range(5):
-        line = _line(points[best])
-        best = np.abs(points @ line[:2] + line[2]) < ON_LINE
-    return line, float(best.sum()) / count
-
-
-def _met(lines: list[np.ndarray]) -> np.ndarray:
-    """Return the intersections (n, 2) of each line with the one before it."""
-    pairs = [np.cross(line, before) for line, before in zip(lines, [lines[-1], *lines[:-1]], strict=True)]
-    return np.array([pair[:2] / pair[2] for pair in pairs])
