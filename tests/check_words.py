@@ -47,7 +47,7 @@ EXCEPTIONS = {
         csrc/secondary/alpha_edges.h csrc/secondary/lune.h csrc/shading/lit/environment.h csrc/texture/texture.cpp
         csrc/texture/texture.h edgegrad/bop/depth.py edgegrad/bop/refine.py edgegrad/files/curve.py
         edgegrad/files/formats/off.py edgegrad/files/formats/ply_elements.py edgegrad/fit/plots.py
-        edgegrad/fit/pose/photo/level.py edgegrad/fit/pose/photo/match.py edgegrad/light/near_field.py
+        edgegrad/fit/pose/photo/match.py edgegrad/light/near_field.py
         edgegrad/points/blend.py edgegrad/points/discontinuous_pixels.py edgegrad/points/hits.py edgegrad/points/pyramid.py
         edgegrad/points/discontinuity_terms.py edgegrad/points/discontinuities.py edgegrad/raster/exact.py edgegrad/render.py
         edgegrad/scene/environment.py edgegrad/scene/texel_edges.py edgegrad/scene/textures.py

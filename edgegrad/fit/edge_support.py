@@ -22,7 +22,6 @@ NOISE_DEVIATIONS = 3.0  # of the noise
 WINDOW = 1.0  # standard deviation in pixels of the windows in which strengths are compared
 NOISE_WINDOW = 3.0  # standard deviation in pixels of the windows in which noise is measured
 STRENGTH_RANGE = -1.0, 2.0  # strengths of one edge
-JPEG_BLOCK = 16  # pixels: a block of JPEG with colours at half the resolution
 DISPLAY_NOISE = 0.01  # of the picture's range: what eight bits and the sRGB curve leave
 
 
@@ -90,29 +89,6 @@ def edge_amount(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> fl
         edges = _gradient(0.5 * (render + again)).norm(dim=0) / extent
         total += float((edges if weight is None else weight * edges).sum())
     return total
-
-
-def block_error(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float:
-    """Return the root mean square difference of block means of renders and pictures, relative to the pictures' range. Blocks
-    are weighted by the strength of the render's edges in them. A mean is free of blur, compression and noise, which all
-    preserve it, and of a pose that is off by a part of a pixel. It keeps what covers the object or has another colour."""
-    total = count = 0.0
-    for render, again, picture, weight in pairs:
-        picture = picture.to(render)
-        w = torch.ones_like(render[..., :1]) if weight is None else weight
-        mean = 0.5 * (render + again)
-        extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
-        r = _blocks(w * (mean - picture) / extent) / _blocks(w).clamp(min=1e-6)
-        edges = _blocks(w * _gradient(mean).norm(dim=0) / extent)
-        total += float((edges * r.square()).sum())
-        count += float(edges.sum())
-    return (total / max(count, 1e-30)) ** 0.5
-
-
-def _blocks(image: Tensor) -> Tensor:
-    """Return means (h, w, C) over JPEG_BLOCK × JPEG_BLOCK pixels."""
-    H, W = (max(1, round(n / JPEG_BLOCK)) for n in image.shape[:2])
-    return F.adaptive_avg_pool2d(image.movedim(-1, 0)[None], (H, W))[0].movedim(0, -1)
 
 
 def _windowed(image: Tensor, sigma: float) -> Tensor:

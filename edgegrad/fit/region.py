@@ -107,7 +107,6 @@ class Windows:
     COLOUR_SIGMA = 0.06  # standard deviation of similar colours, in sRGB values
     WIDTH = 1.5  # standard deviation of a window, in cells
     MIN_COUNT = 1e-3  # pixels of all colours that are added to every window
-    PRESENT = 0.1  # pixels in a window's cell: fewer say nothing about colours
 
     def __init__(self, size: tuple[int, int], label: Tensor, colors: Tensor, radius: float) -> None:
         """`label` (h · w,) is Palette.labels() for the palette's colours (n, C); `radius` of a window in pixels."""
@@ -129,14 +128,6 @@ class Windows:
         windows = smoothed(rows.reshape(self.count, *self.shape), self.WIDTH)
         windows = (windows + self.MIN_COUNT / self.count) / (windows.sum(0) + self.MIN_COUNT)
         return windows.flatten()[self._index].reshape(self.size)
-
-    def present(self, share: Tensor) -> Tensor:
-        """Return 1 where a pixel's window has any weight of `share` (h, w), 0 where it has hardly a pixel, as (h, w)."""
-        cells = torch.zeros(self.shape[0] * self.shape[1], dtype=torch.float32)
-        cell = self._index % (self.shape[0] * self.shape[1])
-        cells.index_add_(0, cell, share.flatten())
-        windows = smoothed(cells.reshape(1, *self.shape), self.WIDTH).flatten()
-        return (windows / (windows + self.PRESENT))[cell].reshape(self.size)
 
 
 def smoothed(images: Tensor, sigma: float) -> Tensor:

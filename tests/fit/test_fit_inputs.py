@@ -15,10 +15,10 @@ from quiet_fits import arranged, quiet
 import edgegrad as eg
 from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
 from edgegrad.fit.options import DESCENT_OPTIONS, POSE_OPTIONS, UNUSED, Settings
+from edgegrad.fit.pose.depth_units import warn_of_units
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
-from edgegrad.fit.pose.photo.depth import warn_of_units
-from edgegrad.fit.pose.photo.photo_descent import CONTOUR_SUPPORT, most_steps
+from edgegrad.fit.pose.settings import POSE
 
 SIZE = 48
 QUICK = {"init": START, "search": False, "progress": False, "steps": 1, "spp": 2, "max_size": 24}
@@ -156,18 +156,11 @@ def test_a_film_begins_where_the_object_is_seen(taken, along, message):
         track(bracket(), [image], view, init, options=FitOptions(seed=0))  # at once
 
 
-def test_more_steps_are_taken_where_they_are_asked_for():
-    levels = (False, True), (False, False), (True, False)
-    assert [most_steps(40, *level) for level in levels] == [12, 8, 20]
-    assert [most_steps(5, *level) for level in levels] == [5, 5, 5]
-    assert most_steps(80, True, False) == 40 and most_steps(80, False, True) == 24
-
-
 def test_what_is_not_explained_is_not_blamed_on_steps(taken):
     """A plain mesh has to show more of its edges than one with colours."""
     view, image = taken
     fit = fit_pose(bracket(True), image, view, init=START, search=False, options=quiet(steps=2))
-    assert 0.6 < fit.explained < CONTOUR_SUPPORT and not fit.converged, fit.explained
+    assert fit.explained < POSE.plain_support and not fit.converged, fit.explained
     assert fit.reason.startswith("edges not explained"), fit.reason
 
 

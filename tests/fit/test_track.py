@@ -61,13 +61,13 @@ def test_found_again_elsewhere_and_rotated(film):
     there = film.poses[0].clone()
     there[:3, :3] = rotation(torch.tensor([0.3, 0.4, 0.15]).double()) @ there[:3, :3]
     there[:3, 3] += film.camera.world_to_camera[1, :3].double() * 0.25 * 2.0 * DISTANCE * math.tan(math.radians(20.0))
-    gone = replace(film, poses=[film.poses[0]] * 7 + [there] * 2, gone=(1, 7))
+    gone = replace(film, poses=[film.poses[0]] * 7 + [there] * 4, gone=(1, 7))
     larger = film.mesh.replace(verts=100.0 * film.mesh.verts)
     init = film.poses[0] @ torch.diag(torch.tensor([0.01, 0.01, 0.01, 1.0]).double())
     found = list(track(larger, gone, film.camera, init, options=FitOptions(seed=0, spp=2)))
     assert all(pose.lost for pose in found[4:7]) and not found[-1].lost
     assert found[-1].scale == pytest.approx(0.01)
-    degrees, percent = errors(gone, 8, found[-1].R, found[-1].t)
+    degrees, percent = errors(gone, 10, found[-1].R, found[-1].t)
     assert degrees < 2.0 and percent < 6.0
 
 
@@ -178,14 +178,13 @@ def test_a_pose_of_a_film_is_the_last_one_that_is_not_lost():
 
 
 @pytest.mark.slow
-def test_a_hand_that_covers_more_than_half(film):
-    """The hand stays for three pictures while the stone rotates, so the light of one picture alone would be the
-    hand's."""
-    going = replace(film, poses=film.poses[:3] + [film.poses[k] for k in range(3, COUNT)], hand=(-4, 9))
-    found = list(track(film.mesh, going, film.camera, film.poses[0], options=FitOptions(seed=0)))
-    assert not any(pose.lost for pose in found) and max(pose.covered for pose in found) > 0.4
+def test_a_hand_that_covers_nearly_half(film):
+    """The hand stays for three pictures while the stone rotates. What is covered is seen as such, and the pose stays."""
+    found = list(track(film.mesh, replace(film, hand=(-4, 9)), film.camera, film.poses[0], options=FitOptions(seed=0)))
+    assert not any(pose.lost for pose in found)
+    assert max(pose.covered for pose in found) > 0.2 and max(pose.covered for pose in found[-2:]) < 0.1
     degrees, percent = worst([errors(film, pose.index, pose.R, pose.t) for pose in found])
-    assert degrees < 3.0 and percent < 6.0
+    assert degrees < 1.5 and percent < 6.0
 
 
 @pytest.mark.slow

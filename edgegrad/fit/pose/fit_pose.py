@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Literal
 
@@ -30,16 +30,15 @@ from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..row_order import MIN_IOU_GAIN, warn_of_flipped_rows
 from ..views import Images, cameras_of
-from .color_search import ColorSearch
+from .depth_units import warn_of_units
+from .hypotheses import probabilities
 from .initial_pose import initial_pose
 from .inputs import ArgumentNames, warn_of_scale, without_colors
-from .photo.depth import warn_of_units
-from .photo.match import matches
-from .photo.multi_start import MultiStartSearch, Report, around, everywhere
-from .photo.photo_search import SAME_POSE_ANGLE, PhotoSearch
 from .pose import Pose, angle, pose_from_matrix
+from .pose_search import Groups, PoseSearch, Report, anywhere, around, everywhere
 from .replay_log import ReplayLog
-from .result import PoseFit, with_own_history
+from .result import PoseFit, PoseMode, with_own_history
+from .settings import POSE
 from .task import PoseTask, Unknowns
 from .uncertainty import MAX_SHIFT, Uncertainty
 
@@ -140,22 +139,15 @@ def search_pose(
     if search != "global":
         warn_of_units(task.scene.transformed(start.R, start.t, start.scale), seen, measured, "at the start")
 
-    def search_from(start: Pose, log: ReplayLog, further: bool) -> ColorSearch | PhotoSearch:
-        if task.aovs == ("alpha",) and depths is None:
-            return ColorSearch(task, task.pyramid(start, settings), start, settings, log, further)
-        return PhotoSearch(task, start, measured, settings, log, further)
-
-    state: ColorSearch | PhotoSearch | MultiStartSearch
-    if isinstance(search, bool):
-        state = search_from(start, log, search)
-    else:
-
-        def made(report: Report) -> list[Pose]:
-            if search == "global":
-                return matches(task, settings.seed, report)
-            return (around if init is not None else everywhere)(task, start, search)
-
-        state = MultiStartSearch(task, start, made, measured, settings, log, partial(search_from, further=False))
+    proposals: Callable[[Report], Groups] | None = None
+    if search == "global":
+        proposals = partial(anywhere, task, settings.seed)
+    elif not isinstance(search, bool):
+        poses = (around if init is not None else everywhere)(task, start, search)
+        proposals = lambda _: [(start, poses)]  # noqa: E731
+    state = PoseSearch(
+        task, start, measured, settings, log, search is not False, proposals=proposals, symmetries=symmetries
+    )  # fmt: skip
     interrupted = False
 
     def seconds() -> float:
@@ -176,7 +168,7 @@ def search_pose(
         sure = state.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
             best.R.clone(), best.t.clone(), float(best.scale), cameras[0], state.loss, len(history), seconds(), sure, interrupted,
-            state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough,
+            state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough, modes=modes_of(state),
         )  # fmt: skip
 
     total = max(state.planned, log.steps)
@@ -190,18 +182,17 @@ def search_pose(
         bar.update()
         if settings.callback is not None:
             settings.callback(with_own_history(result()))
-        if settings.checkpoint is not None and log.steps % settings.checkpoint.every == 0:
+        if settings.checkpoint is not None and len(state.history) % settings.checkpoint.every == 0:
             keep()
 
     state.after_step = after_step
-    if isinstance(state, MultiStartSearch):
-        state.report = bar.set_postfix_str
+    state.report = bar.set_postfix_str
     try:
         state.run()
         if search == "global":
             warn_of_units(task.scene.transformed(state.best.R, state.best.t, state.best.scale), seen, measured, "found")
         wrong = not state.converged and state.edge_support < state.enough
-        if search and wrong and not isinstance(state, MultiStartSearch):
+        if search and wrong and proposals is None:
             _warn_of_flipped_pictures(task, state, init is None)
     except KeyboardInterrupt:
         interrupted = True
@@ -211,14 +202,20 @@ def search_pose(
     return result()
 
 
+def modes_of(state: PoseSearch) -> list[PoseMode]:
+    """Return the modes that a search has found, with their probabilities."""
+    pairs = zip(state.modes, probabilities(state.modes), strict=True)
+    return [PoseMode(mode.pose.matrix.clone(), share) for mode, share in pairs]
+
+
 def ambiguity(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None, task: PoseTask) -> str:
     """Return in words that another pose, which is not known to be equivalent, may be the right one; else an empty string."""
     same = others if symmetries is None else [other.closest(symmetries, pose) for other in others]
     apart = max((angle(pose.R, other.R) for other in same), default=0.0)
     away = max((task.between(pose, other) for other in same), default=0.0)
-    if apart < SAME_POSE_ANGLE and away < MAX_SHIFT:
+    if apart < POSE.same_mode and away < MAX_SHIFT:
         return ""
-    other = f"turned by {math.degrees(apart):.0f}°" if apart >= SAME_POSE_ANGLE else f"{away:.0%} of the size away"
+    other = f"turned by {math.degrees(apart):.0f}°" if apart >= POSE.same_mode else f"{away:.0%} of the size away"
     colors = "the mesh's colours, " if task.colorless else ""
     return (
         f"ambiguous: the pictures hardly separate it from a pose that is {other}; give {colors}"
@@ -294,15 +291,11 @@ def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -
     raise TypeError(f'{name}: expected Symmetries, "find" or None, got {type(given).__name__}')
 
 
-def _warn_of_flipped_pictures(task: PoseTask, search: ColorSearch | PhotoSearch, place: bool) -> None:
+def _warn_of_flipped_pictures(task: PoseTask, search: PoseSearch, place: bool) -> None:
     """Warn where a fit to the pictures turned over finds in them what it did not find as they are."""
     turned, settings = task.turned_over(), search.settings
     start = initial_pose(turned) if place else search.start
-    again: ColorSearch | PhotoSearch
-    if task.clutter:
-        again = PhotoSearch(turned, start, [None] * len(task.shots), settings)
-    else:
-        again = ColorSearch(turned, turned.pyramid(start, settings), start, settings)
+    again = PoseSearch(turned, start, [None] * len(task.shots), settings)
     found = again.first_end()
     if found >= max(again.enough, search.edge_support + MIN_IOU_GAIN):
         warn_of_flipped_rows(

@@ -20,11 +20,11 @@ from ..by_camera import numbered, one_for_each
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
+from .depth_units import warn_of_units
 from .fit_pose import ambiguity, depth_images, symmetries_of
 from .inputs import ArgumentNames, check_in_front, check_seen
-from .photo.depth import warn_of_units
-from .photo.poses_search import PosesSearch
 from .pose import Pose, pose_from_matrix
+from .poses_search import PosesSearch
 from .result import PoseFit, with_own_history
 from .task import PoseTask, Unknowns
 from .uncertainty import Uncertainty
@@ -105,7 +105,7 @@ def fit_poses(
         check_seen(task.names.init, task.scene, [shot.camera for shot in task.shots], start)
     moved = [mesh for task, start in zip(tasks, starts, strict=True) for mesh in _moved(task, start)]
     warn_of_units(Scene(moved), [shot.camera for shot in tasks[0].shots], measured, "at the start")
-    state = PosesSearch(tasks, starts, measured, settings, check_flag("search", search))
+    state = PosesSearch(tasks, starts, measured, settings, check_flag("search", search), known_symmetries)
     interrupted = False
 
     def results() -> list[PoseFit]:  # A callback may change their tensors in place.
@@ -132,9 +132,7 @@ def fit_poses(
     bar = tqdm(total=None, desc="fit", unit="step", disable=not settings.progress, leave=False)
 
     def after_step() -> None:
-        bar.set_postfix_str(
-            f"{state.levels[-1].size[1]} × {state.levels[-1].size[0]} px, loss {state.loss:.2e}", refresh=False
-        )
+        bar.set_postfix_str(f"meshes[{state.seeking}], loss {state.loss:.2e}", refresh=False)
         bar.update()
         if settings.callback is not None:
             settings.callback([with_own_history(one) for one in results()])

@@ -45,28 +45,6 @@ class Motion:
         return directions @ turn.transpose(1, 2)
 
 
-@dataclass(frozen=True)
-class Motions:
-    """Several objects of a scene, one after the other, each with the directions in which it alone moves."""
-
-    parts: Sequence[Motion]
-    counts: Sequence[int]  # vertices of each object
-    K: None = None  # The camera stays.
-    distortion: None = None
-
-    def __len__(self) -> int:
-        return sum(map(len, self.parts))
-
-    def of_points(self, points: Tensor) -> Tensor:
-        """Return the tangents (D, n, 3) of points (n, 3) in the world, those of the objects one after the other."""
-        found, first = points.new_zeros(len(self), len(points), 3), 0
-        vertices = torch.arange(len(points)).split(list(self.counts))
-        for part, rows in zip(self.parts, vertices, strict=True):
-            found[first : first + len(part), rows] = part.of_points(points[rows])
-            first += len(part)
-        return found
-
-
 class Rendered:
     """Channels of a scene, equal to the bit to those of render_aovs(), and then their derivatives by motions.
 
@@ -87,13 +65,13 @@ class Rendered:
             image, self._hits, _ = forward_kernel(self._request)
         self.images = by_name(scene, aovs, image[0])  # (H, W, c) by name
 
-    def derivatives(self, motion: Motion | Motions) -> dict[str, Tensor]:
-        """Return the derivatives (D, H, W, c) by name. Motions of several objects allow "image" and "alpha" only."""
+    def derivatives(self, motion: Motion) -> dict[str, Tensor]:
+        """Return the derivatives (D, H, W, c) by name."""
         with torch.no_grad():
             dots = jvp_kernel(self._hits, self._request, self._tangents(motion), len(motion))
         return by_name(self.scene, self.aovs, dots[:, 0])
 
-    def _tangents(self, motion: Motion | Motions) -> dict[str, Tensor]:
+    def _tangents(self, motion: Motion) -> dict[str, Tensor]:
         """Return the tangents of the kernel's inputs."""
         flat, camera, auxiliary = self._request.scene, self._request.camera, self._request.auxiliary
         points = motion.of_points(flat.verts)
@@ -103,8 +81,6 @@ class Rendered:
         if motion.distortion is not None:
             unsought = MOST_COEFFICIENTS - motion.distortion.shape[1]
             tangents["distortion"] = torch.nn.functional.pad(motion.distortion, (0, unsought))[:, None]
-        if isinstance(motion, Motions):
-            return tangents
         parts = []
         if "position" in self.aovs:
             parts.append(points)

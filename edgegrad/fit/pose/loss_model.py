@@ -10,7 +10,6 @@ Consistent Covariance Matrix, 1987).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -23,11 +22,11 @@ from .blur_estimate import estimate_blur
 from .color_search import JUDGE_SPP, ColorSearch
 from .gauss_newton import NormalEquations
 from .jacobian import Rendered
-from .photo.level import PhotoLevel, photo_levels
-from .photo.occluders import occluder_weights, weighted
-from .photo.photo_search import UNCHANGED_COLORS
+from .likelihood.objective import PoseLevel, pose_levels
+from .likelihood.support import edge_share
 from .pose import Pose
 from .robust_loss import MIN_WIDTH, Comparison
+from .settings import POSE
 from .task import PoseTask
 from .uncertainty import CORRELATION_LENGTH
 
@@ -87,24 +86,22 @@ class ColorLoss:
 
 
 class PhotoLoss:
-    """The terms of PhotoSearch, which are log likelihoods, for pictures in unknown light or before unknown things."""
+    """The objective of PoseSearch, for pictures in unknown light or before unknown things."""
 
-    def __init__(self, task: PoseTask, pose: Pose, levels: Sequence[PhotoLevel], seed: int) -> None:
-        self.task, self.seed = task, seed
-        last = levels[-1]
-        views = last.comparisons(pose, seed)
-        last, weights = last.focused(views), occluder_weights(views)
-        self.photo = last if weights is None else weighted(last, weights)
-        self.level = self.photo.pyramid_level
+    def __init__(self, task: PoseTask, pose: Pose, objective: PoseLevel) -> None:
+        self.task, self.objective = task, objective.informed([pose]).focused(pose)
+        self.level = task.level(1.0, 0.0, 1.0, objective.spp, task.dofs)
 
     def at(self, pose: Pose) -> LossModel:
         """Return the model at a pose, from the same samples at each."""
-        normal, loss = self.photo.equations(pose, self.seed)
-        return LossModel(*normal, CORRELATION_LENGTH**2 * normal.curvature, loss, abs(loss), 1.0)
+        model = self.objective.model([pose])
+        assert isinstance(model.gradient, Tensor) and isinstance(model.curvature, Tensor)
+        cost, curvature = float(model.cost), model.curvature[0]
+        return LossModel(curvature, model.gradient[0], CORRELATION_LENGTH**2 * curvature, cost, abs(cost), 1.0)
 
     def judged(self, pose: Pose) -> tuple[float, float]:
         """Return the loss, and the share of the render's edges that the pictures show."""
-        return self.photo.equations(pose, self.seed)[1], self.photo.edge_support(pose, self.seed)
+        return float(self.objective.costs([pose])[0]), edge_share(self.objective, pose)[0]
 
 
 LossSource = ColorLoss | PhotoLoss
@@ -113,12 +110,12 @@ LossSource = ColorLoss | PhotoLoss
 def loss_source(task: PoseTask, pose: Pose, settings: Settings) -> LossSource:
     """Return the loss that suits the pictures best, by what light does to the mesh's colours at a pose."""
     if task.aovs != ("alpha",):
-        levels = photo_levels(task, pose, [None] * len(task.shots), settings)
-        lit = [] if task.colorless else [seen.lit for seen in levels[-1].comparisons(pose, settings.seed)]
+        objective = pose_levels(task, pose, [None] * len(task.shots), settings)[-1]
+        lights = [one.light for one in objective.comparisons([pose])]
         # A surface too small to show its light is compared by colours where the background is known.
-        changes = [one.change() for one in lit if one is not None]
-        if (task.clutter and not changes) or max(changes, default=0.0) > UNCHANGED_COLORS:
-            return PhotoLoss(task, pose, levels, settings.seed)
+        changes = [float(light.change()[0]) for light in lights if light is not None]
+        if (task.clutter and not changes) or max(changes, default=0.0) > POSE.unchanged_colors:
+            return PhotoLoss(task, pose, objective)
     return ColorLoss(task, pose, settings)
 
 

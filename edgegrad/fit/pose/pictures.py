@@ -67,7 +67,8 @@ def curves_of(fit: PoseFit) -> Figure:
         label = None if (h, w) in labelled else f"{w} × {h} px"  # Later ones belong to restarts.
         labelled.add((h, w))
         above.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
-    above.set_yscale("log")
+    if min(step.loss for step in history) > 0.0:  # Log likelihood ratios are not.
+        above.set_yscale("log")
     above.set_ylabel("loss")
     above.spines[["top", "right"]].set_visible(False)
     above.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)

@@ -39,7 +39,7 @@ class ReplayLog:
     def __init__(self, saved: dict[str, Any] | None = None) -> None:
         saved = saved or {"descents": [], "numbers": []}
         self.descents = [_unpacked(state) for state in saved["descents"]]
-        self._numbers: list[list[float]] = list(saved["numbers"])
+        self._numbers: list[Any] = list(saved["numbers"])
         self._read = self._entered = 0
 
     @property
@@ -55,8 +55,8 @@ class ReplayLog:
         """Record the state of the descent that was entered last."""
         self.descents[self._entered - 1 :] = [state]
 
-    def replay(self, compute: Callable[[], list[float]]) -> list[float]:
-        """Return the next numbers, which are computed unless the log has them."""
+    def replay(self, compute: Callable[[], Any]) -> Any:
+        """Return the next numbers, or dictionaries and lists of them, which are computed unless the log has them."""
         self._read += 1
         if self._read > len(self._numbers):
             self._numbers.append(compute())

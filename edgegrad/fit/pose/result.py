@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -43,6 +43,13 @@ class Step(NamedTuple):
     gradient: Mapping[str, float]
 
 
+class PoseMode(NamedTuple):
+    """A pose at which the pictures are likely, and the share of the posterior's mass about it, see docs/pose.md."""
+
+    matrix: Tensor  # (4, 4) float64, mesh to world
+    probability: float
+
+
 @dataclass(frozen=True, eq=False)
 class PoseFit(FitResult):
     """The result of fit_pose(), a FitResult.
@@ -54,7 +61,7 @@ class PoseFit(FitResult):
     they are, or by the mask of a plain mesh, it is the mean over pixels and channels of Geman and McClure's ρ(r) = r² / (1 +
     r²/c²): r is the difference of a pixel to the picture, in linear radiance of which 1 is the picture's white, and c a tenth
     of the picture's range. Before an unknown background a reward for what the object covers is subtracted. By the terms for
-    photographs it is the region term alone: the mean of −log(likelihood) over the pixels around the object, in nats.
+    photographs it is −log of how much likelier the pictures are with the object than without, in nats of independent pixels.
     """
 
     R: Tensor
@@ -74,6 +81,8 @@ class PoseFit(FitResult):
     visible: float = 1.0  # share of this object that the others of fit_poses() do not hide; not kept in JSON
     conflict: str = ""  # the other pose or object that may be the right one, in words; not kept in JSON
     enough: float = MIN_EDGE_SUPPORT  # least `explained` of a right pose; not kept in JSON
+    # The poses at which the search came to rest, the likeliest first. Empty where colours as they are were compared alone.
+    modes: Sequence[PoseMode] = ()
 
     @property
     def matrix(self) -> Tensor:

@@ -1,14 +1,15 @@
 """track(): the pose of a known mesh in each picture of a film.
 
-Position and motion in the last pictures predict the pose. From there a few Gauss-Newton steps over the terms of photographs
-(region, contour, light and depth) refine it, on two levels of resolution around the object alone. Where they do not end at
-edges of the picture, more steps begin on the coarsest level, also from the last good pose. Where that fails for some
-pictures, the object is lost, and is searched for in the whole picture, in the light in which it was seen.
+A picture's likelihood is that of fit_pose. Its prior is the motion so far: the position in the last picture and the velocity
+predict the pose with a normal distribution, whose variance the film teaches. The posterior's maximum is sought from the
+prediction, on two levels of resolution around the object alone. Where it does not lie at edges of the picture, the object moved
+otherwise, and the search of fit_pose begins at the prediction and where the object was seen last. After some such pictures the
+object is lost, and is searched for in the whole picture.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike as OsPath
 from typing import NamedTuple
@@ -17,47 +18,62 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...camera.poses import rigid
-from ...files.image import read_image
+from ...camera.poses import rigid, rotation
+from ...files.image import linear_to_srgb, read_image, srgb_to_linear
 from ...files.paths import PathLike
+from ...optim.levenberg_marquardt import Descent, LevenbergMarquardtSettings, Model, Problem, minimise
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..modes import in_full_precision
 from ..options import FitOptions, Settings
-from ..region import Palette, palette
+from ..region import Palette
 from ..views import check_image
+from .depth_units import warn_of_units
 from .fit_pose import depth_image
-from .gauss_newton import NormalEquations
+from .hypotheses import HypothesisSearch
 from .inputs import ArgumentNames, check_in_front, check_seen, depth_of
-from .photo.depth import warn_of_units
-from .photo.level import PhotoLevel, PictureComparison, photo_levels
-from .photo.light_history import LightHistory
+from .likelihood.light import harmonics_of
+from .likelihood.objective import PoseLevel, pose_levels
+from .likelihood.support import edge_share, enough_support
 from .photo.match import VIEW_PIXELS, places
-from .photo.photo_descent import PHOTO_SUPPORT, enough_support
-from .photo.picture import Picture
 from .photo.template_views import TemplateViews, across, ball
-from .pose import Pose, angle, pose_from_matrix
+from .pose import Pose, pose_from_matrix, rotation_vector
 from .result import PoseFit
+from .settings import POSE
 from .task import PoseTask, Unknowns
 
 FrameLike = Tensor | PathLike
-TRACK_STEPS = 4  # steps on each of the last two levels, where the prediction is good
-RETRY_STEPS = 8  # steps on each level, where it is not
-# The standard deviation from constant velocity, in radians and object sizes, has this first and this least value.
-STEADY, STEADIEST = 0.03, 0.005
-SHORT_STEP = 1e-3  # length of a short step on the last level, radians and object sizes
-MIN_SHOWN_SUPPORT = 0.45  # share of edges below which a picture hardly shows the object
-PATIENCE = 4  # successive poor pictures after which the object is lost
-SEARCH_INTERVAL = 5  # pictures from one search for a lost object to the next
-STEADINESS_RATE = 0.1  # weight of a picture in `steady`
-LEARNING_SUPPORT = 0.8  # share of edges in pictures that light is learnt from
-MAX_COVERED_INCREASE = 0.3  # increase of the covered share that is not believed
-HARDLY, MOSTLY = 0.2, 0.6  # covered shares of the object
-# A search for a lost object renders views up to so many radians from the last good pose and this much larger or smaller,
-# takes a few steps from some matches, and refines the best.
-SEARCH_VIEWS, SEARCH_RADIUS, SIZE_FACTOR = 160, 1.1, 1.2
-CANDIDATES, REFINED_CANDIDATES = 20, 4
-MAX_DRIFT = 0.25  # longest path of the steps from their start, radians and object sizes
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Numbers of the tracker. Deviations from the predicted pose are in radians and sizes of the object."""
+
+    steps: int = 5  # Most steps on a level: half as many leave errors to the next picture, twice as many take longer.
+    short_step: float = 1e-3  # A shorter one ends a descent. Twice as much saves a step, and adds as much noise.
+    # A step ends it, too, that is predicted to gain less, in nats of independent pixels. A fourth takes a third more evaluations
+    # for the same errors.
+    least_gain: float = 4.0
+    # The standard deviation of the prediction, before the film teaches it: half as much holds back objects that accelerate.
+    deviation: float = 0.03
+    # Its least value: a lower one holds back objects that were at rest, a higher one lets poses tremble.
+    least_deviation: float = 0.005
+    learning_rate: float = 0.1  # weight of a picture in that deviation: twice as much follows changes of motion sooner
+    velocity_rate: float = 0.5  # weight of a picture in the velocity, which has the errors of two poses
+    # Share of edges below which a picture hardly shows the object. Poses in clutter show up to 0.57.
+    hardly_seen: float = 0.45
+    mostly_covered: float = 0.6  # covered share of the object above which `reason` says so
+    patience: int = 4  # successive pictures that hardly show the object until it is lost: more wait longer for it
+    search_interval: int = 5  # pictures from one search in the whole picture to the next: fewer take longer
+    # That search renders so many views, up to so many radians from where the object was seen last, and this much larger or
+    # smaller. Half as many miss objects that have turned; twice as many take as much longer.
+    views: int = 160
+    view_radius: float = 1.1
+    size_factor: float = 1.2
+    matches: int = 12  # best places of views that are refined
+
+
+TRACK = TrackSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,18 +86,18 @@ class TrackedPose:
     scale: float  # as of `init`
     explained: float  # share of the render's visible edges that the picture shows, 0 … 1
     lost: bool  # The pose is the last one at which the object was seen.
-    covered: float = 0.0  # share of the object that does not match in the light of earlier pictures, 0 … 1
+    covered: float = 0.0  # share of the object that something else seems to cover, 0 … 1
 
     @property
     def reason(self) -> str:
         """How well the pose is known, in words: "seen", or "lost: …", "hardly seen: …" or "covered: …"."""
         if self.lost:
             return "lost: where the object was seen last, since pictures one after the other hardly show it"
-        if self.explained < MIN_SHOWN_SUPPORT:
+        if self.explained < TRACK.hardly_seen:
             return (
                 f"hardly seen: where its motion leads, for the picture shows {self.explained:.0%} of the render's edges"
             )
-        if self.covered > MOSTLY:
+        if self.covered > TRACK.mostly_covered:
             return f"covered: {self.covered:.0%} of the object is not what it looked like before"
         return "seen"
 
@@ -175,205 +191,178 @@ def _poses(
 
 
 class FrameCandidate(NamedTuple):
-    """A refined pose in one picture."""
+    """A pose in one picture."""
 
     pose: Pose
-    share: float  # visible edges of the render that the picture shows
-    covered: float  # share of the object
-    views: list[PictureComparison]
+    share: float = 0.0  # edges of the render that the picture shows
+    visible: float = 0.0  # share of the object
+    level: PoseLevel | None = None  # on which it was found
 
-    @property
-    def shown(self) -> float:
-        """How much of the object the picture shows there."""
-        return self.share * (1.0 - self.covered)
+
+@dataclass(frozen=True)
+class PredictedLevel(Problem[Pose]):
+    """A picture at one resolution, with a prior of the pose: the objective of fit_pose, and that of a normal deviation."""
+
+    level: PoseLevel
+    predicted: Pose
+    deviation: float  # standard deviation of each entry of a step from the predicted pose
+
+    def model(self, points: Sequence[Pose]) -> Model:
+        found = self.level.model(points)
+        assert isinstance(found.gradient, Tensor) and isinstance(found.curvature, Tensor)
+        offset = torch.stack([self.offset(pose) for pose in points])
+        # Errors that neighbouring pixels have in common, successive pictures have, too. The prediction does not correct them,
+        # so costs count as they are, without the temperature of Mode.log_mass.
+        known = self.deviation**-2
+        return Model(
+            found.cost + 0.5 * known * offset.square().sum(1, keepdim=True), found.gradient + known * offset,
+            found.curvature + known * torch.eye(offset.shape[1], dtype=torch.float64),
+        )  # fmt: skip
+
+    def moved(self, points: Sequence[Pose], steps: Tensor) -> list[Pose]:
+        return self.level.moved(points, steps)
+
+    def offset(self, pose: Pose) -> Tensor:
+        """Return the step (n,) from the predicted pose to this one."""
+        task, V = self.level.task, self.level.task.shots[0].camera.world_to_camera[:3, :3].double()
+        turn = V @ rotation_vector(pose.R @ self.predicted.R.T)
+        shift = V @ (task.center_at(pose) - task.center_at(self.predicted)) / task.size
+        return torch.cat([turn, shift])[list(self.level.dofs)]
+
+
+def _rested(problem: PredictedLevel, start: Pose) -> Descent[Pose]:
+    """Return the descent from a pose when it rests."""
+    settings = LevenbergMarquardtSettings(
+        steps=TRACK.steps + 1, start_damping=POSE.fine_damping, least_damping=0.1 * POSE.fine_damping, unseen_damping=1e-5,
+        trust_radius=POSE.longest_step, least_gain=TRACK.least_gain,
+        shortest_step=TRACK.short_step * problem.level.coarseness,
+    )  # fmt: skip
+    return minimise(problem, [start], settings).descents[0]
 
 
 class Tracker:
     """The state of tracking through a film."""
 
     def __init__(self, mesh: Mesh | Scene, camera: Camera, start: Pose, settings: Settings) -> None:
-        self.mesh, self.camera = mesh, camera
-        self.settings, self.seed = settings, settings.seed
+        self.mesh, self.camera, self.settings = mesh, camera, settings
         self.pose = self.good = start  # last pose, and last one at which the object was seen
-        self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-        self.poor = self.lost = 0  # successive pictures that hardly show the object, and in which it is lost
-        self.first, self.moves = True, False  # `moves`: the velocity is known.
+        self.velocity: tuple[Tensor, Tensor] | None = None  # rotation and shift a picture, where they are known
+        self.poor = 0  # successive pictures that hardly show the object
         self.task: PoseTask | None = None
-        self.palettes: list[Palette] = []
-        self.steady = STEADY
-        self.covered = 0.0  # share in the last picture
-        self.light = LightHistory()
+        self.blur: float | None = None  # of the film's contours
+        self.palettes: list[Palette] | None = None  # of the pictures that were last searched
+        self.shown: PoseLevel | None = None  # picture that shows the object there
+        self.variance = TRACK.deviation**2  # of the prediction
 
     @in_full_precision
     def follow(self, index: int, frame: object, measured: object) -> TrackedPose:
         """Return the pose in the next picture. Raises TypeError, ValueError or OSError."""
         name = f"frames[{index}]"
-        picture = self._picture(name, frame)
+        picture, first = self._picture(name, frame), self.task is None
         if self.task is None:
             self.task = self._task(name, picture)
         task = replace(self.task, shots=[self.task.shots[0]._replace(target=picture / self.task.white)])
-        near = None if measured is None else depth_image(f"depths[{index}]", measured, self.camera.size)
-        if self.first:
+        depth = None if measured is None else depth_image(f"depths[{index}]", measured, self.camera.size)
+        if first:
             there = task.scene.transformed(self.pose.R, self.pose.t, self.pose.scale)
-            warn_of_units(there, [task.shots[0].camera], [near], "at the start")
-        predicted = self._predicted()
-        pose, share, self.covered, _ = self._found(task, near, predicted)
-        if self.first or share >= MIN_SHOWN_SUPPORT:
-            self.poor = self.lost = 0
-        else:
-            self.poor += 1
-        lost = self.poor >= PATIENCE
-        self.lost = self.lost + 1 if lost else 0
-        if lost and self.lost % SEARCH_INTERVAL == 0:
-            again = self._searched(task, near)
-            if again.share >= enough_support(task) and again.covered < MOSTLY:
-                pose, share, self.covered, _ = again
-                lost, self.poor, self.lost = False, 0, 0
-        self._move(pose, share, lost)
-        where = self.pose.R, self.pose.t, float(self.pose.scale)
-        return TrackedPose(index, *where, share, lost, self.covered)
+            warn_of_units(there, [task.shots[0].camera], [depth], "at the start")
+        predicted, lost, enough = self._predicted(task), self.poor >= TRACK.patience, enough_support(task)
+        found = FrameCandidate(predicted) if first or lost else self._followed(task, depth, predicted)
+        seen, jumped = found.share >= TRACK.hardly_seen, False
+        if found.share < enough:
+            groups = [(predicted, [predicted, self.good][: 1 if predicted is self.good else 2])]
+            if lost and (self.poor - TRACK.patience) % TRACK.search_interval == 0:
+                groups += [(pose, [pose]) for pose in self._matches(task)]
+            again = self._searched(task, depth, groups)
+            if first or again.share >= enough:
+                found, seen, jumped = again, True, True
+        self.poor = 0 if seen else self.poor + 1
+        lost = self.poor >= TRACK.patience
+        pose = self.good if lost else found.pose if seen else predicted
+        self._move(task, pose, unknown=lost or jumped)
+        if found.share >= enough:
+            self.good, self.shown = pose, found.level
+        return TrackedPose(index, pose.R, pose.t, float(pose.scale), found.share, lost, 1.0 - found.visible)
 
-    def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> FrameCandidate:
-        """Find the object near the predicted or the last good pose."""
-        best = FrameCandidate(predicted, 0.0, 1.0, [])
-        if not self.first and not self.lost:
-            levels = self._levels(task, depth, predicted)
-            offset = torch.zeros(len(levels[-1].pyramid_level.dofs), dtype=torch.float64) if self.moves else None
-            best = self._believed(self._down(levels[-2:], predicted, TRACK_STEPS, offset), predicted)
-            if offset is not None and best.share >= LEARNING_SUPPORT and best.covered < HARDLY:
-                variance = (1.0 - STEADINESS_RATE) * self.steady**2 + STEADINESS_RATE * float(offset.square().mean())
-                self.steady = max(variance**0.5, STEADIEST)
-        if (
-            best.share < PHOTO_SUPPORT or best.covered > self.covered + MAX_COVERED_INCREASE
-        ):  # Occlusion grows gradually.
-            for start in [predicted] if self.first or predicted is self.good else [predicted, self.good]:
-                again = self._believed(self._down(self._levels(task, depth, start), start, RETRY_STEPS), start)
-                if again.shown > best.shown:
-                    best = again
-                if best.share >= PHOTO_SUPPORT and best.covered < MOSTLY:
-                    break
-        if self.first and best.share < PHOTO_SUPPORT:  # The coarsest level spoils some near starts.
-            again = self._down(self._levels(task, depth, predicted)[-2:], predicted, RETRY_STEPS)
-            best = max(best, again, key=lambda end: end.shown)
-        if best.share >= LEARNING_SUPPORT and best.covered < MOSTLY:
-            self.light.learn(best.views)
-        return best if best.share >= MIN_SHOWN_SUPPORT else best._replace(pose=predicted)
+    def _followed(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> FrameCandidate:
+        """Return the posterior's maximum near the predicted pose."""
+        coarse, fine = pose_levels(task, predicted, [depth], self.settings, self.palettes)[-2:]
+        deviation = TRACK.deviation if self.velocity is None else self.variance**0.5
+        start = _rested(PredictedLevel(coarse, predicted, deviation), predicted).point
+        fine = fine.focused(start) if self.blur is None else replace(fine, contour_blur=self.blur)
+        self.blur, problem = fine.contour_blur, PredictedLevel(fine, predicted, deviation)
+        found = _rested(problem, start)
+        share, visible = edge_share(fine, found.point)
+        if self.velocity is not None and share >= enough_support(task):
+            square = float(problem.offset(found.point).square().mean())
+            variance = self.variance + TRACK.learning_rate * (square - self.variance)
+            self.variance = max(variance, TRACK.least_deviation**2)
+        return FrameCandidate(found.point, share, visible, fine)
 
-    def _down(self, levels: list[PhotoLevel], start: Pose, most: int, offset: Tensor | None = None) -> FrameCandidate:
-        """Refine through the levels, with at most so many steps on each; `offset` as of _stepped()."""
-        occluder = self.light.occluder(levels[-2].comparisons(start, self.seed)) if offset is not None else None
-        pose, views = start, []
-        for level in levels:
-            pose, views = self._stepped(level if occluder is None else occluder.left_out(level), pose, most, offset)
-            occluder = self.light.occluder(views) or occluder
-        share = levels[-1].edge_support(pose, self.seed, views)
-        return FrameCandidate(pose, share, 0.0 if occluder is None else occluder.share, views)
+    def _searched(
+        self, task: PoseTask, depth: Tensor | None, groups: Sequence[tuple[Pose, Sequence[Pose]]]
+    ) -> FrameCandidate:  # fmt: skip
+        """Return where the search of fit_pose ends, which knows no motion."""
+        modes = HypothesisSearch(task, groups, [depth], self.settings, further=False).run()
+        if not modes:
+            return FrameCandidate(self.good)
+        pose = modes[0].pose
+        level = pose_levels(task, pose, [depth], self.settings)[-1]
+        self.palettes = [picture.palette for picture in level.pictures]
+        return FrameCandidate(pose, *edge_share(level, pose), level)
 
-    def _believed(self, end: FrameCandidate, start: Pose) -> FrameCandidate:
-        """Reject a candidate far from its start: such steps follow something other than the object, whatever they match
-        there."""
-        assert self.task is not None
-        moved = float((self._center(start) - self._center(end.pose)).norm())
-        near = angle(start.R, end.pose.R) < MAX_DRIFT and moved < MAX_DRIFT * self.task.size
-        return end if near or self.first else FrameCandidate(start, 0.0, 1.0, [])
-
-    def _center(self, pose: Pose) -> Tensor:
-        assert self.task is not None
-        return self.task.center_at(pose)
-
-    def _stepped(
-        self, level: PhotoLevel, pose: Pose, most: int, offset: Tensor | None = None
-    ) -> tuple[Pose, list[PictureComparison]]:  # fmt: skip
-        """Take at most so many Gauss-Newton steps, until a short one; return the pose and the comparisons before the last
-        step. `offset` (n,) is how far the steps have led from the prediction, which they add to. Where the picture shows
-        little, the pose is pulled to the prediction."""
-        views: list[PictureComparison] = []
-        for step in range(most):
-            views = level.comparisons(pose, self.seed)
-            if level.last and step == 0:
-                level = level.focused(views)
-            normal, _loss = level.equations(pose, self.seed, views)
-            if not float(normal.curvature.trace()) > 0.0:
-                break  # The prior below would hide that.
-            if offset is not None:
-                known = torch.eye(len(offset), dtype=torch.float64) / self.steady**2
-                normal = NormalEquations(normal.curvature + known, normal.gradient + known @ offset)
-            move = level.step(normal)
-            assert move is not None
-            pose = level.task.moved(pose, level.pyramid_level.dofs, move)
-            if offset is not None:
-                offset += move
-            if float(move.abs().max()) < SHORT_STEP * level.pyramid_level.coarseness:
-                break
-        return pose, views
-
-    def _levels(self, task: PoseTask, depth: Tensor | None, pose: Pose) -> list[PhotoLevel]:
-        return photo_levels(task, pose, [depth], self.settings, self.palettes)
-
-    def _searched(self, task: PoseTask, depth: Tensor | None) -> FrameCandidate:
-        """Search the whole picture for the object, about as large as it was, and rotated by up to some 60°."""
-        camera, scale, best = task.shots[0].camera, self.good.scale, FrameCandidate(self.good, 0.0, 1.0, [])
+    def _matches(self, task: PoseTask) -> list[Pose]:
+        """Return where in the whole picture the object might be, about as large as it was, and rotated by up to some 60°."""
+        camera, scale = task.shots[0].camera, self.good.scale
         if camera.projection not in ("perspective", "orthographic"):
-            return best
+            return []
         unit = replace(
             task, scene=task.scene.transformed(torch.eye(3), torch.zeros(3), scale), center=scale * task.center
         )
-        rotations = ball(SEARCH_VIEWS, SEARCH_RADIUS) @ (camera.world_to_camera[:3, :3] @ self.good.R)
-        far = self._distance(self.good)
+        rotations = ball(TRACK.views, TRACK.view_radius) @ (camera.world_to_camera[:3, :3] @ self.good.R)
+        far = float(depth_of(camera, self.good, task.center))
         size = across(unit, camera, far) / min(camera.size)
-        views = self.light.illuminated(TemplateViews.from_rotations(unit, rotations, VIEW_PIXELS, self.seed), camera)
-        lit = self.light.light is not None
-        poses = [
-            pose._replace(scale=scale) for pose in places(unit, views, (size / SIZE_FACTOR, size * SIZE_FACTOR), lit)
-        ]
+        views = TemplateViews.from_rotations(unit, rotations, VIEW_PIXELS, self.settings.seed)
+        views, lit = self._lit(views, camera)
+        found = places(unit, views, (size / TRACK.size_factor, size * TRACK.size_factor), lit)
+        poses = [pose._replace(scale=scale) for pose in found[: TRACK.matches]]
         if camera.projection == "orthographic":  # The match does not show depth.
             axis = camera.world_to_camera[2, :3]
-            poses = [pose._replace(t=pose.t + (far - self._distance(pose)) * axis) for pose in poses]
-        found = []
-        for pose in poses[:CANDIDATES]:
-            level = self._levels(task, depth, pose)[0]
-            pose, views = self._stepped(level, pose, TRACK_STEPS)
-            found.append((level.edge_support(pose, self.seed, views), pose))
-        found.sort(key=lambda one: -one[0])
-        for _, pose in found[:REFINED_CANDIDATES]:
-            again = self._down(self._levels(task, depth, pose), pose, RETRY_STEPS)
-            best = max(best, again, key=lambda end: end.shown)
-            if best.share >= LEARNING_SUPPORT and best.covered < HARDLY:
-                break
-        return best
+            off = [far - float(depth_of(camera, pose, task.center)) for pose in poses]
+            poses = [pose._replace(t=pose.t + shift * axis) for pose, shift in zip(poses, off, strict=True)]
+        return poses
 
-    def _distance(self, pose: Pose) -> float:
-        """Return the distance of the object's centre from the camera along its axis, world units."""
-        assert self.task is not None
-        return float(depth_of(self.camera.to(torch.float64), pose, self.task.center))
+    def _lit(self, views: TemplateViews, camera: Camera) -> tuple[TemplateViews, bool]:
+        """Return the views in the light in which the object was seen last, and whether that is known."""
+        light = None if self.shown is None else self.shown.comparisons([self.good])[0].light
+        if light is None:
+            return views, False
+        world = camera.world_to_camera[:3, :3].double().T @ views.rotations  # The light turned with the mesh.
+        normals = torch.einsum("nij,nhwj->nihw", (self.good.R.T @ world).float(), views.normals)
+        irradiance = harmonics_of(normals, light.coefficients.shape[2]).movedim(1, -1) @ light.coefficients[0].T
+        radiance = srgb_to_linear(views.colors) * irradiance
+        return replace(views, colors=linear_to_srgb(radiance.clamp(0.0, 1.0))), True
 
-    def _predicted(self) -> Pose:
+    def _predicted(self, task: PoseTask) -> Pose:
         """Predict the pose by constant velocity."""
-        assert self.task is not None
-        if self.lost:
-            return self.good
-        R = self.turn @ self.pose.R
-        where = self._center(self.pose) + self.shift
-        return self.pose._replace(R=R, t=where - self.pose.scale * (R @ self.task.center))
+        if self.velocity is None:
+            return self.pose
+        turn, shift = self.velocity
+        R = turn @ self.pose.R
+        return self.pose._replace(R=R, t=task.center_at(self.pose) + shift - self.pose.scale * (R @ task.center))
 
-    def _move(self, pose: Pose, share: float, lost: bool) -> None:
+    def _move(self, task: PoseTask, pose: Pose, unknown: bool) -> None:
         """Update position and velocity."""
-        if not (self.first or lost) and (share < MIN_SHOWN_SUPPORT or self.covered > MOSTLY):
-            self.pose = pose  # The velocity stays.
-            return
-        moved, self.moves = self.moves, not (self.first or lost)
-        if lost:  # The velocity is not known.
-            self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-        elif not self.first:
-            far = angle(self.pose.R, pose.R) > MAX_DRIFT  # It was found again.
-            turn = torch.eye(3, dtype=torch.float64) if far else pose.R @ self.pose.R.T
-            shift = torch.zeros(3, dtype=torch.float64) if far else self._center(pose) - self._center(self.pose)
-            # A difference of two poses has the errors of both, so velocities are averaged.
-            known = moved and not far
-            self.turn, self.shift = (_between(self.turn, turn), 0.5 * (self.shift + shift)) if known else (turn, shift)
-        self.pose, self.first = self.good if lost else pose, False
-        if share >= PHOTO_SUPPORT and not lost:
-            self.good = pose
+        turn, shift = pose.R @ self.pose.R.T, task.center_at(pose) - task.center_at(self.pose)
+        if unknown:
+            self.velocity = None
+        elif self.velocity is None:
+            self.velocity = turn, shift
+        else:
+            before, way = self.velocity
+            turn = rotation(TRACK.velocity_rate * rotation_vector(turn @ before.T)) @ before
+            self.velocity = turn, way + TRACK.velocity_rate * (shift - way)
+        self.pose = pose
 
     def _task(self, name: str, picture: Tensor) -> PoseTask:
         task = PoseTask.from_arguments(
@@ -381,8 +370,6 @@ class Tracker:
         )  # fmt: skip
         # The background counts as unknown, since a film shows more than one.
         task = replace(task, clutter=True, shots=[task.shots[0]._replace(background=None)])
-        whole = Picture.from_shot(task.shots[0], False, None, self.camera.size)
-        self.palettes = [palette(whole.outlined, self.seed)]
         return task
 
     def _picture(self, name: str, frame: object) -> Tensor:
@@ -396,9 +383,3 @@ class Tracker:
         if self.task is not None and picture.shape[-1] != (C := self.task.shots[0].target.shape[-1]):
             raise ValueError(f"{name}: expected {C} channels as of the frames before, got {picture.shape[-1]}")
         return picture
-
-
-def _between(A: Tensor, B: Tensor) -> Tensor:
-    """Return the rotation midway between two (3, 3)."""
-    U, _, Vh = torch.linalg.svd(A + B)
-    return U @ Vh

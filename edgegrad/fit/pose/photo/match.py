@@ -21,7 +21,6 @@ from ...views import area_mean
 from ..pose import Pose
 from ..target_images import scaled
 from ..task import PoseTask
-from .occluders import at_one_side
 from .template_views import TemplateViews, across, all_sides, pose_at
 from .templates import Templates, surprise
 
@@ -35,7 +34,6 @@ PLACES_PER_VIEW = 3  # at one size
 MAX_RANKED = 1500  # most matches that are compared with one another
 MIP_RATIO = 1.15  # ratio between two sizes of the picture
 MAX_SHIFT_PIXELS = 2  # pixels by which a match is moved to all sides
-HIDDEN_SHARE = 0.3  # share of the object's pixels at a side that is left out
 
 
 @dataclass(frozen=True)
@@ -46,21 +44,16 @@ class Matches:
     positions: Tensor  # (n, 2) float64 of the object's centre, pixels of the picture
     pixels: Tensor  # (n,) float64 of the picture, across the object
     scores: Tensor  # (n,)
-    sides: Tensor | None = None  # (n,), sides that are left out, see at_one_side()
 
     def select(self, rows: Tensor) -> Matches:
-        sides = None if self.sides is None else self.sides[rows]
-        return Matches(self.rotations[rows], self.positions[rows], self.pixels[rows], self.scores[rows], sides)
+        return Matches(self.rotations[rows], self.positions[rows], self.pixels[rows], self.scores[rows])
 
     def turned(self, turns: Tensor) -> Matches:
         """Rotate each match by all rotations (k, 3, 3), without comparing."""
         k = len(turns)
         positions, pixels = (x.repeat_interleave(k, 0) for x in (self.positions, self.pixels))
-        sides = None if self.sides is None else self.sides.repeat_interleave(k, 0)
         rotations = (turns @ self.rotations[:, None]).flatten(0, 1)
-        return Matches(
-            rotations, positions, pixels, torch.full((len(rotations),), -math.inf, dtype=torch.float32), sides
-        )
+        return Matches(rotations, positions, pixels, torch.full((len(rotations),), -math.inf, dtype=torch.float32))
 
     def distinct(self, most: int, turned: float, spacing: float, sized: float) -> Matches:
         """Return the best matches, the best first, that differ from one another. Of two whose angle is below `turned` radians,
@@ -271,11 +264,7 @@ def closer(task: PoseTask, found: Matches, mips: Mips, one: Round, rare: float, 
 def fitted(task: PoseTask, given: Matches, mips: Mips, one: Round, rare: float, seed: int) -> Matches:
     """Move each match to the best of the places and sizes around it, with its rotation."""
     views = TemplateViews.from_rotations(task, given.rotations, one.across, seed)
-    shown = None
-    if given.sides is not None:
-        pairs = zip(views.alpha, given.sides.tolist(), strict=True)
-        shown = torch.stack([at_one_side(alpha, side, HIDDEN_SHARE) for alpha, side in pairs])
-    templates, T = Templates(views, rare, shown), views.alpha.shape[-1]
+    templates, T = Templates(views, rare), views.alpha.shape[-1]
     best = given
     for factor in (1.0 - one.grow, 1.0, 1.0 + one.grow):
         pixels = factor * given.pixels

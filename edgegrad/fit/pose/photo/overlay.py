@@ -5,14 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ....aovs import render_aovs
 from ...contour_colors import draw_contour
+from ..likelihood.light import harmonics_of
+from ..likelihood.objective import Comparison, whole_level
 from ..pose import Pose
-from ..robust_loss import Comparison
+from ..robust_loss import Comparison as ColorComparison
 from ..task import BACKGROUND_BRIGHTNESS, PoseTask, PyramidLevel
-from .light import HARMONICS, FittedLight, harmonics_of
-from .picture import Picture
-from .surface_interior import AOVS, SurfaceInterior
 
 
 def overlay(task: PoseTask, level: PyramidLevel, pose: Pose) -> list[Tensor]:
@@ -20,29 +18,25 @@ def overlay(task: PoseTask, level: PyramidLevel, pose: Pose) -> list[Tensor]:
     alone."""
     if not task.clutter:
         with torch.no_grad():
-            return Comparison(task, level, task.images(level, pose, level.spp, 0)).renders
-    moved = task.scene.transformed(pose.R, pose.t, pose.scale)
+            return ColorComparison(task, level, task.images(level, pose, level.spp, 0)).renders
     found = []
-    for shot in level.shots:
-        camera = task.lens(shot.camera, pose)
-        with torch.no_grad():
-            channels = render_aovs(moved, camera, AOVS, level.spp, 0)
-            alpha = channels["alpha"].float()
-            image = shot.target * alpha if task.colorless else _lit(task, level, pose, channels, len(found))
+    objective = whole_level(task, [shot.camera.size for shot in level.shots], level.spp)
+    for shot, one in zip(level.shots, objective.comparisons([pose]), strict=True):
+        alpha = torch.zeros(*shot.camera.size, 1, dtype=torch.float32)
+        image = torch.zeros_like(shot.target)
+        one.seen.box.cut(alpha.movedim(-1, 0)).copy_(one.seen.alpha)
+        one.seen.box.cut(image.movedim(-1, 0)).copy_(_shown(one))
         image = image + (1.0 - alpha) * BACKGROUND_BRIGHTNESS * shot.target
         found.append(draw_contour(image, alpha))
     return found
 
 
-def _lit(task: PoseTask, level: PyramidLevel, pose: Pose, channels: dict[str, Tensor], k: int) -> Tensor:
-    """Return the radiance (h, w, C) times alpha."""
-    shot, image = level.shots[k], channels["image"].float()
-    picture = Picture.from_shot(shot, False, None, shot.camera.size)
-    surface = SurfaceInterior.from_channels(
-        task.lens(shot.camera, pose), channels, task.motion(level._replace(dofs=task.dofs), shot, pose)
-    )
-    lit = FittedLight.from_picture(picture, surface, 1 if task.scene.is_shaded else HARMONICS)
-    if lit is None:
-        return image
-    Y = harmonics_of(surface.normals)[..., : lit.coefficients.shape[1]]
-    return (image * (Y @ lit.coefficients.T)).clamp(min=0.0)
+def _shown(one: Comparison) -> Tensor:
+    """Return the radiance (C, h, w) times alpha: in the fitted light where there is one."""
+    seen, light = one.seen, one.light
+    if seen.color is None or seen.normal is None:
+        return one.part.radiance * seen.alpha
+    if light is None:
+        return seen.color[0]
+    L = light.coefficients[0]
+    return (seen.color[0] * torch.einsum("cn,nhw->chw", L, harmonics_of(seen.normal, L.shape[1])[0])).clamp(min=0.0)

@@ -91,18 +91,6 @@ def pose_at(task: PoseTask, R: Tensor, position: Tensor, depth: float) -> Pose:
     return Pose(turned, t, one, one)
 
 
-def seen_at(task: PoseTask, pose: Pose) -> tuple[Tensor, Tensor, float]:
-    """Return what pose_at() makes a pose of: rotation (3, 3) of a view, position (2,) and depth."""
-    camera = task.shots[0].camera
-    view, K = camera.world_to_camera.double(), camera.K.double()
-    center = view[:3, :3] @ (pose.R @ task.center + pose.t) + view[:3, 3]
-    R, ray = view[:3, :3] @ pose.R, center[:2]
-    if camera.projection != "orthographic":
-        ray = center[:2] / center[2]
-        R = _towards(ray).T @ R
-    return R, K[:2, :2] @ ray + K[:2, 2], float(center[2])
-
-
 def all_sides() -> Tensor:
     """Return the rotations (DIRECTIONS · ROLLS, 3, 3): directions on Fibonacci's sphere, each rotated about itself."""
     k = torch.arange(DIRECTIONS, dtype=torch.float64)

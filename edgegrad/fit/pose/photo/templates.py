@@ -30,9 +30,8 @@ SAMPLED_PIXELS = 1500  # number of pixels that estimate the density of colours
 class Templates:
     """Views as filters of pictures with the channels C, which may be none."""
 
-    def __init__(self, views: TemplateViews, rare: float, shown: Tensor | None = None) -> None:
-        """`rare` weights the ratio to the picture's colours against that to one colour. `shown` (n, T, T) is 0 where views
-        are not compared."""
+    def __init__(self, views: TemplateViews, rare: float) -> None:
+        """`rare` weights the ratio to the picture's colours against that to one colour."""
         self.rare = rare
         alpha, colors, normals = views.alpha, views.colors, views.normals
         self.C = colors.shape[-1]
@@ -40,8 +39,6 @@ class Templates:
         self.inside = torch.where(alpha > 0.5, alpha, torch.zeros_like(alpha))
         near = F.max_pool2d((alpha > 0.02).float()[:, None], 2 * views.ring + 1, 1, views.ring)[:, 0]
         self.around = near * (alpha < 0.02)
-        if shown is not None:
-            self.inside, self.around = shown * self.inside, shown * self.around
         Y = torch.cat([torch.ones_like(normals[..., :1]), normals], -1)
         basis = colors[..., None] * Y[..., None, :]  # (n, T, T, C, 4)
         weighted = basis * self.inside[..., None, None]

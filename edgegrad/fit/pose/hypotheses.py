@@ -1,0 +1,229 @@
+"""The search for a pose: hypotheses, of which the likeliest are refined from level to level, and the modes that remain.
+
+Hypotheses are the start, poses turned from it, or matches of views with the whole picture. Damped Gauss-Newton steps lower
+the costs of those about one start in lockstep, and after a few steps the unlikely ones go (successive halving, Jamieson and
+Talwalkar, Non-stochastic Best Arm Identification, 2016). Low resolution separates some directions badly, such as a turn out of
+the image plane from a shift. So on the next level, further hypotheses are drawn along the directions that the likeliest one
+leaves open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...optim.levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtSettings, Rest
+from ...scene.symmetries import Symmetries
+from ..options import Settings
+from .camera_motion import moved_poses
+from .color_search import norms_of
+from .likelihood.objective import PoseLevel, pose_levels
+from .pose import Pose, angle
+from .result import Step
+from .settings import POSE
+from .task import ROTATION, TRANSLATION, PoseTask
+
+Round = tuple[int, int]
+LAST_ROUNDS: tuple[Round, ...] = ((3, 3), (5, 3))  # on the last level, before and after its noise and blur are known
+LAST_STEPS = 20  # most steps then
+HELD = 1e2  # λ of a descent that comes to rest, for its cost falls along no step
+
+
+class Mode(NamedTuple):
+    """A pose at which the pictures' likelihood has a maximum."""
+
+    pose: Pose
+    cost: float  # −log likelihood ratio to pictures without the object, nats of independent pixels
+    curvature: Tensor  # (n, n), of the cost
+    rests: bool  # The last step was short.
+
+    @property
+    def log_mass(self) -> float:
+        """The logarithm of the posterior's mass about the mode (Laplace's approximation), up to a constant. Errors of
+        neighbouring pixels have common causes, which a temperature accounts for."""
+        temperature = POSE.correlation_length**2
+        known = self.curvature / temperature + torch.eye(len(self.curvature), dtype=torch.float64)
+        return -self.cost / temperature - 0.5 * float(torch.logdet(known))
+
+
+class Group:
+    """Hypotheses that are compared in one part of the pictures, each with the descent that it is on."""
+
+    def __init__(self, levels: list[PoseLevel], poses: Sequence[Pose]) -> None:
+        self.levels, self.poses = levels, list(poses)
+        self.descents: LevenbergMarquardt[Pose] | None = None
+        self.level = levels[0]
+
+    def enter(self, k: int, settings: Settings) -> None:
+        """Begin descents on level k; of fewer levels the last serves."""
+        self.level = self.levels[min(k, len(self.levels) - 1)].informed(self.poses)
+        self.begin(settings)
+
+    def begin(self, settings: Settings) -> None:
+        last = self.level.last
+        self.descents = LevenbergMarquardt(self.level, self.poses, LevenbergMarquardtSettings(
+            steps=settings.steps + 1, start_damping=POSE.fine_damping if last else POSE.coarse_damping,
+            least_damping=0.1 * POSE.fine_damping, most_damping=HELD, unseen_damping=1e-5, trust_radius=POSE.longest_step,
+            least_gain=POSE.least_gain, shortest_step=settings.step_tolerance * self.level.coarseness,
+        ))  # fmt: skip
+
+    @property
+    def costs(self) -> list[float]:
+        assert self.descents is not None
+        return [descent.mean_cost for descent in self.descents.descents]
+
+    def keep(self, rows: Sequence[int]) -> None:
+        """Keep these hypotheses alone."""
+        assert self.descents is not None
+        self.descents.descents = [self.descents.descents[row] for row in rows]
+        self.poses = [descent.point for descent in self.descents.descents]
+
+    def open_ends(self, row: int) -> list[Pose]:
+        """Return poses about a hypothesis along the directions in which its cost rises least."""
+        assert self.descents is not None
+        descent = self.descents.descents[row]
+        values, vectors = torch.linalg.eigh(descent.curvature)
+        steps = []
+        for value, vector in zip(values[: POSE.weak_directions].tolist(), vectors.T, strict=False):
+            size = POSE.weak_deviations * OPEN_LENGTH / math.sqrt(max(value, 1e-9))
+            size = min(size, POSE.turns[-1] / float(vector.abs().max()))
+            steps += [size * vector, -size * vector]
+        return moved_poses(self.level.task, [descent.point] * len(steps), self.level.dofs, torch.stack(steps))
+
+
+OPEN_LENGTH = 4.0  # Correlation length by which a level's posterior is as wide as ends of descents spread.
+
+
+class HypothesisSearch:
+    """Refinement of hypotheses. `likeliest` and `history` are valid after each step."""
+
+    def __init__(
+        self, task: PoseTask, groups: Sequence[tuple[Pose, Sequence[Pose]]], depths: Sequence[Tensor | None],
+        settings: Settings, symmetries: Symmetries | None = None, further: bool = True, coarse: bool = True,
+    ) -> None:  # fmt: skip
+        """`groups` have a pose, about which pictures are compared, and hypotheses. `further`: draw more of them. `coarse`: begin
+        on the coarsest level, and not on the last one."""
+        self.task, self.depths, self.settings, self.symmetries = task, depths, settings, symmetries
+        self.further, self.coarse = further, coarse
+        self.groups: list[Group] = []
+        self.given = groups
+        self.likeliest = groups[0][1][0]
+        self.cost = math.inf
+        self.history: list[Step] = []
+        self.after_step: Callable[[], Any] = lambda: None
+        self.report: Callable[[str], Any] = lambda _: None
+
+    def run(self) -> list[Mode]:
+        """Return the modes, the likeliest first; none where nothing in the pictures depends on the poses."""
+        for about, poses in self.given:
+            self.groups.append(Group(pose_levels(self.task, about, self.depths, self.settings), poses))
+        deepest = max(len(group.levels) for group in self.groups)
+        for k in range(deepest - 1 if self.coarse else 0):
+            self.report(f"{sum(len(group.poses) for group in self.groups)} hypotheses on level {k + 1} of {deepest}")
+            for group in self.groups:
+                group.enter(k, self.settings)
+            self._halve(POSE.first_rounds if k == 0 else POSE.later_rounds, by_group=k == 0)
+            if self.further:
+                best = min(self.groups, key=lambda group: min(group.costs))
+                order = sorted(range(len(best.poses)), key=best.costs.__getitem__)
+                drawn = 1 if best.levels[min(k + 1, len(best.levels) - 1)].last else 2
+                best.poses += [pose for row in order[:drawn] for pose in best.open_ends(row)]
+        for group in self.groups:
+            group.enter(deepest - 1, self.settings)
+        self._halve((LAST_ROUNDS[0],))
+        self._halve((LAST_ROUNDS[1],))
+        for group in self.groups:
+            group.level = group.level.informed(group.poses).focused(group.poses[0])
+            group.begin(self.settings)
+        self._halve(((LAST_STEPS, POSE.modes),))
+        return self._modes()
+
+    def _halve(self, rounds: Sequence[Round], by_group: bool = False) -> None:
+        """Take steps, and keep the likeliest hypotheses after each round. `by_group`: at least one of each group."""
+        for steps, kept in rounds:
+            for group in self.groups:
+                assert group.descents is not None
+                for _ in range(min(steps + (group.descents.steps == 0), self.settings.steps + 1)):
+                    if group.descents.resting:
+                        break
+                    group.descents.advance()
+                    self._note(group)
+            self._keep(kept)
+
+    def _keep(self, most: int) -> None:
+        """Keep the likeliest hypotheses that differ."""
+        ranked = sorted(
+            ((cost, g, row) for g, group in enumerate(self.groups) for row, cost in enumerate(group.costs)),
+            key=lambda one: one[0],
+        )
+        kept: list[tuple[int, int]] = []
+        for cost, g, row in ranked:
+            pose = self._descent(g, row).point
+            alone = all(self.apart(pose, self._descent(*other).point) > POSE.distinct for other in kept)
+            if math.isfinite(cost) and alone and len(kept) < most:
+                kept.append((g, row))
+        kept = kept or [(ranked[0][1], ranked[0][2])]
+        for g, group in enumerate(self.groups):
+            group.keep([row for at, row in kept if at == g])
+        self.groups = [group for group in self.groups if group.poses]
+
+    def _descent(self, g: int, row: int) -> Any:
+        descents = self.groups[g].descents
+        assert descents is not None
+        return descents.descents[row]
+
+    def _note(self, group: Group) -> None:
+        """Add the likeliest hypothesis of a group to the history, and make it the answer so far."""
+        assert group.descents is not None
+        best = min(group.descents.descents, key=lambda descent: descent.mean_cost)
+        if not best.accepted:
+            return
+        norms = norms_of(list(group.level.dofs), best.gradient)
+        first = len(self.groups) > 1 and any(other.descents is None for other in self.groups)
+        better = first or best.mean_cost <= min(
+            (min(other.costs) for other in self.groups if other.descents is not None), default=math.inf
+        )
+        if better:
+            self.likeliest, self.cost = best.point, best.mean_cost
+        self.history.append(Step(group.level.size, best.mean_cost, best.point, better, norms))
+        self.after_step()
+
+    def _modes(self) -> list[Mode]:
+        """Return the ends of all descents that differ, the likeliest first."""
+        found: list[Mode] = []
+        for group in self.groups:
+            assert group.descents is not None
+            for one in group.descents.descents:
+                if one.accepted and one.rest is not Rest.FLAT:
+                    rests = one.rest in (Rest.SHORT, Rest.DAMPED)
+                    found.append(Mode(one.point, one.mean_cost, one.curvature, rests))
+        kept: list[Mode] = []
+        for mode in sorted(found, key=lambda mode: mode.cost):
+            if all(self.apart(mode.pose, other.pose) > POSE.same_mode for other in kept):
+                kept.append(mode)
+        return kept
+
+    def apart(self, one: Pose, other: Pose) -> float:
+        """Return how far apart two poses are, in radians or object sizes, whichever is more, up to symmetries."""
+        if self.symmetries is not None:
+            other = other.closest(self.symmetries, one)
+        return max(angle(one.R, other.R), self.task.between(one, other))
+
+
+def probabilities(modes: Sequence[Mode]) -> list[float]:
+    """Return how the posterior's mass divides among modes."""
+    return torch.tensor([mode.log_mass for mode in modes], dtype=torch.float64).softmax(0).tolist() if modes else []
+
+
+def turned(task: PoseTask, pose: Pose) -> list[Pose]:
+    """Return the pose, and poses turned from it about each axis of the camera to both sides."""
+    steps = [torch.zeros(3, dtype=torch.float64)]
+    for size in POSE.turns:
+        for axis in range(3):
+            for sign in (1.0, -1.0):
+                steps.append(torch.zeros(3, dtype=torch.float64).index_fill(0, torch.tensor([axis]), sign * size))
+    return moved_poses(task, [pose] * len(steps), range(ROTATION, TRANSLATION), torch.stack(steps))

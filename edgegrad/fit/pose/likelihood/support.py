@@ -1,0 +1,83 @@
+"""Edge support of a pose in photographs: the share of the render's edges that the pictures show, of contours and inside."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ....files.image import linear_to_srgb
+from ...contour_colors import ALONE_INFORMATION, ALONE_SHOWN, COLOUR_WINDOW, CONTOUR_BLUR, CONTRAST, PURE
+from ...edge_support import edge_support
+from ...region import information, smoothed
+from ..pose import Pose
+from ..settings import POSE
+from ..task import PoseTask
+from .contour import Sides
+from .objective import Comparison, PoseLevel
+
+RESOLVED = 40.0  # Pixels across the object: light and colours fitted to fewer match any picture.
+MIN_SHOWN_CONTOUR = 0.5  # Edge support is reduced if less of the contour shows.
+FULLY_VISIBLE = 0.65  # Of an object that is hidden more, what is left matches something by chance.
+
+
+def enough_support(task: PoseTask) -> float:
+    """Return the least edge support of a right pose."""
+    return POSE.plain_support if task.colorless else POSE.photo_support
+
+
+def edge_share(level: PoseLevel, pose: Pose) -> tuple[float, float]:
+    """Return the share, 0 … 1, of the render's edges that the pictures show, without what covers the object, and the visible
+    share of the object."""
+    compared = level.comparisons([pose])
+    total = sum(float(one.seen.alpha.sum()) for one in compared)
+    visible = sum(float((one.seen.alpha * one.visible).sum()) for one in compared) / max(total, 1e-30)
+    extent = max(picture.extent for picture in level.pictures)
+    whole = _share(compared, extent, level.harmonics > 0, False)
+    if whole == 1.0 or visible < FULLY_VISIBLE:
+        return whole, visible
+    return max(whole, _share(compared, extent, level.harmonics > 0, True)), visible
+
+
+def _share(compared: list[Comparison], extent: float, colored: bool, uncovered: bool) -> float:
+    pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]] = []
+    shown = length = bits = pixels = 0.0
+    for one in compared:
+        part, seen = one.part, one.seen
+        visible = one.visible if uncovered else torch.ones_like(one.visible)
+        sides, weight = (
+            Sides.from_picture(part, seen, visible, CONTOUR_BLUR, window=COLOUR_WINDOW),
+            (part.weight * visible)[0],
+        )
+        on = ((sides.alpha > PURE) & (sides.alpha < 1.0 - PURE)) * part.weight * visible
+        length += float(on.sum())
+        shown += float((on * (sides.contrast > CONTRAST) * (sides.band > 0.0)).sum())
+        if not colored:
+            soft = smoothed(seen.alpha, COLOUR_WINDOW)
+            ring = ((soft > PURE) & (soft < 1.0 - PURE)) * part.weight
+            inside, outside = seen.box.cut(one.colors.inside), seen.box.cut(one.colors.outside)
+            bits += float((ring * information(inside / (inside + outside), seen.alpha)).sum())
+            pixels += float(ring.sum())
+        mixed, band = sides.mixed[0], sides.band[0]
+        if one.light is None or part.mask is not None:
+            pairs.append(_pair(mixed, part.outlined, band))
+        if one.light is not None:
+            inner, size = one.light.inside[0], one.light.inside.shape[1:]
+            expected = linear_to_srgb(one.light.predicted[0].reshape(-1, *size).clamp(0.0, 1.0))
+            covered = torch.where(inner, weight, 0.0)
+            if part.mask is None:
+                expected, covered = torch.where(inner, expected, mixed), torch.where(inner, weight, band)
+            pairs.append(_pair(expected, part.display, covered))
+    if length == 0.0:
+        return 0.0
+    share = edge_support(pairs, softer=True) * min(1.0, extent / RESOLVED)
+    if colored:
+        return share * min(1.0, shown / length / MIN_SHOWN_CONTOUR)
+    # Off the object, both sides of a contour have similar colours, however strong the edges that it follows.
+    sure = max(0.0, min(1.0, bits / max(pixels, 1e-30) / ALONE_INFORMATION))
+    return share * min(1.0, shown / length / ALONE_SHOWN) * sure
+
+
+def _pair(expected: Tensor, picture: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Return what edge_support() compares, of images (C, h, w) and weights (h, w)."""
+    first = expected.movedim(0, -1)
+    return first, first, picture.movedim(0, -1), weight[..., None]

@@ -1,0 +1,55 @@
+"""Colours on both sides of contours, and near them, against oracles."""
+
+import pytest
+import torch
+
+from edgegrad.files.image import linear_to_srgb, srgb_to_linear
+from edgegrad.fit.contour_colors import CONTOUR_BLURS, PIXEL_NOISE, ContourColors, blur_losses, mask_noise
+from edgegrad.fit.region import Windows, palette, posterior, smoothed
+from edgegrad.fit.views import area_mean
+
+
+def test_the_posterior_separates_colours_near_the_contour_alone():
+    """The left object is red on green, the right one green on red: one pair of histograms for the picture would show
+    nothing."""
+    alpha = torch.zeros(60, 60)
+    alpha[20:40, 5:25] = alpha[20:40, 35:55] = 1.0
+    red, green = torch.tensor([0.8, 0.1, 0.1]), torch.tensor([0.1, 0.8, 0.1])
+    left = (torch.arange(60) < 30).expand(60, 60)
+    image = torch.where(((alpha > 0.5) == left)[..., None], red, green)
+    display = linear_to_srgb(image)
+    colours = palette(display, 0)
+    P = posterior(Windows((60, 60), colours.labels(display), colours.colors, 6.0), alpha, torch.ones(60, 60))
+    edge = smoothed(alpha[None], 1.5)[0]
+    near = (edge > 0.02) & (edge < 0.98)
+    assert float(P[near & (alpha > 0.5)].min()) > 0.8 and float(P[near & (alpha < 0.5)].max()) < 0.2
+    whole = posterior(Windows((60, 60), colours.labels(display), colours.colors, 1000.0), alpha, torch.ones(60, 60))
+    assert float(whole[near & (alpha > 0.5)].min()) < 0.6
+
+
+def test_the_noise_of_a_mask_is_that_of_its_pixels():
+    """A mask of a disc holds zeros and ones also where a pixel is mixed; it is taken whole and reduced."""
+    n, fine = 96, (torch.arange(960) + 0.5) / 10
+    disc = (fine - 47.4).square() + (fine[:, None] - 48.3).square() < 37.3**2
+    exact = area_mean(disc[..., None].float(), (n, n))[..., 0]
+    hard = (exact > 0.5).float()
+    for factor, size in ((1.0, n), (1 / 3, n // 3)):
+        right, seen = (area_mean(one[..., None], (size, size))[..., 0] for one in (exact, hard))
+        off = (seen - right)[(right > 0.02) & (right < 0.98)].square().mean().sqrt()
+        assert mask_noise(hard, factor) == pytest.approx(float(off), rel=0.3), factor
+    assert mask_noise(exact, 1.0) == mask_noise(smoothed(hard[None], 0.7)[0], 1.0) == PIXEL_NOISE
+
+
+@pytest.mark.parametrize("blur", CONTOUR_BLURS)
+def test_how_sharp_a_contour_is(blur):
+    """A noisy disc lies before something dark. The blur that it was taken with leaves the smallest residual."""
+    n = 64
+    y, x = torch.meshgrid(torch.arange(n) + 0.5, torch.arange(n) + 0.5, indexing="ij")
+    alpha = (17.3 - ((x - 31.6).square() + (y - 32.2).square()).sqrt()).add(0.5).clamp(0.0, 1.0)
+    front, behind = (srgb_to_linear(torch.tensor(colour)) for colour in ((0.9, 0.6, 0.1), (0.1, 0.15, 0.2)))
+    mixed = smoothed(alpha[None], blur)[0][..., None]
+    noise = 0.02 * torch.randn(n, n, 3, generator=torch.Generator().manual_seed(0))
+    display = linear_to_srgb(srgb_to_linear(linear_to_srgb(mixed * front + (1 - mixed) * behind) + noise).clamp(0, 1))
+    sides = ContourColors.from_image(display, smoothed(alpha[None], max(CONTOUR_BLURS))[0], torch.ones(n, n))
+    losses = blur_losses(sides, display, torch.ones(n, n), alpha)
+    assert CONTOUR_BLURS[int(losses.argmin())] == blur, losses
