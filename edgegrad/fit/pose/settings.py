@@ -44,10 +44,12 @@ class PoseSettings:
 
     # The contour, on the last level.
     contour_window: float = 1.4  # standard deviation of the windows from which the colours of both sides are taken
-    contour_blurs: tuple[float, ...] = (0.3, 0.5, 0.7, 0.9, 1.1, 1.4)  # of which the likeliest one is taken
-    contour_support: float = (
-        1.1  # the blur that says which pixels are compared: wider ones leave too few about thin parts
-    )
+    contour_blurs: tuple[float, ...] = (
+        0.3,
+        0.5,
+        0.7,
+        0.9,
+    )  # of which the likeliest is taken; wider ones pass for an offset
     contour_tolerance: float = 12.0  # squared differences in variances; far larger ones hardly count
     min_contour_pixels: int = 20
 

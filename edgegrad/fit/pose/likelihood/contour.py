@@ -35,20 +35,17 @@ class Sides(NamedTuple):
 
     @staticmethod
     def from_picture(
-        picture: PictureLevel, seen: RenderedPoses, visible: Tensor, blur: float, support: float | None = None,
-        window: float = POSE.contour_window,
+        picture: PictureLevel, seen: RenderedPoses, visible: Tensor, blur: float, window: float = POSE.contour_window
     ) -> Sides:  # fmt: skip
-        """Measure the colours in the picture of a box, in windows of so many pixels; `visible` (N, h, w) weights the pixels.
-        Another blur, `support`, says where pixels show one side alone, so that costs of several blurs are of the same pixels."""
+        """Measure the colours in the picture of a box, in windows of so many pixels; `visible` (N, h, w) weights the pixels."""
         alpha = smoothed(seen.alpha, blur)
-        shared = alpha if support is None else smoothed(seen.alpha, support)
         image, curved = picture.outlined, picture.mask is None  # A mask's values mix as they are.
         near = picture.weight * visible
         behind = torch.zeros_like(image) if picture.background is None else picture.background
         front, front_variance, front_count = _local(
-            image.expand(len(alpha), -1, -1, -1), (shared > 1.0 - PURE) * near, window
+            image.expand(len(alpha), -1, -1, -1), (alpha > 1.0 - PURE) * near, window
         )
-        back, back_variance, back_count = _local((image - behind).expand_as(front), (shared < PURE) * near, window)
+        back, back_variance, back_count = _local((image - behind).expand_as(front), (alpha < PURE) * near, window)
         known = (front_count > SUPPORT) & (back_count > SUPPORT) & (near > MIN_VISIBLE)
         a = alpha[:, None]
         variance = picture.noise**2 + a.square() * front_variance + (1.0 - a).square() * back_variance
@@ -60,16 +57,14 @@ class Sides(NamedTuple):
         if curved:
             mixed = linear_to_srgb(mixed.clamp(0.0, 1.0))
             step = srgb_slope(mixed) * step
-        band = ((shared > PURE) & (shared < 1.0 - PURE) & known) * near
+        band = ((alpha > PURE) & (alpha < 1.0 - PURE) & known) * near
         return Sides(alpha, contrast, band, mixed, step, variance)
 
 
-def contour_term(
-    picture: PictureLevel, seen: RenderedPoses, visible: Tensor, blur: float, support: float | None = None
-) -> Term:  # fmt: skip
-    """Return the term of N silhouettes for the picture of their box, with alpha blurred by so many pixels; `visible` and
-    `support` are as of Sides.from_picture()."""
-    sides = Sides.from_picture(picture, seen, visible, blur, support)
+def contour_term(picture: PictureLevel, seen: RenderedPoses, visible: Tensor, blur: float) -> Term:
+    """Return the term of N silhouettes for the picture of their box, with alpha blurred by so many pixels. `visible` (N, h, w)
+    weights the pixels."""
+    sides = Sides.from_picture(picture, seen, visible, blur)
     deviation, band = sides.variance.sqrt(), sides.band
     residual, step = (sides.mixed - picture.outlined) / deviation, sides.step / deviation
     squares, channels = residual.square().sum(1), len(picture.outlined)

@@ -61,7 +61,6 @@ class PoseLevel(Problem[Pose]):
     harmonics: int  # 0 for a mesh without colours
     last: bool
     contour_blur: float = 0.9
-    contour_support: float | None = None  # as of contour_term()
     light_deviations: tuple[float | None, ...] = ()  # of each picture
 
     @property
@@ -110,7 +109,7 @@ class PoseLevel(Problem[Pose]):
                 terms.append(depth_term(part, seen, moving, flow, scale, self.task.size))
         terms.append(region_term(picture, seen, colors, visible, self.alpha_blur))
         if self.last:
-            terms.append(contour_term(part, seen, visible, self.contour_blur, self.contour_support))
+            terms.append(contour_term(part, seen, visible, self.contour_blur))
         total = terms[0]
         for term in terms[1:]:
             total = total.plus(term)
@@ -126,9 +125,8 @@ class PoseLevel(Problem[Pose]):
 
     def focused(self, pose: Pose) -> PoseLevel:
         """Return the level with contours as sharp as the pictures show them at a pose."""
-        levels = [replace(self, contour_blur=blur, contour_support=POSE.contour_support) for blur in POSE.contour_blurs]
-        best = min(levels, key=lambda level: float(level.costs([pose])[0]))
-        return replace(best, contour_support=None)
+        levels = [replace(self, contour_blur=blur) for blur in POSE.contour_blurs]
+        return min(levels, key=lambda level: float(level.costs([pose])[0]))
 
 
 class Crop(NamedTuple):
