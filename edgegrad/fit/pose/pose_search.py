@@ -52,6 +52,7 @@ class PoseSearch:
         bare = task.aovs == ("alpha",) or (not task.clutter and "alpha" not in task.aovs)
         self.colors_first = bare and proposals is None and all(depth is None for depth in depths)
         self.seed = settings.seed
+        self._levels: dict[tuple[float, ...], PoseLevel] = {}  # by the numbers of the pose that they are about
 
     @property
     def planned(self) -> int:
@@ -175,8 +176,11 @@ class PoseSearch:
 
     def _last_level(self, pose: Pose) -> PoseLevel:
         """Return the finest level of what surrounds a pose, with the noise and the blur that it leaves."""
-        level = pose_levels(self.task, pose, self.depths, self.settings)[-1].informed([pose])
-        return level.focused(pose)
+        key = tuple(pose.numbers)
+        if key not in self._levels:
+            level = pose_levels(self.task, pose, self.depths, self.settings)[-1].informed([pose])
+            self._levels[key] = level.focused(pose)
+        return self._levels[key]
 
     def _by_colors(self, start: Pose, levels: list[PyramidLevel]) -> ColorSearch:
         """Search by unlit colours from a start, with its steps added to the history."""
