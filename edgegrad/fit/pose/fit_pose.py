@@ -1,9 +1,9 @@
 """fit_pose(): the pose of a known mesh in one or several pictures.
 
-An image pyramid is searched from coarse to fine. Colours as they are, or the mask of a plain mesh, are compared by a robust
-squared difference of blurred pictures and renders (color_search.py); photographs by a sum of likelihoods (photo/level.py). In
-both, what covers the object hardly counts. Each Gauss-Newton step rotates the object about its centre, shifts it in units of
-its size, and changes logarithms of scale and focal length.
+An image pyramid is searched from coarse to fine. Photographs are compared by a sum of log likelihoods (likelihood/), from
+several hypotheses (hypotheses.py); colours as they are, or the mask of a plain mesh, by a robust squared difference of blurred
+pictures and renders (color_search.py). In both, what covers the object hardly counts. Each Gauss-Newton step rotates the object
+about its centre, shifts it in units of its size, and changes logarithms of scale and focal length.
 """
 
 from __future__ import annotations

@@ -28,9 +28,6 @@ from .settings import POSE
 from .task import ROTATION, TRANSLATION, PoseTask
 
 Round = tuple[int, int]
-LAST_ROUNDS: tuple[Round, ...] = ((3, 3), (5, 3))  # on the last level, before and after its noise and blur are known
-LAST_STEPS = 20  # most steps then
-HELD = 1e2  # λ of a descent that comes to rest, for its cost falls along no step
 
 
 class Mode(NamedTuple):
@@ -67,8 +64,9 @@ class Group:
         last = self.level.last
         self.descents = LevenbergMarquardt(self.level, self.poses, LevenbergMarquardtSettings(
             steps=settings.steps + 1, start_damping=POSE.fine_damping if last else POSE.coarse_damping,
-            least_damping=0.1 * POSE.fine_damping, most_damping=HELD, unseen_damping=1e-5, trust_radius=POSE.longest_step,
-            least_gain=POSE.least_gain, shortest_step=settings.step_tolerance * self.level.coarseness,
+            least_damping=0.1 * POSE.fine_damping, most_damping=POSE.most_damping, unseen_damping=1e-5,
+            trust_radius=POSE.longest_step, least_gain=POSE.least_gain,
+            shortest_step=settings.step_tolerance * self.level.coarseness,
         ))  # fmt: skip
 
     @property
@@ -89,13 +87,10 @@ class Group:
         values, vectors = torch.linalg.eigh(descent.curvature)
         steps = []
         for value, vector in zip(values[: POSE.weak_directions].tolist(), vectors.T, strict=False):
-            size = POSE.weak_deviations * OPEN_LENGTH / math.sqrt(max(value, 1e-9))
+            size = POSE.weak_deviations * POSE.open_length / math.sqrt(max(value, 1e-9))
             size = min(size, POSE.turns[-1] / float(vector.abs().max()))
             steps += [size * vector, -size * vector]
         return moved_poses(self.level.task, [descent.point] * len(steps), self.level.dofs, torch.stack(steps))
-
-
-OPEN_LENGTH = 4.0  # Correlation length by which a level's posterior is as wide as ends of descents spread.
 
 
 class HypothesisSearch:
@@ -126,7 +121,7 @@ class HypothesisSearch:
             self.report(f"{sum(len(group.poses) for group in self.groups)} hypotheses on level {k + 1} of {deepest}")
             for group in self.groups:
                 group.enter(k, self.settings)
-            self._halve(POSE.first_rounds if k == 0 else POSE.later_rounds, by_group=k == 0)
+            self._halve(POSE.first_rounds if k == 0 else POSE.later_rounds)
             if self.further:
                 best = min(self.groups, key=lambda group: min(group.costs))
                 order = sorted(range(len(best.poses)), key=best.costs.__getitem__)
@@ -134,16 +129,15 @@ class HypothesisSearch:
                 best.poses += [pose for row in order[:drawn] for pose in best.open_ends(row)]
         for group in self.groups:
             group.enter(deepest - 1, self.settings)
-        self._halve((LAST_ROUNDS[0],))
-        self._halve((LAST_ROUNDS[1],))
+        self._halve(POSE.last_rounds)
         for group in self.groups:
             group.level = group.level.informed(group.poses).focused(group.poses[0])
             group.begin(self.settings)
-        self._halve(((LAST_STEPS, POSE.modes),))
+        self._halve(((POSE.last_steps, POSE.modes),))
         return self._modes()
 
-    def _halve(self, rounds: Sequence[Round], by_group: bool = False) -> None:
-        """Take steps, and keep the likeliest hypotheses after each round. `by_group`: at least one of each group."""
+    def _halve(self, rounds: Sequence[Round]) -> None:
+        """Take steps, and keep the likeliest hypotheses after each round."""
         for steps, kept in rounds:
             for group in self.groups:
                 assert group.descents is not None
@@ -183,10 +177,7 @@ class HypothesisSearch:
         if not best.accepted:
             return
         norms = norms_of(list(group.level.dofs), best.gradient)
-        first = len(self.groups) > 1 and any(other.descents is None for other in self.groups)
-        better = first or best.mean_cost <= min(
-            (min(other.costs) for other in self.groups if other.descents is not None), default=math.inf
-        )
+        better = best.mean_cost <= min(min(other.costs) for other in self.groups)
         if better:
             self.likeliest, self.cost = best.point, best.mean_cost
         self.history.append(Step(group.level.size, best.mean_cost, best.point, better, norms))

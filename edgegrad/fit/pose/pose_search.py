@@ -58,16 +58,16 @@ class PoseSearch:
     def planned(self) -> int:
         """About the number of steps."""
         rounds = (*POSE.first_rounds, *POSE.later_rounds)
-        return sum(min(steps, self.settings.steps) for steps, _ in rounds) + min(20, self.settings.steps)
+        return sum(min(steps, self.settings.steps) for steps, _ in rounds) + min(POSE.last_steps, self.settings.steps)
 
     def run(self) -> None:
         """Search; raise ValueError when nothing in the pictures depends on the pose."""
-        if not (self.colors_first and self._colors_do()):
+        if not (self.colors_first and self._colors_suffice()):
             self._photograph()
         size = self.history[-1].size if self.history else self.task.shots[0].camera.size
         self.history.append(Step(size, self.loss, self.best, True, {}))
 
-    def _colors_do(self) -> bool:
+    def _colors_suffice(self) -> bool:
         """Compare colours as they are; return whether the pictures show the render's edges at the end."""
         self._adopt(self._by_colors(self.start, self.task.pyramid(self.start, self.settings)))
         return self.edge_support >= self.enough or not self.further

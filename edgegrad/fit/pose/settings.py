@@ -44,12 +44,8 @@ class PoseSettings:
 
     # The contour, on the last level.
     contour_window: float = 1.4  # standard deviation of the windows from which the colours of both sides are taken
-    contour_blurs: tuple[float, ...] = (
-        0.3,
-        0.5,
-        0.7,
-        0.9,
-    )  # of which the likeliest is taken; wider ones pass for an offset
+    # Of which the likeliest is taken. Wider ones pass for an offset: with 1.1 and 1.4 four of ten lit cases were off.
+    contour_blurs: tuple[float, ...] = (0.3, 0.5, 0.7, 0.9)
     contour_tolerance: float = 12.0  # squared differences in variances; far larger ones hardly count
     min_contour_pixels: int = 20
 
@@ -59,28 +55,30 @@ class PoseSettings:
     correlated_depth: float = 4.0  # Neighbouring errors of a sensor correlate: so many pixels count as one.
 
     # The search.
-    turns: tuple[float, ...] = (
-        0.2,
-        0.4,
-    )  # radians of the first hypotheses about each axis of the camera, to both sides
+    # Radians of the first hypotheses about each axis of the camera, to both sides.
+    turns: tuple[float, ...] = (0.2, 0.4)
     start_radius: float = 0.8  # radians: the largest rotation of a given number of starts around one
-    first_rounds: tuple[tuple[int, int], ...] = (
-        (3, 8),
-        (4, 4),
-    )  # steps on the coarsest level, and hypotheses kept then
+    # Steps on the coarsest level, and hypotheses kept then.
+    first_rounds: tuple[tuple[int, int], ...] = ((3, 8), (4, 4))
     later_rounds: tuple[tuple[int, int], ...] = ((2, 6), (3, 3))  # the same on each further level before the last
+    last_rounds: tuple[tuple[int, int], ...] = (
+        (3, 3),
+        (5, 3),
+    )  # on the last level, before its noise and blur are known
+    last_steps: int = 20  # most steps then
     weak_directions: int = 3  # of the likeliest mode, along which hypotheses are drawn for the next level
     weak_deviations: float = 2.0  # standard deviations of the level's posterior at which they are drawn
+    open_length: float = 4.0  # pixels: the correlation length by which that posterior is as wide as ends of descents
     distinct: float = 0.03  # Radians and object sizes: of hypotheses nearer to one another the likeliest is kept.
     modes: int = 3  # kept on the last level
     same_mode: float = 0.1  # Radians and object sizes: nearer ends are one mode.
     coarse_damping: float = 0.1  # λ at first, before the last level and on it
     fine_damping: float = 0.01
+    most_damping: float = 100.0  # A descent with a larger λ rests, for its cost falls along no step.
     longest_step: float = 0.1  # radians, object sizes and logarithms
     least_gain: float = 0.1  # nats of independent pixels: a step that is predicted to gain less is short
-    correlation_length: float = (
-        8.0  # Errors of neighbouring pixels have common causes: posteriors have its square as temperature.
-    )
+    # Errors of neighbouring pixels have common causes: posteriors have its square as temperature.
+    correlation_length: float = 8.0
     ambiguous_nats: float = 3.0  # A mode that is less likely by a smaller factor than exp(this) may be the right one.
 
     # What counts as right: the share of the render's edges that pictures show.

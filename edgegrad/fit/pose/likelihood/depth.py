@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..camera_motion import MovingCameras
 from ..settings import POSE
-from .light import _inner, _median, slope
+from .light import inner_pixels, slope, weighted_median
 from .picture import PictureLevel, RenderedPoses
 from .term import Term
 
@@ -29,12 +29,12 @@ def depth_term(
     axis = moving.cameras.world_to_camera[:, 2]  # (N, 4)
     s = scale[:, None, None]
     z = (s * (torch.einsum("nk,nkhw->nhw", axis[:, :3], points) + axis[:, 3, None, None])).float()
-    inside = _inner(seen.alpha) & picture.depth.isfinite() & (picture.weight > 0.0)
+    inside = inner_pixels(seen.alpha) & picture.depth.isfinite() & (picture.weight > 0.0)
     residual = torch.where(inside, z - picture.depth.nan_to_num(), 0.0)
     weight = (picture.weight * inside).flatten(1)
     known = (inside.sum((1, 2)) >= POSE.min_depth_pixels).float()
     low, high = (size * share for share in POSE.depth_noise)
-    deviation = (1.4826 * _median(residual.abs().flatten(1), weight, weight)).clamp(low, high)[:, None]
+    deviation = (1.4826 * weighted_median(residual.abs().flatten(1), weight, weight)).clamp(low, high)[:, None]
     r = residual.flatten(1)
     e = POSE.occluded
     likely = -0.5 * (r / deviation).square() - (deviation * math.sqrt(2.0 * math.pi) / size).log()

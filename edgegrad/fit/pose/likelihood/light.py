@@ -63,7 +63,7 @@ class FittedLight(NamedTuple):
         None where hardly anything of any surface is seen.
         """
         assert seen.color is not None and seen.normal is not None
-        inside = _inner(seen.alpha)
+        inside = inner_pixels(seen.alpha)
         known = inside.sum((1, 2)) >= POSE.min_light_pixels
         if not bool(known.any()):
             return None
@@ -101,7 +101,7 @@ class FittedLight(NamedTuple):
             )  # Clipped white may be any brighter colour.
             residual = shown - wanted
             size = residual.square().sum(1).sqrt()
-            own = _median(size, count * visible.flatten(1), flat) / _median_length(C)
+            own = weighted_median(size, count * visible.flatten(1), flat) / _median_length(C)
             own = own.clamp(min=POSE.min_light_noise)
             used = own if deviation is None else torch.full_like(own, deviation)
             likely = _log_normal(size, used, C) - density
@@ -163,7 +163,7 @@ def slope(image: Tensor) -> Tensor:
     return found.reshape(2, *image.shape)
 
 
-def _inner(alpha: Tensor) -> Tensor:
+def inner_pixels(alpha: Tensor) -> Tensor:
     """Return which pixels of silhouettes (N, h, w) are covered with all their neighbours."""
     return F.max_pool2d((alpha < MIN_PIXEL_ALPHA).float()[:, None], 3, 1, 1)[:, 0] == 0.0
 
@@ -181,7 +181,7 @@ def _log_normal(size: Tensor, deviation: Tensor, channels: int) -> Tensor:
     return -0.5 * (size / sigma).square() - channels * (sigma * math.sqrt(2.0 * math.pi)).log()
 
 
-def _median(values: Tensor, weights: Tensor, among: Tensor) -> Tensor:
+def weighted_median(values: Tensor, weights: Tensor, among: Tensor) -> Tensor:
     """Return the weighted medians (N,) of rows (N, M), of what `among` (N, M) does not leave out."""
     ordered, order = torch.where(among > 0.0, values, math.inf).sort(1)
     below = weights.gather(1, order).cumsum(1)
