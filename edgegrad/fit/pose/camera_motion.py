@@ -134,7 +134,7 @@ def moving_cameras(task: PoseTask, camera: Camera, poses: Sequence[Pose], dofs: 
         if perspective:
             shift[PRINCIPAL + axis] = -(first.size[1] / focal_of(first) / pose.focal * depth)[:, None] * axes[axis]
     lenses = [task.lens(camera, one) for one in poses]
-    kept, scale = torch.tensor(list(dofs)), pose.scale[:, None]
+    kept, scale = torch.tensor(list(dofs), dtype=torch.int64), pose.scale[:, None]
     R, tau = V @ pose.R, (pose.t @ V.T + v) / scale
     middle = (center @ V.T + v) / scale
     turn = cross_matrices(omega[kept] @ V.T)  # (D, 3, 3)

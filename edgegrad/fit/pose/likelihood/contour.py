@@ -71,8 +71,7 @@ def contour_term(picture: PictureLevel, seen: RenderedPoses, visible: Tensor, bl
     tolerance = POSE.contour_tolerance
     excess = squares / (1.0 + squares / tolerance) - channels / (1.0 + channels / tolerance)
     enough = ((band > 0.0).sum((1, 2)) >= POSE.min_contour_pixels).float()
-    D, N = seen.tangents.shape[:2]
-    rows = smoothed(seen.tangents.flatten(0, 1), blur).reshape(D, N, -1).movedim(0, 1)
+    rows = smoothed(seen.tangents.flatten(0, 1), blur).reshape(seen.tangents.shape).flatten(2).movedim(0, 1)
     robust = ((1.0 + squares / tolerance).pow(-2) * band) * enough[:, None, None]
     # One row of J serves all channels, whose slopes by alpha are `step`.
     strength = step.square().sum(1)

@@ -34,9 +34,10 @@ WINDOW_INSIDE = 0.9  # share of a blur's window that must lie inside
 
 
 class FittedLight(NamedTuple):
-    """N surfaces, each in the light that fits a picture best; M pixels of a box."""
+    """N surfaces, each in the light that fits a picture best; M pixels of a box, which show any of them."""
 
     inside: Tensor  # (N, h, w) bool
+    at: Tensor  # (M,), numbers of the pixels
     known: Tensor  # (N,) bool: enough of the surface is seen to show its light
     coefficients: Tensor  # (N, C, n), of harmonics
     predicted: Tensor  # (N, C, M), linear radiance, blurred
@@ -68,22 +69,27 @@ class FittedLight(NamedTuple):
         if not bool(known.any()):
             return None
         (N, h, w), C, n = inside.shape, seen.color.shape[1], harmonic_count
+        near = F.max_pool2d(inside.any(0).float()[None], 3, 1, 1)  # Slopes need the neighbours.
+        at = near.flatten().nonzero()[:, 0]
         share = inside.float()
         Y = harmonics_of(seen.normal, n)
         under = smoothed(share, POSE.light_blur)
         mean = under.clamp(min=1e-3).reciprocal()  # of what lies inside a window
         pictured = smoothed((picture.radiance * share[:, None]).flatten(0, 1), POSE.light_blur)
-        pictured = (pictured.reshape(N, C, h, w) * mean[:, None]).flatten(2)
+        pictured = pictured.reshape(N, C, h, w) * mean[:, None]
         lit = seen.color[:, :, None] * Y[:, None] * share[:, None, None]
-        basis = smoothed(lit.flatten(0, 2), POSE.light_blur).reshape(N, C, n, h, w) * mean[:, None, None]
-        basis, flat = basis.flatten(3), share.flatten(1)
+        basis = smoothed(lit.flatten(0, 2), POSE.light_blur).flatten(1)[:, at].reshape(N, C, n, -1)
+        basis, flat = basis * mean.flatten(1)[:, None, None, at], share.flatten(1)[:, at]
+        shown = pictured.flatten(2)[..., at]
         # The scale is about the slope of the display's curve, by which noise and errors are uniform.
-        middle = pictured.sum((1, 2)) / (C * flat.sum(1)).clamp(min=1.0)
-        scale = (pictured + 0.02 + 0.1 * middle[:, None, None]).clamp(min=1e-3).rsqrt() * flat[:, None]
-        B, target = basis * scale[:, :, None], pictured * scale
-        count = (picture.weight * share).flatten(1)
-        clipped = (pictured > POSE.clipped) & bool(picture.radiance.max() <= 1.0)
-        density = colors.flatten(1).clamp(min=1e-6).log() - C * math.log(POSE.color_kernel * math.sqrt(2.0 * math.pi))
+        middle = (shown * flat[:, None]).sum((1, 2)) / (C * flat.sum(1)).clamp(min=1.0)
+        scale = (shown + 0.02 + 0.1 * middle[:, None, None]).clamp(min=1e-3).rsqrt() * flat[:, None]
+        B, target = basis * scale[:, :, None], shown * scale
+        count = (picture.weight * share).flatten(1)[:, at]
+        clipped = (shown > POSE.clipped) & bool(picture.radiance.max() <= 1.0)
+        density = colors.flatten(1)[:, at].clamp(min=1e-6).log() - C * math.log(
+            POSE.color_kernel * math.sqrt(2.0 * math.pi)
+        )
         window = smoothed(share, POSE.occluder_width).clamp(min=1e-3)
         robust, own, wanted = count, torch.ones(N, dtype=torch.float32), target
         residual, visible = -target, share
@@ -95,30 +101,34 @@ class FittedLight(NamedTuple):
             ridge = (POSE.light_ridge * curvature[..., :1, 0]).repeat(1, 1, n) + 1e-9
             ridge[..., 0] = 1e-9 + 1e-3 * ridge[..., 0]
             light = torch.linalg.solve(curvature + torch.diag_embed(ridge), weighted @ wanted[..., None])[..., 0]
-            shown = (light[:, :, None] @ B)[:, :, 0]
+            fitted = (light[:, :, None] @ B)[:, :, 0]
             wanted = torch.where(
-                clipped, torch.maximum(target, shown), target
+                clipped, torch.maximum(target, fitted), target
             )  # Clipped white may be any brighter colour.
-            residual = shown - wanted
+            residual = fitted - wanted
             size = residual.square().sum(1).sqrt()
-            own = weighted_median(size, count * visible.flatten(1), flat) / _median_length(C)
+            own = weighted_median(size, count * visible.flatten(1)[:, at], flat) / _median_length(C)
             own = own.clamp(min=POSE.min_light_noise)
             used = own if deviation is None else torch.full_like(own, deviation)
             likely = _log_normal(size, used, C) - density
-            visible = _visible(likely.reshape(N, h, w), inside, window)
+            visible = _visible(_spread(likely, at, (h, w)), inside, window)
             tail = (1.0 + (size / (POSE.tail * own[:, None])).square()).pow(-2)
-            robust = count * visible.flatten(1) * tail
+            robust = count * visible.flatten(1)[:, at] * tail
         predicted = (light[:, :, None] @ basis)[:, :, 0]
-        slopes = slope(0.5 * (predicted + pictured).reshape(N, C, h, w)).flatten(3)
+        slopes = slope(0.5 * (_spread(predicted, at, (h, w)) + pictured)).flatten(3)[..., at]
         # Near the silhouette a blur reaches fewer pixels, and slopes are too low.
-        whole = (under > WINDOW_INSIDE).flatten(1)
+        whole = (under > WINDOW_INSIDE).flatten(1)[:, at]
         # Along the silhouette a blur mixes the contours of object and occluder, so a margin counts as occluded.
         hidden = F.max_pool2d(torch.where(inside, 1.0 - visible, 0.0)[:, None], 5, 1, 2)[:, 0]
         visible = 1.0 - torch.where(inside, 1.0 - visible, hidden) * known[:, None, None]
         robust = robust * whole * known[:, None]
         return FittedLight(
-            inside, known, light, predicted, residual, count, robust, used, likely, visible, B, scale, slopes, ridge
+            inside, at, known, light, predicted, residual, count, robust, used, likely, visible, B, scale, slopes, ridge
         )
+
+    def image(self, values: Tensor) -> Tensor:
+        """Return images (…, h, w) of pixels (…, M), zero elsewhere."""
+        return _spread(values, self.at, self.inside.shape[1:])
 
     def change(self) -> Tensor:
         """Return the relative change (N,) of the mesh's colours by the light: 0 where one number multiplies all of them."""
@@ -134,7 +144,7 @@ class FittedLight(NamedTuple):
         gain = ((1.0 - e) * self.likely.clamp(max=20.0).exp() + e).log()
         cost = -(self.weight * gain).sum(1) / POSE.correlated_light * self.known
         D, N, C = len(flow), len(self.inside), self.residual.shape[1]
-        x, y = flow.flatten(3).movedim(0, 1).unbind(2)  # (N, D, M)
+        x, y = flow.flatten(3)[..., self.at].movedim(0, 1).unbind(2)  # (N, D, M)
         gradient, curvature = torch.zeros(N, D, dtype=torch.float32), torch.zeros(N, D, D, dtype=torch.float32)
         for c in range(C):
             moved = -(x * self.slopes[0, :, None, c] + y * self.slopes[1, :, None, c]) * self.scale[:, None, c]
@@ -154,6 +164,12 @@ def harmonics_of(normals: Tensor, count: int) -> Tensor:
     """Return the first harmonics (N, count, h, w), up to factors, of directions (N, 3, h, w) of any length."""
     one, y, z, x, *second = harmonics(F.normalize(normals, dim=1, eps=1e-6).movedim(1, -1), UNSCALED)
     return torch.stack([one, x, y, z, *second], 1)[:, :count]
+
+
+def _spread(values: Tensor, at: Tensor, size: tuple[int, ...]) -> Tensor:
+    """Return images (…, h, w) of the values (…, M) of some pixels, zero elsewhere."""
+    h, w = size
+    return values.new_zeros(*values.shape[:-1], h * w).index_copy(-1, at, values).reshape(*values.shape[:-1], h, w)
 
 
 def slope(image: Tensor) -> Tensor:

@@ -79,7 +79,7 @@ class PoseLevel(Problem[Pose]):
 
     def costs(self, poses: Sequence[Pose]) -> Tensor:
         """Return the costs (N,) of poses."""
-        return self.model(poses).cost[:, 0]
+        return replace(self, dofs=()).model(poses).cost[:, 0]
 
     def comparisons(self, poses: Sequence[Pose]) -> list[Comparison]:
         """Compare renders at N poses with each picture."""
@@ -118,15 +118,19 @@ class PoseLevel(Problem[Pose]):
     def informed(self, poses: Sequence[Pose]) -> PoseLevel:
         """Return the level with the noise that the likeliest of these poses leaves in each picture."""
         found: list[float | None] = []
-        for one in replace(self, light_deviations=()).comparisons(poses):
+        for one in replace(self, light_deviations=(), dofs=(), last=False).comparisons(poses):
             light = one.light
             found.append(None if light is None else float(light.deviation[light.known].min()))
         return replace(self, light_deviations=tuple(found))
 
     def focused(self, pose: Pose) -> PoseLevel:
         """Return the level with contours as sharp as the pictures show them at a pose."""
-        levels = [replace(self, contour_blur=blur) for blur in POSE.contour_blurs]
-        return min(levels, key=lambda level: float(level.costs([pose])[0]))
+        compared = replace(self, dofs=(), last=False).comparisons([pose])
+
+        def cost(blur: float) -> float:
+            return sum(float(contour_term(one.part, one.seen, one.visible, blur).cost) for one in compared)
+
+        return replace(self, contour_blur=min(POSE.contour_blurs, key=cost))
 
 
 class Crop(NamedTuple):

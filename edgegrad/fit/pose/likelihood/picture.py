@@ -142,22 +142,27 @@ class RenderedPoses(NamedTuple):
         box = Box.around(task, moving.cameras)
         cut = moving.crop(*box)
         with torch.no_grad():
+            moves = len(cut.tangents["world_to_camera"])
             if colored and task.scene.is_shaded:
                 seen = render_aovs(task.scene, cut.cameras, names, spp, seed)
                 request = aovs_request(task.scene, cut.cameras, ["alpha"], spp, seed)
-                hits = forward_kernel(request)[1]
+                hits = forward_kernel(request)[1] if moves else None
             else:
                 request = aovs_request(task.scene, cut.cameras, names, spp, seed)
                 image, hits, _ = forward_kernel(request)
                 seen = by_name(task.scene, names, image)
                 if len(names) > 1:  # The derivatives of the silhouette alone are cheaper.
                     request = aovs_request(task.scene, cut.cameras, ["alpha"], spp, seed)
-            tangents = jvp_kernel(hits, request, cut.tangents, len(cut.tangents["world_to_camera"]))
+            if moves:
+                assert hits is not None
+                tangents = jvp_kernel(hits, request, cut.tangents, moves)[..., 0].float()
+            else:
+                tangents = seen["alpha"][None, ..., 0].float()[:0]
         whole = box.grown(CONTOUR_MARGIN, size)
 
         def channel(name: str) -> Tensor | None:
             return box.pasted(seen[name].float().movedim(-1, 1), whole) if name in seen else None
 
         alpha = box.pasted(seen["alpha"][..., 0].float(), whole)
-        slopes = box.pasted(tangents[..., 0].float(), whole)
+        slopes = box.pasted(tangents, whole)
         return RenderedPoses(whole, alpha, slopes, channel("image"), channel("normal"), channel("position"))

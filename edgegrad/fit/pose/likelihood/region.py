@@ -69,7 +69,6 @@ def region_term(
     likelihood = soft * inside + (1.0 - soft) * outside + POSE.region_outliers * (inside + outside)
     cost = -far - (weight * (likelihood / every).log()).sum((1, 2))
     slope = ((outside - inside) / likelihood * weight).flatten(1)
-    D, N = seen.tangents.shape[:2]
-    blurred = smoothed(seen.tangents.flatten(0, 1), sigma).reshape(D, N, -1).movedim(0, 1)
+    blurred = smoothed(seen.tangents.flatten(0, 1), sigma).reshape(seen.tangents.shape).flatten(2).movedim(0, 1)
     rows = (blurred * slope[:, None]).double()  # Sums of many large numbers of both signs need more digits.
     return Term(cost.double(), rows.sum(-1), rows @ rows.mT)

@@ -61,8 +61,8 @@ def _share(compared: list[Comparison], extent: float, colored: bool, uncovered: 
         if one.light is None or part.mask is not None:
             pairs.append(_pair(mixed, part.outlined, band))
         if one.light is not None:
-            inner, size = one.light.inside[0], one.light.inside.shape[1:]
-            expected = linear_to_srgb(one.light.predicted[0].reshape(-1, *size).clamp(0.0, 1.0))
+            inner = one.light.inside[0]
+            expected = linear_to_srgb(one.light.image(one.light.predicted)[0].clamp(0.0, 1.0))
             covered = torch.where(inner, weight, 0.0)
             if part.mask is None:
                 expected, covered = torch.where(inner, expected, mixed), torch.where(inner, weight, band)
