@@ -1,19 +1,15 @@
 """Poses that outlines hardly separate from another one: two exchanged limbs, or a rotation that two bones share
 differently."""
 
-from collections.abc import Sequence
-from typing import Any
-
 import pytest
 import torch
 
 import edgegrad as eg
 from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.options import Settings
-from edgegrad.fit.rig.alternatives import Alternatives, exchanged
-from edgegrad.fit.rig.axial_rotations import search_axial_rotations
 from edgegrad.fit.rig.free_parameters import FreeParameters
-from edgegrad.fit.rig.limbs import Limb, LimbSearch, Values, limbs
+from edgegrad.fit.rig.proposals import Proposals, exchanged, limbs
+from edgegrad.fit.rig.search import HypothesisSearch
 from edgegrad.fit.views import views_of
 
 roma = pytest.importorskip("roma")
@@ -86,26 +82,24 @@ def test_axial_rotations_are_found(seed: int) -> None:
     assert fit.converged and float(body.Errors.of(fit.rig, fit.values["rotations"], truth).rotation.quantile(0.9)) < 3.0
 
 
-def arm_of(rig: eg.rig.Rig) -> tuple[FreeParameters, Alternatives]:
-    """Return the rotations of one arm of a figure as free parameters, and their alternatives."""
+def arm_of(rig: eg.rig.Rig) -> tuple[FreeParameters, Proposals]:
+    """Return the rotations of one arm of a figure as free parameters, and their proposals."""
     free = FreeParameters.from_arguments(rig, ARM, {"rotations": figure.pose(7, 40.0)}, {})
-    return free, Alternatives(rig, free, "rotations")
+    return free, Proposals(rig, free, "rotations")
 
 
 def test_an_axial_rotation_keeps_what_hangs_below_in_place() -> None:
     rig = figure.figure(fine=3)
-    free, alternatives = arm_of(rig)
+    free, proposals = arm_of(rig)
     values = {"rotations": figure.pose(7, 40.0)[[rig.joints.names.index(name) for name in ARM]]}
-    rotations = {
-        (ARM[t.row], None if t.child is None else ARM[t.child]): t for t in alternatives.axial_rotations(values)
-    }
+    rotations = {(ARM[t.row], None if t.child is None else ARM[t.child]): t for t in proposals.axial_rotations(values)}
     assert list(rotations) == [("left arm", "left elbow"), ("left elbow", "left hand"), ("left hand", None)]
     # The hand's own axis points to the middle of its ellipsoid.
     along = torch.tensor(figure.BONES_ALONG[8], dtype=F64)
     assert float(rotations["left hand", None].axis @ along / along.norm()) > 0.99
     before = rig.joints.world(roma.rotvec_to_rotmat(free.all(values)["rotations"]))
     for (name, _), rotation in rotations.items():
-        found = free.all({"rotations": alternatives.with_rotation(values, rotation, 0.7)})["rotations"]
+        found = free.all({"rotations": proposals.with_rotation(values, rotation, 0.7)})["rotations"]
         after = rig.joints.world(roma.rotvec_to_rotmat(found))
         at = rig.joints.names.index(name)
         others = [k for k in range(20) if k != at]
@@ -118,7 +112,7 @@ def test_an_axial_rotation_keeps_what_hangs_below_in_place() -> None:
 def test_axial_rotations_are_found_by_the_loss_along_them() -> None:
     """A hand is rotated across its true place, and an arm against its elbow. What is right stays."""
     rig, cameras = figure.figure(fine=4), figure.cameras(64)[:3]
-    free, alternatives = arm_of(rig)
+    free, proposals = arm_of(rig)
     parameter = free.parameters["rotations"]
     assert parameter.value is not None
     truth = {"rotations": parameter.value}
@@ -129,52 +123,13 @@ def test_axial_rotations_are_found_by_the_loss_along_them() -> None:
         views,
         Settings(spp=32),
     )
-    shared, _, across = alternatives.axial_rotations(truth)
-    wrong = {"rotations": alternatives.with_rotation(truth, shared, 0.35)}
-    wrong = {"rotations": alternatives.with_rotation(wrong, across, 1.5)}
+    shared, _, across = proposals.axial_rotations(truth)
+    wrong = {"rotations": proposals.with_rotation(truth, shared, 0.35)}
+    wrong = {"rotations": proposals.with_rotation(wrong, across, 1.5)}
     for start, most in ((wrong, 0.1), (truth, 0.06)):
-        found = search_axial_rotations(objective, alternatives, parameter, start)["rotations"]
+        search = HypothesisSearch(
+            objective, proposals, ARM, free.parameters, 0.0 * parameter.value, lambda *_: truth, torch.Generator()
+        )
+        found = search.rotate_about_bones(start)["rotations"]
         R, S = (roma.rotvec_to_rotmat(one) for one in (found, truth["rotations"]))
         assert float(roma.rotmat_geodesic_distance(R, S).max()) < most
-
-
-@pytest.mark.parametrize(("nearly", "costs", "tries"), [(True, [1.0], 6), (False, [1.0], 20), (True, [0.9, 0.89], 7)])
-def test_tries_that_gain_nothing_end(nearly: bool, costs: list[float], tries: int) -> None:
-    """They end after six where a finer level may explain the rest, and otherwise after all."""
-
-    class Same:
-        worse, gain = 2.0, 0.0
-
-        def cost(self, values: Values) -> float:
-            return 1.0
-
-        def matches(self, values: Values) -> bool:
-            return False
-
-        def nearly_matches(self, values: Values) -> bool:
-            return nearly
-
-        def off(self, values: Values) -> torch.Tensor:
-            return torch.ones(1)
-
-        def renew(self, values: Values) -> None:
-            pass
-
-    class Few(LimbSearch):
-        def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
-            return (
-                (dict(best[0]), costs[len(reports)])
-                if len(reports) < len(costs) and costs[len(reports)] < 1.0
-                else best
-            )
-
-        def drawn(self, best: Values, limb: Limb) -> list[Values]:
-            return []
-
-    reports: list[None] = []
-    nothing: Any = None
-    search = Few(
-        nothing, Same(), "x", [Limb([0])], {}, torch.zeros(1), nothing, nothing, 0, lambda: reports.append(None)
-    )
-    search.run({"x": torch.zeros(1)}, 20)
-    assert len(reports) == tries

@@ -23,9 +23,8 @@ from .free_parameters import FreeParameters
 from .keypoints import keypoint_term
 from .levels import CoarseToFine
 from .result import RigFit
+from .settings import RIG
 
-MAX_GAUSS_NEWTON = 200  # largest number of values that "gauss-newton" seeks by default
-RIG_STEPS = 40  # on the last level
 RIG_OPTIONS = (*DESCENT_OPTIONS, "coarsest")
 Appearance = Callable[..., Scene | Mesh]
 
@@ -85,12 +84,12 @@ def fit_rig(
     """
     if not isinstance(rig, Rig):
         raise TypeError(f"rig: expected a Rig, got {type(rig).__name__}; load one with eg.rig.load(path)")
-    tries = 40 * search if isinstance(search, bool) else check_int("search", search, 0, 10**6)
+    tries = RIG.tries * search if isinstance(search, bool) else check_int("search", search, 0, 10**6)
     scene_of, parameters = appearance if isinstance(appearance, tuple) else (appearance or (lambda scene: scene), {})
     free = FreeParameters.from_arguments(rig, seek, init or {}, parameters)
     count = sum(p.value.numel() for p in free.parameters.values() if p.value is not None)
-    method = "gauss-newton" if count <= MAX_GAUSS_NEWTON else "adam"
-    settings = Settings.from_options(options, "fit_rig", RIG_OPTIONS, method=method, steps=RIG_STEPS, spp=8)
+    method = "gauss-newton" if count <= RIG.most_numbers else "adam"
+    settings = Settings.from_options(options, "fit_rig", RIG_OPTIONS, method=method, steps=RIG.steps, spp=RIG.spp)
     views = views_of(cameras, images, masks, weights)
     if settings.loss == REGION:
         views = region_views(views)

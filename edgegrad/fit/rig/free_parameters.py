@@ -14,6 +14,7 @@ from ...rig.control import Control
 from ...rig.rig import Rig
 from ...rig.skinned import SkinDeformer
 from ..parameter import Parameter
+from .settings import RIG
 
 F64 = torch.float64
 
@@ -33,12 +34,9 @@ class FreeParameters:
         rig: Rig, seek: Sequence[str] | None, init: Mapping[str, Any], appearance: Mapping[str, Parameter]
     ) -> FreeParameters:
         """Check what is sought. Raises TypeError or ValueError."""
-        place = {
-            "translation": torch.zeros(3, dtype=F64),
-            "orientation": torch.zeros(3, dtype=F64),
-            "scale": torch.ones((), dtype=F64),
-        }
-        known = {**{name: control.rest for name, control in rig.controls.items()}, **place}
+        known = {name: control.rest for name, control in rig.controls.items()}
+        known |= {name: torch.zeros(3, dtype=F64) for name in ("translation", "orientation")}
+        known["scale"] = torch.ones((), dtype=F64)
         skinned = isinstance(rig.deformer, SkinDeformer)
         if seek is None:
             seek = [name for name in rig.controls if not skinned or name not in ("joint_translations", "joint_scales")]
@@ -55,12 +53,12 @@ class FreeParameters:
                     raise ValueError(f"{kind}: expected names among {', '.join(allowed)}, got {name!r}")
         fixed = {}
         for name, rest in known.items():
-            given, value = init.get(name), rest.clone()
-            if name in rig.controls:
-                value = (
-                    rig.controls[name].within(value) if given is None else rig.clamped(**{name: given})[name].detach()
-                )
-            elif given is not None:
+            given = init.get(name)
+            if given is None:
+                value = rig.controls.get(name, Control(rest)).within(rest.clone())
+            elif name in rig.controls:
+                value = rig.clamped(**{name: given})[name].detach()
+            else:
                 value = as_tensor(f"init[{name!r}]", given, like=rest).detach().double()
             check_shape(f"init[{name!r}]", value, tuple(rest.shape), fix="one pose")
             check_finite(f"init[{name!r}]", value)
@@ -144,10 +142,10 @@ def _free(rig: Rig, name: str, control: Control, joints: Sequence[str] | None) -
 def _rate(rig: Rig, name: str, control: Control) -> float:
     """Return the size of a step, in the value's own units."""
     if control.rotates or name in ("orientation", "angles"):
-        return 0.03
+        return RIG.rotation_rate
     if name in ("translation", "joint_translations"):
-        return 0.01 * rig.size
+        return RIG.translation_rate * rig.size
     if control.low is not None and control.high is not None:
         span = float((control.high - control.low).max())
-        return 0.05 * span if 0.0 < span < float("inf") else 0.05
-    return 0.05
+        return RIG.other_rate * span if 0.0 < span < float("inf") else RIG.other_rate
+    return RIG.other_rate

@@ -7,7 +7,7 @@ regions of the masks show it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -17,11 +17,8 @@ from ..descent.curvature import derivatives
 from ..descent.objective import Objective
 from ..edge_support import edge_amount, edge_support
 from ..views import Observation
+from .settings import RIG
 
-MOVED_SHARE = 0.05  # Pixels move with a joint from this share of its largest derivative.
-JOINT_MARGIN = 2  # pixels around these
-MIN_EDGE_PIXELS = 8.0  # With fewer pixels of edges in all views, a joint is not judged.
-SUPPORT_SPP = 32
 SUPPORT_STEPS = 2**22, 2**23  # No fit takes so many steps, so these samples are of no minimised loss.
 
 
@@ -34,7 +31,12 @@ def edge_support_by_joint(
     with torch.no_grad():
         scene, cameras = objective.build(tensors)
         first, second = (
-            _by_view(objective.renders(scene, cameras, every, SUPPORT_SPP, objective.seed(step)))
+            {
+                (name, i): image
+                for group, channels in objective.renders(scene, cameras, every, RIG.support_spp, objective.seed(step))
+                for name, images in channels.items()
+                for i, image in zip(group, images, strict=True)
+            }
             for step in SUPPORT_STEPS
         )
     moved: dict[str, dict[tuple[str, int], Tensor]] = {}
@@ -51,7 +53,7 @@ def edge_support_by_joint(
             # Pictures of regions have other colours; the contour alone gives its length.
             picture = view.wanted.get(name, one)
             pairs.append((one, other, picture, area if view.weight is None else area * view.weight))
-        if edge_amount(pairs) < MIN_EDGE_PIXELS:
+        if edge_amount(pairs) < RIG.least_edges:
             continue
         if objective.regions is None:
             found[joint] = edge_support(pairs)
@@ -72,21 +74,12 @@ def places_of(tensors: Mapping[str, Tensor], joints: Mapping[str, Sequence[str]]
     return found
 
 
-def _by_view(groups: Iterable[tuple[list[int], dict[str, Tensor]]]) -> dict[tuple[str, int], Tensor]:
-    """Return channels (H, W, c) by name and the view's place."""
-    found = {}
-    for group, channels in groups:
-        for name, images in channels.items():
-            found |= {(name, i): image for i, image in zip(group, images, strict=True)}
-    return found
-
-
 def _areas(moved: Mapping[tuple[str, int], Tensor]) -> dict[tuple[str, int], Tensor]:
     """Return for each picture (H, W, 1) 1 where it is moved, or near that, and 0 elsewhere."""
     most = max(float(size.max()) for size in moved.values())
-    wide = 2 * JOINT_MARGIN + 1
+    wide = 2 * RIG.joint_margin + 1
     return {
-        key: F.max_pool2d((size > MOVED_SHARE * most).float()[None], wide, 1, JOINT_MARGIN)[0][..., None]
+        key: F.max_pool2d((size > RIG.moved_share * most).float()[None], wide, 1, RIG.joint_margin)[0][..., None]
         for key, size in moved.items()
     }
 

@@ -11,19 +11,19 @@ from ...camera.camera import Camera
 from ...check import as_tensor
 from ...rig.rig import Rig
 from ..measured import Measured
+from .settings import RIG
 
 NONZERO_ANGLE = 1e-9  # radians
-KEYPOINT_WIDTH = 0.02  # Share of the picture's diagonal: larger distances count linearly.
 
 
 def keypoint_term(
     rig: Rig, cameras: Sequence[Camera], given: Mapping[str, Tensor] | Measured
 ) -> Callable[[Mapping[str, Tensor]], Tensor]:
-    """Return weight · mean of ρ(d² / σ²) over all visible keypoints, as a function of all values. d are distances in pixels, σ
-    is KEYPOINT_WIDTH of the picture's diagonal, and ρ(x) = 2 √(1 + x) − 2 (Charbonnier et al. 1997), which pulls from afar and
-    gives no wrong point more weight than others. Raises TypeError or ValueError."""
+    """Return weight · mean of ρ(d² / σ²) over all visible keypoints, as a function of all values, with distances d and the width
+    σ in pixels. ρ(x) = 2 √(1 + x) − 2 (Charbonnier et al. 1997) pulls from afar and gives no wrong point more weight than others.
+    Raises TypeError or ValueError."""
     keypoints = given.values if isinstance(given, Measured) else given
-    weight = 1e-3 * (given.factor if isinstance(given, Measured) else 1.0)
+    weight = RIG.keypoint_weight * (given.factor if isinstance(given, Measured) else 1.0)
     names = rig.deformer.names
     if not names:
         raise ValueError("keypoints: expected a rig with joints, got one without; give from_function(…, joints=…)")
@@ -61,7 +61,7 @@ def keypoint_term(
             if not bool(there.any()):
                 continue
             shown = camera.project(joints[rows].to(camera.K.dtype)).double()[there]
-            sigma = KEYPOINT_WIDTH * float(torch.tensor(camera.size, dtype=torch.float64).norm())
+            sigma = RIG.keypoint_width * float(torch.tensor(camera.size, dtype=torch.float64).norm())
             x = (shown - pixels[there]).square().sum(-1) / sigma**2
             total = total + 2.0 * ((1.0 + x).sqrt() - 1.0).sum()
         return weight * total / int(seen.sum())

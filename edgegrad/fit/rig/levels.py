@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -23,7 +26,6 @@ from ..descent.curvature import MAX_NUMBERS
 from ..descent.descend import GAUSS_NEWTON, Save, continued, descend_levels, descend_views
 from ..descent.fit_scene import reporter
 from ..descent.objective import Objective
-from ..descent.region_loss import FINAL_STEP
 from ..descent.result import RESULT_SPP, make_fit
 from ..descent.scene_builder import Built, whole_scene
 from ..losses import REGION
@@ -32,28 +34,14 @@ from ..parameter import Parameter
 from ..placement import Coordinates
 from ..priors import Prior
 from ..views import Observation
-from .alternatives import Alternatives
-from .axial_rotations import search_axial_rotations
+from .confidence import features_of
 from .free_parameters import FreeParameters
 from .joint_support import edge_support_by_joint, left_out
-from .limbs import ByContour, ByLoss, Limb, LimbSearch, limbs
+from .proposals import Proposals
 from .result import RigFit
-from .uncertainty import JointUncertainty, uncertainty_of
-
-DRAWN_SIDES = range(24, 97)  # Limbs are drawn on levels with so many pixels on the shorter side.
-DRAW_STEPS = 6  # from each drawn limb
-AXIAL_STEPS = 12  # of a limb after a rotation about a bone's axis, on the last level
-REGION_COST = 4  # A try by regions takes so many times as long, so there are so many times fewer.
-LAST_SPP_FACTOR = 4  # factor of samples on the last level, where axial rotations of limbs show little
-# With a residual loss below this, in units of its noise, these two dampings, relative to the largest curvature, make steps go
-# far where pictures show little: shared axial rotations arrive before the loss, which hardly shows them, seems at rest.
-NEARLY_FITTED = 10.0
-NEARLY_FITTED_SETTINGS = dataclasses.replace(GAUSS_NEWTON, unseen_damping=1e-6, start_damping=1e-4)
-PRIOR_GROWTH = 3.0  # A prior's weight grows by this power of how much coarser the pictures are.
-# The default prior's weight at the pictures' own size, where it would otherwise outweigh what shows axial rotations.
-ANNEALED_WEIGHT = 0.1
-MAX_COARSE_STEPS = 15  # on each level before the last
-F64 = torch.float64
+from .search import HypothesisSearch
+from .settings import RIG
+from .uncertainty import uncertainty_of
 
 
 class CoarseToFine:
@@ -72,142 +60,107 @@ class CoarseToFine:
             sizes.append(2 * sizes[-1])
         # The last level has more samples, and begins where all but axial rotations is right.
         self.factors = [size / full for size in sizes[:-1]] + [1.0] * (2 if options.method == "gauss-newton" else 1)
-        self.tried = [k for k, size in enumerate(sizes) if size in DRAWN_SIDES] or [0]
+        self.searched = [k for k, size in enumerate(sizes) if RIG.least_side <= size <= RIG.most_side] or [0]
         if options.loss == REGION:
-            self.tried = self.tried[-1:]  # Coarse contours show little.
+            self.searched = self.searched[-1:]  # Coarse contours show little.
 
     def run(self) -> RigFit:
-        first = self.free.start
-        given = {
-            "start": self.free.fixed, "parameters": self.free.parameters, "tries": self.tries, "factors": self.factors,
-        }  # fmt: skip
+        free, first = self.free, self.free.start
+        given = {"start": free.fixed, "parameters": free.parameters, "tries": self.tries, "factors": self.factors}
         checkpoint = CheckpointFile.from_views(self.options.checkpoint, self.views, {**given, **self.options.of_steps})
         found = descend_levels(checkpoint, first, len(self.factors), self.descend)
-        values = found.values
-        objective = Objective(self.build(self.views), self.views, self.options, build_batch=self.many(self.views))
-        with torch.no_grad():
-            start, _ = objective.build(first)
-        fit = make_fit(objective, found, start, Coordinates({}))
-        found_values = {name: value.detach() for name, value in self.free.all(values).items()}
-        with torch.no_grad():
-            alphas = [render_aovs(fit.scene, view.camera, ["alpha"], spp=16, seed=0)["alpha"] for view in self.views]
-        return RigFit(self.rig, found_values, fit, *self._information(objective, values), left_out(self.views, alphas))
-
-    def _information(
-        self, objective: Objective, values: Mapping[str, Tensor]
-    ) -> tuple[dict[str, float], JointUncertainty | None]:
-        """Return, for each joint, what the pictures show of it, and how exactly."""
-        joints = self.free.joints
-        if not joints or sum(value.numel() for value in values.values()) > MAX_NUMBERS:
-            return {}, None
-        rates = {name: p.lr for name, p in self.free.parameters.items()}
         # Noise of few samples would count as noise of the pictures.
         options = dataclasses.replace(self.options, spp=max(self.options.spp, RESULT_SPP))
-        objective = Objective(objective.build, self.views, options, build_batch=objective.build_batch)
-        if objective.regions is not None:
-            objective.renew(values, FINAL_STEP)
-        try:
-            return edge_support_by_joint(objective, values, joints), uncertainty_of(objective, values, rates, joints)
-        except TypeError:  # There is no forward mode.
-            return {}, None
+        objective = self.objective(self.views, options)
+        with torch.no_grad():
+            fit = make_fit(objective, found, objective.build(first)[0], Coordinates({}))
+            alphas = [render_aovs(fit.scene, view.camera, ["alpha"], spp=16, seed=0)["alpha"] for view in self.views]
+        values = {name: value.detach() for name, value in free.all(found.values).items()}
+        support, uncertainty, features = {}, None, None
+        if free.joints and sum(value.numel() for value in first.values()) <= MAX_NUMBERS:
+            rates = {name: p.lr for name, p in free.parameters.items()}
+            with contextlib.suppress(TypeError):  # There may be no forward mode.
+                support = edge_support_by_joint(objective, found.values, free.joints)
+                uncertainty = uncertainty_of(objective, found.values, rates, free.joints)
+        if uncertainty is not None and objective.regions is None:  # By regions there is no noise to compare with.
+            with torch.no_grad():
+                features = features_of(support, uncertainty, objective.residual(found.values))
+        return RigFit(self.rig, values, fit, support, uncertainty, left_out(self.views, alphas), features)
 
-    def build(self, views: Sequence[Observation]) -> Callable[[Mapping[str, Tensor]], Built]:
-        values = self.free
-        return lambda tensors: self._scene(self.rig.posed(**values.all(tensors)), values.appearance_of(tensors), views)
+    def objective(self, views: list[Observation], options: Settings, prior: Prior | None = None) -> Objective:
+        """Return the loss of these views."""
+        masked, cameras = any(view.mask is not None for view in views), [view.camera for view in views]
 
-    def many(self, views: Sequence[Observation]) -> Callable[[Mapping[str, Tensor]], list[Built]]:
-        """Return what build() does for a batch of values. Rotations become matrices first: three rotation vectors of three
-        joints have the shape of three matrices."""
+        def scene(posed: Scene | Mesh, appearance: Mapping[str, Tensor]) -> Built:
+            shown = self.appearance(posed, **appearance)
+            if not isinstance(shown, Mesh | Scene):
+                raise TypeError(f"appearance: expected it to return a Mesh or a Scene, got {type(shown).__name__}")
+            return whole_scene(shown, masked), cameras
 
-        def built(tensors: Mapping[str, Tensor]) -> list[Built]:
+        def build(tensors: Mapping[str, Tensor]) -> Built:
+            return scene(self.rig.posed(**self.free.all(tensors)), self.free.appearance_of(tensors))
+
+        def build_batch(tensors: Mapping[str, Tensor]) -> list[Built]:
             values = dict(self.free.all(tensors))
+            # Three rotation vectors of three joints would have the shape of three matrices.
             if "rotations" in values and not isinstance(self.rig.deformer, FunctionDeformer):
                 values["rotations"] = roma().rotvec_to_rotmat(values["rotations"])
             every = self.rig.posed(**values)
-            return [self._scene(posed, self.free.appearance_of(tensors, k), views) for k, posed in enumerate(every)]
+            return [scene(posed, self.free.appearance_of(tensors, k)) for k, posed in enumerate(every)]
 
-        return built
-
-    def _scene(self, posed: Scene | Mesh, values: Mapping[str, Tensor], views: Sequence[Observation]) -> Built:
-        posed = self.appearance(posed, **values)
-        if not isinstance(posed, Mesh | Scene):
-            raise TypeError(f"appearance: expected it to return a Mesh or a Scene, got {type(posed).__name__}")
-        masked = any(view.mask is not None for view in views)
-        return whole_scene(posed, masked), [view.camera for view in views]
+        return Objective(build, views, options, prior=prior, build_batch=build_batch, builder="appearance")
 
     def descend(
         self, values: dict[str, Tensor], level: int, save: Save, saved: Mapping[str, Any] | None
     ) -> DescentResult:  # fmt: skip
         """Run one level; the best values are in the result's."""
-        factor = self.factors[level]
-        views = [view.resized(factor) for view in self.views]
-        grown = factor**-PRIOR_GROWTH if factor < 1.0 or not self.annealed else ANNEALED_WEIGHT
+        factor, last = self.factors[level], level == len(self.factors) - 1
+        grown = factor**-RIG.prior_growth if factor < 1.0 or not self.annealed else RIG.last_prior
 
         def prior(tensors: Mapping[str, Tensor]) -> Tensor:
             known = self.free.values(tensors)
-            total = torch.zeros((), dtype=F64)
-            for term in self.priors:
-                total = total + grown * term(known)
+            total = sum((grown * term(known) for term in self.priors), torch.zeros((), dtype=torch.float64))
             return total if self.points is None else total + self.points(self.free.all(tensors))
 
-        build = self.build(views)
-        spp = max(self.options.spp, 16) if factor < 0.4 else self.options.spp
-        coarse = level < len(self.factors) - 1 and self.options.method == "gauss-newton" and self.options.loss != REGION
-        steps = min(self.options.steps, MAX_COARSE_STEPS) if coarse else self.options.steps
-        fine = level == len(self.factors) - 1
-        spp = LAST_SPP_FACTOR * spp if fine else spp
-        options = dataclasses.replace(self.options, spp=spp, steps=steps)
-        batch = self.many(views)
-        objective = Objective(build, views, options, prior=prior, build_batch=batch, builder="appearance")
+        options, region = self.options, self.options.loss == REGION
+        coarse = not last and options.method == "gauss-newton" and not region
+        steps = min(options.steps, RIG.coarse_steps) if coarse else options.steps
+        spp = max(options.spp, RIG.coarse_spp) if factor < RIG.coarse_share else options.spp
+        options = dataclasses.replace(options, spp=RIG.last_spp * spp if last else spp, steps=steps)
+        objective = self.objective([view.resized(factor) for view in self.views], options, prior)
         if level == 0 and saved is None:
             objective.check(values)
-        title = f"level {level + 1} of {len(self.factors)}"
-        found = self._steps(objective, values, save, saved, title, fine)
+        descend = partial(
+            self._steps, objective, save=save, title=f"level {level + 1} of {len(self.factors)}", last=last
+        )
+        found = descend(values, saved=saved)
         name = next((n for n in ("rotations", "angles") if n in values and n in self.free.joints), None)
-        interrupted = found.ending is Ending.INTERRUPTED
-        if level in self.tried and self.tries and name is not None and saved is None and not interrupted:
-            try:
-                found = found._replace(values=self._searched(objective, found.values, options, name))
-            except KeyboardInterrupt:
-                return found._replace(ending=Ending.INTERRUPTED)
-        if fine and self.tries and name == "rotations" and objective.regions is None and not interrupted:
-            try:
-                search = self._search(objective, found.values, options, name, AXIAL_STEPS)
-                near = objective.residual(found.values) < NEARLY_FITTED
-                values = search.rotated(found.values) if near else found.values
-                values = search_axial_rotations(objective, search.alternatives, self.free.parameters[name], values)
-            except KeyboardInterrupt:
-                return found._replace(ending=Ending.INTERRUPTED)
-            if values is found.values:
-                return found
-            more = self._steps(objective, values, save, None, title, fine)
-            found = more._replace(history=continued(found.history, more.history), seconds=found.seconds + more.seconds)
+        if not self.tries or name is None or saved is not None or found.ending is Ending.INTERRUPTED:
+            return found
+        try:
+            if level in self.searched:
+                tries = math.ceil(RIG.region_share * self.tries) if region else self.tries
+                with tqdm(total=tries, desc="limbs drawn", disable=not options.progress, leave=False) as bar:
+                    search = self._search(objective, name, RIG.refinement_steps, bar.update)
+                    found = found._replace(values=search.draw_limbs(found.values, tries))
+            if last and name == "rotations" and not region:
+                search = self._search(objective, name, RIG.last_refinement_steps)
+                better = search.rotate_about_bones(found.values)
+                if better is not found.values:
+                    more = descend(better, saved=None)
+                    whole = continued(found.history, more.history)
+                    found = more._replace(history=whole, seconds=found.seconds + more.seconds)
+        except KeyboardInterrupt:
+            return found._replace(ending=Ending.INTERRUPTED)
         return found
 
-    def _searched(
-        self, objective: Objective, values: Mapping[str, Tensor], options: Settings, name: str
-    ) -> dict[str, Tensor]:
-        bar = tqdm(total=self.tries, desc="limbs drawn", disable=not options.progress, leave=False)
-        try:
-            search = self._search(objective, values, options, name, DRAW_STEPS, bar.update)
-            return search.run(dict(values), self.tries if objective.regions is None else -(-self.tries // REGION_COST))
-        finally:
-            bar.close()
-
     def _search(
-        self, objective: Objective, values: Mapping[str, Tensor], options: Settings, name: str, count: int,
-        report: Callable[[], Any] = lambda: None,
-    ) -> LimbSearch:  # fmt: skip
+        self, objective: Objective, name: str, count: int, report: Callable[[], Any] = lambda: None
+    ) -> HypothesisSearch:
         """Return the search whose descents take so many steps."""
+        options = objective.options
         few = dataclasses.replace(options, steps=count, loss_tolerance=0.0, progress=False, callback=None)
-        control, rows = self.rig.controls[name], self.free.rows.get(name, torch.arange(len(values[name])))
-        joints = self.free.joints.get(name, ())
-        if not self.rig.deformer.parents:  # The rig does not say what hangs on what.
-            groups = [Limb([k]) for k in range(len(values[name]))]
-        elif name == "rotations":
-            groups = limbs(self.rig, rows.tolist())
-        else:
-            groups = [Limb(list(range(k, len(values[name])))) for k in range(len(values[name]))]
+        rest = self.rig.controls[name].rest
 
         def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
             found = descend_views(objective.with_options(few), parameters)
@@ -215,24 +168,24 @@ class CoarseToFine:
                 raise KeyboardInterrupt
             return found.values
 
-        judge = ByLoss(objective, name) if objective.regions is None else ByContour(objective, name, joints)
-        return LimbSearch(
-            objective, judge, name, groups, self.free.parameters, control.rest[rows],
-            Alternatives(self.rig, self.free, name), steps, options.seed, report,
+        return HypothesisSearch(
+            objective, Proposals(self.rig, self.free, name), self.free.joints[name], self.free.parameters,
+            rest[self.free.rows.get(name, torch.arange(len(rest)))], steps, torch.Generator().manual_seed(options.seed), report,
         )  # fmt: skip
 
     def _steps(
-        self, objective: Objective, values: Mapping[str, Tensor], save: Save,
-        saved: Mapping[str, Any] | None, title: str, fine: bool,
+        self, objective: Objective, values: Mapping[str, Tensor], saved: Mapping[str, Any] | None, save: Save, title: str,
+        last: bool,
     ) -> DescentResult:  # fmt: skip
-        parameters = {
-            name: dataclasses.replace(p, value=p.within(values[name])) for name, p in self.free.parameters.items()
-        }
-        near = objective.regions is None and fine and objective.residual(values) < NEARLY_FITTED
-        settings = NEARLY_FITTED_SETTINGS if near else GAUSS_NEWTON
-        report = reporter(objective.build, objective.views, bones=self.bones)
-        return descend_views(objective, parameters, save, saved, title, report, settings)
+        parameters = {n: dataclasses.replace(p, value=p.within(values[n])) for n, p in self.free.parameters.items()}
+        settings = GAUSS_NEWTON
+        if objective.regions is None and last and objective.residual(values) < RIG.nearly_fitted:
+            damping = {"unseen_damping": RIG.nearly_fitted_unseen, "start_damping": RIG.nearly_fitted_damping}
+            settings = dataclasses.replace(GAUSS_NEWTON, **damping)
 
-    @torch.no_grad()
-    def bones(self, tensors: Mapping[str, Tensor]) -> Tensor | None:
-        return self.rig.bones(self.free.all(tensors))
+        @torch.no_grad()
+        def bones(tensors: Mapping[str, Tensor]) -> Tensor | None:
+            return self.rig.bones(self.free.all(tensors))
+
+        report = reporter(objective.build, objective.views, bones=bones)
+        return descend_views(objective, parameters, save, saved, title, report, settings)

@@ -16,10 +16,9 @@ from ...scene.scene import Scene
 from ..descent.result import Fit
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..result import FitResult, delegated, made_folder
+from .confidence import RIG_CONFIDENCE
+from .settings import RIG
 from .uncertainty import JointUncertainty
-
-MISSED_REGION = 0.01  # A region of a larger share of a mask is a missed limb.
-SHARE_OF_MEDIAN = 0.85  # A joint in a wrong place shows a smaller share of edges, relative to the median joint.
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +35,7 @@ class RigFit(FitResult):
     uncertainty : how exactly the pictures show each joint
         None where that is unknown: of a rig whose controls have no names, or one that PyTorch does not differentiate in
         forward mode.
+    features : what `confidence` is computed from, by name
     """
 
     rig: Rig
@@ -44,6 +44,7 @@ class RigFit(FitResult):
     explained_joints: dict[str, float] = field(default_factory=dict, repr=False)
     uncertainty: JointUncertainty | None = field(default=None, repr=False)
     left_out: float = field(default=0.0, repr=False)
+    features: dict[str, float] | None = field(default=None, repr=False)
 
     loss, explained, history, steps, seconds, interrupted, plot = delegated(
         "fit", "loss explained history steps seconds interrupted plot"
@@ -61,7 +62,7 @@ class RigFit(FitResult):
     @property
     def converged(self) -> bool:
         """Return whether Fit.converged holds, and the pictures show each joint of the fit, and how it is rotated."""
-        return self.fit.converged and not self.missed and self.left_out < MISSED_REGION and not self._unknown
+        return self.fit.converged and not self.missed and self.left_out < RIG.missed_region and not self._unknown
 
     @property
     def reason(self) -> str:
@@ -75,7 +76,7 @@ class RigFit(FitResult):
                 f"edges not explained: the pictures show too few of the edges of {len(self.missed)} joints ({said}); start "
                 "nearer, give more tries or keypoints, or look for what covers them"
             )
-        if self.left_out >= MISSED_REGION:
+        if self.left_out >= RIG.missed_region:
             return (
                 f"masks not explained: a region of {self.left_out:.0%} of one is without the fit, or of the fit outside it; give "
                 "more tries or keypoints, or look for what else the masks show"
@@ -83,6 +84,14 @@ class RigFit(FitResult):
         if self._unknown:
             return f"rotations unknown: {self._unknown}; give more pictures or colours, or seek other joints alone"
         return self.fit.reason
+
+    @property
+    def confidence(self) -> float | None:
+        """Return the calibrated probability, 0 … 1, that the rotations of all sought joints are within 2° of the true ones.
+
+        None: unknown, as of fits by regions and of those without `uncertainty`.
+        """
+        return None if self.features is None else RIG_CONFIDENCE.probability(self.features)
 
     @property
     def _unknown(self) -> str:
@@ -93,7 +102,7 @@ class RigFit(FitResult):
         """Return the joints of whose edges the pictures show too few: they lie in another place."""
         if not self.explained_joints:
             return []
-        least = max(MIN_EDGE_SUPPORT, SHARE_OF_MEDIAN * statistics.median(self.explained_joints.values()))
+        least = max(MIN_EDGE_SUPPORT, RIG.share_of_median * statistics.median(self.explained_joints.values()))
         return [name for name, share in self.explained_joints.items() if share < least]
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:

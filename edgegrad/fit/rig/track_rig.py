@@ -18,9 +18,8 @@ from ..parameter import Parameter
 from ..priors import Prior, near, towards
 from .fit_rig import RIG_OPTIONS, Appearance, fit_rig
 from .result import RigFit
+from .settings import RIG
 
-# Share of the last frame's motion to start with: all of it would add up errors that no picture shows.
-MOTION_SHARE = 0.5
 OF_FRAME = ("images", "masks", "weights", "keypoints")
 
 
@@ -81,11 +80,13 @@ def track_rig(
             found = fit_rig(rig, **shared, init=init, priors=priors, search=search, options=own)
         else:
             last = before[-1]
-            ahead = last if len(before) < 2 else {n: v + MOTION_SHARE * (v - before[-2][n]) for n, v in last.items()}
+            ahead = (
+                last if len(before) < 2 else {n: v + RIG.motion_share * (v - before[-2][n]) for n, v in last.items()}
+            )
             ahead = {n: rig.controls[n].within(v) if n in rig.controls else v for n, v in ahead.items()}
             still = towards({name: control.rest for name, control in rig.controls.items()})
             terms = [near(ahead, smooth), *([still] if priors is None else priors)]
-            own = own if own.coarsest is not None else replace(own, coarsest=48)
+            own = own if own.coarsest is not None else replace(own, coarsest=RIG.track_coarsest)
             found = fit_rig(rig, **shared, init=ahead, priors=terms, search=0, options=own)
             if again and set(found.missed) - missed and not found.interrupted:
                 # A limb in a wrong place would stay there in later frames.

@@ -18,10 +18,7 @@ from torch import Tensor
 from ..descent.curvature import scores
 from ..descent.objective import Objective
 from .joint_support import SUPPORT_STEPS, places_of
-
-# Radians, or as many learning rates as make one: the deviation of what the pictures do not show at all.
-JOINT_PRIOR_DEVIATION = 1.0
-MAX_JOINT_DEGREES = 5.0  # A joint known less exactly counts as unknown.
+from .settings import RIG
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +40,7 @@ class JointUncertainty:
     def unknown(self) -> str:
         """Return the joints that are known less exactly than to 5°, in words, the worst first; empty where there are none."""
         worst = sorted(
-            (name for name, d in self.degrees.items() if d > MAX_JOINT_DEGREES), key=lambda name: -self.degrees[name]
+            (name for name, d in self.degrees.items() if d > RIG.known_degrees), key=lambda name: -self.degrees[name]
         )
         return ", ".join(f"{name} known to ±{self.degrees[name]:.0f}°{self._about(name)} only" for name in worst)
 
@@ -61,18 +58,19 @@ def uncertainty_of(
 ) -> JointUncertainty:
     """Return the uncertainty at these values.
 
-    rates   of each value, of which 1 / 0.03 make as much as a radian does
+    rates   of each value, of which 1 / RIG.rotation_rate make as much as a radian does
     joints  names of joints, by the values that are their rotations
     """
     H, S = scores(objective, tensors, SUPPORT_STEPS[0])
-    unit = torch.cat([torch.full((v.numel(),), rates[name] / 0.03, dtype=torch.float64) for name, v in tensors.items()])
+    units = {name: rates[name] / RIG.rotation_rate for name in tensors}
+    unit = torch.cat([torch.full((v.numel(),), units[name], dtype=torch.float64) for name, v in tensors.items()])
     H, S = H * unit * unit[:, None], S * unit * unit[:, None]
-    # The prior is one more picture, of the pixels' own noise, that shows all to JOINT_PRIOR_DEVIATION.
+    # The prior is one more picture, of the pixels' own noise, that shows all to RIG.prior_deviation.
     noise = float(S.diagonal().sum() / H.diagonal().sum().clamp(min=1e-300))
     inverse = torch.linalg.pinv(
-        H + noise / JOINT_PRIOR_DEVIATION**2 * torch.eye(len(H), dtype=torch.float64), hermitian=True
+        H + noise / RIG.prior_deviation**2 * torch.eye(len(H), dtype=torch.float64), hermitian=True
     )
-    known = S + noise**2 / JOINT_PRIOR_DEVIATION**2 * torch.eye(len(H), dtype=torch.float64)
+    known = S + noise**2 / RIG.prior_deviation**2 * torch.eye(len(H), dtype=torch.float64)
     covariance = inverse @ known @ inverse
     covariance = covariance * unit * unit[:, None]
     degrees: dict[str, float] = {}

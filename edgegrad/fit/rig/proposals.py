@@ -1,4 +1,4 @@
-"""Ambiguous poses: those that outlines hardly separate from another one, and that no descent from that one reaches.
+"""Limbs, and poses that outlines hardly separate from another one, and that no descent from that one reaches.
 
 Two limbs of one build, as two legs, may each be where the other one is; joints in a row may share a rotation about their axes
 otherwise.
@@ -6,8 +6,10 @@ otherwise.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -17,6 +19,45 @@ from ...rig.rig import Rig
 from ...rig.rotations import roma
 from ...rig.skinned import SkinDeformer
 from .free_parameters import FreeParameters
+from .settings import RIG
+
+
+@dataclass(frozen=True)
+class Limb:
+    """Rows that are drawn together."""
+
+    rows: list[int]
+    twins: tuple[list[int], list[int]] | None = None  # rows of two limbs of one build
+
+
+def limbs(rig: Rig, rows: Sequence[int]) -> list[Limb]:
+    """Return each of the joints `rows` with those below it, as places in `rows`; and pairs that hang on one joint, as two
+    legs do."""
+    parents, whole, found = rig.deformer.parents, {}, []
+    for row in rows:
+        group = [place for place, other in enumerate(rows) if row in _above(parents, other)]
+        if len(group) <= max(1.0, RIG.limb_share * len(rows)):
+            whole[row] = group
+        found.append(Limb(whole.get(row, [list(rows).index(row)])))
+    for a, b in itertools.combinations(whole, 2):
+        one, other = whole[a], whole[b]
+        if parents[a] == parents[b] and len(one) > 1 and _hung(parents, rows, one) == _hung(parents, rows, other):
+            found.append(Limb([*one, *other], (one, other)))
+    return found
+
+
+def _above(parents: Sequence[int], joint: int) -> list[int]:
+    """Return a joint and all that it hangs on."""
+    found = [joint]
+    while parents[found[-1]] >= 0:
+        found.append(parents[found[-1]])
+    return found
+
+
+def _hung(parents: Sequence[int], rows: Sequence[int], limb: Sequence[int]) -> list[int]:
+    """Return for each joint of a limb which of these it hangs on, −1 for none."""
+    places = {rows[place]: k for k, place in enumerate(limb)}
+    return [places.get(parents[rows[place]], -1) for place in limb]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +70,7 @@ class AxialRotation:
 
 
 @dataclass(frozen=True)
-class Alternatives:
+class Proposals:
     """Other values of the rotation vectors `name`, given those that are sought."""
 
     rig: Rig
@@ -40,6 +81,17 @@ class Alternatives:
     def joints(self) -> Joints | None:
         """The joints; None where a rig does not say how they hang."""
         return self.rig.deformer.joints if isinstance(self.rig.deformer, SkinDeformer) else None
+
+    @cached_property
+    def limbs(self) -> list[Limb]:
+        """The limbs of the rows that are sought; each row by itself where a rig does not say what hangs on what."""
+        rows = self.free.parameters[self.name].value
+        assert rows is not None
+        if not self.rig.deformer.parents:
+            return [Limb([k]) for k in range(len(rows))]
+        if self.name == "angles":
+            return [Limb(list(range(k, len(rows)))) for k in range(len(rows))]
+        return limbs(self.rig, self._places({self.name: rows}).tolist())
 
     def exchanged(self, values: Mapping[str, Tensor], one: Sequence[int], other: Sequence[int]) -> Tensor:
         """Put two groups of rows each where the other one is. Without joints, rows take their counterparts' rotation
@@ -58,18 +110,12 @@ class Alternatives:
         """Return those of each sought joint on which one other hangs, of those that are sought, or none."""
         if self.joints is None:
             return []
-        places = self._places(values).tolist()
-        row_of, below = {place: row for row, place in enumerate(places)}, dict.fromkeys(range(len(self.joints)), 0)
-        for place in places:
-            at = self.joints.parents[place]
-            while at >= 0:
-                below[at] += 1
-                at = self.joints.parents[at]
+        places, parents = self._places(values).tolist(), self.joints.parents
+        row_of = {place: row for row, place in enumerate(places)}
+        moved = {joint for place in places for joint in _above(parents, place)}  # what has a sought joint below it
         found = []
         for row, place in enumerate(places):
-            branches = [
-                j for j, parent in enumerate(self.joints.parents) if parent == place and (below[j] or j in row_of)
-            ]
+            branches = [j for j, parent in enumerate(parents) if parent == place and j in moved]
             if not branches:
                 along = self._middle(place)
             elif len(branches) == 1 and branches[0] in row_of:
@@ -94,6 +140,13 @@ class Alternatives:
             found[below] = hung.mT @ Q.mT @ hung @ rotations[below]
             rows.append(rotation.child)
         return self._changed(values, found, rows)
+
+    def about_bone(
+        self, values: Mapping[str, Tensor], rotation: AxialRotation, angles: Sequence[float]
+    ) -> list[Tensor]:
+        """Rotate by each of these angles to both sides, and across a flat limb."""
+        angles = (*angles, *([RIG.flat_angle] if rotation.child is None else []))
+        return [self.with_rotation(values, rotation, side * angle) for angle in angles for side in (-1.0, 1.0)]
 
     def _middle(self, place: int) -> Tensor:
         """Return the weighted mean (3,) of the vertices that hang on a joint, from it, along its own axes at rest."""

@@ -1,0 +1,34 @@
+"""Training of the confidence of fits: a logistic regression, and how well its probabilities are calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from edgegrad.fit.logistic import Logistic
+
+NEWTON_STEPS = 50
+BINS = 10  # of probabilities, in which calibration is measured
+
+
+def trained(cases: Sequence[Mapping[str, float]], right: Sequence[bool], ridge: float = 1.0) -> Logistic:
+    """Return the most likely map, with the prior ½ · ridge · |weights|² on standardised features, by Newton's iterations."""
+    names = tuple(cases[0])
+    X = np.array([[case[name] for name in names] for case in cases])
+    mean, deviation = X.mean(0), np.where(X.std(0) > 1e-3, X.std(0), 1.0)
+    X = np.hstack([(X - mean) / deviation, np.ones((len(X), 1))])
+    y, w = np.array(right, dtype=float), np.zeros(len(names) + 1)
+    prior = np.diag([*[ridge] * len(names), 1e-3])
+    for _ in range(NEWTON_STEPS):
+        p = 1.0 / (1.0 + np.exp(-X @ w))
+        w -= np.linalg.solve((X.T * (p * (1.0 - p))) @ X + prior, X.T @ (p - y) + prior @ w)
+    rounded = [tuple(round(float(x), 4) for x in row) for row in (w[:-1], mean, deviation)]
+    return Logistic(names, rounded[0], round(float(w[-1]), 4), *rounded[1:])
+
+
+def calibration_error(probabilities: Sequence[float], right: Sequence[bool], bins: int = BINS) -> float:
+    """Return the expected calibration error: the mean over cases of |mean probability − rate of right ones| of their bin."""
+    p, y = np.array(probabilities), np.array(right, dtype=float)
+    places = np.minimum((p * bins).astype(int), bins - 1)
+    return float(sum(abs((p - y)[places == k].sum()) for k in range(bins)) / len(p))
