@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..check import as_tensor, check_finite, check_int, check_positive_int, check_shape
+from ..check import as_double, check_int, check_positive_int
 from ..scene.mesh import Mesh
 from .regularizers import edges
 from .remeshing import gpytoolbox, remeshed
@@ -73,15 +73,13 @@ def visual_hull(
     count = ((high - low) / cell).ceil().long() + 3
     # One more cell on each side closes the surface.
     axes = [float(low[k]) + cell * (torch.arange(int(count[k])) - 1).double() for k in range(3)]
-    inside = _closed(_inside(views, axes))
+    inside = F.pad(_inside(views, axes)[1:-1, 1:-1, 1:-1], (1,) * 6)  # The surface is closed at the grid's border.
     found = _surface(inside, axes)
     return found if faces is None else remeshed(found, faces)
 
 
 def _checked(bounds: object) -> tuple[Tensor, Tensor]:
-    box = as_tensor("bounds", bounds, floating=True).detach().cpu().double()
-    check_shape("bounds", box, (2, 3))
-    check_finite("bounds", box)
+    box = as_double("bounds", bounds, (2, 3)).cpu()
     low, high = box.amin(0), box.amax(0)
     if not bool((high > low).all()):
         raise ValueError("bounds: expected opposite corners of a box, got one without volume")
@@ -168,15 +166,6 @@ def _beyond(mask: Tensor, unit: Tensor) -> Tensor:
     outside = {"left": x < -1.0, "right": x > 1.0, "top": y < -1.0, "bottom": y > 1.0}
     none = torch.stack([outside[name] for name, touched in ends.items() if not touched] or [torch.zeros_like(x).bool()])
     return (~none.any(0)).float()
-
-
-def _closed(inside: Tensor) -> Tensor:
-    """Set the border of the grid to zero."""
-    inside = inside.clone()
-    for dim in range(3):
-        for end in (0, -1):
-            inside.select(dim, end).zero_()
-    return inside
 
 
 def _surface(inside: Tensor, axes: Sequence[Tensor]) -> Mesh:

@@ -21,14 +21,27 @@ from .by_camera import numbered, one_for_each
 from .measured import Measurement, area_mean, measurements
 
 Images = Tensor | Sequence[Tensor | None]
-FULL = 0.98  # a pixel with a higher mask is covered
-FILL_REACH = 8  # pixels by which colours grow into partly covered ones
 WITH_ALPHA = 2, 4  # channels of pictures with alpha
-BYTE_ROUNDING = 1e-2  # above 255, by resizing a picture
-DARKEST_BYTE = 5.0  # median of a picture of 8-bit numbers that are not whole
-HIGHLIGHTS = 0.01  # share of the pixels that are brighter than white
-ROUNDING = 0.02  # distance of a level from a whole number in float32, in steps of 8 bits
-FAINT_MASK = 0.5  # a mask whose pixels are all below was read with another curve, or holds labels
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """Numbers by which pictures are checked and prepared."""
+
+    full: float = 0.98  # A pixel with a higher mask is covered.
+    fill_reach: int = 8  # pixels by which colours grow into partly covered ones
+    byte_rounding: float = 1e-2  # above 255, by resizing a picture
+    darkest_byte: float = 5.0  # median of a picture of 8-bit numbers that are not whole
+    highlights: float = 0.01  # share of the pixels that are brighter than white
+    rounding: float = 0.02  # distance of a level from a whole number in float32, in steps of 8 bits
+    faint_mask: float = 0.5  # A mask whose pixels are all below was read with another curve, or holds labels.
+    # Rows from the bottom up.
+    compared_views: int = 4
+    flipped_iou: float = 0.75  # least IoU of flipped masks and the start
+    iou_gain: float = 0.15  # over the pictures as given
+
+
+PICTURES = PictureSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +172,7 @@ def _counted(measured: dict[str, Measurement], mask: Tensor | None, weight: Tens
     """Multiply measurements by the weights of the view's pixels, and drop those where the mask is not full: a depth there may
     be the object's, that of what lies behind, or between."""
     count = torch.ones((), dtype=torch.float32) if weight is None else weight
-    count = count if mask is None else count * (mask > FULL)
+    count = count if mask is None else count * (mask > PICTURES.full)
     return {name: replace(one, weight=one.weight * count) for name, one in measured.items()}
 
 
@@ -238,7 +251,7 @@ def check_without_alpha(name: str, image: Tensor) -> None:
 def warn_of_faint(name: str, masks: Sequence[Tensor]) -> None:
     """Warn if no pixel of any mask is nearly covered."""
     most = max((float(mask.max()) for mask in masks), default=0.0)
-    if 0.0 < most < FAINT_MASK:
+    if 0.0 < most < PICTURES.faint_mask:
         warn(
             f"faint {name}",
             f"{name}: expected 1 where the object covers the pixel, got at most {most:.3g}; divide by that number, or choose the "
@@ -249,23 +262,23 @@ def warn_of_faint(name: str, masks: Sequence[Tensor]) -> None:
 def _is_of_bytes(image: Tensor) -> bool:
     """Whether these are 8-bit numbers converted to floats, or resized after that. Radiance of this range, as of a picture with
     a sun, is hardly whole, and low in most pixels."""
-    if not image.numel() or not 100.0 < float(image.max()) <= 255.0 + BYTE_ROUNDING:
+    if not image.numel() or not 100.0 < float(image.max()) <= 255.0 + PICTURES.byte_rounding:
         return False
-    return bool((image == image.round()).all()) or float(image.median()) > DARKEST_BYTE
+    return bool((image == image.round()).all()) or float(image.median()) > PICTURES.darkest_byte
 
 
 def over_black(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor | None]:
     """Return a picture of the object alone (H, W, C), as rendered over black, and where it is sure (H, W, 1); None: everywhere.
     The picture shows the object where the mask is full. In a pixel covered in part it may hold the object's colour (straight
     alpha), the colour times the mask (premultiplied), or a mixture with the background (a photograph), and does not say
-    which. Such a pixel gets the mask times the colour grown from where the mask is full, by up to FILL_REACH pixels; beyond,
+    which. Such a pixel gets the mask times the colour grown from where the mask is full, by up to `fill_reach` pixels; beyond,
     the mask times its own colour. It is not sure."""
-    colors, known = image, mask > FULL
+    colors, known = image, mask > PICTURES.full
     partial = (mask > 0.0) & ~known
     if not bool(known.any()) or not bool(partial.any()):
         return image * mask, None
     left = partial
-    for _ in range(FILL_REACH):
+    for _ in range(PICTURES.fill_reach):
         share = _around(known.to(image))
         fresh = left & (share > 0.01)  # a ninth, or rounding
         if not bool(fresh.any()):
@@ -305,7 +318,7 @@ def white_level(pixels: Tensor) -> float:
     if not len(pixels):
         return 1.0
     brightest = pixels.amax(1)
-    white = float(brightest.kthvalue(max(1, math.ceil((1.0 - HIGHLIGHTS) * len(brightest)))).values)
+    white = float(brightest.kthvalue(max(1, math.ceil((1.0 - PICTURES.highlights) * len(brightest)))).values)
     white = white if white > 0.0 else float(brightest.max())
     return white if white > 0.0 else 1.0
 
@@ -313,4 +326,4 @@ def white_level(pixels: Tensor) -> float:
 def has_levels(picture: Tensor) -> bool:
     """Whether linear radiance of any shape has the 256 levels of an 8-bit file. White is then 1, also in a dark picture."""
     levels = 255.0 * linear_to_srgb(picture)
-    return float(picture.max()) <= 1.0 and bool(((levels - levels.round()).abs() < ROUNDING).all())
+    return float(picture.max()) <= 1.0 and bool(((levels - levels.round()).abs() < PICTURES.rounding).all())

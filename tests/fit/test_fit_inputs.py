@@ -15,9 +15,8 @@ from quiet_fits import arranged, quiet
 import edgegrad as eg
 from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
 from edgegrad.fit.options import DESCENT_OPTIONS, POSE_OPTIONS, UNUSED, Settings
-from edgegrad.fit.pose.depth_units import warn_of_units
 from edgegrad.fit.pose.fit_poses import _masks
-from edgegrad.fit.pose.inputs import ArgumentNames, shots_of
+from edgegrad.fit.pose.inputs import ArgumentNames, shots_of, warn_of_units
 from edgegrad.fit.pose.settings import POSE
 
 SIZE = 48

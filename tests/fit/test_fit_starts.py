@@ -16,9 +16,10 @@ from benchmarks.poses.cases import Placed, Recipe, drawn
 from benchmarks.poses.objects import Sources
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import FitOptions, fit_pose
-from edgegrad.fit.pose.photo.match import BEAM_ROUNDS, SIZE_SPACING, VIEW_PIXELS, Matches, Mips, _in_mask, closer
+from edgegrad.fit.pose.photo.match import Matches, Mips, _in_mask, closer
 from edgegrad.fit.pose.photo.template_views import TemplateViews, all_sides, ball, pose_at, spread
 from edgegrad.fit.pose.pose import Pose, angle
+from edgegrad.fit.pose.settings import TEMPLATES
 from edgegrad.fit.pose.task import PoseTask
 
 CENTER = torch.tensor([1.0, 0.75, 0.4])
@@ -111,18 +112,18 @@ def test_matches_come_closer_than_views_are_apart() -> None:
     R, t = truth((2.5, 0.3, 0.2), (0.3, -0.2, 0.4))
     mesh, picture, mask = pictured(R, t)
     task = task_of(picture, camera(), mesh, mask)
-    mips = Mips(task, VIEW_PIXELS)
-    found = _in_mask(TemplateViews.from_rotations(task, all_sides()[::2], VIEW_PIXELS, 0), mips).distinct(
-        24, 0.2, 0.1, SIZE_SPACING
+    mips = Mips(task, TEMPLATES.view_pixels)
+    found = _in_mask(TemplateViews.from_rotations(task, all_sides()[::2], TEMPLATES.view_pixels, 0), mips).distinct(
+        24, 0.2, 0.1, TEMPLATES.size_spacing
     )
     coarse = found
-    for one in BEAM_ROUNDS:
+    for one in TEMPLATES.beam_rounds:
         before = found
         found = closer(task, before, mips, one, 0.0, 0)
-        if one.across == VIEW_PIXELS:  # the match itself is among those compared
+        if one.across == TEMPLATES.view_pixels:  # the match itself is among those compared
             assert bool((found.scores >= before.scores - 1e-4).all())
             assert float((found.scores - before.scores).mean()) > 0.1
-        found = found.distinct(12, one.turned, one.spacing, SIZE_SPACING)
+        found = found.distinct(12, one.turned, one.spacing, TEMPLATES.size_spacing)
     assert any(near(pose, R, t, task, 0.2, 0.1) for pose in found.poses(task)[:4])
     assert not any(near(pose, R, t, task, 0.2, 0.1) for pose in coarse.poses(task)[:4])
 

@@ -20,15 +20,11 @@ from ...optim.levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtS
 from ...optim.loop import nothing
 from .loss_model import LossModel, LossSource
 from .pose import Pose
+from .settings import CAMERA
 from .task import FOCAL_LENGTH
-from .uncertainty import PRIOR_DEVIATION
 
-MAX_ADJUST_STEPS = 12
 # Poses move by at most 0.1 radians or object sizes in one step. The damping is that of steps that are taken back.
 ADJUST = LevenbergMarquardtSettings(start_damping=1e-3, least_damping=1e-6, unseen_damping=0.0, trust_radius=0.1)
-# Mean step in standard deviations that counts as short: noise of the renders moves steps as far.
-SHORT_STEP_DEVIATIONS = 0.5
-LENS_UNIT = 10.0  # of the numbers of the lens in steps, which may move so many times as far as those of a pose
 Poses = tuple[Pose, ...]
 
 
@@ -60,7 +56,7 @@ def lens_of(source: LossSource, pose: Pose) -> Tensor:
 
 class Bundle(Problem[Poses]):
     """Poses of all places and the lens as one descent. Its cost is in units of the noise of the pictures, so that a standard
-    deviation costs ½. A prior of PRIOR_DEVIATION holds moves of poses, and the lens at the given one."""
+    deviation costs ½. A prior of the settings' prior_deviation holds moves of poses, and the lens at the given one."""
 
     def __init__(self, sources: Sequence[LossSource]) -> None:
         self.sources = sources
@@ -68,7 +64,7 @@ class Bundle(Problem[Poses]):
         n = sum(counts) + len(sources[0].task.dofs) - counts[0]
         self.rows = _rows(counts, n)  # where the entries of each place are among all numbers
         self.units = torch.ones(n, dtype=torch.float64)
-        self.units[sum(counts) :] = LENS_UNIT
+        self.units[sum(counts) :] = CAMERA.lens_unit
         self.noise: float | None = None  # of the first poses
         self.last: Adjustment | None = None  # what was evaluated last
 
@@ -80,8 +76,8 @@ class Bundle(Problem[Poses]):
         H = self._sum([one.curvature for one in evidence]) + self._prior(self.noise)
         gradient = self._sum([one.gradient for one in evidence])
         lens = lens_of(self.sources[0], poses[0])
-        gradient[len(gradient) - len(lens) :] += self.noise / PRIOR_DEVIATION**2 * lens
-        prior = 0.5 / PRIOR_DEVIATION**2 * float(lens.square().sum())
+        gradient[len(gradient) - len(lens) :] += self.noise / CAMERA.prior_deviation**2 * lens
+        prior = 0.5 / CAMERA.prior_deviation**2 * float(lens.square().sum())
         cost = sum(one.loss / one.per_loss for one in evidence) / self.noise + prior
         slack = sum(one.slack / one.per_loss for one in evidence) / self.noise
         return Model(
@@ -123,8 +119,8 @@ class Bundle(Problem[Poses]):
 
     def _prior(self, noise: float) -> Tensor:
         """Return the curvature of the prior: one more pixel of the same noise, which shows each number to within
-        PRIOR_DEVIATION."""
-        return torch.eye(len(self.units), dtype=torch.float64) * noise / PRIOR_DEVIATION**2
+        `prior_deviation`."""
+        return torch.eye(len(self.units), dtype=torch.float64) * noise / CAMERA.prior_deviation**2
 
     def _adjustment(self, poses: Poses, evidence: list[LossModel]) -> Adjustment:
         """Return the poses with the covariance of all numbers."""
@@ -136,7 +132,7 @@ class Bundle(Problem[Poses]):
 
 
 def adjust_bundle(
-    sources: Sequence[LossSource], poses: Sequence[Pose], most: int = MAX_ADJUST_STEPS,
+    sources: Sequence[LossSource], poses: Sequence[Pose], most: int = CAMERA.adjust_steps,
     after_step: Callable[[Adjustment], Any] = nothing,
 ) -> Adjustment:  # fmt: skip
     """Return the most likely poses and lens near the given ones, after at most so many steps. `after_step` is called with the
@@ -149,7 +145,7 @@ def adjust_bundle(
         after_step(best[0])
 
     # The expected decrease of the cost by a step is half its square in standard deviations.
-    short = 0.5 * SHORT_STEP_DEVIATIONS**2 * len(bundle.units)
+    short = 0.5 * CAMERA.short_step**2 * len(bundle.units)
     settings = replace(ADJUST, steps=most + 1, least_gain=short)
     found = minimise(bundle, [bundle.agreed(poses)], settings, note)
     if found.interrupted:

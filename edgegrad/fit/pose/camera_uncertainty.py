@@ -12,8 +12,9 @@ from ...camera.camera import Camera
 from ...camera.lens import MOST_COEFFICIENTS, distort
 from .loss_model import LossSource
 from .pose import Pose
+from .settings import CAMERA
 from .task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, focal_of
-from .uncertainty import MAX_CONTOUR_DEGREES, MAX_DEGREES, MAX_FOCAL, PRIOR_DEVIATION, Uncertainty
+from .uncertainty import Uncertainty
 
 # Coefficients of distortion, in OpenCV's order; those of a fisheye are k1 … k4.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -76,7 +77,7 @@ class CameraUncertainty(Uncertainty):
         principal = [deviations.get(PRINCIPAL + k, 0.0) for k in (0, 1)]
         return CameraUncertainty(
             to_world @ covariance @ to_world.T, task.size, torch.empty(0, 3, dtype=torch.float64),
-            deviations.get(FOCAL_LENGTH, 0.0), MAX_CONTOUR_DEGREES if task.colorless else MAX_DEGREES,
+            deviations.get(FOCAL_LENGTH, 0.0), CAMERA.most_contour_degrees if task.colorless else CAMERA.most_degrees,
             camera.size[1] * torch.tensor(principal, dtype=torch.float64),
             torch.tensor([deviations[entry] for entry in dofs if entry >= DISTORTION], dtype=torch.float64),
             tuple(vague(camera, deviations)), own @ covariance[of_pose][:, of_pose] @ own.T,
@@ -96,10 +97,9 @@ def vague(camera: Camera, deviations: dict[int, float]) -> list[str]:
         if entry < FOCAL_LENGTH:
             continue
         share = deviation * reach(camera, entry)
-        # Where the prior says more than the pictures, the deviation exceeds √½ of PRIOR_DEVIATION.
-        if share <= MAX_FOCAL and deviation**2 <= 0.5 * PRIOR_DEVIATION**2:
+        # Where the prior says more than the pictures, the deviation exceeds √½ of CAMERA.prior_deviation.
+        if share <= CAMERA.most_focal and deviation**2 <= 0.5 * CAMERA.prior_deviation**2:
             continue
-        corner = f", {share:.0%} at the corners of the image"
         if entry == FOCAL_LENGTH:
             found.append(f"focal length known to ±{deviation:.0%} only")
         elif entry < DISTORTION:
@@ -107,7 +107,9 @@ def vague(camera: Camera, deviations: dict[int, float]) -> list[str]:
                 f"principal point known to ±{deviation * camera.size[1]:.2g} pixels in {'xy'[entry - PRINCIPAL]} only"
             )
         else:
-            found.append(f"{coefficient(camera, entry)} known to ±{deviation:.2g} only{corner}")
+            found.append(
+                f"{coefficient(camera, entry)} known to ±{deviation:.2g} only, {share:.0%} at the corners of the image"
+            )
     return found
 
 

@@ -24,13 +24,14 @@ from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..result import FitResult, delegated, made_folder
 from ..views import Images, cameras_of
-from .bundle_adjustment import MAX_ADJUST_STEPS, adjust_bundle
+from .bundle_adjustment import adjust_bundle
 from .camera_uncertainty import CameraUncertainty
 from .fit_pose import search_pose
 from .inputs import ArgumentNames
 from .loss_model import ColorLoss, LossSource, loss_source
 from .pose import Pose
 from .result import PoseFit, Step, with_own_history
+from .settings import CAMERA
 from .task import STEP_PARTS, Unknowns
 
 # Each part of a step moves one tensor of a camera.
@@ -184,7 +185,7 @@ def finished(search: PoseFit, cameras: Sequence[Camera], settings: Settings) -> 
     # A search by colours holds back numbers that the pictures hardly show; one by photographs is at its end.
     further = shown and isinstance(source, ColorLoss)
     try:
-        end = adjust_bundle([source], [pose], min(MAX_ADJUST_STEPS, settings.steps) if further else 0)
+        end = adjust_bundle([source], [pose], min(CAMERA.adjust_steps, settings.steps) if further else 0)
     except KeyboardInterrupt:
         return fitted(replace(search, interrupted=True, converged=False))
     rests = end.short if further else search.converged or search.reason.startswith("directions unknown")

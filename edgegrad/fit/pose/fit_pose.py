@@ -28,19 +28,18 @@ from ..by_camera import numbered, one_for_each
 from ..checkpoints import CheckpointFile, traits
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
-from ..row_order import MIN_IOU_GAIN, warn_of_flipped_rows
-from ..views import Images, cameras_of
-from .depth_units import warn_of_units
+from ..row_order import warn_of_flipped_rows
+from ..views import PICTURES, Images, cameras_of
 from .hypotheses import probabilities
 from .initial_pose import initial_pose
-from .inputs import ArgumentNames, warn_of_scale, without_colors
+from .inputs import ArgumentNames, warn_of_scale, warn_of_units, without_colors
 from .pose import Pose, angle, pose_from_matrix
 from .pose_search import Groups, PoseSearch, Report, anywhere, around, everywhere
 from .replay_log import ReplayLog
 from .result import PoseFit, PoseMode, with_own_history
-from .settings import POSE
+from .settings import CAMERA, POSE
 from .task import PoseTask, Unknowns
-from .uncertainty import MAX_SHIFT, Uncertainty
+from .uncertainty import Uncertainty
 
 MOST_STARTS = 1000
 SEARCHES = f'True, False, a number of starts from 2 to {MOST_STARTS}, or "global"'
@@ -213,7 +212,7 @@ def ambiguity(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None,
     same = others if symmetries is None else [other.closest(symmetries, pose) for other in others]
     apart = max((angle(pose.R, other.R) for other in same), default=0.0)
     away = max((task.between(pose, other) for other in same), default=0.0)
-    if apart < POSE.same_mode and away < MAX_SHIFT:
+    if apart < POSE.same_mode and away < CAMERA.most_shift:
         return ""
     other = f"turned by {math.degrees(apart):.0f}°" if apart >= POSE.same_mode else f"{away:.0%} of the size away"
     colors = "the mesh's colours, " if task.colorless else ""
@@ -297,7 +296,7 @@ def _warn_of_flipped_pictures(task: PoseTask, search: PoseSearch, place: bool) -
     start = initial_pose(turned) if place else search.start
     again = PoseSearch(turned, start, [None] * len(task.shots), settings)
     found = again.first_end()
-    if found >= max(again.enough, search.edge_support + MIN_IOU_GAIN):
+    if found >= max(again.enough, search.edge_support + PICTURES.iou_gain):
         warn_of_flipped_rows(
             search.task.names.images, f"it shows {found:.0%} of the render's edges, as given {search.edge_support:.0%}"
         )

@@ -20,9 +20,8 @@ from ..by_camera import numbered, one_for_each
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
-from .depth_units import warn_of_units
 from .fit_pose import ambiguity, depth_images, symmetries_of
-from .inputs import ArgumentNames, check_in_front, check_seen
+from .inputs import ArgumentNames, check_in_front, check_seen, warn_of_units
 from .pose import Pose, pose_from_matrix
 from .poses_search import PosesSearch
 from .result import PoseFit, with_own_history

@@ -7,12 +7,8 @@ from torch import Tensor
 
 from .inputs import depth_of
 from .pose import Pose
+from .settings import CAMERA
 from .task import PoseTask, TargetView, focal_of
-
-DEFAULT_FILL = 0.5  # Share of the picture's shorter side that an object fills when nothing else is known.
-MIN_OVERLAP = (
-    0.3  # Least intersection over union of the object's box and the mask's at which the file's pose is accepted.
-)
 
 
 def initial_pose(task: PoseTask) -> Pose:
@@ -30,11 +26,11 @@ def initial_pose(task: PoseTask) -> Pose:
     wanted = _mask_box(shot) if "alpha" in task.aovs and not task.clutter else None
     if seen is not None:
         inside = bool((seen[1] > 0).all()) and bool((seen[0] < torch.tensor([W, H])).all())
-        if inside and (wanted is None or _overlap(seen, wanted) > MIN_OVERLAP):
+        if inside and (wanted is None or _overlap(seen, wanted) > CAMERA.least_overlap):
             return identity
     if wanted is None:
         middle = torch.tensor([0.5 * W, 0.5 * H], dtype=torch.float64)
-        across = DEFAULT_FILL * min(H, W)
+        across = CAMERA.default_fill * min(H, W)
     else:
         middle, across = (wanted[0] + wanted[1]) / 2, float((wanted[1] - wanted[0]).max())
     # From a random side, a box is about 0.8 of its diagonal wide.

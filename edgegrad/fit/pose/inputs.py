@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -17,8 +18,7 @@ from ..by_camera import numbered, one_for_each
 from ..region import VISIBLE
 from ..views import cameras_of
 from .pose import Pose
-
-CHECK_SPP = 4  # samples a pixel
+from .settings import CAMERA, POSE
 
 
 class ArgumentNames(NamedTuple):
@@ -62,7 +62,7 @@ def check_seen(name: str, scene: Scene, cameras: Sequence[Camera], pose: Pose) -
     moved = scene.transformed(pose.R, pose.t, pose.scale)
     with torch.no_grad():
         covered = sum(
-            float(render_aovs(without_colors(moved), camera, ["alpha"], CHECK_SPP, 0)["alpha"].sum())
+            float(render_aovs(without_colors(moved), camera, ["alpha"], CAMERA.check_spp, 0)["alpha"].sum())
             for camera in cameras
         )
     if covered < VISIBLE:
@@ -94,3 +94,31 @@ def depth_of(camera: Camera, pose: Pose, point: Tensor) -> Tensor:
     """Return the depth of a point of the mesh along the camera's axis."""
     view = camera.world_to_camera.double()
     return (view[:3, :3] @ (pose.matrix[:3, :3] @ point + pose.t) + view[:3, 3])[2]
+
+
+def warn_of_units(scene: Scene, cameras: Sequence[Camera], depths: Sequence[Tensor | None], where: str) -> None:
+    """Warn where depth images (H, W), NaN without a measurement, have units other than the scene's, with its meshes where they
+    are expected. The depth term would reject all such measurements."""
+    measured, expected = [], []
+    for camera, depth in zip(cameras, depths, strict=True):
+        if depth is None:
+            continue
+        with torch.no_grad():
+            seen = render_aovs(without_colors(scene), camera, ["depth", "alpha"], CAMERA.check_spp, 0)
+        alpha = seen["alpha"][..., 0]
+        inside = (alpha > 0.5) & depth.isfinite()
+        measured.append(depth[inside].double())
+        expected.append((seen["depth"][..., 0] / alpha.clamp(min=0.5))[inside].double())
+    if sum(map(len, measured)) < POSE.min_depth_pixels:
+        return
+    there, here = (float(torch.cat(values).median()) for values in (measured, expected))
+    ratio = here / there
+    if not 1.0 / CAMERA.unit_factor < ratio < CAMERA.unit_factor:
+        power = round(math.log10(ratio))
+        scale = 10.0**power if abs(math.log10(ratio) - power) < 0.15 else ratio
+        warn(
+            f"units of depth {scale:.2g}",
+            f"depths: expected distances in world units, those of the mesh and the camera, got {there:.3g} in the middle where "
+            f"the object is {where}, {here:.3g} away; so depth counts for nothing. If its units are others, multiply it by "
+            f"{scale:.2g}",
+        )

@@ -3,7 +3,7 @@
 The loss L = Σ ρ(r_p) over pixels p has the curvature H = Σ w_p J_p J_pᵀ and the gradient g = Σ s_p with scores s_p = w_p r_p
 J_p. Noise of the pictures gives g the covariance S = Σ E[s_p s_qᵀ] over pairs of pixels, and the numbers that minimise L the
 covariance H⁻¹ S H⁻¹ (Huber, The Behavior of Maximum Likelihood Estimates under Nonstandard Conditions, 1967). Errors of
-edges, blur and shadows correlate in pixels nearby. So pairs less than CORRELATION_LENGTH pixels apart count, with Bartlett's
+edges, blur and shadows correlate in pixels nearby. So pairs less than POSE.correlation_length pixels apart count, with Bartlett's
 weights, which keep S positive (Newey and West, A Simple, Positive Semi-Definite, Heteroskedasticity and Autocorrelation
 Consistent Covariance Matrix, 1987).
 """
@@ -28,7 +28,6 @@ from .pose import Pose
 from .robust_loss import MIN_WIDTH, Comparison
 from .settings import POSE
 from .task import PoseTask
-from .uncertainty import CORRELATION_LENGTH
 
 
 class LossModel(NamedTuple):
@@ -97,7 +96,7 @@ class PhotoLoss:
         model = self.objective.model([pose])
         assert isinstance(model.gradient, Tensor) and isinstance(model.curvature, Tensor)
         cost, curvature = float(model.cost), model.curvature[0]
-        return LossModel(curvature, model.gradient[0], CORRELATION_LENGTH**2 * curvature, cost, abs(cost), 1.0)
+        return LossModel(curvature, model.gradient[0], POSE.correlation_length**2 * curvature, cost, abs(cost), 1.0)
 
     def judged(self, pose: Pose) -> tuple[float, float]:
         """Return the loss, and the share of the render's edges that the pictures show."""
@@ -121,7 +120,7 @@ def loss_source(task: PoseTask, pose: Pose, settings: Settings) -> LossSource:
 
 def score_covariance(scores: Tensor) -> Tensor:
     """Return S (n, n) from the scores (n, h, w) of one picture's pixels."""
-    side = round(CORRELATION_LENGTH)
+    side = round(POSE.correlation_length)
     # Products of sums over windows count a pair of pixels once for each window that holds both: Bartlett's weights.
     padded = F.pad(scores[None], (side - 1,) * 4)
     sums = side * F.avg_pool2d(padded, side, stride=1)[0].flatten(1)

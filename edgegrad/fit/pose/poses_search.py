@@ -25,8 +25,8 @@ from .likelihood.objective import pose_levels
 from .likelihood.support import edge_share, enough_support
 from .pose import Pose, angle
 from .pose_search import ambiguous
-from .result import MIN_VISIBLE_SHARE, Step
-from .settings import POSE
+from .result import Step
+from .settings import CAMERA, POSE
 from .task import PoseTask
 from .uncertainty import information_of
 
@@ -57,7 +57,7 @@ class PosesSearch:
     def converged(self) -> list[bool]:
         found = zip(self.modes, self.edge_support, self.needed, self.visible, strict=True)
         return [
-            bool(modes) and modes[0].rests and share >= needed and seen >= MIN_VISIBLE_SHARE
+            bool(modes) and modes[0].rests and share >= needed and seen >= CAMERA.least_visible
             for modes, share, needed, seen in found
         ]  # fmt: skip
 
@@ -97,7 +97,7 @@ class PosesSearch:
         """Find the pose of one object, while the others stay. After the `first` time it is refined on the last level alone."""
         self.seeking = k
         task, visible = self._uncovered(k)
-        if visible < MIN_VISIBLE_SHARE:
+        if visible < CAMERA.least_visible:
             return
         poses = turned(task, self.best[k]) if first and self.further else [self.best[k]]
         search = HypothesisSearch(

@@ -20,15 +20,13 @@ from ..ending import Ending, reason_of
 from ..history import number_or_none
 from ..result import FitResult, made_folder
 from .pose import Pose, pose_from_matrix
-from .uncertainty import MAX_FOCAL, Uncertainty
+from .settings import CAMERA
+from .uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from .task import PoseTask
-
-
-MIN_VISIBLE_SHARE = 0.1  # With a smaller share of the object left by others in front, its pose is not accepted.
 
 
 class Step(NamedTuple):
@@ -96,7 +94,7 @@ class PoseFit(FitResult):
         These are "edges not explained: …", "hidden: …", "in one place: …", "ambiguous: …", "directions unknown: …", "steps
         ran out: …" and "interrupted".
         """
-        if not self.interrupted and not self.converged and self.visible < MIN_VISIBLE_SHARE:
+        if not self.interrupted and not self.converged and self.visible < CAMERA.least_visible:
             return f"hidden: the other objects leave {self.visible:.0%} of it to be seen; its pose is about its start's"
         if self.conflict and not self.interrupted:
             return self.conflict
@@ -105,7 +103,7 @@ class PoseFit(FitResult):
         if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < self.enough:
             return words
         fix = "give the mesh's colours, symmetries of the mesh, depth, or another picture"
-        if self.uncertainty.focal > MAX_FOCAL:
+        if self.uncertainty.focal > CAMERA.most_focal:
             fix = "give a picture from nearer, where perspective shows, or the lens as it was calibrated"
         return f"directions unknown: {self.uncertainty.unknown}; {fix}"
 

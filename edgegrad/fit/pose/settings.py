@@ -94,3 +94,83 @@ class PoseSettings:
 
 
 POSE = PoseSettings()
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of the search near matches of views."""
+
+    across: int  # pixels of the object's diagonal in the views
+    turn: float  # radians, about each axis
+    grow: float  # relative change of the size
+    kept: int
+    turned: float  # radians between kept matches, see Matches.distinct()
+    spacing: float  # between kept matches, in the object's size
+
+
+@dataclass(frozen=True)
+class TemplateSettings:
+    """Numbers of the search of a whole picture by views of the object (photo/)."""
+
+    # Views.
+    directions: int = 96  # of views; with `rolls` rotations about each, they are some 20° apart
+    rolls: int = 18
+    view_pixels: int = 20  # pixels of the object's diagonal in the first views
+    view_fill: float = 0.6  # share of the picture's shorter side that an object fills, for the perspective of views
+    least_depth: float = 1.2  # of the object's centre, in its sizes
+    ring: float = 0.1  # margin around the object's box for the background, in its diagonal
+    spp: int = 4  # samples a pixel
+    # Places in the picture.
+    smallest: float = 0.25  # the object's diagonal, relative to the picture's shorter side
+    largest: float = 1.25
+    size_ratio: float = 1.2  # between two sizes
+    stride: int = 2  # pixels between two places
+    places_per_view: int = 3  # at one size
+    # Pixels nearby correlate: of an object with unusual colours all pixels are informative, of others hardly any.
+    rare_weights: tuple[float, float] = (0.4, 1.0)
+    most_ranked: int = 1500  # matches that are compared with one another
+    mip_ratio: float = 1.15  # between two sizes of the picture
+    shift_pixels: int = 2  # by which a match is moved to all sides
+    size_spacing: float = 1.1  # factor between the sizes of distinct matches
+    distinct_places: tuple[int, float, float, float] = (24, 0.3, 0.15, 1.3)  # arguments of Matches.distinct()
+    fewer_with_mask: int = 2  # A mask shows where the object is: matches are fewer by this factor.
+    coarse_round: Round = Round(20, 0.2, 0.1, 200, 0.2, 0.1)
+    beam_rounds: tuple[Round, ...] = (
+        Round(20, 0.17, 0.1, 100, 0.1, 0.05), Round(32, 0.12, 0.07, 40, 0.1, 0.05), Round(32, 0.07, 0.04, 16, 0.15, 0.1),
+    )  # fmt: skip
+    # How well a view matches.
+    batch: int = 64  # views
+    noise: float = 0.06  # standard deviation of a pixel in sRGB values, by noise and by the views' spacing
+    light_slope: float = 0.3  # standard deviation of slopes of the light, relative to its constant
+    light_tint: float = 0.15  # standard deviation of the light's colour
+    mask_weight: float = 0.25  # of a mask's error relative to that of colours
+    color_bandwidth: float = 0.08  # standard deviation of similar colours, sRGB values
+    sampled_pixels: int = 1500  # that estimate the density of colours
+
+
+TEMPLATES = TemplateSettings()
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Numbers of fits of cameras, and of what all pose fits check at start and end."""
+
+    # What counts as known; lengths are in sizes of the object.
+    prior_deviation: float = 1.0  # radians and sizes: standard deviation of what the pictures do not show at all
+    most_degrees: float = 5.0  # Directions with a larger standard deviation are unknown.
+    most_shift: float = 0.05
+    most_focal: float = 0.03  # relative to the focal length
+    most_contour_degrees: float = 2.0  # by a contour alone: rotations known to ±2.2° … 5° were 2° … 8° off
+    least_visible: float = 0.1  # With a smaller share left by objects in front, a pose is not accepted.
+    # Steps of all poses and the lens at once.
+    adjust_steps: int = 12
+    short_step: float = 0.5  # mean standard deviations: noise of the renders moves steps as far
+    lens_unit: float = 10.0  # Numbers of the lens may move so many times as far as those of a pose.
+    # The start.
+    check_spp: int = 4  # samples a pixel of renders for checks
+    unit_factor: float = 4.0  # Depths that are off by a larger factor have other units.
+    default_fill: float = 0.5  # share of the picture's shorter side that an object fills if nothing else is known
+    least_overlap: float = 0.3  # IoU of the boxes of object and mask at which the mesh file's pose is accepted
+
+
+CAMERA = CameraSettings()

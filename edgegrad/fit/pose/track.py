@@ -28,18 +28,17 @@ from ..modes import in_full_precision
 from ..options import FitOptions, Settings
 from ..region import Palette
 from ..views import check_image
-from .depth_units import warn_of_units
 from .fit_pose import depth_image
 from .hypotheses import HypothesisSearch
-from .inputs import ArgumentNames, check_in_front, check_seen, depth_of
+from .inputs import ArgumentNames, check_in_front, check_seen, depth_of, warn_of_units
 from .likelihood.light import harmonics_of
 from .likelihood.objective import PoseLevel, pose_levels
 from .likelihood.support import edge_share, enough_support
-from .photo.match import VIEW_PIXELS, places
+from .photo.match import places
 from .photo.template_views import TemplateViews, across, ball
 from .pose import Pose, pose_from_matrix, rotation_vector
 from .result import PoseFit
-from .settings import POSE
+from .settings import POSE, TEMPLATES
 from .task import PoseTask, Unknowns
 
 FrameLike = Tensor | PathLike
@@ -322,7 +321,7 @@ class Tracker:
         rotations = ball(TRACK.views, TRACK.view_radius) @ (camera.world_to_camera[:3, :3] @ self.good.R)
         far = float(depth_of(camera, self.good, task.center))
         size = across(unit, camera, far) / min(camera.size)
-        views = TemplateViews.from_rotations(unit, rotations, VIEW_PIXELS, self.settings.seed)
+        views = TemplateViews.from_rotations(unit, rotations, TEMPLATES.view_pixels, self.settings.seed)
         views, lit = self._lit(views, camera)
         found = places(unit, views, (size / TRACK.size_factor, size * TRACK.size_factor), lit)
         poses = [pose._replace(scale=scale) for pose in found[: TRACK.matches]]

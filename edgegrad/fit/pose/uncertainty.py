@@ -16,15 +16,8 @@ from torch import Tensor
 
 from ...scene.symmetries import Symmetries
 from .pose import Pose
+from .settings import CAMERA, POSE
 from .task import FOCAL_LENGTH, ROTATION, SCALE, PoseTask
-
-PRIOR_DEVIATION = 1.0  # Standard deviation, in radians and object sizes, of what the pictures do not show at all.
-# Shadows, blur and errors of the light model correlate in pixels nearby: errors of fits to lit pictures are so many times
-# larger than independent pixels would make them, as measured.
-CORRELATION_LENGTH = 8.0
-# Directions known less exactly than this, in degrees or object sizes, count as unknown; so does a relative focal length.
-MAX_DEGREES, MAX_SHIFT, MAX_FOCAL = 5.0, 0.05, 0.03
-MAX_CONTOUR_DEGREES = 2.0  # The limit for a contour alone: rotations known to ±2.2° … 5° were 2° … 8° off.
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +40,7 @@ class Uncertainty:
     size: float
     free: Tensor
     focal: float = 0.0
-    most: float = MAX_DEGREES
+    most: float = CAMERA.most_degrees
 
     @property
     def degrees(self) -> float:
@@ -101,11 +94,11 @@ class Uncertainty:
         parts = []
         if self.degrees > self.most:
             parts.append(f"rotation about {_named(self.axis)} known to ±{self.degrees:.0f}° only")
-        if self.shift > MAX_SHIFT * self.size:
+        if self.shift > CAMERA.most_shift * self.size:
             parts.append(
                 f"place along {_named(self.direction)} known to ±{self.shift / self.size:.0%} of the size only"
             )
-        if self.focal > MAX_FOCAL:
+        if self.focal > CAMERA.most_focal:
             parts.append(f"focal length known to ±{self.focal:.0%} only")
         return ", ".join(parts)
 
@@ -122,7 +115,7 @@ class Uncertainty:
         task: PoseTask, pose: Pose, information: Tensor, dofs: list[int], symmetries: Symmetries | None
     ) -> Uncertainty:
         """Return the uncertainty from the inverse covariance (n, n) of the entries `dofs` of a step."""
-        prior = torch.eye(len(dofs), dtype=torch.float64) / PRIOR_DEVIATION**2
+        prior = torch.eye(len(dofs), dtype=torch.float64) / CAMERA.prior_deviation**2
         inverse = torch.linalg.inv(information + prior)
         entries = torch.zeros(SCALE, SCALE, dtype=torch.float64)
         known = [k for k, entry in enumerate(dofs) if ROTATION <= entry < SCALE]
@@ -135,13 +128,13 @@ class Uncertainty:
         focal = (
             float(inverse[dofs.index(FOCAL_LENGTH), dofs.index(FOCAL_LENGTH)].sqrt()) if FOCAL_LENGTH in dofs else 0.0
         )
-        most = MAX_CONTOUR_DEGREES if task.colorless else MAX_DEGREES
+        most = CAMERA.most_contour_degrees if task.colorless else CAMERA.most_degrees
         return Uncertainty(to_world @ entries @ to_world.T, task.size, spun, focal, most)
 
 
 def information_of(curvature: Tensor) -> Tensor:
     """Return the inverse covariance for a log likelihood's JᵀJ, which counts the errors of pixels as independent."""
-    return curvature / CORRELATION_LENGTH**2
+    return curvature / POSE.correlation_length**2
 
 
 def _widest(block: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,21 +19,11 @@ from ....camera.poses import rotation
 from ....files.image import linear_to_srgb
 from ...views import area_mean
 from ..pose import Pose
+from ..settings import TEMPLATES, Round
 from ..target_images import scaled
 from ..task import PoseTask
 from .template_views import TemplateViews, across, all_sides, pose_at
 from .templates import Templates, surprise
-
-# The object's diagonal relative to the picture's shorter side, and the ratio between two sizes.
-SMALLEST_SIZE, LARGEST_SIZE, SIZE_RATIO = 0.25, 1.25, 1.2
-VIEW_PIXELS = 20  # pixels of the object's diagonal in the first views
-STRIDE = 2  # pixels between two places
-# Pixels nearby correlate: of an object with unusual colours all pixels are informative, of one with common colours hardly any.
-RARE_COLOR_WEIGHTS = (0.4, 1.0)
-PLACES_PER_VIEW = 3  # at one size
-MAX_RANKED = 1500  # most matches that are compared with one another
-MIP_RATIO = 1.15  # ratio between two sizes of the picture
-MAX_SHIFT_PIXELS = 2  # pixels by which a match is moved to all sides
 
 
 @dataclass(frozen=True)
@@ -59,7 +49,7 @@ class Matches:
         """Return the best matches, the best first, that differ from one another. Of two whose angle is below `turned` radians,
         whose distance is below `spacing` of their size, and whose sizes differ by less than the factor `sized`, the better one
         is kept."""
-        ranked = self.select(self.scores.argsort(descending=True, stable=True)[:MAX_RANKED])
+        ranked = self.select(self.scores.argsort(descending=True, stable=True)[: TEMPLATES.most_ranked])
         flat = ranked.rotations.flatten(1)
         cosine = 0.5 * (flat @ flat.T - 1.0)
         larger = torch.maximum(ranked.pixels[:, None], ranked.pixels)
@@ -75,6 +65,10 @@ class Matches:
             free[first] = False
         return ranked.select(torch.tensor(kept, dtype=torch.long))
 
+    def best_of(self, one: Round, fewer: int) -> Matches:
+        """Return the distinct matches that a round keeps, fewer by a factor."""
+        return self.distinct(one.kept // fewer, one.turned, one.spacing, TEMPLATES.size_spacing)
+
     def poses(self, task: PoseTask) -> list[Pose]:
         camera = task.shots[0].camera
         found = []
@@ -82,29 +76,6 @@ class Matches:
             depth = 2.0 * task.size if camera.projection == "orthographic" else across(task, camera, 1.0) / pixels
             found.append(pose_at(task, R, position, depth))
         return found
-
-
-@dataclass(frozen=True)
-class Round:
-    """One round of the search near matches."""
-
-    across: int  # pixels of the object's diagonal in the views
-    turn: float  # radians, about each axis
-    grow: float  # relative change of the size
-    kept: int
-    turned: float  # radians between kept matches, see Matches.distinct()
-    spacing: float
-
-
-COARSE_ROUND = Round(VIEW_PIXELS, 0.2, 0.1, 200, 0.2, 0.1)
-BEAM_ROUNDS = (
-    Round(20, 0.17, 0.1, 100, 0.1, 0.05),
-    Round(32, 0.12, 0.07, 40, 0.1, 0.05),
-    Round(32, 0.07, 0.04, 16, 0.15, 0.1),
-)  # fmt: skip
-FEWER_WITH_MASK = 2  # A mask shows where the object is, so fewer matches are kept.
-DISTINCT_PLACES = 24, 0.3, 0.15, 1.3  # arguments of Matches.distinct() for given views
-SIZE_SPACING = 1.1  # factor between the sizes of distinct matches
 
 
 class Mips:
@@ -120,7 +91,7 @@ class Mips:
         colors = linear_to_srgb(radiance if mask is None else radiance * (mask > 0.0))
         self.picture = colors if mask is None else torch.cat([colors, mask], -1)
         self.size = shot.camera.size
-        self.factor = 1.0 if self.masked else min(1.0, finest / (SMALLEST_SIZE * min(self.size)))
+        self.factor = 1.0 if self.masked else min(1.0, finest / (TEMPLATES.smallest * min(self.size)))
         self._levels: dict[int, Tensor] = {}
 
     def reduced(self, factor: float) -> Tensor:
@@ -131,14 +102,14 @@ class Mips:
     def crops(self, positions: Tensor, pixels: Tensor, across: int, side: int) -> Tensor:
         """Return crops (n, C + 1, side, side) around positions (n, 2), `across` of whose pixels are as long as so many (n,)
         of the picture."""
-        wanted = ((self.factor * pixels / across).log() / math.log(MIP_RATIO)).round().clamp(min=0).long()
+        wanted = ((self.factor * pixels / across).log() / math.log(TEMPLATES.mip_ratio)).round().clamp(min=0).long()
         steps = torch.arange(side, dtype=torch.float64) + 0.5 - 0.5 * side
         H, W = self.size
         found = None
         for level in wanted.unique().tolist():
             rows = (wanted == level).nonzero()[:, 0]
             if level not in self._levels:
-                self._levels[level] = self.reduced(self.factor * MIP_RATIO**-level)
+                self._levels[level] = self.reduced(self.factor * TEMPLATES.mip_ratio**-level)
             image = self._levels[level]
             offsets = (pixels[rows] / across)[:, None] * steps
             x = 2.0 * (positions[rows, :1] + offsets) / W - 1.0
@@ -157,19 +128,19 @@ class Mips:
 def matches(task: PoseTask, seed: int, report: Callable[[str], object]) -> list[Pose]:
     """Return the best poses in the first picture, distinct, the best first. The mask, where there is one, shows where they
     are. `report` is called with what is done next."""
-    mips = Mips(task, max(one.across for one in BEAM_ROUNDS))
+    mips = Mips(task, max(one.across for one in TEMPLATES.beam_rounds))
     report("views from all sides")
-    views = TemplateViews.from_rotations(task, all_sides(), VIEW_PIXELS, seed)
-    fewer = FEWER_WITH_MASK if mips.masked else 1
+    views = TemplateViews.from_rotations(task, all_sides(), TEMPLATES.view_pixels, seed)
+    fewer = TEMPLATES.fewer_with_mask if mips.masked else 1
     rankings = []
-    for rare in RARE_COLOR_WEIGHTS[:1] if mips.masked else RARE_COLOR_WEIGHTS:
+    for rare in TEMPLATES.rare_weights[:1] if mips.masked else TEMPLATES.rare_weights:
         found = _in_mask(views, mips) if mips.masked else _everywhere(views, mips, _ratios(views, rare))
-        found = found.distinct(COARSE_ROUND.kept // fewer, COARSE_ROUND.turned, COARSE_ROUND.spacing, SIZE_SPACING)
-        for k, one in enumerate(BEAM_ROUNDS):
+        found = found.best_of(TEMPLATES.coarse_round, fewer)
+        for k, one in enumerate(TEMPLATES.beam_rounds):
             if len(found.scores):
-                report(f"views nearby, {k + 1} of {len(BEAM_ROUNDS)}")
+                report(f"views nearby, {k + 1} of {len(TEMPLATES.beam_rounds)}")
                 found = closer(task, found, mips, one, rare, seed)
-                found = found.distinct(one.kept // fewer, one.turned, one.spacing, SIZE_SPACING)
+                found = found.best_of(one, fewer)
         rankings.append(found.poses(task))
     return [pose for pair in zip_longest(*rankings) for pose in pair if pose is not None]
 
@@ -177,8 +148,8 @@ def matches(task: PoseTask, seed: int, report: Callable[[str], object]) -> list[
 def places(task: PoseTask, views: TemplateViews, sizes: tuple[float, float], lit: bool) -> list[Pose]:
     """Return the best places of some views in the first picture, distinct, the best first. The object's diagonal is between
     two `sizes`, relative to the picture's shorter side. `lit`: the views are in the light of the picture."""
-    score = _errors(views) if lit else _ratios(views, RARE_COLOR_WEIGHTS[0])
-    return _everywhere(views, Mips(task, views.across), score, sizes).distinct(*DISTINCT_PLACES).poses(task)
+    score = _errors(views) if lit else _ratios(views, TEMPLATES.rare_weights[0])
+    return _everywhere(views, Mips(task, views.across), score, sizes).distinct(*TEMPLATES.distinct_places).poses(task)
 
 
 # A score takes a picture (C + 1, h, w), and how many pixels of the whole picture are across the object.
@@ -188,7 +159,7 @@ Score = Callable[[Tensor, float], Tensor]
 def _ratios(views: TemplateViews, rare: float) -> Score:
     """Return a score by weighted log likelihood ratios: larger objects have more pixels, and these correlate."""
     templates = Templates(views, rare)
-    return lambda picture, pixels: templates.everywhere(picture, STRIDE) * pixels
+    return lambda picture, pixels: templates.everywhere(picture, TEMPLATES.stride) * pixels
 
 
 def _errors(views: TemplateViews) -> Score:
@@ -200,28 +171,28 @@ def _errors(views: TemplateViews) -> Score:
 
     def score(picture: Tensor, pixels: float) -> Tensor:
         colors = picture[:-1]
-        squares = F.conv2d(colors.square().sum(0)[None, None], inside[:, None], stride=STRIDE)[0]
-        return -(squares - 2.0 * F.conv2d(colors[None], weighted, stride=STRIDE)[0] + own) / area
+        squares = F.conv2d(colors.square().sum(0)[None, None], inside[:, None], stride=TEMPLATES.stride)[0]
+        return -(squares - 2.0 * F.conv2d(colors[None], weighted, stride=TEMPLATES.stride)[0] + own) / area
 
     return score
 
 
 def _everywhere(
-    views: TemplateViews, mips: Mips, score: Score, sizes: tuple[float, float] = (SMALLEST_SIZE, LARGEST_SIZE)
+    views: TemplateViews, mips: Mips, score: Score, sizes: tuple[float, float] = (TEMPLATES.smallest, TEMPLATES.largest)
 ) -> Matches:
     (H, W), T = mips.size, views.alpha.shape[-1]
     margin = T // 3
     rotations, positions, extents, values = [], [], [], []
-    for k in range(1 + math.floor(math.log(sizes[1] / sizes[0]) / math.log(SIZE_RATIO))):
-        pixels = sizes[0] * SIZE_RATIO**k * min(H, W)  # across the object, in the picture
+    for k in range(1 + math.floor(math.log(sizes[1] / sizes[0]) / math.log(TEMPLATES.size_ratio))):
+        pixels = sizes[0] * TEMPLATES.size_ratio**k * min(H, W)  # across the object, in the picture
         picture = mips.reduced(min(1.0, views.across / pixels))
         h, w = picture.shape[1:]
         if min(h, w) + 2 * margin < T:
             continue
         scores = score(F.pad(picture[None], (margin,) * 4, mode="replicate")[0], pixels)
         columns = scores.shape[-1]
-        best, at = scores.flatten(1).topk(min(PLACES_PER_VIEW, scores[0].numel()))
-        middle = torch.stack([at % columns, at // columns], -1).double() * STRIDE + 0.5 * T - margin
+        best, at = scores.flatten(1).topk(min(TEMPLATES.places_per_view, scores[0].numel()))
+        middle = torch.stack([at % columns, at // columns], -1).double() * TEMPLATES.stride + 0.5 * T - margin
         positions.append((middle * torch.tensor([W / w, H / h], dtype=torch.float64)).flatten(0, 1))
         rotations.append(views.rotations.repeat_interleave(best.shape[1], 0))
         extents.append(torch.full((best.numel(),), pixels, dtype=torch.float64))
@@ -268,13 +239,15 @@ def fitted(task: PoseTask, given: Matches, mips: Mips, one: Round, rare: float, 
     best = given
     for factor in (1.0 - one.grow, 1.0, 1.0 + one.grow):
         pixels = factor * given.pixels
-        scores = templates.near(mips.crops(given.positions, pixels, one.across, T + 2 * MAX_SHIFT_PIXELS), mips.masked)
+        scores = templates.near(
+            mips.crops(given.positions, pixels, one.across, T + 2 * TEMPLATES.shift_pixels), mips.masked
+        )
         values, places = scores.flatten(1).max(1)
         if not mips.masked:
             values = values * pixels.float()
-        side = 2 * MAX_SHIFT_PIXELS + 1
+        side = 2 * TEMPLATES.shift_pixels + 1
         shift = (
-            torch.stack([places % side - MAX_SHIFT_PIXELS, places // side - MAX_SHIFT_PIXELS], -1)
+            torch.stack([places % side - TEMPLATES.shift_pixels, places // side - TEMPLATES.shift_pixels], -1)
             * (pixels / one.across)[:, None]
         )
         up = values > best.scores

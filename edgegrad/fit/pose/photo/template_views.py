@@ -16,13 +16,8 @@ from ....files.image import linear_to_srgb
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
 from ..pose import Pose
+from ..settings import TEMPLATES
 from ..task import PoseTask, focal_of
-
-RING_SHARE = 0.1  # margin around the object's box, in its diagonal, for the background
-DIRECTIONS, ROLLS = 96, 18  # directions of views, and rotations about each; some 20° apart
-VIEW_FILL = 0.6  # share of the picture's shorter side that an object fills for the perspective of its views
-VIEW_SPP = 4
-MIN_VIEW_DEPTH = 1.2  # depth of the object's centre, in its sizes
 
 
 @dataclass(frozen=True)
@@ -38,16 +33,16 @@ class TemplateViews:
     @property
     def ring(self) -> int:
         """The number of pixels around the object's box."""
-        return round(RING_SHARE * self.across)
+        return round(TEMPLATES.ring * self.across)
 
     @staticmethod
     def from_rotations(task: PoseTask, rotations: Tensor, pixels: int, seed: int) -> TemplateViews:
         """Render the object so many pixels large, as on the axis of the first picture's camera."""
-        camera, side = task.shots[0].camera, pixels + 2 * round(RING_SHARE * pixels)
+        camera, side = task.shots[0].camera, pixels + 2 * round(TEMPLATES.ring * pixels)
         perspective = camera.projection != "orthographic"
         depth = 2.0 * task.size
         if perspective:
-            depth = task.size * max(focal_of(camera) / (VIEW_FILL * min(camera.size)), MIN_VIEW_DEPTH)
+            depth = task.size * max(focal_of(camera) / (TEMPLATES.view_fill * min(camera.size)), TEMPLATES.least_depth)
         K = torch.eye(3, dtype=torch.float64)
         K[:2, :2] = camera.K[:2, :2] * (pixels / across(task, camera, depth))
         K[:2, 2] = 0.5 * side
@@ -60,7 +55,7 @@ class TemplateViews:
         if shape_only:
             scene = Scene([Mesh(mesh.verts, mesh.faces) for mesh in scene.meshes])
         with torch.no_grad():
-            seen = render_aovs(scene, cameras, names if shape_only else [*names, "image"], VIEW_SPP, seed)
+            seen = render_aovs(scene, cameras, names if shape_only else [*names, "image"], TEMPLATES.spp, seed)
         alpha = seen["alpha"].float()
         normals = F.normalize(seen["normal"].float(), dim=-1, eps=1e-6)
         channels = task.shots[0].target.shape[-1] - ("alpha" in task.aovs and not task.clutter)
@@ -92,13 +87,13 @@ def pose_at(task: PoseTask, R: Tensor, position: Tensor, depth: float) -> Pose:
 
 
 def all_sides() -> Tensor:
-    """Return the rotations (DIRECTIONS · ROLLS, 3, 3): directions on Fibonacci's sphere, each rotated about itself."""
-    k = torch.arange(DIRECTIONS, dtype=torch.float64)
-    z = 1.0 - (2.0 * k + 1.0) / DIRECTIONS
+    """Return the rotations (directions · rolls, 3, 3): directions on Fibonacci's sphere, each rotated about itself."""
+    k = torch.arange(TEMPLATES.directions, dtype=torch.float64)
+    z = 1.0 - (2.0 * k + 1.0) / TEMPLATES.directions
     longitude = math.pi * (3.0 - math.sqrt(5.0)) * k
     first = _rotations(torch.stack([torch.zeros_like(k), torch.acos(z), torch.zeros_like(k)], -1))
     second = _rotations(torch.stack([torch.zeros_like(k), torch.zeros_like(k), longitude], -1))
-    turn = torch.arange(ROLLS, dtype=torch.float64) * (2.0 * math.pi / ROLLS)
+    turn = torch.arange(TEMPLATES.rolls, dtype=torch.float64) * (2.0 * math.pi / TEMPLATES.rolls)
     turns = _rotations(torch.stack([torch.zeros_like(turn), torch.zeros_like(turn), turn], -1))
     return (turns[None] @ (first @ second)[:, None]).flatten(0, 1)
 

@@ -16,15 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..settings import TEMPLATES
 from .template_views import TemplateViews
-
-VIEWS_PER_BATCH = 64
-TEMPLATE_NOISE = 0.06  # standard deviation of a pixel in sRGB values, by noise and by the views' spacing
-LIGHT_SLOPE = 0.3  # slopes of the light, relative to its constant
-LIGHT_TINT = 0.15  # colour of the light
-MASK_WEIGHT = 0.25  # weight of a mask's error relative to that of colours
-COLOR_BANDWIDTH = 0.08  # standard deviation of similar colours, sRGB values
-SAMPLED_PIXELS = 1500  # number of pixels that estimate the density of colours
 
 
 class Templates:
@@ -51,8 +44,8 @@ class Templates:
         parts = []
         sides = torch.stack([self.inside, self.around], 1)
         colors, surprise = picture[:-1], picture[-1]
-        for at in range(0, len(self.inside), 2 * VIEWS_PER_BATCH):
-            rows = slice(at, at + 2 * VIEWS_PER_BATCH)
+        for at in range(0, len(self.inside), 2 * TEMPLATES.batch):
+            rows = slice(at, at + 2 * TEMPLATES.batch)
             n = len(self.inside[rows])
             b, sums = [], []
             for c in range(self.C):
@@ -72,8 +65,8 @@ class Templates:
         channel is surprise(), or a mask. With a mask, the score is the likelihood of colours and mask, for a view of the same
         size."""
         parts = []
-        for at in range(0, len(crops), VIEWS_PER_BATCH):
-            rows = slice(at, at + VIEWS_PER_BATCH)
+        for at in range(0, len(crops), TEMPLATES.batch):
+            rows = slice(at, at + TEMPLATES.batch)
             colors, last = crops[rows, :-1], crops[rows, -1:]
             sides = torch.stack([self.inside[rows], self.around[rows]], 1)
             n, k = len(sides), crops.shape[-1] - sides.shape[-1] + 1
@@ -85,9 +78,9 @@ class Templates:
                 alpha = self.alpha[rows, None]
                 of_masks = _one_by_one(last[:, 0].square(), torch.ones_like(alpha))
                 shape = of_masks - 2.0 * _one_by_one(last[:, 0], alpha) + alpha.square().sum((2, 3), keepdim=True)
-                error = self._error(b, squares[:, 0], rows) + MASK_WEIGHT * shape[:, 0].clamp(min=0.0)
+                error = self._error(b, squares[:, 0], rows) + TEMPLATES.mask_weight * shape[:, 0].clamp(min=0.0)
                 parts.append(
-                    -torch.log(error / self.alpha[rows].sum((1, 2)).clamp(min=1.0)[:, None, None] + TEMPLATE_NOISE**2)
+                    -torch.log(error / self.alpha[rows].sum((1, 2)).clamp(min=1.0)[:, None, None] + TEMPLATES.noise**2)
                 )
                 continue
             rare = _one_by_one(last[:, 0], sides[:, :1])[:, 0]
@@ -105,9 +98,9 @@ class Templates:
         error = self._error(b, squares[:, 0], rows)
         outside = (squares[:, 1] - sums[:, 1].square().sum(1) / around).clamp(min=0.0)
         even = (squares.sum(1) - sums.sum(1).square().sum(1) / (inside + around)).clamp(min=0.0)
-        noise = TEMPLATE_NOISE**2 * self.C * (inside + around)
+        noise = TEMPLATES.noise**2 * self.C * (inside + around)
         to_one = 0.5 * self.C * (inside + around) * torch.log((even + noise) / (error + outside + noise))
-        variance = error / (self.C * inside) + TEMPLATE_NOISE**2
+        variance = error / (self.C * inside) + TEMPLATES.noise**2
         to_all = rare - 0.5 * self.C * inside * (variance.log() + math.log(2.0 * math.pi) + 1.0)
         return to_one + self.rare * to_all
 
@@ -125,9 +118,9 @@ def surprise(picture: Tensor) -> Tensor:
     """Return −log of the density (H, W) of each pixel's colour in a picture (C, H, W)."""
     C, H, W = picture.shape
     pixels = picture.flatten(1).T
-    some = pixels[torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[:SAMPLED_PIXELS]]
-    log = (-0.5 * (torch.cdist(pixels, some) / COLOR_BANDWIDTH).square()).logsumexp(1) - math.log(len(some))
-    return (C * math.log(COLOR_BANDWIDTH * math.sqrt(2.0 * math.pi)) - log).reshape(H, W)
+    some = pixels[torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[: TEMPLATES.sampled_pixels]]
+    log = (-0.5 * (torch.cdist(pixels, some) / TEMPLATES.color_bandwidth).square()).logsumexp(1) - math.log(len(some))
+    return (C * math.log(TEMPLATES.color_bandwidth * math.sqrt(2.0 * math.pi)) - log).reshape(H, W)
 
 
 def _with_prior(A: Tensor) -> Tensor:
@@ -136,11 +129,11 @@ def _with_prior(A: Tensor) -> Tensor:
     full = torch.zeros(n, C, 4, C, 4, dtype=A.dtype)
     differ = torch.eye(C, dtype=A.dtype) - 1.0 / max(C, 1)
     full += (
-        (TEMPLATE_NOISE / LIGHT_TINT) ** 2
+        (TEMPLATES.noise / TEMPLATES.light_tint) ** 2
         * differ[None, :, None, :, None]
         * torch.eye(4, dtype=A.dtype)[None, None, :, None, :]
     )
-    slopes = torch.tensor([1e-3, 1.0, 1.0, 1.0], dtype=A.dtype) * (TEMPLATE_NOISE / LIGHT_SLOPE) ** 2
+    slopes = torch.tensor([1e-3, 1.0, 1.0, 1.0], dtype=A.dtype) * (TEMPLATES.noise / TEMPLATES.light_slope) ** 2
     for c in range(C):
         full[:, c, :, c] += A[:, c] + torch.diag(slopes)
     return full.reshape(n, 4 * C, 4 * C)
