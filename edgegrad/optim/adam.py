@@ -117,7 +117,7 @@ class AdamDescent(TensorDescent):
 
     def advance(self) -> None:
         settings, window = self.settings, max(1, self.settings.patience // self.settings.windows)
-        renewed = self.renew(self.values)
+        renewed = self.renew_objective(self.values)
         if not self.settling.points:
             self._compare(self.good)
         elif renewed:

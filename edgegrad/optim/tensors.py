@@ -80,7 +80,7 @@ class TensorDescent:
             return Ending.INTERRUPTED
         return Ending.FLAT if self.resting else Ending.FALLING if self.falling else Ending.STEPS
 
-    def renew(self, values: Tensors) -> bool:
+    def renew_objective(self, values: Tensors) -> bool:
         """Renew what the objective holds fixed, if it is due. Return whether losses stop being comparable by that."""
         period, last = self.objective.renewal_steps, self.renewed
         if period is None or (last is not None and self.steps < last[0] + period):
@@ -92,8 +92,12 @@ class TensorDescent:
     @torch.no_grad()
     def set(self, values: Tensors) -> None:
         """Take these values, clamped to their bounds."""
-        for name, value in self.values.items():
-            value.copy_(self.parameters[name].within(values[name]))
+        for name, value in self.within(values).items():
+            self.values[name].copy_(value)
+
+    def within(self, values: Tensors) -> dict[str, Tensor]:
+        """Return values clamped to their bounds."""
+        return {name: self.parameters[name].within(values[name]) for name in self.values}
 
     @torch.no_grad()
     def compared(self, values: Tensors) -> Tensor:
@@ -145,6 +149,20 @@ def gradients_of(loss: Tensor, values: Tensors) -> dict[str, Tensor | None]:
         return dict.fromkeys(values)
     found = torch.autograd.grad(loss, list(values.values()), allow_unused=True)
     return dict(zip(values, found, strict=True))
+
+
+def named(numbers: Tensor, like: Tensors, dtype: torch.dtype | None = None) -> dict[str, Tensor]:
+    """Return numbers (n,) as tensors by name, by default of the types of those that they are like."""
+    parts = numbers.split([value.numel() for value in like.values()])
+    return {
+        name: part.reshape(value.shape).to(dtype or value.dtype)
+        for (name, value), part in zip(like.items(), parts, strict=True)
+    }
+
+
+def flat(tensors: Tensors) -> Tensor:
+    """Return all numbers (n,) float64, one tensor after the other."""
+    return torch.cat([tensor.detach().double().flatten() for tensor in tensors.values()])
 
 
 def detached(values: Tensors) -> dict[str, Tensor]:

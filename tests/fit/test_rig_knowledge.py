@@ -13,6 +13,7 @@ import edgegrad as eg
 from edgegrad.fit import Parameter, fit_rig
 from edgegrad.fit.descent.curvature import curvature, derivatives
 from edgegrad.fit.descent.objective import Objective
+from edgegrad.fit.descent.settings import DescentSettings
 from edgegrad.fit.options import Settings
 from edgegrad.fit.rig.joint_support import edge_support_by_joint, left_out
 from edgegrad.fit.rig.uncertainty import uncertainty_of
@@ -82,7 +83,7 @@ def test_curvature_of_views_in_one_call(monkeypatch) -> None:
     assert images.shape == of_slope["alpha"].shape and slopes[0].shape == (6, 32, 32, 1)
     assert float((images - of_slope["alpha"]).abs().max()) < 0.3  # the same views in the same order
     together = curvature(judged, values, 0)
-    monkeypatch.setattr("edgegrad.fit.descent.curvature.MAX_DERIVATIVES", 0)
+    monkeypatch.setattr("edgegrad.fit.descent.curvature.DESCENT", DescentSettings(max_derivatives=0))
     alone = curvature(judged, values, 0)
     off = float((together - alone).norm() / alone.norm())
     assert off < 0.02 < float((1.05 * together - alone).norm() / alone.norm())

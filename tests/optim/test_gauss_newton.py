@@ -92,17 +92,6 @@ def test_bounds_hold_and_the_others_go_on() -> None:
     assert float(found.values["x"][1]) == pytest.approx(-2.0, abs=0.05)
 
 
-def test_a_step_to_a_nan_loss_is_taken_back() -> None:
-    objective = Valley()
-    descent = valley(0.5, start=(1.6, -2.5), objective=objective)
-    descent.advance()
-    here = descent.best["x"].clone()
-    objective.bottom = objective.bottom * math.nan
-    descent.advance()
-    assert torch.equal(descent.best["x"], here) and torch.isfinite(descent.values["x"]).all()
-    assert math.isnan(descent.history[-1].loss)
-
-
 class Renewed(Valley):
     """A valley whose bottom is known from step 3 on."""
 

@@ -15,50 +15,45 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ...camera.camera import Camera
+from ...optim.tensors import flat, named
 from ...render import jvp
 from ...scene.tree import map_tensors, tensors_in
 from .objective import Objective
 from .scene_builder import Built
+from .settings import DESCENT
 
 MAX_NUMBERS = 400  # each is a direction of differentiation
-CHUNK = 32  # directions at a time, where scenes are made in batches
-MAX_DERIVATIVES = 2**23  # elements of a channel's derivatives in one call
-MIN_RESIDUAL = 1e-3  # of the pictures' range: smaller differences count as this, for some losses have no weight at 0
 
 
 def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> Tensor:
     """Return JᵀWJ (n, n) float64 by all numbers of the tensors, one after the other. Raises TypeError where something has no
     forward mode."""
-    detached = {name: value.detach() for name, value in tensors.items()}
-    n = sum(value.numel() for value in detached.values())
-    total = torch.zeros(n, n, dtype=torch.float64)
-    for rows, weight, _ in _weighted(objective, detached, step):
+    total = torch.zeros(2 * (len(flat(tensors)),), dtype=torch.float64)
+    for rows, weight, _ in _weighted(objective, tensors, step):
         rows = rows * weight.sqrt()
         total += (rows @ rows.T).double()
     if (regularizer := objective.regularizer) is not None:
-        total += _of_term(lambda tensors: regularizer(objective.build(tensors)[0]), detached)
+        total += _of_term(lambda tensors: regularizer(objective.build(tensors)[0]), tensors)
     if objective.prior is not None:
-        total += _of_term(objective.prior, detached)
+        total += _of_term(objective.prior, tensors)
     return total
 
 
 def scores(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> tuple[Tensor, Tensor]:
     """Return the curvature (n, n) of the pictures alone, and Σ s sᵀ (n, n) over the scores s = w r J of all pixels."""
-    detached = {name: value.detach() for name, value in tensors.items()}
-    n = sum(value.numel() for value in detached.values())
-    H, S = (torch.zeros(n, n, dtype=torch.float64) for _ in range(2))
-    for rows, weight, score in _weighted(objective, detached, step):
+    H, S = (torch.zeros(2 * (len(flat(tensors)),), dtype=torch.float64) for _ in range(2))
+    for rows, weight, score in _weighted(objective, tensors, step):
         H += ((rows * weight) @ rows.T).double()
         S += ((rows * score) @ (rows * score).T).double()
     return H, S
 
 
 def _weighted(
-    objective: Objective, detached: Mapping[str, Tensor], step: int
+    objective: Objective, tensors: Mapping[str, Tensor], step: int
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
     """Yield for each view and channel the derivatives J (n, P), the weights w (P,), and the factors w r (P,) of the scores."""
     count = len(objective.picks(step))
-    for name, group, render, slopes in derivatives(objective, detached, step):
+    for name, group, render, slopes in derivatives(objective, tensors, step):
         regions = objective.regions
         if regions is None:
             weight = weights_of(objective, name, group, render)
@@ -101,27 +96,24 @@ def _ratio(
 ) -> dict[str, Tensor]:  # fmt: skip
     """Return the mean size of differences from the pictures, relative to `of` (name, view, image), for each number. Pixels
     count by the size of their derivative."""
-    detached = {name: value.detach() for name, value in tensors.items()}
-    n = sum(value.numel() for value in detached.values())
-    off, all = (torch.full((n,), 1e-30, dtype=torch.float64) for _ in range(2))
-    for name, group, render, slopes in derivatives(objective, detached, step):
+    off, all = (torch.full_like(flat(tensors), 1e-30) for _ in range(2))
+    for name, group, render, slopes in derivatives(objective, tensors, step):
         for i, image, J in zip(group, render, slopes, strict=True):
             if (wanted := objective.views[i].wanted.get(name)) is not None:
-                rows = size(J).reshape(n, -1)
+                rows = size(J).flatten(1)
                 off += (rows @ size(image - wanted).flatten()).double()
                 all += (rows @ of(name, i, image).flatten()).double()
-    parts = (off / all).split([value.numel() for value in detached.values()])
-    return {name: part.reshape(value.shape) for (name, value), part in zip(detached.items(), parts, strict=True)}
+    return named(off / all, tensors, torch.float64)
 
 
 def derivatives(
-    objective: Objective, detached: Mapping[str, Tensor], step: int
+    objective: Objective, tensors: Mapping[str, Tensor], step: int
 ) -> Iterator[tuple[str, list[int], Tensor, list[Tensor]]]:
     """Yield for each batch of views and channel its name, the views' indices, the channel (B, H, W, c), and its derivatives (n,
     H, W, c) by all numbers, one tensor a view. Raises TypeError where something has no forward mode."""
     options = objective.options
     try:
-        (scene, cameras), tangents = _tangents(objective, detached)
+        (scene, cameras), tangents = _tangents(objective, {name: value.detach() for name, value in tensors.items()})
         for group in objective.groups(objective.picks(step)):
             aovs = objective.views[group[0]].aovs
             images: dict[str, list[Tensor]] = {name: [] for name in aovs}
@@ -158,14 +150,14 @@ def _together(
     if any(id(tensor) in moved for i in group for tensor in tensors_in(cameras[i])):
         return [[i] for i in group]
     height, width = cameras[group[0]].size
-    count = max(1, MAX_DERIVATIVES // (len(tangents[0][1]) * height * width)) if tangents else len(group)
+    count = max(1, DESCENT.max_derivatives // (len(tangents[0][1]) * height * width)) if tangents else len(group)
     return [list(group[k : k + count]) for k in range(0, len(group), count)]
 
 
 def _tangents(objective: Objective, tensors: Mapping[str, Tensor]) -> tuple[Built, list[tuple[Tensor, Tensor]]]:
     """Return scene and cameras, and each of their tensors that depends on the numbers with its derivatives (n, *shape)."""
     rows: list[list[Tensor | None]] = []
-    for moved in _moved(tensors, CHUNK if objective.build_batch is not None else 1):
+    for moved in _moved(tensors, DESCENT.batch if objective.build_batch is not None else 1):
         with forward_ad.dual_level():
             duals = {name: forward_ad.make_dual(value, unit) for name, (value, unit) in moved.items()}
             if objective.build_batch is None:
@@ -207,7 +199,7 @@ def weights_of(objective: Objective, name: str, group: list[int], render: Tensor
 
 
 def _weights(loss: Callable[[Tensor], Tensor], render: Tensor, target: Tensor) -> Tensor:
-    least = MIN_RESIDUAL * float((target.amax() - target.amin()).clamp(min=1e-12))
+    least = DESCENT.min_residual * float((target.amax() - target.amin()).clamp(min=1e-12))
     r = render - target
     r = torch.where(r.abs() < least, torch.where(r < 0, -least, least), r)
     with torch.enable_grad():
@@ -241,18 +233,7 @@ def check_pointwise(objective: Objective) -> None:
 
 def _of_term(term: Callable[[dict[str, Tensor]], Tensor], tensors: Mapping[str, Tensor]) -> Tensor:
     """Return the second derivative of a number by the tensors, with negative eigenvalues set to zero."""
-    leaves = [value.clone().requires_grad_() for value in tensors.values()]
     with torch.enable_grad():
-        slope = _gradient(term(dict(zip(tensors, leaves, strict=True))), leaves)
-        H = torch.stack([_gradient(part, leaves) for part in slope]).detach()
+        H = torch.autograd.functional.hessian(lambda numbers: term(named(numbers, tensors)).double(), flat(tensors))
     size, axes = torch.linalg.eigh(0.5 * (H + H.T))
     return axes @ torch.diag(size.clamp(min=0.0)) @ axes.T
-
-
-def _gradient(value: Tensor, leaves: list[Tensor]) -> Tensor:
-    """Return the gradient (n,) float64, differentiable, and zero by leaves on which nothing depends."""
-    if not value.requires_grad:
-        return torch.zeros(sum(leaf.numel() for leaf in leaves), dtype=torch.float64)
-    found = torch.autograd.grad(value, leaves, create_graph=True, allow_unused=True)
-    parts = (torch.zeros_like(leaf) if part is None else part for leaf, part in zip(leaves, found, strict=True))
-    return torch.cat([part.flatten().double() for part in parts])

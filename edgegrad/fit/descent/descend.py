@@ -20,11 +20,10 @@ from ..losses import REGION
 from ..parameter import Parameter
 from .curvature import MAX_NUMBERS, check_pointwise, curvature
 from .objective import Objective
+from .settings import DESCENT
 
 # No number moves by more than ten learning rates in a step.
 GAUSS_NEWTON = LevenbergMarquardtSettings(trust_radius=10.0, settled_steps=6)
-# The first λ by regions, whose start may be far (Nielsen's τ): colours are those of a wrong place.
-REGION_DAMPING = 1.0
 Save = Callable[[dict[str, Any]], Any]
 
 
@@ -71,8 +70,11 @@ def descend_levels(
         history = [Record(*record) for record in saved["history"]]
     while True:
         stage = {"level": level, "values": values, "history": [tuple(r) for r in history], "seconds": seconds}
-        save = partial(_save_stage, checkpoint, stage)
-        found = descend_level(values, level, save, None if saved is None else saved["loop"])
+
+        def save(loop: dict[str, Any], stage: dict[str, Any] = stage) -> None:
+            checkpoint.write({**stage, "loop": loop})
+
+        found: DescentResult = descend_level(values, level, save, None if saved is None else saved["loop"])
         saved, values = None, found.values
         history = continued(history, found.history)
         seconds += found.seconds
@@ -80,10 +82,6 @@ def descend_levels(
             return DescentResult(values, history, seconds, found.ending)
         level += 1
         values = between(values, level)
-
-
-def _save_stage(checkpoint: CheckpointFile, stage: Mapping[str, Any], loop: dict[str, Any]) -> None:
-    checkpoint.write({**stage, "loop": loop})
 
 
 def continued(history: Sequence[Record], later: Sequence[Record]) -> list[Record]:
@@ -111,6 +109,6 @@ def _optimizer(
     settings = replace(
         gauss_newton, steps=options.steps + 1, tolerance=tolerance,
         settled_steps=gauss_newton.settled_steps if tolerance > 0.0 else None,
-        start_damping=REGION_DAMPING if options.loss == REGION else gauss_newton.start_damping,
+        start_damping=DESCENT.region_damping if options.loss == REGION else gauss_newton.start_damping,
     )  # fmt: skip
     return GaussNewtonDescent(objective, partial(curvature, objective), parameters, settings)

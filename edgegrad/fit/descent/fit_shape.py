@@ -30,9 +30,7 @@ from .fit_scene import reporter
 from .objective import Objective
 from .result import Fit, make_fit
 from .scene_builder import whole_scene
-
-SMOOTHNESS = 4.0  # λ of I + λ L
-MIN_PIXELS = 64  # on the shorter side of pictures of coarse levels
+from .settings import DESCENT
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class Refinement:
     levels: int = 3
     faces: int | None = None
     lr: float = 0.01
-    smoothness: float = SMOOTHNESS
+    smoothness: float = 4.0
 
     def __post_init__(self) -> None:
         check_positive_int("refinement.levels", self.levels, most=12)
@@ -179,7 +177,7 @@ class _ShapeFit:
             check_mask_rows(self.views, self.scene(mesh), [view.camera for view in self.views])
         smooth = LaplacianSolver(mesh.faces, len(mesh.verts), self.how.smoothness)
         smallest = min(min(view.camera.size) for view in self.views)
-        factor = min(1.0, max(0.5 ** (self.how.levels - 1 - level), MIN_PIXELS / smallest))
+        factor = min(1.0, max(0.5 ** (self.how.levels - 1 - level), DESCENT.coarsest_pixels / smallest))
         views = [view.resized(factor) for view in self.views]
         low, high = mesh.verts.aminmax(dim=0)
         rate = self.how.lr * float((high - low).norm()) * 0.5**level

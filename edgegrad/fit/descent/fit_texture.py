@@ -19,8 +19,7 @@ from ..parameter import Parameter
 from ..views import Images, views_of
 from .fit_scene import fit_views
 from .result import Fit
-
-COARSEST_TEXELS = 4  # on a side
+from .settings import DESCENT
 
 
 @in_full_precision
@@ -111,7 +110,7 @@ def fit_texture(
         return Scene([shape.replace(texture=texture)], behind), [view.camera for view in views]
 
     sizes = [(h, w)]
-    while min(sizes[-1]) > COARSEST_TEXELS:
+    while min(sizes[-1]) > DESCENT.coarsest_texels:
         sizes.append((max(1, sizes[-1][0] // 2), max(1, sizes[-1][1] // 2)))
     levels = {
         f"level{k}": Parameter(lr / len(sizes), torch.zeros(*s, C, dtype=torch.float32)) for k, s in enumerate(sizes)

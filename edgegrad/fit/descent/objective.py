@@ -19,8 +19,8 @@ from ..options import Settings
 from ..views import Observation, batch_groups
 from .region_loss import RegionLoss
 from .scene_builder import Built, build_detached
+from .settings import DESCENT
 
-SETS_OF_VIEWS = 4  # of samples, by which losses of some views are compared
 Tensors = Mapping[str, Tensor]
 
 
@@ -40,7 +40,7 @@ class Objective(TensorObjective):
         self.regions = RegionLoss(views, options.seed) if options.loss == REGION else None
         self.renewal_steps = None if self.regions is None else self.regions.settings.renewal_steps
         # Some views say less of a step than all.
-        self.sample_sets = 2 if options.views_per_step is None else SETS_OF_VIEWS
+        self.sample_sets = 2 if options.views_per_step is None else DESCENT.sets_of_views
         if options.loss != REGION:
             self.losses["image"] = loss_of("options.loss", options.loss)
 

@@ -24,8 +24,6 @@ from ..region import RADIUS, Windows, likelihood, palette, posterior, slope, smo
 from ..views import Observation, has_levels, white_level
 
 FINAL_STEP = 2**20  # a step at which alpha is as sharp as pictures are
-MIN_COLOUR_RANGE = 1.5 / 255.0  # sRGB values: pixels that differ by no more are of one colour in eight bits
-MIN_BACKGROUND = 0.02  # share of background among the pixels near the object
 
 
 @dataclass(frozen=True)
@@ -46,6 +44,10 @@ class RegionSettings:
     # How surely colours must separate the two sides of a right contour. Wrong ones on edges of clutter reach 0.69, right ones
     # 0.70 … 0.81, so a change by a tenth takes wrong contours for right ones, or right ones for wrong.
     min_sureness: float = 0.695
+    # These refuse starts alone: pixels that differ by no more are of one colour in eight bits, sRGB values; and the share of
+    # background among the pixels near the object.
+    min_color_range: float = 1.5 / 255.0
+    min_background: float = 0.02
 
 
 class RegionLoss:
@@ -155,8 +157,10 @@ class RegionLoss:
             near, extent = self.around(k, share)
             seen += extent > 0.0
             colors = self.displays[k][near > 0.0]
-            colored += len(colors) > 0 and float((colors.amax(0) - colors.amin(0)).max()) > MIN_COLOUR_RANGE
-            if extent > 0.0 and float((near * (1.0 - share)).sum()) <= MIN_BACKGROUND * float(near.sum()):
+            colored += (
+                len(colors) > 0 and float((colors.amax(0) - colors.amin(0)).max()) > self.settings.min_color_range
+            )
+            if extent > 0.0 and float((near * (1.0 - share)).sum()) <= self.settings.min_background * float(near.sum()):
                 raise ValueError(
                     f'scene: expected meshes with some of the picture around them, as loss="region" needs, got a scene that '
                     f"fills picture {k} at the start; leave out ground and walls, for all meshes of the scene are the object"
@@ -183,15 +187,11 @@ class RegionLoss:
         found = [self.sides[i] for i in group]
         if self.narrows or any(sides is None for sides in found):
             return None
-        columns = zip(*(_tensors(sides) for sides in found if sides), strict=True)
-        alpha, inside, outside, variance, band = (torch.stack(list(column)) for column in columns)
+        names = "alpha", "inside", "outside", "variance", "band"
+        alpha, inside, outside, variance, band = (torch.stack([getattr(one, name) for one in found]) for name in names)
         return ContourColors(alpha, inside, outside, variance, band)
 
     def _squares(self, group: Sequence[int], sides: ContourColors, alpha: Tensor) -> Tensor:
         """Return squared differences (B, H, W) of the pictures from the mixture by alpha (B, H, W), over their variance."""
         off = sides.mixed_by(alpha) - torch.stack([self.displays[i] for i in group])
         return (off.square() / sides.variance).sum(-1)
-
-
-def _tensors(sides: ContourColors) -> tuple[Tensor, ...]:
-    return sides.alpha, sides.inside, sides.outside, sides.variance, sides.band
