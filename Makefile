@@ -9,8 +9,18 @@ SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -nam
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test quick test-slow test-browser mutants coverage sanitize sanitize-all sanitize-threads bench report lint docs wheel format
-.PHONY: clean
+.PHONY: calibrate clean
 .DELETE_ON_ERROR:
+
+# The coefficients of the confidence of fit_pose (edgegrad/fit/pose/confidence.py) and what they do on other cases: an hour.
+# MESHES are files of further objects.
+CALIBRATION := out/calibration
+ALIKE := --kinds lit covered plain shadow beside mask easy30 global global-mask --jobs 2 $(if $(MESHES),--meshes $(MESHES))
+calibrate: $(VENV)/.ready
+	$(BIN)/python -m benchmarks.poses $(ALIKE) --first 100 --count 22 --out $(CALIBRATION)/train.jsonl
+	$(BIN)/python -m benchmarks.poses --train $(CALIBRATION)/train.jsonl
+	$(BIN)/python -m benchmarks.poses $(ALIKE) --first 1000 --count 50 --out $(CALIBRATION)/test.jsonl
+	$(BIN)/python -m benchmarks.poses --calibration $(CALIBRATION)/test.jsonl
 
 demo: $(VENV)/.ready
 	$(BIN)/edgegrad demo --runs 4 --out out/demo

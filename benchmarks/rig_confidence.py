@@ -28,8 +28,9 @@ from edgegrad.fit import FitOptions, fit_rig
 from edgegrad.fit.rig.result import RigFit
 from edgegrad.fit.rig.settings import RIG, RigSettings
 
-from .poses.logistic import calibration_error, trained
+from .poses.logistic import trained
 from .poses.sensitivity import variants
+from .poses.summary import bins, calibration_error
 
 RIGHT = 2.0  # degrees
 SURE = 0.95  # A fit with a larger confidence says that it is right.
@@ -131,7 +132,7 @@ def main() -> None:
     said = sum(ok and not good for ok, good in zip(rests, right, strict=True))
     print(f"right: {sum(right)} of {len(right)}; converged: {sum(rests)}, of which wrong {said}")
     print(f"confidence of {SURE} and more: {sum(p >= SURE for p in sure)}, of which wrong {wrong}")
-    print(f"calibration error: {calibration_error(sure, right):.3f}")
+    print(f"calibration error: {calibration_error(bins(list(zip(sure, right, strict=True)))):.3f}")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@
         [--meshes FILE …] [--backgrounds FILE …] [--photos FOLDER] [--pictures DIR]
     python -m benchmarks.poses --kinds lit --seed 1003
     python -m benchmarks.poses --summary FILE.jsonl … [--pictures DIR]
+    python -m benchmarks.poses --train FILE.jsonl …
     python -m benchmarks.poses --calibration FILE.jsonl … [--figure reliability.png]
     python -m benchmarks.poses --sensitivity [--kinds lit] [--count 10]
 
@@ -68,6 +69,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--photos", type=Path, metavar="FOLDER", help=f"real photographs, for {', '.join(REAL)}")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="contours of start, truth and end of wrong fits")
+    parser.add_argument(
+        "--train", nargs="+", type=Path, metavar="FILE.jsonl", help="print the coefficients of confidence"
+    )
     parser.add_argument("--summary", nargs="+", type=Path, metavar="FILE.jsonl", help="the table of these files alone")
     parser.add_argument("--calibration", nargs="+", type=Path, metavar="FILE.jsonl", help="whether confidence is right")
     parser.add_argument(
@@ -78,8 +82,11 @@ def main(argv: list[str] | None = None) -> int:
     )
     given = parser.parse_args(argv)
     sources = Sources(tuple(given.meshes), tuple(given.backgrounds))
+    if given.train:
+        print(summary.training([one for one in runs.read(given.train) if one.get("features")]))
+        return 0
     if given.calibration:
-        found = summary.bins(runs.read(given.calibration))
+        found = summary.bins(summary.said(runs.read(given.calibration)))
         summary.draw_reliability(found, given.figure)
         for one in found:
             print(f"{one.confidence:.3f}: {one.right:.3f} of {one.fits}")

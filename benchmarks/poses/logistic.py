@@ -1,4 +1,4 @@
-"""Training of the confidence of fits: a logistic regression, and how well its probabilities are calibrated."""
+"""Training of the confidence of fits: a logistic regression, and its outcome on cases that were left out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from edgegrad.fit.logistic import Logistic
 
 NEWTON_STEPS = 50
-BINS = 10  # of probabilities, in which calibration is measured
 
 
 def trained(cases: Sequence[Mapping[str, float]], right: Sequence[bool], ridge: float = 1.0) -> Logistic:
@@ -27,8 +26,12 @@ def trained(cases: Sequence[Mapping[str, float]], right: Sequence[bool], ridge: 
     return Logistic(names, rounded[0], round(float(w[-1]), 4), *rounded[1:])
 
 
-def calibration_error(probabilities: Sequence[float], right: Sequence[bool], bins: int = BINS) -> float:
-    """Return the expected calibration error: the mean over cases of |mean probability − rate of right ones| of their bin."""
-    p, y = np.array(probabilities), np.array(right, dtype=float)
-    places = np.minimum((p * bins).astype(int), bins - 1)
-    return float(sum(abs((p - y)[places == k].sum()) for k in range(bins)) / len(p))
+def left_out(cases: Sequence[Mapping[str, float]], right: Sequence[bool], folds: int = 5) -> list[float]:
+    """Return the probability of each case by a map that was trained on the cases of other folds."""
+    found = [0.0] * len(cases)
+    for fold in range(folds):
+        rows = [k for k in range(len(cases)) if k % folds != fold]
+        own = trained([cases[k] for k in rows], [right[k] for k in rows])
+        for k in range(fold, len(cases), folds):
+            found[k] = own.probability(cases[k])
+    return found

@@ -95,6 +95,7 @@ def _record(job: Job, case: Case, found: Found, number: int, work: float) -> Rec
         "right": degrees <= kind.degrees and shift <= kind.shift, "converged": fit.converged, "explained": fit.explained,
         "sigma_degrees": getattr(known, "degrees", math.nan), "sigma_shift": getattr(known, "shift", math.nan) / case.size,
         "confidence": float(getattr(fit, "confidence", getattr(search, "confidence", math.nan))),
+        "features": dict(getattr(search, "features", None) or {}),
         "modes": [_mode(case, mode) for mode in getattr(search, "modes", None) or ()],
         "steps": fit.steps, "work": work, "reason": fit.reason, "start": None, "matrix": found.pose.matrix.tolist(),
     }  # fmt: skip

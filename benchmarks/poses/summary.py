@@ -10,8 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edgegrad.fit.pose.confidence import POSE_CONFIDENCE
+
 from .cases import Case, Placed
 from .kinds import KINDS, cases
+from .logistic import left_out, trained
 from .objects import Sources
 from .runs import Record
 
@@ -36,10 +39,16 @@ def known(record: Record) -> bool:
     return record.get("degrees", math.inf) <= KNOWN[0] and record["shift"] <= shift
 
 
+def confidence(record: Record) -> float:
+    """Return the confidence by a fit's features, so that fits need not run again after a training; NaN without any."""
+    features = record.get("features") or {}
+    return POSE_CONFIDENCE.probability(features) if features else record.get("confidence", math.nan)
+
+
 def sure(record: Record) -> bool:
     """Return whether a fit says that its pose is right."""
-    confidence = record.get("confidence", math.nan)
-    return record.get("converged", False) if math.isnan(confidence) else confidence >= SURE
+    said = confidence(record)
+    return record.get("converged", False) if math.isnan(said) else said >= SURE
 
 
 def compared(records: Sequence[Record], sources: Sources, folder: Path | None) -> list[Record]:
@@ -108,12 +117,18 @@ class Bin(NamedTuple):
     right: float
 
 
-def bins(records: Sequence[Record]) -> list[Bin]:
-    """Return ten bins of confidence, without empty ones. Raises ValueError if no record has a confidence."""
-    pairs = [(one["confidence"], known(one)) for one in records if not math.isnan(one.get("confidence", math.nan))]
+def said(records: Sequence[Record]) -> list[tuple[float, bool]]:
+    """Return the confidence of fits and whether they are right. Raises ValueError if no record has a confidence."""
+    pairs = [(confidence(one), known(one)) for one in records]
+    pairs = [pair for pair in pairs if not math.isnan(pair[0])]
     if not pairs:
-        raise ValueError("--calibration: expected fits with a confidence, got none; the installed fits do not give one")
-    number = [min(int(BINS * confidence), BINS - 1) for confidence, _ in pairs]
+        raise ValueError("--calibration: expected fits with a confidence, got none; run the cases again")
+    return pairs
+
+
+def bins(pairs: Sequence[tuple[float, bool]]) -> list[Bin]:
+    """Return ten bins of confidence, without empty ones, of pairs of a confidence and whether the fit is right."""
+    number = [min(int(BINS * p), BINS - 1) for p, _ in pairs]
     groups = [[pair for pair, its in zip(pairs, number, strict=True) if its == k] for k in range(BINS)]
     return [Bin(len(one), *np.mean(one, axis=0).tolist()) for one in groups if one]
 
@@ -121,6 +136,17 @@ def bins(records: Sequence[Record]) -> list[Bin]:
 def calibration_error(found: Sequence[Bin]) -> float:
     """Return the mean difference of confidence and share of right poses over bins, weighted by their fits."""
     return sum(one.fits * abs(one.confidence - one.right) for one in found) / sum(one.fits for one in found)
+
+
+def training(records: Sequence[Record]) -> str:
+    """Return the coefficients of confidence by the features of fits, and how it does on cases that were left out."""
+    features, right = [one["features"] for one in records], [known(one) for one in records]
+    found, pairs = trained(features, right), list(zip(left_out(features, right), right, strict=True))
+    wrong = sum(p >= SURE and not good for p, good in pairs)
+    return (
+        f"{found}\n{sum(right)} of {len(right)} right; trained on the others, {sum(p >= SURE for p, _ in pairs)} are sure, "
+        f"{wrong} of them wrong; expected calibration error {calibration_error(bins(pairs)):.3f}"
+    )
 
 
 def draw_reliability(found: Sequence[Bin], file: Path) -> None:

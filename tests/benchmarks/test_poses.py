@@ -59,11 +59,11 @@ def test_the_calibration_error_is_that_of_bins(tmp_path: Path) -> None:
     assert summary.wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
     right, wrong = ({"kind": "lit", "degrees": degrees, "shift": 0.01} for degrees in (1.0, 9.0))
     records = [{**one, "confidence": 0.9} for one in (right, wrong)] + [{**wrong, "confidence": 0.15}] * 2
-    found = summary.bins(records)
+    found = summary.bins(summary.said(records))
     assert summary.calibration_error(found) == pytest.approx(0.5 * 0.4 + 0.5 * 0.15)
     summary.draw_reliability(found, tmp_path / "figure.png")
     with pytest.raises(ValueError, match="confidence"):
-        summary.bins([{**right, "confidence": math.nan}])
+        summary.said([{**right, "confidence": math.nan}])
 
 
 def test_each_number_of_the_settings_is_halved_and_doubled() -> None:

@@ -20,7 +20,7 @@ from edgegrad.fit.options import Settings
 from edgegrad.fit.pose import pose_search
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.likelihood.objective import pose_levels
-from edgegrad.fit.pose.likelihood.support import edge_share
+from edgegrad.fit.pose.likelihood.support import Evidence, evidence_of
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.fit.pose.target_images import is_clutter
@@ -55,7 +55,7 @@ def test_a_result_is_judged_by_the_limit_of_the_terms_that_it_is_from(photograph
     # Where colours show too little, the better of both is judged by its own limit.
     colors.edge_support, colors.converged = 0.55, False
     monkeypatch.setattr(search, "_refined", lambda: [SimpleNamespace(pose=search.start)])
-    monkeypatch.setattr(search, "_edge_support", lambda pose: photograph_share)
+    monkeypatch.setattr(search, "_evidence", lambda pose: Evidence(photograph_share, 1.0, 0.1, 40.0))
     monkeypatch.setattr(search, "_take", lambda modes, share: None)
     search.run()
     assert search.enough == (POSE.sure_support if photograph_share > POSE.photo_support else 0.6)
@@ -72,7 +72,7 @@ def taken():
 @pytest.mark.parametrize(
     ("kind", "degrees", "percent"),
     [
-        ("colours", 2.5, 0.6),
+        ("colours", 2.5, 1.0),
         pytest.param("plain", 3.0, 0.9, marks=pytest.mark.slow),
         ("mask", 1.1, 0.6),
         ("depth", 0.3, 0.1),
@@ -146,7 +146,7 @@ def test_a_faint_contour_proves_little(step, least, most):
     task = task_of(image, view, bracket(True))
     pose = pose_from_matrix("init", torch.eye(4))
     level = pose_levels(task, pose, [None], Settings(max_size=96))[-1].informed([pose])
-    assert least <= edge_share(level, pose)[0] <= most
+    assert least <= evidence_of(level, pose).edges <= most
 
 
 @pytest.mark.slow

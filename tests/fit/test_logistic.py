@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.poses.logistic import calibration_error, trained
+from benchmarks.poses.logistic import left_out, trained
+from benchmarks.poses.summary import bins, calibration_error
 from edgegrad.fit.logistic import Logistic
 
 pytestmark = pytest.mark.quick
@@ -21,7 +22,12 @@ def test_a_map_is_found_from_its_outcomes() -> None:
     found = trained(cases, right)
     said = [found.probability(case) for case in cases]
     assert sum(abs(p - q) for p, q in zip(said, truth, strict=True)) / 4000 < 0.02
-    assert calibration_error(said, right) < 0.03 < 0.15 < calibration_error([0.99] * 4000, right)
+
+    def error(said: list[float]) -> float:
+        return calibration_error(bins(list(zip(said, right, strict=True))))
+
+    assert error(left_out(cases[:500], right[:500]) + said[500:]) < 0.05
+    assert error(said) < 0.03 < 0.15 < error([0.99] * 4000)
 
 
 def test_features_far_from_all_cases() -> None:

@@ -30,7 +30,8 @@ from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..row_order import warn_of_flipped_rows
 from ..views import PICTURES, Images, cameras_of
-from .hypotheses import probabilities
+from .confidence import features_of
+from .hypotheses import Mode, probabilities
 from .initial_pose import initial_pose
 from .inputs import ArgumentNames, warn_of_scale, warn_of_units, without_colors
 from .pose import Pose, angle, pose_from_matrix
@@ -163,11 +164,14 @@ def search_pose(
         known = None
         if state.information is not None:
             known = Uncertainty.from_information(task, best, state.information, task.dofs, symmetries)
+        modes = modes_of(state.modes)
+        features = {} if known is None or state.evidence is None else features_of(state.evidence, modes, known)
         conflict = ambiguity(best, state.ambiguous, symmetries, task)
         sure = state.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
             best.R.clone(), best.t.clone(), float(best.scale), cameras[0], state.loss, len(history), seconds(), sure, interrupted,
-            state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough, modes=modes_of(state),
+            state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough, modes=modes,
+            features=features,
         )  # fmt: skip
 
     total = max(state.planned, log.steps)
@@ -201,9 +205,9 @@ def search_pose(
     return result()
 
 
-def modes_of(state: PoseSearch) -> list[PoseMode]:
+def modes_of(found: Sequence[Mode]) -> list[PoseMode]:
     """Return the modes that a search has found, with their probabilities."""
-    pairs = zip(state.modes, probabilities(state.modes), strict=True)
+    pairs = zip(found, probabilities(found), strict=True)
     return [PoseMode(mode.pose.matrix.clone(), share) for mode, share in pairs]
 
 

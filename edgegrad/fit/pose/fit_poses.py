@@ -20,7 +20,8 @@ from ..by_camera import numbered, one_for_each
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
-from .fit_pose import ambiguity, depth_images, symmetries_of
+from .confidence import features_of
+from .fit_pose import ambiguity, depth_images, modes_of, symmetries_of
 from .inputs import ArgumentNames, check_in_front, check_seen, warn_of_units
 from .pose import Pose, pose_from_matrix
 from .poses_search import PosesSearch
@@ -121,10 +122,12 @@ def fit_poses(
             conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
             sure = state.converged[k] and not interrupted and not conflict and not unknown
             seen = [map_tensors(one, Tensor.clone) for one in views]
+            modes, evidence = modes_of(state.modes[k]), state.evidence[k]
+            features = {} if known is None or evidence is None else features_of(evidence, modes, known)
             found.append(PoseFit(
                 best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), time.perf_counter() - began,
                 sure, interrupted, state.edge_support[k], history, task, seen, known, state.visible[k], conflict,
-                state.needed[k],
+                state.needed[k], modes, features,
             ))  # fmt: skip
         return found
 

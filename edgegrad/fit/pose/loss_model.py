@@ -23,7 +23,7 @@ from .color_search import JUDGE_SPP, ColorSearch
 from .gauss_newton import NormalEquations
 from .jacobian import Rendered
 from .likelihood.objective import PoseLevel, pose_levels
-from .likelihood.support import edge_share
+from .likelihood.support import evidence_of
 from .pose import Pose
 from .robust_loss import MIN_WIDTH, Comparison
 from .settings import POSE
@@ -100,7 +100,7 @@ class PhotoLoss:
 
     def judged(self, pose: Pose) -> tuple[float, float]:
         """Return the loss, and the share of the render's edges that the pictures show."""
-        return float(self.objective.costs([pose])[0]), edge_share(self.objective, pose)[0]
+        return float(self.objective.costs([pose])[0]), evidence_of(self.objective, pose).edges
 
 
 LossSource = ColorLoss | PhotoLoss

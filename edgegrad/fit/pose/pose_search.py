@@ -14,7 +14,7 @@ from ..options import Settings
 from .color_search import ColorSearch
 from .hypotheses import HypothesisSearch, Mode, turned
 from .likelihood.objective import PoseLevel, pose_levels
-from .likelihood.support import edge_share, enough_support
+from .likelihood.support import Evidence, enough_support, evidence_of
 from .photo.match import matches
 from .photo.template_views import ball, spread
 from .pose import Pose, angle
@@ -42,6 +42,7 @@ class PoseSearch:
         self.enough = enough_support(task)
         self.best, self.loss, self.converged, self.edge_support = start, math.nan, False, math.nan
         self.information: Tensor | None = None  # inverse covariance of the answer
+        self.evidence: Evidence | None = None  # for the answer
         self.ambiguous: list[Pose] = []  # poses that may be the answer, too
         self.modes: list[Mode] = []
         self.history: list[Step] = []
@@ -64,6 +65,7 @@ class PoseSearch:
         """Search; raise ValueError when nothing in the pictures depends on the pose."""
         if not (self.colors_first and self._colors_suffice()):
             self._photograph()
+        self.evidence = self._evidence(self.best)
         size = self.history[-1].size if self.history else self.task.shots[0].camera.size
         self.history.append(Step(size, self.loss, self.best, True, {}))
 
@@ -75,7 +77,7 @@ class PoseSearch:
     def _photograph(self) -> None:
         """Search by the terms of photographs; colours refine an unlit result, or that of a mask, which is more precise."""
         task, begins, modes = self.task, len(self.history), self._refined()
-        share = self._edge_support(modes[0].pose) if modes else 0.0
+        share = self._evidence(modes[0].pose).edges if modes else 0.0
         if self.colors_first and share < enough_support(task):
             self._forget(slice(begins, None))
             return
@@ -139,13 +141,8 @@ class PoseSearch:
         self.converged = best.rests and share >= self.enough
         self.ambiguous = ambiguous(modes) if share >= self.enough else []
 
-    def _edge_support(self, pose: Pose) -> float:
-        """Return the share of the render's edges that the pictures show, without what covers the object."""
-
-        def share() -> list[float]:
-            return [edge_share(self._last_level(pose), pose)[0]]
-
-        return float(self.log.replay(share)[0])
+    def _evidence(self, pose: Pose) -> Evidence:
+        return Evidence(*self.log.replay(lambda: list(evidence_of(self._last_level(pose), pose))))
 
     def _as_likely(self, pose: Pose, other: Pose) -> bool:
         """Return whether the terms of photographs do not clearly prefer another pose, up to where it comes to rest."""
@@ -212,7 +209,7 @@ class PoseSearch:
             return ColorSearch(self.task, levels, self.start, self.settings).first_end()
         search = HypothesisSearch(self.task, [(self.start, [self.start])], self.depths, self.settings, further=False)
         self.modes = search.run()
-        return self._edge_support(self.modes[0].pose) if self.modes else 0.0
+        return self._evidence(self.modes[0].pose).edges if self.modes else 0.0
 
 
 def ambiguous(modes: Sequence[Mode]) -> list[Pose]:

@@ -22,7 +22,7 @@ from ...scene.symmetries import Symmetries
 from ..options import Settings
 from .hypotheses import HypothesisSearch, Mode, turned
 from .likelihood.objective import pose_levels
-from .likelihood.support import edge_share, enough_support
+from .likelihood.support import Evidence, enough_support, evidence_of
 from .pose import Pose, angle
 from .pose_search import ambiguous
 from .result import Step
@@ -43,6 +43,7 @@ class PosesSearch:
         n = len(tasks)
         self.best, self.loss, self.seeking = list(starts), math.nan, 0
         self.modes: list[list[Mode]] = [[] for _ in tasks]
+        self.evidence: list[Evidence | None] = [None] * n
         self.edge_support, self.visible = [math.nan] * n, [math.nan] * n
         self.history: list[list[Step]] = [[] for _ in tasks]
         self.after_step: Callable[[], Any] = lambda: None
@@ -86,7 +87,8 @@ class PosesSearch:
         for k, (task, visible) in enumerate(seen):
             level = pose_levels(task, self.best[k], self.depths, self.settings)[-1].informed([self.best[k]])
             self.visible[k] = visible
-            self.edge_support[k] = edge_share(level.focused(self.best[k]), self.best[k])[0]
+            evidence = evidence_of(level.focused(self.best[k]), self.best[k])
+            self.evidence[k], self.edge_support[k] = evidence, evidence.edges
             self.history[k].append(Step(level.size, self.loss, self.best[k], True, {}))
 
     def _near(self, k: int, pose: Pose) -> bool:

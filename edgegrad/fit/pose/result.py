@@ -81,11 +81,23 @@ class PoseFit(FitResult):
     enough: float = MIN_EDGE_SUPPORT  # least `explained` of a right pose; not kept in JSON
     # The poses at which the search came to rest, the likeliest first. Empty where colours as they are were compared alone.
     modes: Sequence[PoseMode] = ()
+    features: Mapping[str, float] = field(default_factory=dict, repr=False)  # of the fit, on which `confidence` depends
 
     @property
     def matrix(self) -> Tensor:
         """Mesh to world, (4, 4) float64, for column vectors: `scale · R` and `t`."""
         return rigid(self.scale * self.R, self.t)
+
+    @property
+    def confidence(self) -> float:
+        """The probability, 0 … 1, that the pose is right within 2° and 2 % of the object's size, up to given symmetries.
+
+        It is a logistic regression on features of the fit that was trained on other pictures, see docs/pose.md; NaN before
+        the answer.
+        """
+        from .confidence import POSE_CONFIDENCE
+
+        return POSE_CONFIDENCE.probability(self.features) if self.features else math.nan
 
     @property
     def reason(self) -> str:
@@ -149,7 +161,8 @@ class PoseFit(FitResult):
             },
             "loss": number_or_none(self.loss), "steps": self.steps, "seconds": round(self.seconds, 3),
             "converged": self.converged, "reason": self.reason, "interrupted": self.interrupted,
-            "explained": number_or_none(self.explained),
+            "explained": number_or_none(self.explained), "confidence": number_or_none(self.confidence),
+            "features": dict(self.features),
             "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
         }  # fmt: skip
         return json.dumps(content, indent=2)
@@ -170,10 +183,23 @@ class PoseFit(FitResult):
             share = math.nan if share is None else float(share)
             known = data.get("uncertainty")
             known = None if known is None else Uncertainty.from_dict(known)
+            features = {str(name): float(value) for name, value in data.get("features", {}).items()}
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
         flags = bool(data["converged"]), bool(data["interrupted"])
-        return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags, share, uncertainty=known)
+        return PoseFit(
+            pose.R,
+            pose.t,
+            float(pose.scale),
+            view,
+            loss,
+            steps,
+            seconds,
+            *flags,
+            share,
+            uncertainty=known,
+            features=features,
+        )
 
 
 def with_own_history(fit: PoseFit) -> PoseFit:

@@ -33,7 +33,7 @@ from .hypotheses import HypothesisSearch
 from .inputs import ArgumentNames, check_in_front, check_seen, depth_of, warn_of_units
 from .likelihood.light import harmonics_of
 from .likelihood.objective import PoseLevel, pose_levels
-from .likelihood.support import edge_share, enough_support
+from .likelihood.support import enough_support, evidence_of
 from .photo.match import places
 from .photo.template_views import TemplateViews, across, ball
 from .pose import Pose, pose_from_matrix, rotation_vector
@@ -291,7 +291,7 @@ class Tracker:
         fine = fine.focused(start) if self.blur is None else replace(fine, contour_blur=self.blur)
         self.blur, problem = fine.contour_blur, PredictedLevel(fine, predicted, deviation)
         found = _rested(problem, start)
-        share, visible = edge_share(fine, found.point)
+        share, visible, *_ = evidence_of(fine, found.point)
         if self.velocity is not None and share >= enough_support(task):
             square = float(problem.offset(found.point).square().mean())
             variance = self.variance + TRACK.learning_rate * (square - self.variance)
@@ -308,7 +308,7 @@ class Tracker:
         pose = modes[0].pose
         level = pose_levels(task, pose, [depth], self.settings)[-1]
         self.palettes = [picture.palette for picture in level.pictures]
-        return FrameCandidate(pose, *edge_share(level, pose), level)
+        return FrameCandidate(pose, *evidence_of(level, pose)[:2], level)
 
     def _matches(self, task: PoseTask) -> list[Pose]:
         """Return where in the whole picture the object might be, about as large as it was, and rotated by up to some 60°."""

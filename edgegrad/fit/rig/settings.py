@@ -49,7 +49,7 @@ class RigSettings:
     last_refinement_steps: int = 12
     far_angles: tuple[float, ...] = (0.35, 0.7)
     axial_angles: tuple[float, ...] = (0.05, 0.1, 0.15, 0.3, 0.5, 0.7)  # about bones, to both sides
-    flat_angle: float = 1.5708  # also, where nothing hangs on a limb: a flat one looks alike from both sides
+    flat_angle: float = 1.5708  # also, where nothing hangs on a limb: both sides of a flat one may be equal
     deviations: float = 2.0  # A lower cost counts from so many standard errors of its samples.
     most_worse: float = 2.0  # A hypothesis whose refined limb costs more by this factor is dropped.
     region_gain: float = 0.05  # least decrease of the missing share of contours

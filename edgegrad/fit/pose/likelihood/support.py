@@ -1,6 +1,9 @@
-"""Edge support of a pose in photographs: the share of the render's edges that the pictures show, of contours and inside."""
+"""What speaks for a pose in photographs: above all the share of the render's edges that they show, of contours and inside."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,17 +28,26 @@ def enough_support(task: PoseTask) -> float:
     return POSE.plain_support if task.colorless else POSE.photo_support
 
 
-def edge_share(level: PoseLevel, pose: Pose) -> tuple[float, float]:
-    """Return the share, 0 … 1, of the render's edges that the pictures show, without what covers the object, and the visible
-    share of the object."""
-    compared = level.comparisons([pose])
-    total = sum(float(one.seen.alpha.sum()) for one in compared)
-    visible = sum(float((one.seen.alpha * one.visible).sum()) for one in compared) / max(total, 1e-30)
+class Evidence(NamedTuple):
+    """What speaks for a pose."""
+
+    edges: float  # share, 0 … 1, of the render's edges that the pictures show, without what covers the object
+    visible: float  # share of the object that nothing seems to cover
+    nats: float  # log likelihood ratio to pictures without the object, of a pixel of it
+    across: float  # pixels across the object, in the picture that shows it largest
+
+
+def evidence_of(level: PoseLevel, pose: Pose) -> Evidence:
+    """Return what speaks for a pose in the pictures of a level."""
+    compared = replace(level, dofs=()).comparisons([pose])
+    total = max(sum(float(one.seen.alpha.sum()) for one in compared), 1e-30)
+    visible = sum(float((one.seen.alpha * one.visible).sum()) for one in compared) / total
+    nats = -sum(float(one.term.cost) for one in compared) / total
     extent = max(picture.extent for picture in level.pictures)
-    whole = _share(compared, extent, level.harmonics > 0, False)
-    if whole == 1.0 or visible < FULLY_VISIBLE:
-        return whole, visible
-    return max(whole, _share(compared, extent, level.harmonics > 0, True)), visible
+    edges = _share(compared, extent, level.harmonics > 0, False)
+    if edges < 1.0 and visible >= FULLY_VISIBLE:
+        edges = max(edges, _share(compared, extent, level.harmonics > 0, True))
+    return Evidence(edges, visible, nats, extent)
 
 
 def _share(compared: list[Comparison], extent: float, colored: bool, uncovered: bool) -> float:
