@@ -11,7 +11,7 @@ from quiet_fits import quiet
 from edgegrad.fit import fit_pose
 from edgegrad.fit.pose.confidence import POSE_CONFIDENCE, features_of
 from edgegrad.fit.pose.likelihood.support import Evidence
-from edgegrad.fit.pose.result import PoseFit, PoseMode
+from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.uncertainty import Uncertainty
 
 SURE = Evidence(edges=0.95, visible=1.0, nats=0.8, across=120.0)
@@ -22,8 +22,7 @@ def known(deviation: float) -> Uncertainty:
 
 
 def confidence(evidence: Evidence, deviation: float = 0.003, best: float = 1.0) -> float:
-    modes = [PoseMode(torch.eye(4), share) for share in (best, 1.0 - best)]
-    return POSE_CONFIDENCE.probability(features_of(evidence, modes, known(deviation)))
+    return POSE_CONFIDENCE.probability(features_of(evidence, best, known(deviation)))
 
 
 def test_doubt_lowers_confidence() -> None:

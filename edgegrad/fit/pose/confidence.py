@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from ..logistic import Logistic
 from .likelihood.support import Evidence
-from .result import PoseMode
 from .uncertainty import Uncertainty
 
 RIGHT = 2.0, 0.02  # degrees and share of the object's size within which a pose is right
 
-# By `make calibrate`, of 150 fits, with meshes of twelve files beside those made there.
+# By `make calibrate`, of 150 fits, with meshes of twelve files and those made there.
 POSE_CONFIDENCE = Logistic(
     names=("doubt", "support", "deviation", "visible", "gain", "resolution"),
     weights=(-0.9153, 0.6464, -0.8044, -0.5185, 0.589, -0.0993),
@@ -22,12 +20,11 @@ POSE_CONFIDENCE = Logistic(
 )
 
 
-def features_of(evidence: Evidence, modes: Sequence[PoseMode], known: Uncertainty) -> dict[str, float]:
-    """Return the features of a pose that the pictures show so well, which is known so exactly."""
-    others = 1.0 - modes[0].probability if modes else 0.0
+def features_of(evidence: Evidence, probability: float, known: Uncertainty) -> dict[str, float]:
+    """Return the features of a pose, of this probability among modes."""
     off = max(known.degrees / RIGHT[0], known.shift / known.size / RIGHT[1])
     return {
-        "doubt": math.log10(others + 1e-3),  # of other modes, by the posterior's mass
+        "doubt": math.log10(1.0 - probability + 1e-3),  # of other modes, by the posterior's mass
         "support": evidence.edges,
         "deviation": math.log10(min(max(off, 1e-3), 1e2)),  # standard deviation, relative to what is right
         "visible": evidence.visible,

@@ -165,7 +165,9 @@ def search_pose(
         if state.information is not None:
             known = Uncertainty.from_information(task, best, state.information, task.dofs, symmetries)
         modes = modes_of(state.modes)
-        features = {} if known is None or state.evidence is None else features_of(state.evidence, modes, known)
+        features = (
+            {} if known is None or state.evidence is None else features_of(state.evidence, best_share(modes), known)
+        )
         conflict = ambiguity(best, state.ambiguous, symmetries, task)
         sure = state.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
@@ -209,6 +211,11 @@ def modes_of(found: Sequence[Mode]) -> list[PoseMode]:
     """Return the modes that a search has found, with their probabilities."""
     pairs = zip(found, probabilities(found), strict=True)
     return [PoseMode(mode.pose.matrix.clone(), share) for mode, share in pairs]
+
+
+def best_share(modes: Sequence[PoseMode]) -> float:
+    """Return the probability of the likeliest mode; 1 where no other was sought."""
+    return modes[0].probability if modes else 1.0
 
 
 def ambiguity(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None, task: PoseTask) -> str:

@@ -21,7 +21,7 @@ from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
 from .confidence import features_of
-from .fit_pose import ambiguity, depth_images, modes_of, symmetries_of
+from .fit_pose import ambiguity, best_share, depth_images, modes_of, symmetries_of
 from .inputs import ArgumentNames, check_in_front, check_seen, warn_of_units
 from .pose import Pose, pose_from_matrix
 from .poses_search import PosesSearch
@@ -123,7 +123,7 @@ def fit_poses(
             sure = state.converged[k] and not interrupted and not conflict and not unknown
             seen = [map_tensors(one, Tensor.clone) for one in views]
             modes, evidence = modes_of(state.modes[k]), state.evidence[k]
-            features = {} if known is None or evidence is None else features_of(evidence, modes, known)
+            features = {} if known is None or evidence is None else features_of(evidence, best_share(modes), known)
             found.append(PoseFit(
                 best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), time.perf_counter() - began,
                 sure, interrupted, state.edge_support[k], history, task, seen, known, state.visible[k], conflict,

@@ -19,6 +19,7 @@ from ..edge_support import MIN_EDGE_SUPPORT
 from ..ending import Ending, reason_of
 from ..history import number_or_none
 from ..result import FitResult, made_folder
+from .confidence import POSE_CONFIDENCE
 from .pose import Pose, pose_from_matrix
 from .settings import CAMERA
 from .uncertainty import Uncertainty
@@ -95,8 +96,6 @@ class PoseFit(FitResult):
         It is a logistic regression on features of the fit that was trained on other pictures, see docs/pose.md; NaN before
         the answer.
         """
-        from .confidence import POSE_CONFIDENCE
-
         return POSE_CONFIDENCE.probability(self.features) if self.features else math.nan
 
     @property

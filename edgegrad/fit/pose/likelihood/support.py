@@ -1,4 +1,4 @@
-"""What speaks for a pose in photographs: above all the share of the render's edges that they show, of contours and inside."""
+"""Evidence for a pose in photographs: above all the share of the render's edges that they show, of contours and inside."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def enough_support(task: PoseTask) -> float:
 
 
 class Evidence(NamedTuple):
-    """What speaks for a pose."""
+    """The evidence for a pose in pictures."""
 
     edges: float  # share, 0 … 1, of the render's edges that the pictures show, without what covers the object
     visible: float  # share of the object that nothing seems to cover
