@@ -10,7 +10,7 @@ from .uncertainty import Uncertainty
 
 RIGHT = 2.0, 0.02  # degrees and share of the object's size within which a pose is right
 
-# By `make calibrate`, of 150 fits, with meshes of twelve files and those made there.
+# By the training of `make calibrate`, of 150 fits, which are fewer than it draws, of meshes made there and of twelve files.
 POSE_CONFIDENCE = Logistic(
     names=("doubt", "support", "deviation", "visible", "gain", "resolution"),
     weights=(-0.9153, 0.6464, -0.8044, -0.5185, 0.589, -0.0993),
