@@ -12,7 +12,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: calibrate clean
 .DELETE_ON_ERROR:
 
-# The coefficients of the confidence of fit_pose (edgegrad/fit/pose/confidence.py) and what they do on other cases: an hour.
+# The coefficients of the confidence of fit_pose (edgegrad/fit/pose/confidence.py), and how it does on other cases: an hour.
 # MESHES are files of further objects.
 CALIBRATION := out/calibration
 ALIKE := --kinds lit covered plain shadow beside mask easy30 global global-mask --jobs 2 $(if $(MESHES),--meshes $(MESHES))

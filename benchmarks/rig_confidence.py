@@ -30,10 +30,9 @@ from edgegrad.fit.rig.settings import RIG, RigSettings
 
 from .poses.logistic import trained
 from .poses.sensitivity import variants
-from .poses.summary import bins, calibration_error
+from .poses.summary import SURE, bins, calibration_error
 
 RIGHT = 2.0  # degrees
-SURE = 0.95  # A fit with a larger confidence says that it is right.
 LIMB = ["left arm", "left elbow", "left hand"]  # of a figure, sought alone
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 
+import pytest
 import torch
 from brackets import START, bracket, camera, picture
 from quiet_fits import quiet
@@ -41,8 +43,12 @@ def test_a_fit_says_how_sure_it_is() -> None:
     image = picture(view)
     options = quiet(max_size=48, callback=lambda fit: said.append(fit.confidence))
     fit = fit_pose(bracket(), image, view, init=START, options=options)
-    assert all(map(math.isnan, said)) and fit.converged  # before the answer
+    assert said and all(map(math.isnan, said)) and fit.converged  # before the answer
     assert set(fit.features) == set(POSE_CONFIDENCE.names)
     assert PoseFit.from_json(fit.to_json()).confidence == fit.confidence
+    data = json.loads(fit.to_json())
+    for wrong in ([1.0], {"support": 1.0}):
+        with pytest.raises(ValueError, match=r"PoseFit\.to_json"):
+            PoseFit.from_json(json.dumps({**data, "features": wrong}))
     mirrored = fit_pose(bracket(), image.flip(1), view, init=START, options=quiet(max_size=48))
     assert mirrored.confidence < fit.confidence

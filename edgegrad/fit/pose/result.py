@@ -182,7 +182,8 @@ class PoseFit(FitResult):
             share = math.nan if share is None else float(share)
             known = data.get("uncertainty")
             known = None if known is None else Uncertainty.from_dict(known)
-            features = {str(name): float(value) for name, value in data.get("features", {}).items()}
+            given = dict(data.get("features") or {})
+            features = {name: float(given[name]) for name in POSE_CONFIDENCE.names} if given else {}
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
         flags = bool(data["converged"]), bool(data["interrupted"])
