@@ -21,7 +21,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import FitOptions, calibrate, fit_camera
-from edgegrad.fit.pose.fit_camera import CameraFit
+from edgegrad.fit.pose.camera_result import CameraFit
 
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])
 LENS = torch.tensor([-0.15, 0.05, 0.001, -0.001], dtype=torch.float64)
@@ -90,7 +90,7 @@ def main() -> None:
     for seed, (true, start, shot) in enumerate(cases):
         began = time.process_time()
         fit = calibrate(eg.Scene([mesh], BACKGROUND), shot, start, options=FitOptions(seed=seed, progress=False))
-        ratios += row(fit.fits[0], true[0], time.process_time() - began, fit.reason)
+        ratios += row(fit, true[0], time.process_time() - began, fit.reason)
         if args.plot and seed == 0:
             fit.plot().savefig(args.plot)
     print(f"median of |error| / σ: {float(torch.tensor(ratios).abs().median()):.2f}")

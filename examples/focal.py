@@ -16,7 +16,7 @@ import torch
 
 import edgegrad as eg
 from edgegrad.fit import FitOptions, fit_camera
-from edgegrad.fit.pose.fit_camera import CameraFit
+from edgegrad.fit.pose.camera_result import CameraFit
 
 BACKGROUND = torch.tensor([0.1, 0.15, 0.25])
 TURN, SHIFT, ZOOM = 8.0, 0.08, 0.15  # degrees, object sizes, part of the focal length

@@ -182,13 +182,12 @@ def _timed(done: Sequence[Estimate], given: Sequence[Estimate], spent: dict[tupl
 
 def _draw(folder: Path, number: int, found: Refined) -> None:
     """Draw a fit that took a step."""
-    from ..fit.pose.pictures import draw_fit
+    from ..files.paths import write_figures
 
     if found.fit is not None and found.fit.history:
         row = found.estimate
-        draw_fit(
-            folder / f"{number:06d}_scene{row.scene_id:06d}_image{row.im_id:06d}_object{row.obj_id:06d}.png", found.fit
-        )
+        name = f"{number:06d}_scene{row.scene_id:06d}_image{row.im_id:06d}_object{row.obj_id:06d}.png"
+        write_figures(folder, {name: found.fit.plot})
 
 
 def _line(found: Refined) -> str:

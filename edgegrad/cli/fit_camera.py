@@ -8,7 +8,7 @@ from typing import Any
 
 from .arguments import CHECKPOINT, add_background, add_live, add_mesh, add_out, add_resume, add_steps, add_view, number
 from .inputs import read_background, read_options, read_picture, read_scene, read_view, seen_by
-from .outputs import live_view, make_folder, wait_for_close, write_outputs
+from .outputs import finish, live_view, make_folder, wait_for_close
 
 
 def add(commands: Any) -> None:
@@ -25,7 +25,9 @@ def add(commands: Any) -> None:
     add_steps(parser, 60)
     parser.add_argument("--seed", type=number, default=0)
     add_resume(parser)
-    add_out(parser, f"camera.json, history.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}")
+    add_out(
+        parser, f"camera.json, calibration.json, history.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}"
+    )
     add_live(parser)
     parser.set_defaults(run=run)
 
@@ -33,9 +35,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Find pose and focal length of the camera that took a picture of a mesh, from a start within about 30° and 15 % of the
     mesh's size. Ctrl-C keeps the best so far, and --resume goes on from there."""
-    from .. import save_camera
     from ..fit import fit_camera
-    from . import INTERRUPTED
 
     scene = read_scene(args)
     args.image = seen_by(args.camera, args.image)
@@ -51,13 +51,10 @@ def run(args: argparse.Namespace) -> int:
             scene, picture, start, masks=mask, focal=not args.no_focal, principal=args.principal, distortion=args.distortion,
             options=read_options(args, view),
         )  # fmt: skip
-        print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}")
         K = fit.camera.K.tolist()
         print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
         if fit.uncertainty is not None:
             print(f"standard deviation: {fit.uncertainty.words}", flush=True)
-        save_camera(args.out / "camera.json", fit.camera)
-        names = ["camera.json", fit.write_history(args.out), *write_outputs(args.out, fit.search), CHECKPOINT]
-        print(f"wrote {', '.join(names)} in {args.out}")
+        code = finish(fit, args.out)
         wait_for_close(view, fit)
-    return INTERRUPTED if fit.interrupted else 0
+    return code

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..fit.descent.result import Fit
-    from ..fit.pose.fit_camera import CameraFit
+    from ..fit.pose.camera_result import CameraFit
     from ..fit.pose.result import PoseFit
     from ..fit.rig.result import RigFit
     from ..live.view import Viewer
@@ -74,20 +74,19 @@ def pose_lines(fit: PoseFit) -> list[str]:
 def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
     """Write the result and return the names of the files; without the libraries of figures the pose alone. Raises OSError that
     names the file."""
+    from ..files.paths import write_figures
+
     names = ["pose.json"] + ["fit.png", "loss.png", "fit.webp"] * bool(fit.history and _can_draw())
     for name in names:
         try:
             if name == "pose.json":
                 write_pose(folder, fit)
-            else:
-                from ..fit.pose import pictures  # matplotlib takes a while to import
+            elif name == "fit.webp":
+                from ..fit.pose.pictures import draw_animation  # matplotlib takes a while to import
 
-                draw = {
-                    "fit.png": pictures.draw_fit,
-                    "loss.png": pictures.draw_loss,
-                    "fit.webp": pictures.draw_animation,
-                }
-                draw[name](folder / name, fit)
+                draw_animation(folder / name, fit)
+            else:
+                write_figures(folder, {name: fit.plot if name == "fit.png" else fit.plot_history})
         except OSError as error:
             raise OSError(
                 f"{folder / name}: expected to write it, got: {error.strerror or error}; make room or rights"
@@ -95,8 +94,8 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
     return names
 
 
-def finish(fit: Fit | RigFit, folder: Path) -> int:
-    """Print how a fit by descent ended, save it, and return the exit code. Raises OSError."""
+def finish(fit: Fit | CameraFit | RigFit, folder: Path) -> int:
+    """Print how a fit ended, save it, and return the exit code. Raises OSError."""
     from . import INTERRUPTED
     from .arguments import CHECKPOINT
 

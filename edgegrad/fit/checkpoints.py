@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -22,7 +22,7 @@ from .parameter import Parameter
 from .placement import Placement
 from .views import Observation
 
-FORMAT = 11
+FORMAT = 12
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,20 @@ class Checkpoint:
         check_flag("checkpoint.resume", self.resume)
         if not (folder := Path(self.path).absolute().parent).is_dir():
             raise FileNotFoundError(f"checkpoint: expected the folder {folder} to exist; make it first with Path.mkdir")
+
+    def of_part(self, k: int) -> Checkpoint:
+        """Return the checkpoint of part k of a fit, with its number in the file's name.
+
+        Only the first must be there to go on from: a fit may end before the others begin.
+        """
+        whole = Path(self.path)
+        path = whole.with_name(f"{whole.stem}-{k + 1:04d}{whole.suffix}")
+        return replace(self, path=path, resume=self.resume and (k == 0 or path.exists()))
+
+
+def checkpoint_of(given: Checkpoint | PathLike | None) -> Checkpoint | None:
+    """Return the checkpoint with a path, or the given one. Raises as Checkpoint does."""
+    return given if given is None or isinstance(given, Checkpoint) else Checkpoint(given)
 
 
 class CheckpointFile:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -39,95 +39,76 @@ MIN_MIXED = 0.1  # of the pixels along a mask's border; a mask with fewer mixed 
 CONTOUR_STEP = 0.3  # of alpha between neighbours, where a contour is drawn
 
 
-@dataclass(frozen=True)
-class ContourColors:
-    """The colours on both sides of a contour, the 0.5 level of a blurred alpha (h, w)."""
+class ContourColors(NamedTuple):
+    """The colours on both sides of N contours, the 0.5 level of a blurred alpha."""
 
-    alpha: Tensor  # (h, w)
-    inside: Tensor  # (h, w, C)
-    outside: Tensor
-    variance: Tensor  # (h, w, C) of their mixture
-    band: Tensor  # (h, w) bool: mixed pixels whose sides are both known
-    curved: bool = True  # sRGB values, which mix as radiance; a mask's values mix as they are
+    alpha: Tensor  # (N, h, w)
+    behind: Tensor  # (N, C, h, w), linear radiance
+    step: Tensor  # (N, C, h, w), from there to the object's
+    variance: Tensor  # (N, C, h, w), of their mixture
+    contrast: Tensor  # (N, h, w), difference of both sides in standard deviations
+    band: Tensor  # (N, h, w) bool: mixed pixels whose sides are both known
 
     @staticmethod
-    def from_image(
-        image: Tensor, alpha: Tensor, near: Tensor, curved: bool = True, noise: float = PIXEL_NOISE
-    ) -> ContourColors:
-        """Measure the colours in an image (h, w, C) of sRGB values, or in a mask with `curved` False. `near` (h, w) says which
-        pixels may be used; `noise` is the standard deviation of a mixed pixel."""
-        front, front_spread, front_count = _local(image, (alpha > 1.0 - PURE) * near)
-        behind, behind_spread, behind_count = _local(image, (alpha < PURE) * near)
-        known = (front_count > SUPPORT) & (behind_count > SUPPORT) & (near > 0.0)
-        a = alpha[..., None]
-        variance = noise**2 + a.square() * front_spread + (1.0 - a).square() * behind_spread
-        return ContourColors(alpha, front, behind, variance, (alpha > PURE) & (alpha < 1.0 - PURE) & known, curved)
-
-    @property
-    def mixed(self) -> Tensor:
-        """The mixture (h, w, C), which the picture shows if the contour is right."""
-        return self.mixed_by(self.alpha)
-
-    def mixed_by(self, alpha: Tensor) -> Tensor:
-        """Return the mixture (h, w, C) by another alpha (h, w)."""
-        behind, step = self._radiances()
-        mixed = behind + alpha[..., None] * step
-        return linear_to_srgb(mixed.clamp(0.0, 1.0)) if self.curved else mixed
-
-    def slope_by(self, alpha: Tensor) -> Tensor:
-        """Return the derivative (h, w, C) of mixed_by() by alpha."""
-        step = self._radiances()[1]
-        return srgb_slope(self.mixed_by(alpha)) * step if self.curved else step
-
-    def _radiances(self) -> tuple[Tensor, Tensor]:
-        """Return the radiance behind the contour, and the step from there to the object's."""
-        inside, outside = (
-            (srgb_to_linear(self.inside), srgb_to_linear(self.outside)) if self.curved else (self.inside, self.outside)
+    def from_image(image: Tensor, alpha: Tensor, near: Tensor) -> ContourColors:
+        """Measure the colours in images (N, C, h, w) of sRGB values. `near` (N, h, w) says how much each pixel counts."""
+        front, front_variance, front_count = local_colors(image, (alpha > 1.0 - PURE) * near, COLOUR_WINDOW)
+        back, back_variance, back_count = local_colors(image, (alpha < PURE) * near, COLOUR_WINDOW)
+        known = (front_count > SUPPORT) & (back_count > SUPPORT) & (near > 0.0)
+        a = alpha[:, None]
+        variance = PIXEL_NOISE**2 + a.square() * front_variance + (1.0 - a).square() * back_variance
+        contrast = ((front - back).square() / variance).sum(1).sqrt()
+        front, back = srgb_to_linear(front), srgb_to_linear(back)
+        return ContourColors(
+            alpha, back, front - back, variance, contrast, (alpha > PURE) & (alpha < 1.0 - PURE) & known
         )
-        return outside, inside - outside
 
-    @property
-    def contrast(self) -> Tensor:
-        """The difference (h, w) of both sides, in standard deviations."""
-        return ((self.inside - self.outside).square() / self.variance).sum(-1).sqrt()
+    def mixed(self, alpha: Tensor) -> Tensor:
+        """Return the mixture (N, C, h, w) by alpha (N, h, w), which the picture shows if the contour is right."""
+        return linear_to_srgb((self.behind + alpha[:, None] * self.step).clamp(0.0, 1.0))
+
+    def slope(self, alpha: Tensor) -> Tensor:
+        """Return the derivative (N, C, h, w) of the mixture by alpha."""
+        return srgb_slope(self.mixed(alpha)) * self.step
+
+    def squares(self, alpha: Tensor, image: Tensor) -> Tensor:
+        """Return squared differences (N, h, w) of images (N, C, h, w) from the mixture by alpha, over their variance."""
+        return ((self.mixed(alpha) - image).square() / self.variance).sum(1)
 
 
 def contour_support(parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
-    """Return the share, 0 … 1, of the contour that pictures show. A part is an image (h, w, C) in sRGB values, its alpha (h,
-    w), and the weights (h, w) of the pixels near the object."""
+    """Return the share, 0 … 1, of the contour that pictures show. A part is an image (1, C, h, w) in sRGB values, its alpha (1,
+    h, w), and the weights (1, h, w) of the pixels near the object."""
     pairs, shown, length = [], 0.0, 0.0
     for image, alpha, near in parts:
-        contour = smoothed(alpha[None], CONTOUR_BLUR)[0]
+        contour = smoothed(alpha, CONTOUR_BLUR)
         sides = ContourColors.from_image(image, contour, near)
         on = ((contour > PURE) & (contour < 1.0 - PURE)) * near
         length += float(on.sum())
         shown += float((on * (sides.contrast > CONTRAST) * sides.band).sum())
-        pairs.append((sides.mixed, sides.mixed, image, (sides.band * near)[..., None]))
+        mixed, picture = (one[0].movedim(0, -1) for one in (sides.mixed(contour), image))
+        pairs.append((mixed, mixed, picture, (sides.band * near)[0, ..., None]))
     return edge_support(pairs, softer=True) * min(1.0, shown / length / ALONE_SHOWN) if length > 0.0 else 0.0
 
 
 def blur_losses(sides: ContourColors, image: Tensor, weight: Tensor, alpha: Tensor) -> Tensor:
-    """Return for each of CONTOUR_BLURS half the robust squared differences of an image (h, w, C) from the mixture, with alpha
-    (h, w) blurred by it, weighted (h, w). The tails of a blur show far in sRGB values, so one that is too wide puts bright
-    contours too far out."""
-    found = []
-    for blur in CONTOUR_BLURS:
-        off = (sides.mixed_by(smoothed(alpha[None], blur)[0]) - image).square() / sides.variance
-        squares = off.sum(-1)
-        found.append(0.5 * (sides.band * weight * squares / (1.0 + squares / TOLERANCE)).sum())
-    return torch.stack(found)
+    """Return for each of CONTOUR_BLURS half the robust squared differences of images (N, C, h, w) from the mixture, with alpha
+    (N, h, w) blurred by it, weighted (N, h, w). The tails of a blur show far in sRGB values, so one that is too wide puts
+    bright contours too far out."""
+    squares = torch.stack([sides.squares(smoothed(alpha, blur), image) for blur in CONTOUR_BLURS])
+    return 0.5 * (sides.band * weight * squares / (1.0 + squares / TOLERANCE)).sum((1, 2, 3))
 
 
 def mask_noise(mask: Tensor, factor: float) -> float:
-    """Return the standard deviation of the mixed pixels of a mask (H, W) whose sides were multiplied by `factor`. A mask of
-    zeros and ones only says on which side of a pixel's middle the contour runs. This is off by 1/√12, evenly distributed,
-    and of the 1/factor² pixels that become one, 1/factor lie on the contour."""
+    """Return the standard deviation, besides other noise, of the mixed pixels of a mask (H, W) whose sides were multiplied by
+    `factor`. A mask of zeros and ones only says on which side of a pixel's middle the contour runs. This is off by 1/√12,
+    evenly distributed, and of the 1/factor² pixels that become one, 1/factor lie on the contour."""
     between = (mask > PURE) & (mask < 1.0 - PURE)
     rows = mask[None, None]
     border = F.max_pool2d(rows, 3, 1, 1) + F.max_pool2d(-rows, 3, 1, 1) > 0.5
     if int(between.sum()) >= MIN_MIXED * int(border.sum()):
-        return PIXEL_NOISE
-    return math.hypot(PIXEL_NOISE, min(1.0, factor) ** 1.5 / math.sqrt(12.0))
+        return 0.0
+    return min(1.0, factor) ** 1.5 / math.sqrt(12.0)
 
 
 def draw_contour(image: Tensor, alpha: Tensor) -> Tensor:
@@ -136,12 +117,13 @@ def draw_contour(image: Tensor, alpha: Tensor) -> Tensor:
     return torch.where(contour, image.new_tensor(OUTLINE if image.shape[-1] == 3 else [1.0] * image.shape[-1]), image)
 
 
-def _local(image: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mean and variance (h, w, C) of the pixels in each pixel's window, weighted by `share` (h, w), and its weight (h,
-    w)."""
-    rows = image.movedim(-1, 0)
-    count = smoothed(share.to(image)[None], COLOUR_WINDOW)[0]
-    enough = count.clamp(min=1e-4)
-    mean = smoothed(rows * share, COLOUR_WINDOW) / enough
-    square = smoothed(rows.square() * share, COLOUR_WINDOW) / enough
-    return mean.movedim(0, -1), (square - mean.square()).clamp(min=0.0).movedim(0, -1), count
+def local_colors(image: Tensor, share: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return mean and variance (N, C, h, w) of pixels in each pixel's window, weighted by `share` (N, h, w), and its weight."""
+    count = smoothed(share, sigma)
+    enough = count.clamp(min=1e-4)[:, None]
+
+    def mean(values: Tensor) -> Tensor:
+        return smoothed((values * share[:, None]).flatten(0, 1), sigma).reshape(values.shape) / enough
+
+    first = mean(image)
+    return first, (mean(image.square()) - first.square()).clamp(min=0.0), count

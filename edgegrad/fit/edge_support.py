@@ -35,13 +35,6 @@ def picture_noise(picture: Tensor) -> Tensor:
     return 1.4826 * second.abs().flatten(1).median(dim=1).values
 
 
-def edge_strength(image: Tensor) -> Tensor:
-    """Return the largest difference (H, W, C) of each pixel to its neighbours."""
-    padded = F.pad(image.movedim(-1, 0)[None], (1, 1, 1, 1), mode="replicate")
-    high, low = F.max_pool2d(padded, 3, stride=1), -F.max_pool2d(-padded, 3, stride=1)
-    return (high - low)[0].movedim(0, -1)
-
-
 def edge_support(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]], softer: bool = False) -> float:
     """Return the share, 0 … 1, of the renders' edges that the pictures show, over all views.
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from ..camera.camera import Camera
 from ..check import as_double, check_int, check_positive_int
 from ..scene.mesh import Mesh
-from .regularizers import edges
 from .remeshing import gpytoolbox, remeshed
 from .views import Images, Observation, views_of
 
@@ -160,12 +159,10 @@ def _inside(views: Sequence[Observation], axes: Sequence[Tensor], reach: float =
 def _beyond(mask: Tensor, unit: Tensor) -> Tensor:
     """Return the mask (N,) at places outside of an image with corners at ±1: 1 beyond sides that the mask touches, where the
     object may go on, and 0 beyond the others."""
-    sides = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
-    ends = {name: bool((side > 0.5).any()) for name, side in sides.items()}
+    touched = torch.stack([(side > 0.5).any() for side in (mask[:, 0], mask[:, -1], mask[0], mask[-1])])
     x, y = unit.unbind(-1)
-    outside = {"left": x < -1.0, "right": x > 1.0, "top": y < -1.0, "bottom": y > 1.0}
-    none = torch.stack([outside[name] for name, touched in ends.items() if not touched] or [torch.zeros_like(x).bool()])
-    return (~none.any(0)).float()
+    beyond = torch.stack([x < -1.0, x > 1.0, y < -1.0, y > 1.0])
+    return (~beyond[~touched].any(0)).float()
 
 
 def _surface(inside: Tensor, axes: Sequence[Tensor]) -> Mesh:
@@ -185,17 +182,9 @@ def _surface(inside: Tensor, axes: Sequence[Tensor]) -> Mesh:
 
 def _without_crumbs(verts: Tensor, faces: Tensor) -> Mesh:
     """Drop small pieces."""
-    label = torch.arange(len(verts))
-    pairs = edges(faces)
-    while True:  # label connected vertices by the least index among them, in steps that double
-        new = label.scatter_reduce(0, pairs[:, 0], label[pairs[:, 1]], "amin")
-        new = new.scatter_reduce(0, pairs[:, 1], new[pairs[:, 0]], "amin")
-        new = new[new]
-        if torch.equal(new, label):
-            break
-        label = new
-    piece = label[faces[:, 0]]
-    count = torch.bincount(piece, minlength=len(verts))
-    faces = faces[count[piece] >= MIN_PIECE * count.max()]
+    _, piece = gpytoolbox("a visual hull").connected_components(faces.int().numpy(), return_face_indices=True)
+    label = torch.from_numpy(np.asarray(piece)).long()
+    count = torch.bincount(label)
+    faces = faces[count[label] >= MIN_PIECE * count.max()]
     used, index = faces.unique(return_inverse=True)
     return Mesh(verts[used].float(), index.reshape(-1, 3))

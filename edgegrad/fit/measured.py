@@ -23,6 +23,7 @@ from .by_camera import numbered, one_for_each
 CHANNELS = {"depths": "depth", "normals": "shading_normal", "positions": "position"}
 WIDTHS = {"depth": 1, "shading_normal": 3, "position": 3}
 NORMAL_SCALE = 0.1  # about 6°
+SIZE_FIX = "the camera must have the picture's size: camera.resized((H, W))"
 MAD = 1.4826  # standard deviation of Gaussian noise over the median of its sizes
 
 
@@ -119,31 +120,41 @@ def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[di
     return found
 
 
-def _checked(name: str, picture: Any, weight: Any, width: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return values (H, W, width) and weights (H, W, 1), both zero where nothing was measured. Raises TypeError or
-    ValueError."""
-    fix = "the camera must have the picture's size: camera.resized((H, W))"
-    value = as_tensor(name, picture).detach().cpu()
+def depth_images(depths: Any, cameras: Sequence[Camera]) -> list[Tensor | None]:
+    """Return the measured depth (H, W) of each camera, NaN where there is none. Raises TypeError or ValueError."""
+    found = [given.get("depth") for given in measurements({"depths": depths}, cameras)]
+    return [None if one is None else torch.where(one.weight > 0, one.value, torch.nan)[..., 0] for one in found]
+
+
+def measured_image(name: str, given: Any, size: tuple[int, int], width: int = 1) -> Tensor:
+    """Return measured values (H, W, width), NaN where nothing was measured. Raises TypeError or ValueError."""
+    value = as_tensor(name, given).detach().cpu()
     if not value.is_floating_point():
         raise TypeError(
             f"{name}: expected floating-point numbers, got {value.dtype}; of a sensor's integers take x.float() times its unit"
         )
     check_float(name, value)
     shapes = [(*size, 1), size] if width == 1 else [(*size, width)]
-    check_shape(name, value, *shapes, fix=fix)
+    check_shape(name, value, *shapes, fix=SIZE_FIX)
     value = value.reshape(*size, width).float()
-    known = value.isfinite().all(-1, keepdim=True)
-    value = torch.where(known, value, 0.0)
-    known = known & (value != 0).any(-1, keepdim=True)
-    if width == 1 and bool((value < 0).any()):
+    known = value.isfinite().all(-1, keepdim=True) & (value != 0).any(-1, keepdim=True)
+    if width == 1 and bool((value[known] < 0).any()):
         raise ValueError(
-            f"{name}: expected depths along the optical axis, +Z, from 0 up, got {float(value.min()):g}; OpenGL's look along "
-            "−Z: take −z"
+            f"{name}: expected depths along the optical axis, +Z, from 0 up, got {float(value[known].min()):g}; OpenGL's look "
+            "along −Z: take −z"
         )
+    return torch.where(known, value, torch.nan)
+
+
+def _checked(name: str, picture: Any, weight: Any, width: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return values (H, W, width) and weights (H, W, 1), both zero where nothing was measured. Raises TypeError or
+    ValueError."""
+    value = measured_image(name, picture, size, width)
+    known, value = value.isfinite().all(-1, keepdim=True), value.nan_to_num()
     if weight is None:
         return value, known.float()
     count = as_tensor(f"weights of {name}", weight).detach().cpu().float()
-    check_shape(f"weights of {name}", count, (*size, 1), size, fix=fix)
+    check_shape(f"weights of {name}", count, (*size, 1), size, fix=SIZE_FIX)
     if not bool((count >= 0).all()) or not bool(count.isfinite().all()):
         raise ValueError(f"weights of {name}: expected finite numbers from 0 up, got {float(count.min()):g}")
     known = known & (count.reshape(*size, 1) > 0)

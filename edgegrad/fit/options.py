@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ..check import check_flag, check_int, check_positive
 from ..files.paths import PathLike
+from ..optim.progress import Progress, nothing
 from ..sampling import Sampling, drawn_seed
-from .checkpoints import Checkpoint, saved_seed
+from .checkpoints import Checkpoint, checkpoint_of, saved_seed
 from .losses import REGION, Loss, loss_of
 
 METHODS = ("adam", "gauss-newton")
@@ -121,16 +122,24 @@ class FitOptions:
             )
         if not isinstance(self.sampling, Sampling | None):
             raise TypeError(f"options.sampling: expected a Sampling, got {type(self.sampling).__name__}")
-        _checkpoint(self.checkpoint)
+        checkpoint_of(self.checkpoint)
+
+    def of_part(self, k: int) -> FitOptions:
+        """Return the options of part k of a fit, which keeps its state in a file of its own."""
+        checkpoint = checkpoint_of(self.checkpoint)
+        return self if checkpoint is None else replace(self, checkpoint=checkpoint.of_part(k))
 
 
-def _checkpoint(given: Checkpoint | PathLike | None) -> Checkpoint | None:
-    return given if given is None or isinstance(given, Checkpoint) else Checkpoint(given)
+def options_of(given: object) -> FitOptions:
+    """Return the options that a fit was given, by default none. Raises TypeError."""
+    if not isinstance(given, FitOptions | None):
+        raise TypeError(f"options: expected FitOptions, got {type(given).__name__}; give FitOptions(steps=…)")
+    return FitOptions() if given is None else given
 
 
 @dataclass(frozen=True)
-class Settings:
-    """The options of one fit, as FitOptions has them, with its defaults in place of None."""
+class Settings(FitOptions):
+    """The options of one fit, with its defaults in place of None."""
 
     steps: int = 500
     step_tolerance: float = 3e-4
@@ -139,33 +148,32 @@ class Settings:
     spp: int = 16
     seed: int = 0
     max_size: int = 256
-    views_per_step: int | None = None
     loss: str | Loss = "l2"
     mask_loss: str | Loss = "l2"
     method: str = "adam"
-    progress: bool = True
-    callback: Callable[[Any], Any] | None = None
     checkpoint: Checkpoint | None = None
-    sampling: Sampling | None = None
-    shadows: bool | None = None
-    bounces: int | None = None
     coarsest: int = 16
 
     @staticmethod
     def from_options(options: FitOptions | None, fit: str, used: tuple[str, ...], **defaults: Any) -> Settings:
         """Return the settings of a fit that uses some options. Raises TypeError, or ValueError for an option that it does not
         use."""
-        given = FitOptions() if options is None else options
-        if not isinstance(given, FitOptions):
-            raise TypeError(f"options: expected FitOptions, got {type(given).__name__}; give FitOptions(steps=…)")
+        given = options_of(options)
         set_ones = {name: value for name, value in vars(given).items() if value is not None}
         for name in set_ones:
             if name in UNUSED and name not in used:
                 raise ValueError(f"options.{name}: {fit} {UNUSED[name]}; leave it out")
-        checkpoint = _checkpoint(given.checkpoint)
+        checkpoint = checkpoint_of(given.checkpoint)
         seed = saved_seed(checkpoint) if given.seed is None else given.seed
         seed = int(drawn_seed()) % 2**32 if seed is None else seed
         return Settings(**{**defaults, **set_ones, "seed": seed, "checkpoint": checkpoint})
+
+    def progress_of(self, title: str, result: Callable[[], Any]) -> Progress:
+        """Return the context of a fit's steps. After each, the callback gets the result so far."""
+        callback = self.callback
+        after_step = nothing if callback is None else lambda: callback(result())
+        every = None if self.checkpoint is None else self.checkpoint.every
+        return Progress(title if self.progress else None, after_step, every=every)
 
     @property
     def of_steps(self) -> dict[str, Any]:

@@ -186,32 +186,30 @@ class Coordinates:
 
     def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
         """Return a tensor, or a Pose for each PoseParameter, by the parameters' names; differentiable."""
-        if not self.placements:
-            return dict(tensors)
-        found: dict[str, Any] = dict(tensors)
-        for name, placement in self.placements.items():
-            parts = {part: found.pop(f"{name}.{part}") for part in placement.coordinates}
-            found[name] = Pose(*(part.to(placement.dtype) for part in placement.pose(parts)[:3]))
-        return found
+        poses = {name: self._pose(name, tensors) for name in self.placements}
+        typed = {n: Pose(*(part.to(self.placements[n].dtype) for part in pose[:3])) for n, pose in poses.items()}
+        return {**self._others(tensors), **typed}
 
+    @torch.no_grad()
     def result_values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the values without gradients, poses as matrices (4, 4) float64, as results and histories hold them."""
-        with torch.no_grad():
-            found = {name: tensor.detach() for name, tensor in tensors.items()}
-            for name, pose in self.poses(tensors).items():
-                for part in self.placements[name].coordinates:
-                    del found[f"{name}.{part}"]
-                found[name] = pose.matrix
-            return found
+        others = {name: tensor.detach() for name, tensor in self._others(tensors).items()}
+        return {**others, **{name: pose.matrix for name, pose in self.poses(tensors).items()}}
 
     def recorded(self, record: Record) -> Record:
         """Return the record as histories hold it."""
         return record._replace(values=self.result_values(record.values)) if self.placements else record
 
+    @torch.no_grad()
     def poses(self, tensors: Mapping[str, Tensor]) -> dict[str, Pose]:
         """Return the poses by name, in float64."""
-        with torch.no_grad():
-            return {
-                name: placement.pose({part: tensors[f"{name}.{part}"].detach() for part in placement.coordinates})
-                for name, placement in self.placements.items()
-            }
+        return {name: self._pose(name, tensors) for name in self.placements}
+
+    def _pose(self, name: str, tensors: Mapping[str, Tensor]) -> Pose:
+        placement = self.placements[name]
+        return placement.pose({part: tensors[f"{name}.{part}"] for part in placement.coordinates})
+
+    def _others(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the tensors that are no coordinates of poses."""
+        parts = {f"{name}.{part}" for name, placement in self.placements.items() for part in placement.coordinates}
+        return {name: tensor for name, tensor in tensors.items() if name not in parts}

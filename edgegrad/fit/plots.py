@@ -40,25 +40,24 @@ def comparison(rows: Sequence[tuple[Tensor, Tensor, Tensor]], differences: bool 
 
 def curves(history: Sequence[Record]) -> Figure:
     """Draw the loss, and the norm of the gradient by each parameter."""
-    figure = Figure(figsize=(6.4, 4.4), dpi=200, layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
-    steps = [record.step + 1 for record in history]
-    above.plot(steps, [record.loss for record in history], color=INK, linewidth=1)
-    above.set_ylabel("loss")
-    draw_gradients(below, [record.gradient for record in history])
-    above.set_yscale("log")
-    above.spines[["top", "right"]].set_visible(False)
+    figure, axes = loss_figure([record.gradient for record in history])
+    axes.plot([record.step + 1 for record in history], [record.loss for record in history], color=INK, linewidth=1)
+    if min(record.loss for record in history) > 0.0:  # Log likelihood ratios are not.
+        axes.set_yscale("log")
     return figure
 
 
-def draw_gradients(axes: Axes, gradients: Sequence[Mapping[str, float]]) -> None:
-    """Draw each norm from step 1 on, with gaps where a step has none of that name."""
+def loss_figure(gradients: Sequence[Mapping[str, float]]) -> tuple[Figure, Axes]:
+    """Return a figure with each norm of the gradient from step 1 on, and the axes above for the loss."""
+    figure = Figure(figsize=(6.4, 4.6), dpi=200, layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
     for name in dict.fromkeys(name for gradient in gradients for name in gradient):
-        norms = [gradient.get(name, math.nan) for gradient in gradients]
+        norms = [gradient.get(name, math.nan) for gradient in gradients]  # There are gaps where a step has none.
         # A step between gaps has no line, so it is drawn as a point.
-        axes.plot(range(1, len(norms) + 1), norms, ".-", markersize=3, linewidth=1, label=name)
-    axes.set_yscale("log")
-    axes.set_ylabel("|gradient|")
-    axes.set_xlabel("step")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
+        below.plot(range(1, len(norms) + 1), norms, ".-", markersize=3, linewidth=1, label=name)
+    below.set(yscale="log", ylabel="|gradient|", xlabel="step")
+    below.legend(frameon=False, fontsize=8)
+    above.set_ylabel("loss")
+    for axes in (above, below):
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure, above

@@ -41,14 +41,7 @@ def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
     rest, weight : mapping of names to Tensor, rotations in radians, and float, default 1e-6
     """
 
-    def prior(values: Mapping[str, Tensor]) -> Tensor:
-        total = torch.zeros((), dtype=torch.float64)
-        for name, value in values.items():
-            if name not in PLACE:
-                total = total + (value - rest[name].to(value)).square().sum()
-        return weight * total
-
-    return prior
+    return _squares({name: value for name, value in rest.items() if name not in PLACE}, weight)
 
 
 def mirrored(
@@ -87,8 +80,14 @@ def near(before: Mapping[str, Tensor], weight: float = 1e-5) -> Prior:
     tensor(2.5000)
     """
 
+    return _squares(before, weight)
+
+
+def _squares(reference: Mapping[str, Tensor], weight: float) -> Prior:
+    """Return weight · Σ (x − reference)² over the values that have one."""
+
     def prior(values: Mapping[str, Tensor]) -> Tensor:
-        parts = [(value - before[name].to(value)).square().sum() for name, value in values.items() if name in before]
+        parts = [(x - reference[name].to(x)).square().sum() for name, x in values.items() if name in reference]
         return weight * torch.stack(parts).sum() if parts else torch.zeros((), dtype=torch.float64)
 
     return prior

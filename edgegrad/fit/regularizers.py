@@ -52,7 +52,8 @@ def laplacian(verts: Tensor, faces: Tensor) -> Tensor:
     sums = torch.zeros_like(verts).index_add(0, both[:, 0], verts[both[:, 1]])
     used = count > 0
     apart = verts[used] - sums[used] / count[used, None]
-    return apart.square().sum(1).mean() / _mean_square_edge(verts, pairs)
+    size = (verts[pairs[:, 0]] - verts[pairs[:, 1]]).square().sum(1).mean().detach()
+    return apart.square().sum(1).mean() / size.clamp(min=1e-30)
 
 
 def edge_length(verts: Tensor, faces: Tensor) -> Tensor:
@@ -102,7 +103,3 @@ def total_variation(texture: Tensor) -> Tensor:
     texture : (h, w, C) float
     """
     return (texture[1:] - texture[:-1]).abs().mean() + (texture[:, 1:] - texture[:, :-1]).abs().mean()
-
-
-def _mean_square_edge(verts: Tensor, pairs: Tensor) -> Tensor:
-    return (verts[pairs[:, 0]] - verts[pairs[:, 1]]).square().sum(1).mean().detach().clamp(min=1e-30)

@@ -18,7 +18,7 @@ from ..files.image import linear_to_srgb
 from ..scene.tree import map_tensors
 from ..warnings import warn
 from .by_camera import numbered, one_for_each
-from .measured import Measurement, area_mean, measurements
+from .measured import SIZE_FIX, Measurement, area_mean, measurements
 
 Images = Tensor | Sequence[Tensor | None]
 WITH_ALPHA = 2, 4  # channels of pictures with alpha
@@ -128,11 +128,6 @@ def views_of(
     by_camera = measurements(measured or {}, split)
     views = []
     for i, (camera, image, mask, weight) in enumerate(zip(split, pictures, shapes, counts, strict=True)):
-        for name, value in (("masks", mask), ("weights", weight)):
-            if value is not None:
-                check_shape(name, value, (*camera.size, 1))
-        if weight is not None and not bool((weight >= 0).all()):
-            raise ValueError(f"weights: expected numbers from 0 up, got {float(weight.min()):g}")
         if image is None and mask is None and not by_camera[i]:
             which = f" for cameras[{i}]" if any(x is not None for x in (*pictures, *shapes)) or any(by_camera) else ""
             raise ValueError(f"images: expected pictures or masks to compare with, got neither{which}")
@@ -189,17 +184,8 @@ def cameras_of(cameras: object) -> list[Camera]:
             raise TypeError(f"cameras[{i}]: expected a Camera, got {type(camera).__name__}")
         # Autograd keeps no tensors that were made in torch.inference_mode(), so they are copied.
         camera = map_tensors(camera, lambda tensor: tensor.detach().cpu().clone())
-        split += [camera] if camera.batch is None else [part_of(camera, k) for k in range(camera.batch)]
+        split += [camera] if camera.batch is None else list(camera)
     return split
-
-
-def part_of(camera: Camera, k: int) -> Camera:
-    """Return camera k of a batch."""
-    fields: dict[str, Any] = {"world_to_camera": 3, "K": 3, "distortion": 2}
-    values = {name: getattr(camera, name) for name in fields}
-    return camera.replace(
-        **{name: v[k] if v is not None and v.dim() == fields[name] else v for name, v in values.items()}
-    )
 
 
 def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
@@ -210,18 +196,17 @@ def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
         raise TypeError(f"{name}: expected an image (H, W, C) of numbers, got {got}; read one with {read}(path)")
     image = as_tensor(name, value).detach().cpu()
     image = image.float() if image.dtype == torch.bool else image
-    fix = "the camera must have the picture's size: camera.resized((H, W))"
     if name.startswith(("mask", "weight")):
         if not image.is_floating_point():
             raise TypeError(
                 f"{name}: expected floating-point numbers, got {image.dtype}; of 8-bit numbers take x / 255, of 0 "
                 "and 1 x.float()"
             )
-        check_shape(name, image, size, (*size, 1), fix=fix)
+        check_shape(name, image, size, (*size, 1), fix=SIZE_FIX)
     else:
         check_float(name, image)
     image = image[..., None] if image.dim() == 2 else image
-    check_shape(name, image, (*size, "C"), fix=fix)
+    check_shape(name, image, (*size, "C"), fix=SIZE_FIX)
     check_finite(name, image)
     rounding = 1e-3
     if name.startswith("mask") and bool((image < -rounding).any() | (image > 1.0 + rounding).any()):
@@ -229,6 +214,8 @@ def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
             f"{name}: expected numbers from 0 to 1, got {float(image.min()):g} to {float(image.max()):g}; of 8-bit numbers take "
             "x / 255"
         )
+    if name.startswith("weight") and bool((image < 0).any()):
+        raise ValueError(f"{name}: expected numbers from 0 up, got {float(image.min()):g}")
     if not name.startswith("weight") and _is_of_bytes(image):
         whole = "whole " if bool((image == image.round()).all()) else ""
         warn(

@@ -15,8 +15,7 @@ from ..camera.camera import Camera
 from ..fit.contour_colors import draw_contour
 from ..fit.descent.fit_scene import Progress
 from ..fit.descent.result import Fit
-from ..fit.pose.calibrate import Calibration
-from ..fit.pose.fit_camera import CameraFit
+from ..fit.pose.camera_result import CameraFit
 from ..fit.pose.photo.overlay import overlay
 from ..fit.pose.result import PoseFit, Step
 from ..fit.pose.task import PoseTask
@@ -54,16 +53,16 @@ class Snapshot(NamedTuple):
             return [as_bytes(picture) for picture in (target, shown, CONTRAST * (render - target).abs())]
 
 
-Shown = PoseFit | CameraFit | Calibration | RigFit | Progress | Fit
+Shown = PoseFit | CameraFit | RigFit | Progress | Fit
 
 
 def snapshot_from_fit(fit: Shown) -> Snapshot:
     """Return the snapshot of what a fit's callback gets, or of a result. Raises TypeError for anything else, and for a pose
     from a file."""
-    if isinstance(fit, Calibration):
-        return snapshot_from_fit(fit.fits[-1])
     if isinstance(fit, CameraFit):  # the search moves the scene instead of the camera
-        return snapshot_from_fit(fit.search)._replace(matrix=None, cameras=[camera.detach() for camera in fit.cameras])
+        last = fit.searches[-1]
+        cameras = [camera.detach() for camera in fit.cameras[-len(last.cameras) :]]
+        return snapshot_from_fit(last)._replace(matrix=None, cameras=cameras)
     if isinstance(fit, PoseFit) and fit.task is not None and fit.history:
         return _snapshot_from_pose(fit.task, next(step for step in reversed(fit.history) if step.best))
     if isinstance(fit, RigFit):
@@ -114,8 +113,7 @@ def _snapshot(scene: Scene, cameras: list[Camera], views: list[Observation]) -> 
 def _snapshot_from_pose(task: PoseTask, step: Step) -> Snapshot:
     def render(index: int) -> Tensor:
         one = dataclasses.replace(task, shots=[task.shots[index]])
-        factor = min(1.0, MAX_SIDE / max(one.shots[0].camera.size))
-        return overlay(one, one.level(factor, blur=0.0, coarseness=1.0, spp=SPP, dofs=[]), step.pose)[0]
+        return overlay(one, MAX_SIDE, SPP, step.pose)[0][1]
 
     cameras = [task.lens(shot.camera, step.pose) for shot in task.shots]
     return Snapshot(task.scene, step.pose.matrix, cameras, [shot.target for shot in task.shots], render)

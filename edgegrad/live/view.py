@@ -23,8 +23,7 @@ from ..scene.scene import Scene
 
 if TYPE_CHECKING:
     from ..fit.descent.result import Fit
-    from ..fit.pose.calibrate import Calibration
-    from ..fit.pose.fit_camera import CameraFit
+    from ..fit.pose.camera_result import CameraFit
     from ..fit.pose.result import PoseFit
     from ..fit.rig.result import RigFit
     from .browser import Browser
@@ -145,7 +144,7 @@ class Viewer:
         number = None if loss is None else float(loss)
         return self._step(number, lambda: snapshot_from_scene(scene, cameras, images, masks))
 
-    def show(self, fit: Fit | PoseFit | CameraFit | Calibration | RigFit) -> None:
+    def show(self, fit: Fit | PoseFit | CameraFit | RigFit) -> None:
         """Draw a fit's result at once, for its last step may not have been drawn."""
         from .snapshot import snapshot_from_fit
 

@@ -27,7 +27,7 @@ class Adam:
     def __init__(self, values: Mapping[str, Tensor], rates: Mapping[str, float], uniform: Collection[str] = ()) -> None:
         self.values, self.rates, self.uniform = values, dict(rates), uniform
         # How many gradients there were, their mean, and that of their squares.
-        self._moments: dict[str, dict[str, Any]] = {}
+        self.moments: dict[str, dict[str, Any]] = {}
 
     @torch.no_grad()
     def step(self, gradients: Mapping[str, Tensor | None]) -> None:
@@ -37,9 +37,9 @@ class Adam:
             if gradient is None:
                 continue
             value = self.values[name]
-            if name not in self._moments:
-                self._moments[name] = {"count": 0, "mean": torch.zeros_like(value), "square": torch.zeros_like(value)}
-            state = self._moments[name]
+            if name not in self.moments:
+                self.moments[name] = {"count": 0, "mean": torch.zeros_like(value), "square": torch.zeros_like(value)}
+            state = self.moments[name]
             state["count"] += 1
             state["mean"].lerp_(gradient, 1.0 - b1)
             state["square"].lerp_(gradient.square(), 1.0 - b2)
@@ -49,20 +49,12 @@ class Adam:
             epsilon = 1e-8 * float(size.max()) + 1e-30
             value.sub_(self.rates[name] / (1.0 - b1 ** state["count"]) * state["mean"] / (size + epsilon))
 
-    def shorten(self, factor: float) -> None:
-        """Multiply all learning rates."""
-        self.rates = {name: rate * factor for name, rate in self.rates.items()}
-
-    def forget(self) -> None:
-        """Drop the moments of the gradients so far."""
-        self._moments.clear()
-
     def state(self) -> dict[str, Any]:
         """Return what steps depend on besides the values."""
-        return {"rates": self.rates, "moments": self._moments}
+        return {"rates": self.rates, "moments": self.moments}
 
     def load(self, state: Mapping[str, Any]) -> None:
-        self.rates, self._moments = dict(state["rates"]), dict(state["moments"])
+        self.rates, self.moments = dict(state["rates"]), dict(state["moments"])
 
 
 @dataclass(frozen=True)
@@ -111,10 +103,6 @@ class AdamDescent(TensorDescent):
         """The present values while the loss falls, and the mean of those since it last fell afterwards."""
         return self.mean if self.settling.settled else detached(self.values)
 
-    @property
-    def falling(self) -> bool:
-        return self.settling.points > 1 and self.settling.settled == 0
-
     def advance(self) -> None:
         settings, window = self.settings, max(1, self.settings.patience // self.settings.windows)
         renewed = self.renew_objective(self.values)
@@ -129,7 +117,7 @@ class AdamDescent(TensorDescent):
         if not math.isfinite(self.loss + sum(norms.values())):
             # The step went too far: go back to where the loss last fell, with shorter steps.
             self._cut()
-            self.adam.forget()
+            self.adam.moments.clear()
             self.set(self.good)
             return
         self.total = {n: v.detach() + (self.total[n] if self.summed else 0.0) for n, v in self.values.items()}
@@ -155,7 +143,7 @@ class AdamDescent(TensorDescent):
         self.resting = self.cuts == self.settings.cuts
         if not self.resting:
             self.cuts, self.summed, self.settling.settled = self.cuts + 1, 0, 0
-            self.adam.shorten(self.settings.cut)
+            self.adam.rates = {name: rate * self.settings.cut for name, rate in self.adam.rates.items()}
 
     def state(self) -> dict[str, Any]:
         return {**super().state(), "adam": self.adam.state(), "settling": dict(vars(self.settling))}

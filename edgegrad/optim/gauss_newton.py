@@ -29,6 +29,7 @@ class GaussNewtonDescent(TensorDescent, Problem[dict[str, Tensor]]):
         rates = [torch.full((v.numel(),), parameters[n].lr, dtype=torch.float64) for n, v in self.values.items()]
         self.rates = torch.cat(rates).clamp(min=1e-150)  # A rate of 0 holds a number fixed.
         self.descents = LevenbergMarquardt(self, [detached(self.values)], settings)
+        (self.settling,) = self.descents.descents
 
     @property
     def best(self) -> dict[str, Tensor]:
@@ -36,23 +37,14 @@ class GaussNewtonDescent(TensorDescent, Problem[dict[str, Tensor]]):
         return self.descents.points[0]
 
     @property
-    def falling(self) -> bool:
-        """Whether the loss fell in the last step by more than its noise."""
-        descent = self.descents.descents[0]
-        return descent.accepted > 1 and descent.settled == 0
-
-    @property
     def provisional(self) -> bool:
         return self.objective.provisional
 
     def advance(self) -> None:
         (accepted,) = self.descents.advance()
-        descent = self.descents.descents[0]
-        norms = dict.fromkeys(self.values, math.nan)
-        if accepted:
-            norms = {
-                name: float(slope.norm()) for name, slope in named(descent.gradient / self.rates, self.values).items()
-            }
+        (descent,) = self.descents.descents
+        slopes = named(descent.gradient / self.rates, self.values) if accepted else {}
+        norms = {name: float(slopes[name].norm()) if accepted else math.nan for name in self.values}
         self.set(self.candidate)
         self.record(self.cost, norms)
         self.set(descent.point)
@@ -64,6 +56,7 @@ class GaussNewtonDescent(TensorDescent, Problem[dict[str, Tensor]]):
     def load(self, state: Mapping[str, Any]) -> None:
         super().load(state)
         self.descents.load(state["descents"])
+        (self.settling,) = self.descents.descents
 
     def model(self, points: Sequence[dict[str, Tensor]]) -> Model:
         (values,) = points

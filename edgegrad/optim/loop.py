@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from tqdm import tqdm
+from .progress import Progress, nothing
 
 
 class Optimizer(Protocol):
@@ -23,10 +22,6 @@ class Optimizer(Protocol):
     def advance(self) -> Any: ...
     def state(self) -> dict[str, Any]: ...
     def load(self, state: Mapping[str, Any]) -> None: ...
-
-
-def nothing(*_: Any) -> None:
-    """Do nothing after a step, or with a state."""
 
 
 @dataclass(frozen=True)
@@ -51,29 +46,18 @@ class Loop:
 def run(optimizer: Optimizer, loop: Loop) -> tuple[float, bool]:
     """Take steps until the optimizer rests or the steps run out. Ctrl-C ends the loop with what the optimizer has. Return the
     seconds, those before a saved state included, and whether Ctrl-C ended it."""
-    began, interrupted = time.perf_counter(), False
+    progress = Progress(loop.title, loop.after_step, every=loop.every, total=loop.steps)
     if loop.saved is not None:
         optimizer.load(loop.saved)
-        began -= loop.saved["seconds"]
+        progress.earlier, progress.steps = loop.saved["seconds"], optimizer.steps
 
-    def keep() -> float:
-        seconds = time.perf_counter() - began
-        loop.save({**optimizer.state(), "seconds": seconds})
-        return seconds
+    def keep() -> None:
+        loop.save({**optimizer.state(), "seconds": progress.seconds})
 
-    bar = tqdm(
-        total=loop.steps, initial=optimizer.steps, desc=loop.title, unit="step", disable=loop.title is None, leave=False
-    )
-    try:
+    progress.keep = keep
+    with progress:
         while optimizer.steps < loop.steps and not optimizer.resting:
             optimizer.advance()
-            bar.set_postfix_str(f"loss {optimizer.loss:.3e}", refresh=False)
-            bar.update()
-            loop.after_step()
-            if loop.every is not None and optimizer.steps % loop.every == 0:
-                keep()
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        bar.close()
-    return keep(), interrupted
+            progress.step(f"loss {optimizer.loss:.3e}")
+    keep()
+    return progress.seconds, progress.interrupted

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from .convergence import Settling
 from .history import Ending, Record
 from .loop import Loop, run
 
@@ -48,6 +48,7 @@ class TensorDescent:
     """The state of a descent: its tensors, the best ones so far, and whether steps still lead down."""
 
     saved: ClassVar[tuple[str, ...]] = ("steps", "resting", "renewed")  # attributes in checkpoints
+    settling: Settling  # of the loss, which says whether more steps would lower it
 
     def __init__(self, objective: Objective, parameters: Mapping[str, Parameter]) -> None:
         self.objective, self.parameters = objective, parameters
@@ -70,15 +71,11 @@ class TensorDescent:
         """The loss of the last record."""
         return self.history[-1].loss
 
-    @property
-    def falling(self) -> bool:
-        """Whether more steps would lower the loss."""
-        raise NotImplementedError
-
     def ending(self, interrupted: bool) -> Ending:
         if interrupted:
             return Ending.INTERRUPTED
-        return Ending.FLAT if self.resting else Ending.FALLING if self.falling else Ending.STEPS
+        falling = self.settling.points > 1 and self.settling.settled == 0
+        return Ending.FLAT if self.resting else Ending.FALLING if falling else Ending.STEPS
 
     def renew_objective(self, values: Tensors) -> bool:
         """Renew what the objective holds fixed, if it is due. Return whether losses stop being comparable by that."""
@@ -133,12 +130,8 @@ class DescentResult(NamedTuple):
     ending: Ending
 
 
-def descend(
-    descent: TensorDescent, loop: Loop, after_step: Callable[[Record, dict[str, Tensor]], Any] | None = None
-) -> DescentResult:
-    """Run a descent. `after_step` gets each step's record, and the tensors after it."""
-    if after_step is not None:
-        loop = replace(loop, after_step=lambda: after_step(descent.history[-1], descent.values))
+def descend(descent: TensorDescent, loop: Loop) -> DescentResult:
+    """Run a descent."""
     seconds, interrupted = run(descent, loop)
     return DescentResult(descent.best, descent.history, seconds, descent.ending(interrupted))
 

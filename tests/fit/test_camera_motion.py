@@ -15,7 +15,7 @@ from edgegrad.fit.pose.camera_motion import moved_poses, moving_cameras
 from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.likelihood.picture import Box, RenderedPoses
 from edgegrad.fit.pose.pose import Pose
-from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, PoseTask, Unknowns
+from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, STEP_SIZE, PoseTask, Unknowns, focal_of
 
 F64 = torch.float64
 SIZE = 48
@@ -80,6 +80,26 @@ def differences(task: PoseTask, poses: list[Pose], value: Callable[[Pose], Tenso
     return torch.stack(found)
 
 
+def moved(task: PoseTask, pose: Pose, dofs: list[int], p: torch.Tensor) -> Pose:
+    """Return the pose after a step, from where the object's centre goes in the first camera's axes."""
+    step = p.new_zeros(STEP_SIZE).index_put((torch.tensor(dofs),), p)
+    camera = task.shots[0].camera
+    V, v = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    R = eg.camera.poses.rotation(V.T @ step[:3]) @ pose.R
+    center = V @ task.center_at(pose) + v + task.size * step[3:6]
+    scale, zoom = pose.scale * step[6].exp(), step[7].exp()
+    if camera.projection != "orthographic":
+        if 8 in dofs:  # The shift of the principal point is made up for.
+            aside = step[8:10] * camera.size[1] / focal_of(camera) / pose.focal
+            center = torch.cat([center[:2] - aside * center[2:], center[2:]])
+        if 7 in dofs and 6 in dofs:  # So is the enlargement by a longer lens, by scale or distance.
+            scale = scale / zoom
+        elif 7 in dofs:
+            center = torch.cat([center[:2], center[2:] * zoom])
+    t = V.T @ (center - v) - scale * (R @ task.center)
+    return Pose(R, t, scale, pose.focal * zoom, pose.principal + step[8:10], pose.distortion + step[10:])
+
+
 @pytest.mark.quick
 @pytest.mark.parametrize(("lens", "unknowns"), CASES)
 def test_poses_move_in_a_batch_as_one_by_one(lens: str, unknowns: Unknowns) -> None:
@@ -89,7 +109,7 @@ def test_poses_move_in_a_batch_as_one_by_one(lens: str, unknowns: Unknowns) -> N
     for dofs in (task.dofs, without_lens):
         steps = 0.1 * torch.randn(2, len(dofs), generator=torch.Generator().manual_seed(4), dtype=F64)
         for pose, step, found in zip(poses, steps, moved_poses(task, poses, dofs, steps), strict=True):
-            for part, expected in zip(found, task.moved(pose, dofs, step), strict=True):
+            for part, expected in zip(found, moved(task, pose, dofs, step), strict=True):
                 torch.testing.assert_close(part, expected, rtol=1e-12, atol=1e-12)
 
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
-from edgegrad.fit.contour_colors import CONTOUR_BLURS, PIXEL_NOISE, ContourColors, blur_losses, mask_noise
-from edgegrad.fit.region import Windows, palette, posterior, smoothed
+from edgegrad.fit.contour_colors import CONTOUR_BLURS, ContourColors, blur_losses, mask_noise
+from edgegrad.fit.region import ColorFrequencies, palette, smoothed
 from edgegrad.fit.views import area_mean
 
 
@@ -19,12 +19,15 @@ def test_the_posterior_separates_colours_near_the_contour_alone():
     image = torch.where(((alpha > 0.5) == left)[..., None], red, green)
     display = linear_to_srgb(image)
     colours = palette(display, 0)
-    P = posterior(Windows((60, 60), colours.labels(display), colours.colors, 6.0), alpha, torch.ones(60, 60))
+    labels, whole = colours.labels(display), torch.ones(60, 60)
+    P, wide = (
+        ColorFrequencies.from_labels(labels, colours.colors, alpha[None], whole, radius, 1e-3).posterior[0]
+        for radius in (6.0, 1000.0)
+    )
     edge = smoothed(alpha[None], 1.5)[0]
     near = (edge > 0.02) & (edge < 0.98)
     assert float(P[near & (alpha > 0.5)].min()) > 0.8 and float(P[near & (alpha < 0.5)].max()) < 0.2
-    whole = posterior(Windows((60, 60), colours.labels(display), colours.colors, 1000.0), alpha, torch.ones(60, 60))
-    assert float(whole[near & (alpha > 0.5)].min()) < 0.6
+    assert float(wide[near & (alpha > 0.5)].min()) < 0.6
 
 
 def test_the_noise_of_a_mask_is_that_of_its_pixels():
@@ -37,7 +40,7 @@ def test_the_noise_of_a_mask_is_that_of_its_pixels():
         right, seen = (area_mean(one[..., None], (size, size))[..., 0] for one in (exact, hard))
         off = (seen - right)[(right > 0.02) & (right < 0.98)].square().mean().sqrt()
         assert mask_noise(hard, factor) == pytest.approx(float(off), rel=0.3), factor
-    assert mask_noise(exact, 1.0) == mask_noise(smoothed(hard[None], 0.7)[0], 1.0) == PIXEL_NOISE
+    assert mask_noise(exact, 1.0) == mask_noise(smoothed(hard[None], 0.7)[0], 1.0) == 0.0
 
 
 @pytest.mark.parametrize("blur", CONTOUR_BLURS)
@@ -50,6 +53,7 @@ def test_how_sharp_a_contour_is(blur):
     mixed = smoothed(alpha[None], blur)[0][..., None]
     noise = 0.02 * torch.randn(n, n, 3, generator=torch.Generator().manual_seed(0))
     display = linear_to_srgb(srgb_to_linear(linear_to_srgb(mixed * front + (1 - mixed) * behind) + noise).clamp(0, 1))
-    sides = ContourColors.from_image(display, smoothed(alpha[None], max(CONTOUR_BLURS))[0], torch.ones(n, n))
-    losses = blur_losses(sides, display, torch.ones(n, n), alpha)
+    whole, image = torch.ones(1, n, n), display.movedim(-1, 0)[None]
+    sides = ContourColors.from_image(image, smoothed(alpha[None], max(CONTOUR_BLURS)), whole)
+    losses = blur_losses(sides, image, whole, alpha[None])
     assert CONTOUR_BLURS[int(losses.argmin())] == blur, losses

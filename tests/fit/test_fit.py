@@ -136,9 +136,9 @@ def test_scene_of_several_meshes_moves_together():
 
 def test_a_picture_larger_than_max_size_is_reduced():
     view = camera(96)
-    fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(max_size=32, steps=12))
-    assert max(max(step.size) for step in fit.history) == 32
-    assert max(errors(fit)) < 1.5
+    fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(max_size=48, steps=12))
+    assert max(max(step.size) for step in fit.history) == 48
+    assert max(errors(fit)) < 1.0
     assert torch.equal(fit.camera.K, view.K) and fit.camera.size == view.size
 
 
@@ -158,14 +158,14 @@ def test_interruption_keeps_the_best_pose():
 
     def stop(fit):
         seen.append(fit)
-        if len(seen) == 7:
+        if len(seen) == 10:
             raise KeyboardInterrupt
 
     fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(callback=stop))
-    assert fit.interrupted and not fit.converged and fit.steps == 7
+    assert fit.interrupted and not fit.converged and fit.steps == len(fit.history) >= 10
     assert torch.equal(fit.matrix, seen[-1].matrix)
     assert fit.loss == min(f.loss for f in seen) and fit.loss < seen[0].loss
-    assert sum(errors(fit)) < 5.0  # 12 + 8 at the start, 1.3 now
+    assert sum(errors(fit)) < 7.0  # 12 + 8 at the start
 
 
 def test_json_round_trip():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from brackets import BACKGROUND, bracket, camera, rotation
+from messages import T, V, check_message
 from quiet_fits import arranged
 
 import edgegrad as eg
@@ -139,27 +140,21 @@ class NoForward(torch.autograd.Function):
 
 
 @pytest.mark.parametrize(
-    ("change", "error", "message"),
+    ("change", "error", "parts"),
     [
-        ({"method": "newton"}, ValueError, "method: expected one of adam, gauss-newton, got 'newton'"),
-        ({"parameters": {"texture": 0.1}}, ValueError, r"expected at most 400 numbers .* got 3072; give method=.adam"),
-        ({"views_per_step": 1}, ValueError, "views_per_step: expected None for method"),
-        ({"loss": losses.multiscale()}, ValueError, "loss: expected a loss of each pixel by itself"),
-        ({"loss": "iou"}, ValueError, "loss: expected a loss of each pixel by itself"),
-        (
-            {"scene": lambda values: quad().replace(verts=NoForward.apply(values["v"])), "parameters": {"v": None}},
-            TypeError,
-            r"method: expected .* forward mode.*give method=.adam",
-        ),
+        ({"method": "newton"}, V, ["method: expected one of adam, gauss-newton, got 'newton'"]),
+        ({"parameters": {"texture": 0.1}}, V, ["expected at most 400 numbers", "got 3072; give method=", "adam"]),
+        ({"views_per_step": 1}, V, ["views_per_step: expected None for method"]),
+        ({"loss": losses.multiscale()}, V, ["loss: expected a loss of each pixel by itself"]),
+        ({"loss": "iou"}, V, ["loss: expected a loss of each pixel by itself"]),
+        ({"scene": lambda values: quad().replace(verts=NoForward.apply(values["v"]))}, T, ["method: expected", "forward mode"]),
     ],
-)
-def test_errors_name_the_argument(change, error, message):
-    arguments = {"scene": quad(), "parameters": {"verts": 0.01}, "method": "gauss-newton", **QUIET, **change}
-    if "v" in arguments["parameters"]:
-        arguments["parameters"] = {"v": Parameter(0.01, quad().verts)}
+)  # fmt: skip
+def test_errors_name_the_argument(change, error, parts):
+    parameters = {"v": Parameter(0.01, quad().verts)} if "scene" in change else {"verts": 0.01}
     view = eg.Camera.look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), size=(16, 16))
-    with pytest.raises(error, match=message):
-        fit_scene(images=torch.zeros(16, 16, 3), cameras=view, **arranged(**arguments))
+    given = {"scene": quad(), "parameters": parameters, "method": "gauss-newton", **QUIET, **change}
+    check_message(lambda: fit_scene(images=torch.zeros(16, 16, 3), cameras=view, **arranged(**given)), error, *parts)
 
 
 def quad():

@@ -3,24 +3,23 @@
 import math
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
 import trimesh
-from brackets import CENTER, START, about_center, bracket, camera, errors, rotation, task_of
+from brackets import CENTER, START, bracket, camera, errors, task_of
 from photographs import clutter, coverage, depth_of, photograph
 from quiet_fits import arranged, quiet
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import srgb_to_linear
-from edgegrad.fit import Checkpoint, fit_camera, fit_pose
+from edgegrad.fit import fit_camera, fit_pose
 from edgegrad.fit.options import Settings
 from edgegrad.fit.pose import pose_search
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.likelihood.objective import pose_levels
-from edgegrad.fit.pose.likelihood.support import Evidence, evidence_of
+from edgegrad.fit.pose.likelihood.support import evidence_of
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.fit.pose.target_images import is_clutter
@@ -36,29 +35,6 @@ def test_an_ambiguous_pose_may_be_shifted(taken):
         others = [pose, pose._replace(t=pose.t + far * task.size * torch.tensor([0.0, 0.6, 0.8]))]
         said = ambiguity(pose, others, None, task)
         assert words in said and bool(said) == bool(words)
-
-
-@pytest.mark.parametrize("photograph_share", [0.5, 0.7])
-def test_a_result_is_judged_by_the_limit_of_the_terms_that_it_is_from(photograph_share, monkeypatch):
-    """Colours that show 62 % of the edges converged, though the terms of photographs would need more."""
-    view = camera(48)
-    image = eg.render(eg.Scene([bracket()], torch.tensor([0.1, 0.2, 0.3])), view, spp=16, seed=0)
-    few = Settings(steps=10, step_tolerance=1e-3, spp=8, max_size=48)
-    search = pose_search.PoseSearch(task_of(image, view), pose_from_matrix("pose", START), [None], few)
-    assert search.colors_first
-    colors = SimpleNamespace(
-        best=search.start, loss=1.0, edge_support=0.62, converged=True, information=None, enough=0.6, history=[]
-    )
-    monkeypatch.setattr(search, "_by_colors", lambda *_: colors)
-    search.run()
-    assert search.converged and search.edge_support >= search.enough == 0.6
-    # Where colours show too little, the better of both is judged by its own limit.
-    colors.edge_support, colors.converged = 0.55, False
-    monkeypatch.setattr(search, "_refined", lambda: [SimpleNamespace(pose=search.start)])
-    monkeypatch.setattr(search, "_evidence", lambda pose: Evidence(photograph_share, 1.0, 0.1, 40.0))
-    monkeypatch.setattr(search, "_take", lambda modes, share: None)
-    search.run()
-    assert search.enough == (POSE.sure_support if photograph_share > POSE.photo_support else 0.6)
 
 
 @pytest.fixture(scope="module")
@@ -157,35 +133,17 @@ def test_noise_is_refused_without_following_other_starts():
     assert fit.reason.startswith("edges not explained")
 
 
-def test_a_resumed_fit_ends_as_if_it_had_never_stopped(taken, tmp_path):
-    view, image = taken
-    start, whole = about_center(rotation(0.05, -0.04, 0.03)), {"progress": False, "search": False, "spp": 8, "steps": 4}
-    expected = fit_pose(bracket(), image, view, init=start, **arranged(**whole))
-
-    def stop(fit):
-        if fit.steps == 5:
-            raise KeyboardInterrupt
-
-    file = tmp_path / "fit.pt"
-    first = fit_pose(bracket(), image, view, init=start, **arranged(callback=stop, checkpoint=file, **whole))
-    assert first.interrupted and first.steps == 5 and not first.converged
-    found = fit_pose(bracket(), image, view, init=start, **arranged(checkpoint=Checkpoint(file, resume=True), **whole))
-    assert torch.equal(found.matrix, expected.matrix) and found.explained == expected.explained
-    assert found.steps == expected.steps and found.converged == expected.converged
-    with pytest.raises(ValueError, match="depth"):
-        fit_pose(
-            bracket(), image, view, init=start, depths=depth_of(view),
-            **arranged(checkpoint=Checkpoint(file, resume=True), **whole),
-        )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("depth", "error", "message"),
     [
         (torch.ones(10, 10), ValueError, r"depths: expected shape .*96.*, got .*10.*"),
-        (torch.full((96, 96), -1.0), ValueError, r"depths: expected distances along the camera's axis.*got -1"),
-        (torch.ones(96, 96, dtype=torch.int32), TypeError, r"depths: expected .*float.*take depth / 1000"),
-        (torch.zeros(96, 96), ValueError, r"depths: expected distances somewhere, got none"),
+        (torch.full((96, 96), -1.0), ValueError, r"depths: expected depths along the optical axis.*got -1"),
+        (
+            torch.ones(96, 96, dtype=torch.int32),
+            TypeError,
+            r"depths: expected .*float.*take x\.float\(\) times its unit",
+        ),
+        (torch.zeros(96, 96), ValueError, r"depths: expected a pixel that was measured, got none"),
         ([torch.ones(96, 96)] * 2, ValueError, r"depths: expected 1, one for each camera, got 2"),
     ],
 )

@@ -5,7 +5,6 @@ import warnings
 import pytest
 import torch
 from brackets import (
-    BACKGROUND,
     CENTER,
     START,
     about_center,
@@ -16,7 +15,6 @@ from brackets import (
     picture,
     rotation,
     silhouette,
-    task_of,
 )
 from photographs import compressed
 from quiet_fits import quiet
@@ -24,11 +22,8 @@ from quiet_fits import quiet
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb
 from edgegrad.fit import fit_pose
-from edgegrad.fit.pose import color_search
-from edgegrad.fit.pose.blur_estimate import estimate_blur
-from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.robust_loss import Comparison
-from edgegrad.fit.pose.target_images import blurred, is_clutter
+from edgegrad.fit.pose.target_images import is_clutter
+from edgegrad.fit.region import smoothed
 
 
 def covered(view, image):
@@ -51,6 +46,10 @@ def test_a_quarter_covered(how, steps):
     assert fit.converged and fit.explained > 0.5
 
 
+def blurred(image, sigma):
+    return smoothed(image.movedim(-1, 0), sigma).movedim(0, -1)
+
+
 WORN = {
     "sharp": lambda image: image,
     "soft": lambda image: blurred(image, 1.0),
@@ -67,21 +66,11 @@ def test_blur_and_compression_cost_no_second_search(kind):
     view = camera(80)
     fit = fit_pose(before_sky(), WORN[kind](picture(view)), view, init=START, options=quiet())
     degrees, percent = errors(fit)
-    limit = 0.15 if kind in ("sharp", "soft") else 1.0  # without the blur of renders: 0.5 for soft
+    limit = {"sharp": 0.1, "soft": 0.5}.get(kind, 1.0)  # blurs are tried in steps of a fifth of a pixel
     shown = 0.9 if kind in ("sharp", "soft") else 0.75  # what compression makes stronger is not the render's
     assert degrees < limit and percent < limit and fit.converged and fit.explained > shown, (degrees, percent)
     sizes = [step.size for step in fit.history]
     assert sizes == sorted(sizes) and fit.steps < 60  # a second search begins at a coarse level again
-
-
-def test_the_softness_of_a_picture():
-    view = camera(64)
-    for sigma in (0.0, 0.6, 1.0):
-        task = task_of(blurred(picture(view), sigma), view, background=BACKGROUND)
-        pose = pose_from_matrix("", torch.eye(4))
-        level = task.level(1.0, 0.0, 1.0, 64, task.dofs)
-        renders = [task.images(level, pose, 64, seed) for seed in (0, 1)]
-        assert estimate_blur(task, level, *renders) == pytest.approx(sigma, abs=0.1)
 
 
 def lit():
@@ -107,14 +96,6 @@ def test_an_unlit_mesh_in_a_lit_picture_stays_near_its_start(further):
     if not further:
         sizes = [step.size for step in fit.history]
         assert sizes == sorted(sizes)
-
-
-def test_an_answer_shows_as_much_of_the_edges():
-    start = color_search.Score(loss=1.0, edge_support=0.5, edges=10.0)
-    assert start._replace(loss=0.9, edge_support=0.6).beats(start)
-    assert not start._replace(loss=1.1, edge_support=0.9).beats(start)
-    assert not start._replace(loss=0.9, edge_support=0.4).beats(start)
-    assert not start._replace(loss=0.9, edge_support=0.9, edges=5.0).beats(start)  # hardly in view
 
 
 def test_a_border_of_many_colours_is_clutter():
@@ -166,36 +147,3 @@ def test_the_start_is_placed_where_the_picture_shows_the_object():
     assert float((where - CENTER).norm()) < 0.1
     started = fit.history[0].pose
     assert torch.equal(started.R, torch.eye(3, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("clutter", [False, True])
-def test_residuals_have_the_gradient_of_the_loss(clutter):
-    """Σ f ∂f is half the derivative of Σ ρ − (1 − (1 − α)²) c²/2 with weights held fixed and optimal gains. Renders are
-    functions of one number, which finite differences change."""
-    view = camera(16)
-    background = None if clutter else BACKGROUND
-    image = picture(
-        view, background=torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(1)) if clutter else BACKGROUND
-    )
-    task = task_of(image, view, weight=torch.rand(16, 16), background=background)
-    assert task.clutter == clutter
-    level = task.level(1.0, 0.0, 1.0, 4, task.dofs)
-    g = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        (base,) = (layer.double() for layer in task.images(level, pose_from_matrix("", torch.eye(4)), 16, 0))
-    base, way = (
-        base + 0.05 * torch.rand(base.shape, generator=g),
-        torch.rand(base.shape, generator=g, dtype=torch.float64),
-    )
-    c, h = 0.3, 1e-5
-
-    def at(x):
-        return Comparison(task, level, [base + x * way])
-
-    x = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    (found,) = torch.autograd.grad(sum(0.5 * f.square().sum() for f in at(x).residuals(c)), x)
-    weight = level.shots[0].weight
-    count = float(weight.sum()) * 3
-    assert at(x).count == pytest.approx(count)
-    expected = 0.5 * count * (at(h).loss(c)[0] - at(-h).loss(c)[0]) / (2 * h)
-    assert float(found) == pytest.approx(expected, rel=1e-3)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from brackets import BACKGROUND, bracket
+from messages import T, V, check_message
 from quiet_fits import arranged
 from small_scenes import QUIET, pictures, views
 
@@ -82,41 +83,32 @@ def test_weights_and_a_robust_loss_exclude_what_covers_the_object():
     assert off() > 0.05
 
 
+def background_fit(rate, start=(0.0, 0.0, 0.0), shown=None, size=32, **options):
+    """Return a fit of the background behind the bracket to a picture, of the bracket or of something else."""
+    cameras, scene = views(1, size), eg.Scene([bracket()], torch.tensor(start))
+    target = pictures(eg.Scene([shown or bracket()], BACKGROUND), cameras)
+    return fit_scene(scene, target, cameras, {"background": rate}, **arranged(**{**QUIET, **options}))
+
+
 def test_a_flat_loss_alone_is_no_convergence():
     """The colours of one object cannot explain the picture of another one: the loss gets flat, at a wrong place."""
-    cameras = views(1)
-    other = bracket().transformed(
-        torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double(), torch.tensor([2.0, 1.5, 0]).double()
-    )
-    target = pictures(eg.Scene([other], BACKGROUND), cameras)
-    fit = fit_scene(
-        eg.Scene([bracket()], BACKGROUND), target, cameras, {"background": 0.02}, **arranged(steps=200, patience=8, **QUIET),
-    )  # fmt: skip
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+    other = bracket().transformed(turn, torch.tensor([2.0, 1.5, 0]).double())
+    fit = background_fit(0.02, BACKGROUND.tolist(), other, steps=200, patience=8)
     assert fit.ending is Ending.FLAT and not fit.converged and fit.explained < 0.6
     assert fit.reason.startswith("edges not explained: the pictures show")
 
 
 @pytest.mark.parametrize(("method", "rate"), [("adam", 0.3), ("gauss-newton", 0.02)])
 def test_a_tolerance_of_0_takes_all_steps(method, rate):
-    cameras = views(1)
-    options = {"steps": 60, "patience": 2, "method": method, **QUIET, "spp": 1}
-    target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
-
     def steps(tolerance):
-        scene = eg.Scene([bracket()], torch.zeros(3))
-        return fit_scene(
-            scene, target, cameras, {"background": rate}, **arranged(loss_tolerance=tolerance, **options)
-        ).steps
+        return background_fit(rate, method=method, loss_tolerance=tolerance, steps=60, patience=2, spp=1).steps
 
     assert steps(0.01) < 60 and steps(0.0) == 60
 
 
 def test_a_loss_that_still_falls_is_no_convergence():
-    cameras = views(1)
-    target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
-    fit = fit_scene(
-        eg.Scene([bracket()], torch.zeros(3)), target, cameras, {"background": 1e-3}, **arranged(steps=20, **QUIET)
-    )
+    fit = background_fit(1e-3, steps=20)
     assert not fit.converged and fit.reason.startswith("loss still falling: give it more steps")
 
 
@@ -125,29 +117,6 @@ def colour_fit(cameras, target, **options):
     return fit_scene(
         start, target, cameras, {"meshes.0.face_colors": 0.03, "background": 0.02}, **arranged(**QUIET, **options)
     )
-
-
-def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path):
-    cameras = views()
-    target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
-
-    def stop(record):
-        if record.step == 13:
-            raise KeyboardInterrupt
-
-    whole = colour_fit(cameras, target, steps=30, patience=5, views_per_step=2)
-    file = tmp_path / "fit.ckpt"
-    options = {"steps": 30, "patience": 5, "checkpoint": file, "views_per_step": 2}
-    half = colour_fit(cameras, target, callback=stop, **options)
-    options["resume"] = True
-    assert half.interrupted and not half.converged and half.steps == 14 and file.exists()
-    again = colour_fit(cameras, target, **options)
-    assert again.steps == whole.steps and not again.interrupted
-    for name, value in whole.values.items():
-        assert torch.equal(again.values[name], value)
-    assert [r.loss for r in again.history] == [r.loss for r in whole.history]
-    assert list(tmp_path.iterdir()) == [file]  # nothing half done stays behind
-    assert colour_fit(cameras, target, **options).steps == whole.steps  # nothing left to do
 
 
 def test_a_checkpoint_of_something_else_is_refused(tmp_path):
@@ -175,29 +144,14 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
         colour_fit(cameras, target, steps=1, checkpoint=file, resume=True)
 
 
-def test_an_interruption_keeps_the_best_values():
-    cameras = views(1)
-    target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
-    fit = colour_fit(
-        cameras, target, steps=40, callback=lambda r: (_ for _ in ()).throw(KeyboardInterrupt) if r.step == 25 else None
-    )
-    assert fit.interrupted and fit.reason == "interrupted" and fit.steps == 26
-    assert fit.loss < 0.5 * fit.history[0].loss
-
-
 def test_a_step_too_far_is_taken_back():
     """A learning rate throws the values out of float32. The fit goes back and continues with shorter steps."""
-    cameras = views(1, 16)
-    target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
 
     def broken(image, wanted, weight):
         loss = losses.l2(image, wanted, weight)
         return loss * (math.nan if float(image.detach().max()) > 1.5 else 1.0)
 
-    fit = fit_scene(
-        eg.Scene([bracket()], torch.zeros(3)), target, cameras, {"background": 0.9},
-        **arranged(loss=broken, steps=40, **QUIET),
-    )  # fmt: skip
+    fit = background_fit(0.9, size=16, loss=broken, steps=40)
     assert all(bool(value.isfinite().all()) for value in fit.values.values())
     assert fit.loss < fit.history[0].loss
 
@@ -228,113 +182,83 @@ def test_saves_the_materials_it_found(tmp_path):
     assert float(found.material.roughness) == pytest.approx(0.4)
 
 
+def errors_of(**change):
+    """Return the call of a fit of the background to two pictures, with other arguments."""
+    given = {
+        "scene": eg.Scene([bracket()], BACKGROUND), "cameras": views(2), "images": torch.zeros(2, 32, 32, 3),
+        "parameters": {"background": 0.1},
+    }  # fmt: skip
+    if "options" in change:
+        return lambda: fit_scene(**given, **change)
+    return lambda: fit_scene(**arranged(**{**given, **change}))
+
+
 @pytest.mark.parametrize(
-    "change, error, message",
+    ("change", "error", "message"),
     [
-        ({"parameters": {"meshes.0.vert": 1e-3}}, ValueError, "did you mean 'meshes.0.verts'"),
-        ({"parameters": {}}, ValueError, "parameters: expected a name or more of what is sought, got none"),
+        ({"scene": 3}, T, "scene: expected a Scene, a Mesh, or a function"),
+        ({"images": torch.zeros(8, 8, 3)}, V, "images: expected 2, one for each camera, got 1 in shape"),
+        ({"images": None}, V, "images: expected pictures or masks"),
+        ({"cameras": []}, V, "cameras: expected one for each picture, got an empty list"),
+        ({"cameras": "here"}, T, "cameras: expected a Camera"),
+        ({"masks": torch.ones(2, 32, 32, 3)}, V, "masks[0]: expected shape (32, 32) or (32, 32, 1)"),
+        ({"masks": torch.zeros(2, 32, 32)}, V, "masks: expected numbers above 0 somewhere"),
+        ({"weights": -torch.ones(2, 32, 32)}, V, "weights[0]: expected numbers from 0 up"),
+        ({"weights": torch.zeros(2, 32, 32)}, V, "weights: expected numbers above 0 somewhere"),
+        ({"loss": "l3"}, V, "loss: expected one of l1, l2"),
+        ({"loss": lambda image, target: image.mean()}, T, "loss: expected a function of image, target and weight"),
+        ({"loss": lambda a, b, weight: a - b}, V, "gives a tensor of one number, got shape"),
         (
-            {"parameters": ["background"]},
-            TypeError,
-            "parameters: expected a mapping of names to learning rates or Parameters, got list",
+            {"loss": lambda a, b, weight: (a - b).detach().mean()},
+            V,
+            "options.loss: expected a number with a gradient by",
         ),
-        (
-            {"parameters": {"background": [0.1]}},
-            TypeError,
-            "background: expected a learning rate or a Parameter, got list",
-        ),
-        ({"cameras": []}, ValueError, "cameras: expected one for each picture, got an empty list"),
-        (
-            {"parameters": {"background": "fast"}},
-            TypeError,
-            "background: expected a learning rate or a Parameter, got str",
-        ),
-        ({"parameters": {"background": Parameter(0.1, torch.zeros(4))}}, ValueError, "background: expected shape (3,)"),
-        (
-            {"parameters": {"background": Parameter(0.1, low=1.0, high=0.0)}},
-            ValueError,
-            "background: expected low ≤ high",
-        ),
-        ({"images": torch.zeros(8, 8, 3)}, ValueError, "images: expected 2, one for each camera, got 1 in shape"),
-        ({"images": None}, ValueError, "images: expected pictures or masks"),
-        ({"weights": -torch.ones(2, 32, 32)}, ValueError, "weights: expected numbers from 0 up"),
-        ({"masks": torch.ones(2, 32, 32, 3)}, ValueError, "masks[0]: expected shape (32, 32) or (32, 32, 1)"),
-        ({"cameras": "here"}, TypeError, "cameras: expected a Camera"),
-        ({"scene": 3}, TypeError, "scene: expected a Scene, a Mesh, or a function"),
-        ({"loss": "l3"}, ValueError, "loss: expected one of l1, l2"),
-        ({"max_size": 64}, ValueError, "options.max_size: fit_scene compares pictures at their own size"),
-        ({"options": {"steps": 3}}, TypeError, "options: expected FitOptions, got dict; give FitOptions(steps=…)"),
-        ({"steps": 0}, ValueError, "steps: expected an int from 1"),
+        ({"max_size": 64}, V, "options.max_size: fit_scene compares pictures at their own size"),
+        ({"options": {"steps": 3}}, T, "options: expected FitOptions, got dict; give FitOptions(steps=…)"),
+        ({"steps": 0}, V, "steps: expected an int from 1"),
         ({"checkpoint": "/nowhere/at/all"}, FileNotFoundError, "checkpoint: expected the folder"),
-        ({"sampling": {"lights": 3}}, TypeError, "options.sampling: expected a Sampling, got dict"),
-        (
-            {"loss": lambda image, target: image.mean()},
-            TypeError,
-            "loss: expected a function of image, target and weight",
-        ),
-        ({"loss": lambda image, target, weight: image - target}, ValueError, "gives a tensor of one number, got shape"),
-        ({"weights": torch.zeros(2, 32, 32)}, ValueError, "weights: expected numbers above 0 somewhere"),
-        ({"masks": torch.zeros(2, 32, 32)}, ValueError, "masks: expected numbers above 0 somewhere"),
-        ({"parameters": {"background": Parameter(0.1, high=0.01)}}, ValueError, "background: expected a start within"),
-        ({"parameters": {"cameras.0.world_to_camera": 0.1}}, ValueError, "expected 'cameras.0.pose' to move a camera"),
-        ({"parameters": {0: 0.1}}, TypeError, "parameters: expected names of what is sought as str, got int (0)"),
-        ({"parameters": {"background": Parameter(0.1, 1.0)}}, ValueError, "background: expected shape (3,), got ()"),
-        (
-            {"parameters": {"background": Parameter(0.1, [0.1, 0.2])}},
-            ValueError,
-            "background: expected shape (3,), got (2,)",
-        ),
-        ({"parameters": {"background": Parameter(0.1, "0")}}, TypeError, "background: value: expected a tensor, array"),
-        ({"parameters": {"background": Parameter(0.1, [math.nan] * 3)}}, ValueError, "background: "),
-        ({"parameters": {"background": Parameter("0")}}, TypeError, "background: lr: expected a number, got str"),
-        (
-            {"parameters": {"background": Parameter(0.1, low="0")}},
-            TypeError,
-            "background: low: expected a tensor, array",
-        ),
-        (
-            {"parameters": {"background": Parameter(0.1, high=math.nan)}},
-            ValueError,
-            "background: high: expected a number",
-        ),
-        (
-            {"parameters": {"background": Parameter(0.1, low=[0.0, 0.0])}},
-            ValueError,
-            "background: low: expected a number or",
-        ),
-        (
-            {
-                "scene": lambda values: eg.Scene([bracket()], values["background"].detach()),
-                "parameters": {"background": Parameter(0.1, BACKGROUND)},
-            },
-            ValueError,
-            "scene: expected a function whose scene depends on the parameters background",
-        ),
-        (
-            {"loss": lambda image, target, weight: (image - target).detach().square().mean()},
-            ValueError,
-            "options.loss: expected a number with a gradient by the image",
-        ),
+        ({"sampling": {"lights": 3}}, T, "options.sampling: expected a Sampling, got dict"),
     ],
 )
 def test_errors_name_the_argument(change, error, message):
-    cameras = views(2)
-    arguments = {
-        "scene": eg.Scene([bracket()], BACKGROUND), "cameras": cameras, "images": torch.zeros(2, 32, 32, 3),
-        "parameters": {"background": 0.1},
-    }  # fmt: skip
-    with pytest.raises(error) as caught:
-        fit_scene(
-            **{**arranged(**arguments), **(change if "options" in change else arranged(**{**arguments, **change}))}
-        )
-    assert message in str(caught.value)
+    check_message(errors_of(**change), error, message)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "error", "message"),
+    [
+        ({}, V, "parameters: expected a name or more of what is sought, got none"),
+        (["background"], T, "parameters: expected a mapping of names to learning rates or Parameters, got list"),
+        ({0: 0.1}, T, "parameters: expected names of what is sought as str, got int (0)"),
+        ({"meshes.0.vert": 1e-3}, V, "did you mean 'meshes.0.verts'"),
+        ({"cameras.0.world_to_camera": 0.1}, V, "expected 'cameras.0.pose' to move a camera"),
+        ({"background": [0.1]}, T, "background: expected a learning rate or a Parameter, got list"),
+        ({"background": "fast"}, T, "background: expected a learning rate or a Parameter, got str"),
+        ({"background": Parameter("0")}, T, "background: lr: expected a number, got str"),
+        ({"background": Parameter(0.1, torch.zeros(4))}, V, "background: expected shape (3,)"),
+        ({"background": Parameter(0.1, 1.0)}, V, "background: expected shape (3,), got ()"),
+        ({"background": Parameter(0.1, [0.1, 0.2])}, V, "background: expected shape (3,), got (2,)"),
+        ({"background": Parameter(0.1, "0")}, T, "background: value: expected a tensor, array"),
+        ({"background": Parameter(0.1, [math.nan] * 3)}, V, "background: "),
+        ({"background": Parameter(0.1, low=1.0, high=0.0)}, V, "background: expected low ≤ high"),
+        ({"background": Parameter(0.1, high=0.01)}, V, "background: expected a start within"),
+        ({"background": Parameter(0.1, low="0")}, T, "background: low: expected a tensor, array"),
+        ({"background": Parameter(0.1, high=math.nan)}, V, "background: high: expected a number"),
+        ({"background": Parameter(0.1, low=[0.0, 0.0])}, V, "background: low: expected a number or"),
+    ],
+)
+def test_errors_name_the_parameter(parameters, error, message):
+    check_message(errors_of(parameters=parameters), error, message)
+
+
+def test_a_scene_that_does_not_depend_on_a_parameter_is_named():
+    change = {"scene": lambda values: eg.Scene([bracket()], values["background"].detach())}
+    change["parameters"] = {"background": Parameter(0.1, BACKGROUND)}
+    check_message(errors_of(**change), V, "scene: expected a function whose scene depends on the parameters background")
 
 
 def test_numbers_and_lists_are_values_and_bounds():
-    cameras = views(1, 16)
-    target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
-    wanted = {"background": Parameter(0.1, [0.0, 0.0, 0.0], low=0, high=np.full(3, 0.15))}
-    fit = fit_scene(eg.Scene([bracket()], BACKGROUND), target, cameras, wanted, **arranged(steps=5, **QUIET))
+    fit = background_fit(Parameter(0.1, [0.0, 0.0, 0.0], low=0, high=np.full(3, 0.15)), size=16, steps=5)
     assert float(fit.values["background"].min()) > 0.0 and float(fit.values["background"].max()) <= 0.151
 
 

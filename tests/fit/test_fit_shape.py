@@ -56,27 +56,6 @@ def test_a_shape_that_cannot_be_remeshed_is_refused_before_the_first_level():
     )
 
 
-def test_a_shape_resumes_on_a_later_level(tmp_path):
-    pytest.importorskip("gpytoolbox")
-    cameras, masks = egg_views()
-    file = tmp_path / "shape.ckpt"
-
-    def stop(record):
-        stop.count += 1
-        if stop.count == 9:
-            raise KeyboardInterrupt
-
-    stop.count = 0
-    options = {"masks": masks, "refinement": Refinement(2), "steps": 6, "checkpoint": file, **QUIET}
-    half = fit_shape(ball(1), None, cameras, **arranged(callback=stop, **options))
-    assert half.interrupted and half.steps == 9
-    again = fit_shape(ball(1), None, cameras, **arranged(resume=True, **options))
-    file.unlink()
-    whole = fit_shape(ball(1), None, cameras, **arranged(**options))
-    assert again.steps == whole.steps == 12
-    torch.testing.assert_close(again.mesh.verts, whole.mesh.verts, rtol=0, atol=1e-6)
-
-
 def test_colours_without_an_appearance_are_named():
     cameras, masks = egg_views()
     mesh = ball(1).replace(face_colors=torch.full((len(ball(1).faces), 1), 0.5))

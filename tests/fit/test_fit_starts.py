@@ -113,17 +113,16 @@ def test_matches_come_closer_than_views_are_apart() -> None:
     mesh, picture, mask = pictured(R, t)
     task = task_of(picture, camera(), mesh, mask)
     mips = Mips(task, TEMPLATES.view_pixels)
-    found = _in_mask(TemplateViews.from_rotations(task, all_sides()[::2], TEMPLATES.view_pixels, 0), mips).distinct(
-        24, 0.2, 0.1, TEMPLATES.size_spacing
-    )
+    views = TemplateViews.from_rotations(task, all_sides()[::2], TEMPLATES.view_pixels, 0)
+    found = _in_mask(views, mips).distinct(24, *TEMPLATES.distinct)
     coarse = found
     for one in TEMPLATES.beam_rounds:
         before = found
-        found = closer(task, before, mips, one, 0.0, 0)
+        found = closer(task, before, mips, one, 0)
         if one.across == TEMPLATES.view_pixels:  # the match itself is among those compared
             assert bool((found.scores >= before.scores - 1e-4).all())
             assert float((found.scores - before.scores).mean()) > 0.1
-        found = found.distinct(12, one.turned, one.spacing, TEMPLATES.size_spacing)
+        found = found.distinct(12, *TEMPLATES.distinct)
     assert any(near(pose, R, t, task, 0.2, 0.1) for pose in found.poses(task)[:4])
     assert not any(near(pose, R, t, task, 0.2, 0.1) for pose in coarse.poses(task)[:4])
 

@@ -13,6 +13,7 @@ from edgegrad.fit.pose import hypotheses
 from edgegrad.fit.pose.camera_motion import moved_poses
 from edgegrad.fit.pose.hypotheses import Group, HypothesisSearch, Mode, probabilities, turned
 from edgegrad.fit.pose.pose import angle, pose_from_matrix
+from edgegrad.fit.pose.replay_log import ReplayLog
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.optim.levenberg_marquardt import Model, Problem
 
@@ -28,13 +29,17 @@ class KnownMinima(Problem):
     coarseness, size = 1.0, (64, 64)
 
     def __init__(self, task, minima, last):
-        self.task, self.minima, self.last, self.dofs = task, minima, last, tuple(task.dofs)
+        self.task, self.minima, self.last, self.dofs = task, minima, last, tuple(task.dofs) if task else ()
+        self.contour_noises = ()
 
     def informed(self, poses):
         return self
 
     def focused(self, pose):
         return self
+
+    def temperature(self, pose):
+        return T
 
     def moved(self, points, steps):
         return moved_poses(self.task, points, self.dofs, steps)
@@ -67,6 +72,7 @@ def search_of(monkeypatch, minima, groups=None, symmetries=None):
     return HypothesisSearch(task, groups or [(START, turned(task, START))], [None], Settings(), symmetries)
 
 
+T = 64.0  # pixels that count as one
 MINIMA = [(-3000.0, RIGHT), (-2900.0, WRONG)]
 
 
@@ -119,7 +125,7 @@ def test_ctrl_c_keeps_the_likeliest_so_far(monkeypatch):
 @pytest.mark.quick
 def test_further_hypotheses_lie_where_the_cost_rises_least(monkeypatch):
     search = search_of(monkeypatch, MINIMA)
-    group = Group([KnownMinima(search.task, MINIMA, False)], [RIGHT])
+    group = Group([KnownMinima(search.task, MINIMA, False)], [RIGHT], ReplayLog())
     group.enter(0, Settings())
     group.descents.advance()
     ends = group.open_ends(0)
@@ -134,13 +140,12 @@ def test_further_hypotheses_lie_where_the_cost_rises_least(monkeypatch):
 @pytest.mark.quick
 def test_probabilities_of_modes_are_ratios_of_gaussian_integrals():
     """The prior of a step is a normal one of variance 1. Numbers are of a grid."""
-    T = POSE.correlation_length**2
     x = torch.linspace(-6, 6, 1201, dtype=F64)
     grid = torch.cartesian_prod(x, x)
     modes, masses = [], []
     for cost, rows in ((-300.0, [[900.0, 100.0], [100.0, 300.0]]), (-250.0, [[90.0, 0.0], [0.0, 40.0]])):
         H = torch.tensor(rows, dtype=F64)
-        modes.append(Mode(RIGHT, cost, H, True))
+        modes.append(Mode(RIGHT, cost, H, True, KnownMinima(None, [], True), T))
         masses.append(float((-(cost + 0.5 * ((grid @ H) * grid).sum(1)) / T - 0.5 * grid.square().sum(1)).exp().sum()))
     found = probabilities(modes)
     assert found == pytest.approx([mass / sum(masses) for mass in masses], rel=1e-6)

@@ -18,7 +18,7 @@ from edgegrad.fit.options import Settings
 from edgegrad.fit.pose.camera_motion import moved_poses, moving_cameras
 from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.likelihood import light, objective
-from edgegrad.fit.pose.likelihood.contour import contour_term
+from edgegrad.fit.pose.likelihood.contour import ContourNoise, Sides, contour_rows, contour_term
 from edgegrad.fit.pose.likelihood.depth import depth_term
 from edgegrad.fit.pose.likelihood.light import FittedLight
 from edgegrad.fit.pose.likelihood.objective import pose_levels
@@ -79,7 +79,7 @@ def test_the_region_terms_gradient_is_that_of_its_cost():
 
     steps = h * torch.eye(6, dtype=F64)
     seen = silhouettes([RIGHT], 1024)
-    term = region_term(level, seen, colors, torch.ones_like(seen.alpha), sigma)
+    term = region_term(level, seen, colors, torch.ones_like(seen.alpha), None, sigma)
     ends = silhouettes(moved_poses(task, [RIGHT] * 12, task.dofs, torch.cat([steps, -steps])), 1024)
     ahead, behind = cost(pasted(ends, ends.alpha, n)).split(6)
     expected = (ahead - behind) / (2 * h)
@@ -107,7 +107,7 @@ def test_the_right_silhouette_is_the_likeliest(masked):
                          tangents=torch.cat([seen.tangents, torch.zeros_like(seen.tangents[:, :1])], 1))  # fmt: skip
     level = level_of(view, radiance, masked=masked)
     colors = Frequencies.from_picture(level, pasted(seen, seen.alpha, n))
-    term = region_term(level, seen, colors, torch.ones_like(seen.alpha), 0.0)
+    term = region_term(level, seen, colors, torch.ones_like(seen.alpha), None, 0.0)
     assert float(term.cost[0]) < 0.0 and bool((term.cost[0] < term.cost[1:] - 3.0).all()), term.cost
     if masked:
         assert float(term.cost[0]) == pytest.approx(-n * n * math.log(2.0), rel=0.05)
@@ -220,7 +220,9 @@ def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle, front, behind, known
         alpha = torch.special.ndtr((along - at) / sharp)[None]
         tangents = -torch.exp(-0.5 * ((along - at) / sharp).square()) / (sharp * math.sqrt(2 * math.pi))
         seen = RenderedPoses(box, alpha, tangents[None, None], None, None, None)
-        return contour_term(level, seen, ones, math.sqrt(blur**2 - sharp**2))
+        noise = ContourNoise(math.sqrt(blur**2 - sharp**2), 0.03)
+        sides = Sides.from_picture(level, seen, ones, None, ones, noise)
+        return contour_term(level, sides, contour_rows(seen, noise.blur))
 
     at = 0.0
     for _ in range(6):
@@ -294,7 +296,9 @@ def test_the_objective_is_the_sum_of_its_terms_for_each_pose_alone(monkeypatch):
     monkeypatch.setattr(Box, "around", staticmethod(lambda _, camera: Box(*(slice(0, side) for side in camera.size))))
     model = level.model(poses)
     assert len(kept) == 7
-    for found, parts in zip((model.cost[:, 0], model.gradient, model.curvature), zip(*kept, strict=True), strict=True):
+    for found, parts in zip(
+        (model.cost[:, 0], model.gradient, model.curvature), zip(*(one[:3] for one in kept), strict=True), strict=True
+    ):
         torch.testing.assert_close(found, sum(parts))
     assert bool((torch.linalg.eigvalsh(model.curvature) > 0.0).all())
     single = [level.model([pose]) for pose in poses]
@@ -319,7 +323,8 @@ def test_noise_and_blur_are_those_of_the_likeliest_pose(blur):
     assert informed.light_deviations[0] == pytest.approx(float(min(alone)), rel=0.05)
     known = informed.comparisons(poses)[0].light.deviation
     assert bool((known == known[0]).all()) and float(known[0]) == pytest.approx(informed.light_deviations[0])
-    assert level.focused(RIGHT).contour_blur == pytest.approx(blur, abs=0.21)
+    (noise,) = level.focused(RIGHT).contour_noises
+    assert noise.blur == pytest.approx(blur, abs=0.21) and 0.007 < noise.deviation < 0.04
 
 
 UNUSUAL = {

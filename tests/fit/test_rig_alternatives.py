@@ -118,18 +118,13 @@ def test_axial_rotations_are_found_by_the_loss_along_them() -> None:
     truth = {"rotations": parameter.value}
     masks = [eg.render_aovs(rig.posed(free.fixed["rotations"]), c, ["alpha"], spp=64, seed=5)["alpha"] for c in cameras]
     views = views_of(cameras, None, masks, None)
-    objective = Objective(
-        lambda values: (eg.Scene([rig.posed(**free.all(values))]), cameras),
-        views,
-        Settings(spp=32),
-    )
+    build = lambda values: (eg.Scene([rig.posed(**free.all(values))]), cameras)  # noqa: E731
+    objective = Objective(build, views, Settings(spp=32))
     shared, _, across = proposals.axial_rotations(truth)
     wrong = {"rotations": proposals.with_rotation(truth, shared, 0.35)}
     wrong = {"rotations": proposals.with_rotation(wrong, across, 1.5)}
     for start, most in ((wrong, 0.1), (truth, 0.06)):
-        search = HypothesisSearch(
-            objective, proposals, ARM, free.parameters, 0.0 * parameter.value, lambda *_: truth, torch.Generator()
-        )
+        search = HypothesisSearch(objective, proposals, lambda *_: truth, torch.Generator())
         found = search.rotate_about_bones(start)["rotations"]
         R, S = (roma.rotvec_to_rotmat(one) for one in (found, truth["rotations"]))
         assert float(roma.rotmat_geodesic_distance(R, S).max()) < most

@@ -100,7 +100,7 @@ def test_what_no_picture_shows_is_unknown() -> None:
     )  # fmt: skip
     assert fit.uncertainty is not None and fit.uncertainty.degrees["bone 1"] > 5.0
     assert "bone 1 known to ±" in fit.uncertainty.unknown
-    assert fit.confidence is not None and fit.confidence < 0.1
+    assert fit.confidence < 0.1
 
 
 def test_light_is_found_with_the_pose() -> None:

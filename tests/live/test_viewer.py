@@ -61,12 +61,12 @@ def test_a_pose_moves_the_mesh_and_keeps_the_camera(viewer):
 
 
 def test_a_camera_moves_before_a_scene_at_rest(viewer):
-    at = camera(32)
+    at = camera(48)
     away = at.world_to_camera.clone()
     away[0, 3] += 0.1
     fit = fit_camera(
         before_sky(), picture(at), at.replace(world_to_camera=away), focal=False, **arranged(callback=viewer, **QUIET |
-        {"spp": 64}),
+        {"spp": 64, "steps": 40}),
     )  # fmt: skip
     viewer.show(fit)
     np.testing.assert_allclose(

@@ -94,6 +94,6 @@ def test_ctrl_c_keeps_the_best_values_and_the_last_state() -> None:
 
     x = Parameter(0.05, torch.zeros(3, dtype=torch.float64))
     descent = AdamDescent(Bowl(), {"x": x}, AdamSettings())
-    found = descend(descent, Loop(200, save=states.append), stop)
+    found = descend(descent, Loop(200, stop, states.append))
     assert found.ending is Ending.INTERRUPTED and len(found.history) == 30
     assert states[-1]["steps"] == 30 and 0.0 < off(found) < 2.3

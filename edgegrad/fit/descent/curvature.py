@@ -70,40 +70,14 @@ def _weighted(
 def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
     """Return Σ |J| |r| / Σ |J| for each number, in the tensors' shapes: how far pixels are from their pictures where it moves
     them. It is large for what lies in a wrong place, also where the slope of the loss is zero."""
-    return _ratio(objective, tensors, step, lambda x: x.abs(), lambda name, i, image: torch.ones_like(image))
-
-
-def residuals(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
-    """Return Σ J² r² / Σ J² n² for each number, in the tensors' shapes, with the noise n² of the render's samples. It is about
-    1 for what lies where the pictures have it."""
-    with torch.no_grad():
-        scene, cameras = objective.build(tensors)
-        picks = objective.picks(step)
-        renders = objective.renders(scene, cameras, picks, objective.options.spp, objective.seed(step + 1))
-        again = {
-            (name, i): image
-            for group, channels in renders
-            for name, images in channels.items()
-            for i, image in zip(group, images, strict=True)
-        }
-    noise = lambda name, i, image: 0.5 * (image - again[name, i]).square()  # noqa: E731
-    return _ratio(objective, tensors, step, torch.square, noise)
-
-
-def _ratio(
-    objective: Objective, tensors: Mapping[str, Tensor], step: int, size: Callable[[Tensor], Tensor],
-    of: Callable[[str, int, Tensor], Tensor],
-) -> dict[str, Tensor]:  # fmt: skip
-    """Return the mean size of differences from the pictures, relative to `of` (name, view, image), for each number. Pixels
-    count by the size of their derivative."""
-    off, all = (torch.full_like(flat(tensors), 1e-30) for _ in range(2))
+    off, moved = (torch.full_like(flat(tensors), 1e-30) for _ in range(2))
     for name, group, render, slopes in derivatives(objective, tensors, step):
         for i, image, J in zip(group, render, slopes, strict=True):
             if (wanted := objective.views[i].wanted.get(name)) is not None:
-                rows = size(J).flatten(1)
-                off += (rows @ size(image - wanted).flatten()).double()
-                all += (rows @ of(name, i, image).flatten()).double()
-    return named(off / all, tensors, torch.float64)
+                rows = J.abs().flatten(1)
+                off += (rows @ (image - wanted).abs().flatten()).double()
+                moved += rows.sum(1).double()
+    return named(off / moved, tensors, torch.float64)
 
 
 def derivatives(

@@ -32,7 +32,7 @@ def descend_views(
     parameters: Mapping[str, Parameter],
     save: Save = nothing,
     saved: Mapping[str, Any] | None = None,
-    title: str = "fit",
+    title: str | None = "fit",
     report: Callable[[Record, dict[str, Tensor]], Record] = lambda record, values: record,
     gauss_newton: LevenbergMarquardtSettings = GAUSS_NEWTON,
 ) -> DescentResult:
@@ -42,14 +42,15 @@ def descend_views(
     report       makes what the callback gets, of a step's record and the tensors after the step
     Raises ValueError where the options' method cannot serve.
     """
-    options = objective.options
-    loop = Loop(
-        options.steps, save=save, every=None if options.checkpoint is None else options.checkpoint.every, saved=saved,
-        title=title if options.progress else None,
-    )  # fmt: skip
-    callback = options.callback
-    after_step = None if callback is None else lambda record, values: callback(report(record, values))
-    return descend(_optimizer(objective, parameters, gauss_newton), loop, after_step)
+    options, descent = objective.options, _optimizer(objective, parameters, gauss_newton)
+    callback, every = options.callback, None if options.checkpoint is None else options.checkpoint.every
+
+    def after_step() -> None:
+        if callback is not None:
+            callback(report(descent.history[-1], descent.values))
+
+    title = title if options.progress else None
+    return descend(descent, Loop(options.steps, after_step, save=save, every=every, saved=saved, title=title))
 
 
 def descend_levels(

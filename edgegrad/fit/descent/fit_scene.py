@@ -146,12 +146,11 @@ def fit_views(
     def whole(tensors: Mapping[str, Tensor]) -> Built:
         return build(coordinates.values(tensors))
 
-    start, cameras = build_detached(
-        whole, {n: p.value for n, p in coordinates.parameters.items() if p.value is not None}
-    )
+    first = {name: p.value for name, p in coordinates.parameters.items() if p.value is not None}
+    start, cameras = build_detached(whole, first)
     check_mask_rows(views, start, cameras)
     objective = Objective(whole, views, options, regularizer)
-    objective.check({n: p.value for n, p in coordinates.parameters.items() if p.value is not None})
+    objective.check(first)
     report = reporter(whole, views, coordinates)
     descent = descend_views(objective, coordinates.parameters, checkpoint.write, saved, report=report)
     return make_fit(objective, descent, start, coordinates)

@@ -107,15 +107,15 @@ class Objective(TensorObjective):
         """Compute what the loss holds fixed between steps at these values."""
         if self.regions is None:
             return
-        for i, alpha in enumerate(self._alphas(tensors, self.options.spp, self.seed(step))):
-            self.regions.renew(i, alpha, step)
+        for i, shown in enumerate(self.images(tensors, self.options.spp, step)):
+            self.regions.renew(i, shown["alpha"], step)
         self.provisional = self.regions.narrows
 
     def check(self, tensors: Tensors) -> None:
         """Check the start, and that the loss depends on all tensors. Raises ValueError."""
         if self.regions is None:
             return
-        self.regions.check(self._alphas(tensors, self.options.spp, self.seed(0)))
+        self.regions.check([shown["alpha"] for shown in self.images(tensors, self.options.spp, 0)])
         self.renew(tensors, 0)
         leaves = {name: value.detach().clone().requires_grad_() for name, value in tensors.items()}
         loss = self(leaves, 0)
@@ -127,15 +127,6 @@ class Objective(TensorObjective):
                     f'parameters: expected what moves the outline of the scene, as loss="region" needs, got {name!r}, on which '
                     "alpha does not depend; fit it afterwards, with another loss"
                 )
-
-    def _alphas(self, tensors: Tensors, spp: int, seed: int) -> list[Tensor]:
-        """Return the alpha (H, W, 1) of each view."""
-        scene, cameras = build_detached(self.build, dict(tensors))
-        found: dict[int, Tensor] = {}
-        with torch.no_grad():
-            for group, renders in self.renders(scene, cameras, [*range(len(self.views))], spp, seed):
-                found |= dict(zip(group, renders["alpha"], strict=True))
-        return [found[i] for i in range(len(self.views))]
 
     def group_loss(self, name: str, group: Sequence[int], render: Tensor) -> Tensor:
         """Return the sum of these views' losses in the channel `name`, rendered as (B, H, W, c)."""
@@ -176,3 +167,14 @@ class Objective(TensorObjective):
         for group in self.groups(picks):
             batch, aovs = Camera.stack([cameras[i] for i in group]), self.views[group[0]].aovs
             yield group, render_aovs(scene, batch, aovs, spp=spp, seed=seed, **self.options.render)
+
+    def images(self, tensors: Tensors, spp: int, step: int) -> list[dict[str, Tensor]]:
+        """Return the channels (H, W, c) of each view by name, without gradients."""
+        scene, cameras = build_detached(self.build, dict(tensors))
+        found: list[dict[str, Tensor]] = [{} for _ in self.views]
+        with torch.no_grad():
+            for group, renders in self.renders(scene, cameras, [*range(len(self.views))], spp, self.seed(step)):
+                for name, images in renders.items():
+                    for i, image in zip(group, images, strict=True):
+                        found[i][name] = image
+        return found

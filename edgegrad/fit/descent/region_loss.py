@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from torch import Tensor
 from ...files.image import linear_to_srgb
 from ..contour_colors import CONTOUR_BLUR, CONTOUR_BLURS, PURE, TOLERANCE, ContourColors, blur_losses, contour_support
 from ..edge_support import MIN_EDGE_SUPPORT
-from ..region import RADIUS, Windows, likelihood, palette, posterior, slope, smoothed, surroundings
+from ..region import COLORS, ColorFrequencies, likelihood, palette, slope, smoothed, surroundings
 from ..views import Observation, has_levels, white_level
 
 FINAL_STEP = 2**20  # a step at which alpha is as sharp as pictures are
@@ -50,6 +51,14 @@ class RegionSettings:
     min_background: float = 0.02
 
 
+class ViewColors(NamedTuple):
+    """The colours of a view's picture as its last renewal divided them, (1, H, W) each."""
+
+    near: Tensor  # weights of the pixels near the object
+    posterior: Tensor
+    contour: ContourColors | None = None
+
+
 class RegionLoss:
     """The colours of some views' pictures, and the loss of silhouettes by them."""
 
@@ -57,68 +66,61 @@ class RegionLoss:
         self.settings = settings or RegionSettings()
         pictures = [view.image for view in views if view.image is not None]
         whites = [1.0 if has_levels(picture) else white_level(picture.flatten(0, 1)) for picture in pictures]
-        shown = [picture / white for picture, white in zip(pictures, whites, strict=True)]
-        self.displays = [linear_to_srgb(picture.clamp(0.0, 1.0)) for picture in shown]
-        self.palettes = [palette(display, seed) for display in self.displays]
-        self.labels = [own.labels(display) for display, own in zip(self.displays, self.palettes, strict=True)]
+        shown = [linear_to_srgb((image / white).clamp(0.0, 1.0)) for image, white in zip(pictures, whites, strict=True)]
+        self.displays = [display.movedim(-1, 0)[None] for display in shown]  # (1, C, H, W) each
+        self.palettes = [palette(display, seed) for display in shown]
+        self.labels = [own.labels(display) for display, own in zip(shown, self.palettes, strict=True)]
         most = max((float(view.weight.max()) for view in views if view.weight is not None), default=1.0)
         self.weights = [None if view.weight is None else view.weight[..., 0] / most for view in views]
-        self.near = [torch.zeros(view.camera.size, dtype=torch.float32) for view in views]
-        self.posteriors = [torch.full(view.camera.size, 0.5, dtype=torch.float32) for view in views]
-        self.sides: list[ContourColors | None] = [None for _ in views]
+        blank = [torch.zeros(1, *view.camera.size, dtype=torch.float32) for view in views]
+        self.colors = [ViewColors(zero, zero + 0.5) for zero in blank]
         self.blur = self.settings.least_blur
         self.narrows = False  # whether alpha is blurred more than at later steps
-        self._losses = [
-            torch.zeros(len(CONTOUR_BLURS), dtype=torch.float32) for _ in views
-        ]  # of each view's contour, for each of CONTOUR_BLURS
+        # Of each view's contour, for each of CONTOUR_BLURS.
+        self._losses = [torch.zeros(len(CONTOUR_BLURS), dtype=torch.float32) for _ in views]
 
     def renew(self, index: int, alpha: Tensor, step: int = FINAL_STEP) -> None:
         """Take posterior and colours from a view's silhouette alpha (H, W, 1) at a step; keep the last ones if it is empty."""
         settings = self.settings
         wide = settings.start_blur * settings.narrowing ** (step // settings.renewal_steps)
         self.narrows = wide > settings.least_blur
-        share = alpha[..., 0].detach().float()
-        near, extent = self.around(index, share)
+        share, display = alpha[None, ..., 0].detach().float(), self.displays[index]
+        near, extent = self.around(index, alpha)
         if extent > 0.0 and bool((near > 0.0).any()):
-            windows = Windows(
-                (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index].colors, RADIUS * extent
-            )
-            self.near[index], self.posteriors[index] = near, posterior(windows, share, near)
-            sides = ContourColors.from_image(self.displays[index], smoothed(share[None], CONTOUR_BLUR)[0], near)
-            self.sides[index] = sides
-            self._losses[index] = blur_losses(sides, self.displays[index], near, share)
+            labels, colors, radius = self.labels[index], self.palettes[index].colors, COLORS.radius * extent
+            found = ColorFrequencies.from_labels(labels, colors, share, near[0], radius, COLORS.prior_pixels)
+            contour = ContourColors.from_image(display, smoothed(share, CONTOUR_BLUR), near)
+            self.colors[index] = ViewColors(near, found.posterior, contour)
+            self._losses[index] = blur_losses(contour, display, near, share)
         known = torch.stack(self._losses).sum(0)
         self.blur = (
             wide if self.narrows else CONTOUR_BLURS[int(known.argmin())] if bool(known.any()) else settings.least_blur
         )
 
     def around(self, index: int, alpha: Tensor) -> tuple[Tensor, float]:
-        """Return weights (H, W) of the pixels near the object, and its extent in pixels, 0 if it is not seen."""
-        near, extent = surroundings(alpha)
+        """Return weights (1, H, W) of the pixels near the object, and its extent in pixels, 0 if it is not seen."""
+        near, extent = surroundings(alpha[..., 0].detach().float())
         weight = self.weights[index]
-        return near if weight is None else near * weight, extent
+        return (near if weight is None else near * weight)[None], extent
 
     def loss(self, group: Sequence[int], alpha: Tensor) -> Tensor:
         """Return the sum of these views' losses at their alpha (B, H, W, 1)."""
-        P, near = self._of(group)
-        soft = self.blurred(alpha)
+        P, soft = self._posteriors(group), self.blurred(alpha)
         found = -likelihood(P, soft).double().log()
-        if (sides := self._sides(group)) is not None:
-            squares = self._squares(group, sides, soft)
-            found = found + 0.5 * sides.band * (squares / (1.0 + squares / TOLERANCE)).double()
-        return (near * found).sum()
+        if (contour := self._contours(group)) is not None:
+            squares = contour.squares(soft, self._displays(group))
+            found = found + 0.5 * contour.band * (squares / (1.0 + squares / TOLERANCE)).double()
+        return (self.shares(group) * found).sum()
 
     def curvature(self, group: Sequence[int], alpha: Tensor) -> Tensor:
         """Return the curvature (B, H, W) of loss() by each pixel's blurred alpha: Fisher's information of the region term, and
         the squared slopes of the mixture in the contour term."""
-        P, near = self._of(group)
-        soft = self.blurred(alpha)
+        P, soft = self._posteriors(group), self.blurred(alpha)
         found = slope(P, soft).square()
-        if (sides := self._sides(group)) is not None:
-            robust = (1.0 + self._squares(group, sides, soft) / TOLERANCE).pow(-2)
-            slopes = (sides.slope_by(soft).square() / sides.variance).sum(-1)
-            found = found + sides.band * robust * slopes
-        return near * found
+        if (contour := self._contours(group)) is not None:
+            robust = (1.0 + contour.squares(soft, self._displays(group)) / TOLERANCE).pow(-2)
+            found = found + contour.band * robust * (contour.slope(soft).square() / contour.variance).sum(1)
+        return self.shares(group) * found
 
     def blurred(self, images: Tensor) -> Tensor:
         """Blur alpha or its derivatives (n, H, W, 1) as the loss does; return (n, H, W)."""
@@ -126,7 +128,8 @@ class RegionLoss:
 
     def shares(self, group: Sequence[int]) -> Tensor:
         """Return the weights (B, H, W) of the pixels, which sum to 1 in each view."""
-        return self._of(group)[1]
+        near = torch.cat([self.colors[i].near for i in group])
+        return near / near.sum((1, 2), keepdim=True).clamp(min=1e-30)
 
     def edge_support(self, alphas: Sequence[Tensor], within: Sequence[Tensor] | None = None) -> float:
         """Return how much of the contour the pictures show, 0 … 1, from the alphas (H, W, 1) of the last renewal. It is the
@@ -134,33 +137,28 @@ class RegionLoss:
         mean of 2P − 1 inside and 1 − 2P outside, scaled so that `min_sureness` is just enough. `within` (H, W) masks pixels."""
         parts, sureness, length = [], 0.0, 0.0
         for k, alpha in enumerate(alphas):
-            share = alpha[..., 0].float()
-            near = self.around(k, share)[0]
+            share, near = alpha[None, ..., 0].float(), self.around(k, alpha)[0]
             near = near if within is None else near * within[k]
             parts.append((self.displays[k], share, near))
-            soft = smoothed(share[None], self.settings.sureness_blur)[0]
+            soft = smoothed(share, self.settings.sureness_blur)
             band = ((soft > PURE) & (soft < 1.0 - PURE)) * near
-            sure = 2.0 * self.posteriors[k] - 1.0
+            sure = 2.0 * self.colors[k].posterior - 1.0
             sureness += float((band * torch.where(share > 0.5, sure, -sure)).sum())
             length += float(band.sum())
-        return max(
-            0.0,
-            min(MIN_EDGE_SUPPORT / self.settings.min_sureness * sureness / max(length, 1e-30), contour_support(parts)),
-        )
+        sure_share = MIN_EDGE_SUPPORT / self.settings.min_sureness * sureness / max(length, 1e-30)
+        return max(0.0, min(sure_share, contour_support(parts)))
 
     def check(self, alphas: Sequence[Tensor]) -> None:
         """Check that the silhouettes of the start leave pixels of the pictures around them, of more than one colour. Raises
         ValueError."""
         seen = colored = 0
         for k, alpha in enumerate(alphas):
-            share = alpha[..., 0].float()
-            near, extent = self.around(k, share)
+            near, extent = self.around(k, alpha)
             seen += extent > 0.0
-            colors = self.displays[k][near > 0.0]
-            colored += (
-                len(colors) > 0 and float((colors.amax(0) - colors.amin(0)).max()) > self.settings.min_color_range
-            )
-            if extent > 0.0 and float((near * (1.0 - share)).sum()) <= self.settings.min_background * float(near.sum()):
+            colors, least = self.displays[k][0][:, near[0] > 0.0], self.settings.min_color_range
+            colored += colors.numel() > 0 and float((colors.amax(1) - colors.amin(1)).max()) > least
+            behind = float((near * (1.0 - alpha[..., 0])).sum())
+            if extent > 0.0 and behind <= self.settings.min_background * float(near.sum()):
                 raise ValueError(
                     f'scene: expected meshes with some of the picture around them, as loss="region" needs, got a scene that '
                     f"fills picture {k} at the start; leave out ground and walls, for all meshes of the scene are the object"
@@ -176,22 +174,16 @@ class RegionLoss:
                 "where it is at the start and around it; start nearer, or look for what made the pictures black or white"
             )
 
-    def _of(self, group: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return posteriors (B, H, W), and weights that sum to 1 in each view."""
-        near = torch.stack([self.near[i] for i in group])
-        return torch.stack([self.posteriors[i] for i in group]), near / near.sum((1, 2), keepdim=True).clamp(min=1e-30)
+    def _posteriors(self, group: Sequence[int]) -> Tensor:
+        return torch.cat([self.colors[i].posterior for i in group])
 
-    def _sides(self, group: Sequence[int]) -> ContourColors | None:
-        """Stack the contour colours of these views; None while alpha is blurred widely, or if some view has not shown the
+    def _displays(self, group: Sequence[int]) -> Tensor:
+        return torch.cat([self.displays[i] for i in group])
+
+    def _contours(self, group: Sequence[int]) -> ContourColors | None:
+        """Return the contour colours of these views; None while alpha is blurred widely, or if some view has not shown the
         object."""
-        found = [self.sides[i] for i in group]
-        if self.narrows or any(sides is None for sides in found):
+        found = [contour for i in group if (contour := self.colors[i].contour) is not None]
+        if self.narrows or len(found) < len(group):
             return None
-        names = "alpha", "inside", "outside", "variance", "band"
-        alpha, inside, outside, variance, band = (torch.stack([getattr(one, name) for one in found]) for name in names)
-        return ContourColors(alpha, inside, outside, variance, band)
-
-    def _squares(self, group: Sequence[int], sides: ContourColors, alpha: Tensor) -> Tensor:
-        """Return squared differences (B, H, W) of the pictures from the mixture by alpha (B, H, W), over their variance."""
-        off = sides.mixed_by(alpha) - torch.stack([self.displays[i] for i in group])
-        return (off.square() / sides.variance).sum(-1)
+        return ContourColors(*(torch.cat(parts) for parts in zip(*found, strict=True)))

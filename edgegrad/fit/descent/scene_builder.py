@@ -95,10 +95,10 @@ def _moved(scene: Scene | Mesh, cameras: list[Camera], poses: Mapping[str, Pose]
     return scene, cameras
 
 
-def suggestion(name: str, names: Sequence[str]) -> str:
-    """Return what to add to an error about an unknown name."""
+def _unknown(what: str, name: str, names: Sequence[str]) -> ValueError:
     close = difflib.get_close_matches(name, names, n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    suggestion = f"; did you mean {close[0]!r}?" if close else ""
+    return ValueError(f"parameters: expected {what} among {', '.join(names)}, got {name!r}{suggestion}")
 
 
 def checked_parameters(parameters: object, known: SceneTensors | None) -> dict[str, Parameter | Placement]:
@@ -135,10 +135,7 @@ def checked_parameters(parameters: object, known: SceneTensors | None) -> dict[s
             if name in known.movable:
                 raise TypeError(f"{name}: expected a PoseParameter, got {type(given).__name__}; give PoseParameter()")
             if name not in known.tensors:
-                names = [*known.tensors, *known.movable]
-                raise ValueError(
-                    f"parameters: expected names among {', '.join(names)}, got {name!r}{suggestion(name, names)}"
-                )
+                raise _unknown("names", name, [*known.tensors, *known.movable])
             value = known.tensors[name]
             own = value if parameter.value is None else as_tensor(f"{name}: value", parameter.value, like=value)
             check_shape(name, own, tuple(value.shape), fix="the shape of the scene's tensor")
@@ -151,10 +148,7 @@ def _placement(name: str, given: PoseParameter, known: SceneTensors | None) -> P
     if known is None:
         return given.placed(name)
     if name not in known.movable:
-        names = list(known.movable)
-        raise ValueError(
-            f"parameters: expected a pose's name among {', '.join(names)}, got {name!r}{suggestion(name, names)}"
-        )
+        raise _unknown("a pose's name", name, list(known.movable))
     if name.startswith("cameras.") and given.scale is not None:
         raise ValueError(f"{name}: scale: expected None for a camera, got {given.scale!r}; leave it out")
     return given.placed(name, known.movable[name])

@@ -1,24 +1,22 @@
 """Joint refinement of poses and of the lens that all pictures share.
 
-Each place has a quadratic model of its loss by its pose and the lens (loss_model.py). The sum of these models is one by all
-poses and the lens, whose damped Gauss-Newton steps lead to the most likely ones (Triggs et al., Bundle Adjustment: A Modern
-Synthesis, 2000). Fits of single pictures have lenses of their own; a step of all their models finds the lens on which they
-agree best.
+Each place has the objective of pose fits by its pose and the lens. The sum of these is one objective of all poses and the lens,
+whose damped Gauss-Newton steps lead to the most likely ones (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000). Fits
+of single pictures have lenses of their own; a step of all their models finds the lens on which they agree best.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ...optim.levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtSettings, Model, Problem, Rest, minimise
-from ...optim.loop import nothing
-from .loss_model import LossModel, LossSource
+from .likelihood.objective import PoseLevel
 from .pose import Pose
 from .settings import CAMERA
 from .task import FOCAL_LENGTH
@@ -29,115 +27,112 @@ Poses = tuple[Pose, ...]
 
 
 class Adjustment(NamedTuple):
-    """Poses at one lens, and the covariance of all numbers."""
+    """Poses at one lens, and the objective there."""
 
     poses: Poses
-    covariance: Tensor  # (n, n), of the entries of all poses, place by place, and then of the lens
-    loss: float
-    evidence: list[LossModel]
+    costs: list[float]  # of each place
+    gradients: list[Tensor]  # (m,) of each place by its pose and the lens, the entries that its task seeks
+    covariances: list[Tensor]  # (m, m)
     short: bool = False  # The last step was short.
 
-    def covariance_of(self, k: int, source: LossSource) -> Tensor:
-        """Return the covariance (m, m) of one place's pose and the lens, in the order of the entries that its task seeks."""
-        rows = _rows([len(poses_of(source))] * len(self.poses), len(self.covariance))[k]
-        return self.covariance[rows][:, rows]
+    @property
+    def loss(self) -> float:
+        """The mean cost of the places."""
+        return sum(self.costs) / len(self.costs)
 
-
-def poses_of(source: LossSource) -> list[int]:
-    """Return the entries of a step that move the pose."""
-    return [entry for entry in source.task.dofs if entry < FOCAL_LENGTH]
-
-
-def lens_of(source: LossSource, pose: Pose) -> Tensor:
-    """Return the changes of the sought numbers of the lens, in the order of a step's entries."""
-    found = torch.cat([pose.focal.log()[None], pose.principal, pose.distortion])
-    return found[[entry - FOCAL_LENGTH for entry in source.task.dofs if entry >= FOCAL_LENGTH]]
+    def gradient(self, dofs: Sequence[int]) -> Tensor:
+        """Return the gradient (m,) of the mean cost by the entries of a step, of the poses' entries the norm over all places."""
+        each = torch.stack(self.gradients) / len(self.gradients)
+        return torch.where(torch.tensor(dofs) < FOCAL_LENGTH, each.norm(dim=0), each.sum(0))
 
 
 class Bundle(Problem[Poses]):
-    """Poses of all places and the lens as one descent. Its cost is in units of the noise of the pictures, so that a standard
-    deviation costs ½. A prior of the settings' prior_deviation holds moves of poses, and the lens at the given one."""
+    """Poses of all places and the lens as one descent.
 
-    def __init__(self, sources: Sequence[LossSource]) -> None:
-        self.sources = sources
-        counts = [len(poses_of(source)) for source in sources]
-        n = sum(counts) + len(sources[0].task.dofs) - counts[0]
-        self.rows = _rows(counts, n)  # where the entries of each place are among all numbers
-        self.units = torch.ones(n, dtype=torch.float64)
-        self.units[sum(counts) :] = CAMERA.lens_unit
-        self.noise: float | None = None  # of the first poses
+    Its cost is in units of the noise of the pictures, so that a standard deviation costs ½: errors of neighbouring pixels have
+    common causes, and count as one. A prior of the settings' prior_deviation holds moves of poses, and the lens at the given
+    one. The numbers (n,) of a step are those of all poses, place by place, and then those of the lens in their own unit.
+    """
+
+    def __init__(self, levels: Sequence[PoseLevel]) -> None:
+        self.levels = levels
+        places, m = len(levels), len(levels[0].dofs)
+        lens = sum(entry >= FOCAL_LENGTH for entry in levels[0].dofs)
+        self.n = places * (m - lens) + lens
+        # The curvature of the prior: one more pixel of the same noise shows each number to within `prior_deviation`.
+        units = torch.ones(self.n, dtype=torch.float64)
+        units[self.n - lens :] = CAMERA.lens_unit
+        self.prior = (units / CAMERA.prior_deviation).square().diag()
+        *own, shared = units.diag().split([m - lens] * places + [lens])
+        self.entries = [torch.cat([rows, shared]) for rows in own]  # (m, n), the entries of each place's step
         self.last: Adjustment | None = None  # what was evaluated last
+        self.noise: float | None = None  # pixels that count as one, at the first poses
 
     def model(self, points: Sequence[Poses]) -> Model:
         (poses,) = points
-        evidence = [source.at(pose) for source, pose in zip(self.sources, poses, strict=True)]
-        self.last = self._adjustment(poses, evidence)
-        self.noise = self.noise or _noise(evidence)
-        H = self._sum([one.curvature for one in evidence]) + self._prior(self.noise)
-        gradient = self._sum([one.gradient for one in evidence])
-        lens = lens_of(self.sources[0], poses[0])
-        gradient[len(gradient) - len(lens) :] += self.noise / CAMERA.prior_deviation**2 * lens
-        prior = 0.5 / CAMERA.prior_deviation**2 * float(lens.square().sum())
-        cost = sum(one.loss / one.per_loss for one in evidence) / self.noise + prior
-        slack = sum(one.slack / one.per_loss for one in evidence) / self.noise
-        return Model(
-            torch.tensor([[cost]], dtype=torch.float64), (gradient * self.units / self.noise)[None],
-            (H * self.units * self.units[:, None] / self.noise)[None], torch.tensor([slack], dtype=torch.float64),
-        )  # fmt: skip
+        costs, gradients, curvatures = self._models(poses)
+        lens, known = self._lens(0, poses[0]), CAMERA.prior_deviation**-2
+        noise = self._noise(poses)
+        cost = sum(costs) / noise + 0.5 * known * float(lens.square().sum())
+        gradient = self._sum(gradients) / noise + known * self.entries[0].T @ lens
+        curvature = self._sum(curvatures) / noise + self.prior
+        covariance = torch.linalg.inv(curvature)
+        self.last = Adjustment(poses, costs, gradients, [E @ covariance @ E.T for E in self.entries])
+        # Renders of other samples would differ by more than a step does at the end.
+        slack = torch.tensor([sum(map(abs, costs)) / noise], dtype=torch.float64)
+        return Model(torch.tensor([[cost]], dtype=torch.float64), gradient[None], curvature[None], slack)
 
     def moved(self, points: Sequence[Poses], steps: Tensor) -> list[Poses]:
-        moves = [[move[own] for own in self.rows] for move in steps * self.units]
+        moves = [[own @ step for own in self.entries] for step in steps]
         return [self._moved(poses, parts) for poses, parts in zip(points, moves, strict=True)]
 
     def agreed(self, poses: Sequence[Pose]) -> Poses:
         """Return the most likely poses at a common lens, by the models at poses with lenses of their own. Each picture alone may
-        have a lower loss with its own."""
-        lenses = [lens_of(source, pose) for source, pose in zip(self.sources, poses, strict=True)]
-        if all(lens.numel() == 0 or float((lens - lenses[0]).abs().max()) < 1e-9 for lens in lenses):
+        have a lower cost with its own."""
+        here = [self._lens(k, pose) for k, pose in enumerate(poses)]  # Poses count from where they are.
+        if all(float((x - here[0]).abs().max()) < 1e-9 for x in here):
             return tuple(poses)
-        evidence = [source.at(pose) for source, pose in zip(self.sources, poses, strict=True)]
-        self.noise = _noise(evidence)
-        # Poses count from where they are, the lens from the given one.
-        here = [
-            torch.cat([lens.new_zeros(len(own) - len(lens)), lens]) for own, lens in zip(self.rows, lenses, strict=True)
-        ]
-        slopes = [one.gradient - one.curvature @ x for one, x in zip(evidence, here, strict=True)]
-        H = self._sum([one.curvature for one in evidence]) + self._prior(self.noise)
+        _, gradients, curvatures = self._models(poses)
+        slopes = [g - H @ x for g, H, x in zip(gradients, curvatures, here, strict=True)]
+        H = self._sum(curvatures) + self._noise(poses) * self.prior
         end = -torch.linalg.solve(H, self._sum(slopes))
-        return self._moved(poses, [end[own] - x for own, x in zip(self.rows, here, strict=True)])
+        return self._moved(poses, [own @ end - x for own, x in zip(self.entries, here, strict=True)])
+
+    def _noise(self, poses: Sequence[Pose]) -> float:
+        if self.noise is None:
+            self.noise = fmean(level.temperature(pose) for level, pose in zip(self.levels, poses, strict=True))
+        return self.noise
+
+    def _models(self, poses: Sequence[Pose]) -> tuple[list[float], list[Tensor], list[Tensor]]:
+        """Return cost, gradient (m,) and curvature (m, m) of each place at its pose."""
+        models = [level.model([pose]) for level, pose in zip(self.levels, poses, strict=True)]
+        gradients = [model.gradient for model in models if isinstance(model.gradient, Tensor)]
+        curvatures = [model.curvature for model in models if isinstance(model.curvature, Tensor)]
+        return [float(model.cost) for model in models], [g[0] for g in gradients], [H[0] for H in curvatures]
 
     def _moved(self, poses: Sequence[Pose], moves: Sequence[Tensor]) -> Poses:
-        places = zip(self.sources, poses, moves, strict=True)
-        return tuple(source.task.moved(pose, source.task.dofs, move) for source, pose, move in places)
+        places = zip(self.levels, poses, moves, strict=True)
+        first, *others = (level.moved([pose], move[None])[0] for level, pose, move in places)
+        lens = {"focal": first.focal, "principal": first.principal, "distortion": first.distortion}
+        return first, *(one._replace(**lens) for one in others)  # one lens, bit for bit
+
+    def _lens(self, k: int, pose: Pose) -> Tensor:
+        """Return the step (m,) from the given lens to that of a pose, with zeros for the entries of the pose."""
+        found = torch.cat([pose.R.new_zeros(FOCAL_LENGTH), pose.focal.log()[None], pose.principal, pose.distortion])
+        return found[list(self.levels[k].dofs)]
 
     def _sum(self, parts: Sequence[Tensor]) -> Tensor:
-        """Return the sum, by all numbers, of vectors (m,) or matrices (m, m) by the numbers of each place."""
-        total = torch.zeros((len(self.units),) * parts[0].dim(), dtype=torch.float64)
-        for own, part in zip(self.rows, parts, strict=True):
-            total[torch.meshgrid([own] * part.dim(), indexing="ij")] += part
-        return total
-
-    def _prior(self, noise: float) -> Tensor:
-        """Return the curvature of the prior: one more pixel of the same noise, which shows each number to within
-        `prior_deviation`."""
-        return torch.eye(len(self.units), dtype=torch.float64) * noise / CAMERA.prior_deviation**2
-
-    def _adjustment(self, poses: Poses, evidence: list[LossModel]) -> Adjustment:
-        """Return the poses with the covariance of all numbers."""
-        noise = _noise(evidence)
-        prior = self._prior(noise)
-        inverse = torch.linalg.inv(self._sum([one.curvature for one in evidence]) + prior)
-        covariance = inverse @ (self._sum([one.scores for one in evidence]) + noise * prior) @ inverse
-        return Adjustment(poses, covariance, sum(one.loss for one in evidence), evidence)
+        """Return the sum, by all numbers, of gradients (m,) or curvatures (m, m) by the entries of each place."""
+        pairs = zip(self.entries, parts, strict=True)
+        return torch.stack([E.T @ part if part.dim() == 1 else E.T @ part @ E for E, part in pairs]).sum(0)
 
 
 def adjust_bundle(
-    sources: Sequence[LossSource], poses: Sequence[Pose], most: int = CAMERA.adjust_steps,
-    after_step: Callable[[Adjustment], Any] = nothing,
+    levels: Sequence[PoseLevel], poses: Sequence[Pose], most: int, after_step: Callable[[Adjustment], Any]
 ) -> Adjustment:  # fmt: skip
     """Return the most likely poses and lens near the given ones, after at most so many steps. `after_step` is called with the
-    best so far."""
-    bundle, best = Bundle(sources), []
+    best so far. Raises KeyboardInterrupt."""
+    bundle, best = Bundle(levels), []
 
     def note(descents: LevenbergMarquardt[Poses]) -> None:
         if bundle.last is not None and descents.descents[0].point is bundle.last.poses:
@@ -145,21 +140,9 @@ def adjust_bundle(
         after_step(best[0])
 
     # The expected decrease of the cost by a step is half its square in standard deviations.
-    short = 0.5 * CAMERA.short_step**2 * len(bundle.units)
+    short = 0.5 * CAMERA.short_step**2 * bundle.n
     settings = replace(ADJUST, steps=most + 1, least_gain=short)
     found = minimise(bundle, [bundle.agreed(poses)], settings, note)
     if found.interrupted:
         raise KeyboardInterrupt
     return best[0]._replace(short=found.descents[0].rest is Rest.SHORT)
-
-
-def _noise(evidence: Sequence[LossModel]) -> float:
-    """Return the ratio of the covariance of the loss's gradient to the loss's curvature."""
-    curvature = sum(float(one.curvature.trace()) for one in evidence)
-    return sum(float(one.scores.trace()) for one in evidence) / max(curvature, 1e-300) or math.ulp(0.0)
-
-
-def _rows(counts: Sequence[int], n: int) -> list[Tensor]:
-    lens = torch.arange(sum(counts), n)
-    firsts = [sum(counts[:k]) for k in range(len(counts))]
-    return [torch.cat([torch.arange(a, a + count), lens]) for a, count in zip(firsts, counts, strict=True)]

@@ -14,12 +14,17 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from .jacobian import cross_matrices
 from .pose import Pose
 from .task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, ROTATION, SCALE, STEP_SIZE, TRANSLATION, PoseTask, focal_of
 
 F64 = torch.float64
 DIFFERENCE = 1e-4  # step of central differences, relative to the distance of the points
+
+
+def cross_matrices(vectors: Tensor) -> Tensor:
+    """Return the matrices (n, 3, 3) of ω × for vectors (n, 3)."""
+    basis = torch.eye(3, dtype=F64)
+    return torch.linalg.cross(vectors[:, None], basis[None], dim=-1).transpose(1, 2)
 
 
 def stacked(poses: Sequence[Pose]) -> Pose:
@@ -28,7 +33,7 @@ def stacked(poses: Sequence[Pose]) -> Pose:
 
 
 def moved_poses(task: PoseTask, poses: Sequence[Pose], dofs: Sequence[int], steps: Tensor) -> list[Pose]:
-    """Return the poses after steps (N, D) whose entries are `dofs`, as PoseTask.moved() has them."""
+    """Return the poses after steps (N, D) whose entries are `dofs`."""
     pose, camera = stacked(poses), task.shots[0].camera
     step = steps.new_zeros(len(steps), STEP_SIZE)
     step[:, list(dofs)] = steps

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
 from ...camera.lens import MOST_COEFFICIENTS, distort
-from .loss_model import LossSource
+from .camera_motion import moving_cameras
 from .pose import Pose
 from .settings import CAMERA
-from .task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, focal_of
+from .task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, PoseTask, focal_of
 from .uncertainty import Uncertainty
 
 # Coefficients of distortion, in OpenCV's order; those of a fisheye are k1 … k4.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CameraUncertainty(Uncertainty):
     """Standard deviations of a camera's pose and lens, each with all other numbers unknown, too.
 
@@ -34,11 +34,11 @@ class CameraUncertainty(Uncertainty):
     distortion : (n,) of the coefficients of distortion that were sought, in the order of Camera.distortion
     """
 
-    principal: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
-    distortion: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
-    vague: Sequence[str] = ()  # unknown numbers of the lens, in words
-    at_lens: Tensor | None = None  # (6, 6), the covariance at the lens found
-    names: Sequence[str] = ()  # coefficients of distortion
+    principal: Tensor
+    distortion: Tensor
+    names: Sequence[str]  # of these coefficients
+    vague: Sequence[str]  # unknown numbers of the lens, in words
+    at_lens: Tensor  # (6, 6), the covariance at the lens found
 
     @property
     def unknown(self) -> str:
@@ -47,7 +47,6 @@ class CameraUncertainty(Uncertainty):
         It is empty where all are known. A number of the lens is named where its deviation moves a corner of the image by more
         than 3 % of its distance from the principal point, or where a guess says as much as the pictures.
         """
-        assert self.at_lens is not None
         pose = Uncertainty(self.at_lens, self.size, self.free, most=self.most).unknown
         return ", ".join([pose, *self.vague] if pose else self.vague)
 
@@ -61,27 +60,27 @@ class CameraUncertainty(Uncertainty):
         return ", ".join(parts)
 
     @staticmethod
-    def from_covariance(source: LossSource, pose: Pose, covariance: Tensor) -> CameraUncertainty:
-        """Return the uncertainty from the covariance (m, m) of the entries of a step that the source's task seeks."""
-        task, dofs = source.task, source.task.dofs
-        camera = task.lens(task.shots[0].camera, pose)
-        # Entries move the scene before a camera at rest; `to_world` is the same seen with the scene at rest.
-        moves = task.motion(source.level._replace(dofs=dofs), source.level.shots[0], pose)
-        center = pose.matrix[:3, :3] @ task.center + pose.t
-        L = 0.5 * (moves.linear - moves.linear.mT)
-        rotations = torch.stack([L[:, 2, 1], L[:, 0, 2], L[:, 1, 0]])
-        to_world = torch.cat([pose.R.T @ rotations, pose.R.T @ (moves.linear @ center + moves.shift).T])
+    def from_covariance(task: PoseTask, pose: Pose, covariance: Tensor) -> CameraUncertainty:
+        """Return the uncertainty from the covariance (m, m) of the entries of a step that the task seeks."""
+        dofs, first = task.dofs, task.shots[0].camera
+        camera = task.lens(first, pose)
+        # The camera that sees the scene at rest; its motion in the scene's axes is about the scene's centre.
+        moving = moving_cameras(task, first, [pose], dofs)
+        view, dW = moving.cameras.world_to_camera[0, :3, :3], moving.tangents["world_to_camera"][:, 0, :3]
+        turn, shift = view.T @ dW[:, :, :3], (dW[:, :, :3] @ task.center + dW[:, :, 3]) @ view
+        to_world = torch.cat([torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]]), shift.T])
         of_pose = [k for k, entry in enumerate(dofs) if entry < FOCAL_LENGTH]
         own = to_world[:, of_pose]
         deviations = dict(zip(dofs, covariance.diagonal().clamp(min=0.0).sqrt().tolist(), strict=True))
-        principal = [deviations.get(PRINCIPAL + k, 0.0) for k in (0, 1)]
+        bent = [entry for entry in dofs if entry >= DISTORTION]
+        pixels = [camera.size[1] * deviations.get(PRINCIPAL + k, 0.0) for k in (0, 1)]
         return CameraUncertainty(
             to_world @ covariance @ to_world.T, task.size, torch.empty(0, 3, dtype=torch.float64),
             deviations.get(FOCAL_LENGTH, 0.0), CAMERA.most_contour_degrees if task.colorless else CAMERA.most_degrees,
-            camera.size[1] * torch.tensor(principal, dtype=torch.float64),
-            torch.tensor([deviations[entry] for entry in dofs if entry >= DISTORTION], dtype=torch.float64),
-            tuple(vague(camera, deviations)), own @ covariance[of_pose][:, of_pose] @ own.T,
-            tuple(coefficient(camera, entry) for entry in dofs if entry >= DISTORTION),
+            principal=torch.tensor(pixels, dtype=torch.float64),
+            distortion=torch.tensor([deviations[entry] for entry in bent], dtype=torch.float64),
+            names=[coefficient(camera, entry) for entry in bent], vague=vague(camera, deviations),
+            at_lens=own @ covariance[of_pose][:, of_pose] @ own.T,
         )  # fmt: skip
 
 

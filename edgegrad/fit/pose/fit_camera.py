@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -14,104 +11,27 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.lens import COEFFICIENT_COUNTS
 from ...check import check_flag, check_int
-from ...files.cameras import save_camera
-from ...files.paths import PathLike, write_json
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
-from ..history import Record, history_rows
+from ..ending import Ending
+from ..history import Record
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
-from ..result import FitResult, delegated, made_folder
 from ..views import Images, cameras_of
-from .bundle_adjustment import adjust_bundle
+from .bundle_adjustment import Adjustment, adjust_bundle
+from .camera_result import CameraFit, fitted, record_of
 from .camera_uncertainty import CameraUncertainty
 from .fit_pose import search_pose
+from .hypotheses import norms_of
 from .inputs import ArgumentNames
-from .loss_model import ColorLoss, LossSource, loss_source
-from .pose import Pose
+from .likelihood.objective import PoseLevel, pose_levels
+from .likelihood.support import evidence_of
 from .result import PoseFit, Step, with_own_history
 from .settings import CAMERA
-from .task import STEP_PARTS, Unknowns
+from .task import Unknowns
 
-# Each part of a step moves one tensor of a camera.
-TENSOR_OF = {
-    "rotation": "world_to_camera", "shift": "world_to_camera", "focal": "K", "principal": "K", "distortion": "distortion",
-}  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class CameraFit(FitResult):
-    """The result of fit_camera(), a FitResult: the cameras, and the search, in which the scene moved before cameras at rest.
-
-    `history` has a Record of each step: the loss, comparable within one level of the image pyramid; the cameras, float64, by
-    the names that fit_scene() has for them ("cameras.0.world_to_camera", and "cameras.0.K" and "cameras.0.distortion" where
-    they are sought); and norms of the gradient by "world_to_camera" (in radians and sizes of the scene), "K" (logarithm of
-    the focal length, widths of the image) and "distortion", which all cameras share. Norms are those of numbers sought on the
-    level; there are none where the loss rose and the step was taken back. The last record is the final comparison.
-    `search.history` has the size of the level and marks the best steps so far.
-
-    `uncertainty` has the standard deviation of each number that was sought; None before the last step and after an
-    interruption.
-    """
-
-    cameras: list[Camera]
-    search: PoseFit
-    uncertainty: CameraUncertainty | None = None
-    loss, explained, steps, seconds, converged, interrupted, plot, plot_history, _repr_png_ = delegated(
-        "search", "loss explained steps seconds converged interrupted plot plot_history _repr_png_"
-    )
-
-    @property
-    def camera(self) -> Camera:
-        """Return the first camera."""
-        return self.cameras[0]
-
-    @property
-    def history(self) -> list[Record]:
-        return [self._record(number, step) for number, step in enumerate(self.search.history)]
-
-    @property
-    def reason(self) -> str:
-        """Return the reason as PoseFit has it, or "not known: …" with numbers of pose and lens that the pictures hardly show."""
-        known = self.uncertainty
-        if known is None or not known.unknown:
-            return self.search.reason
-        return reason_with(replace(self.search, uncertainty=None, converged=True).reason, known)
-
-    def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """Write the result to a folder, and return the names of the files. Raises OSError, ImportError.
-
-        They are history.json, camera.json for load_camera (of several cameras camera-0.json and so on) and what PoseFit.save
-        writes. ImportError comes at last, when matplotlib or pillow is missing.
-        """
-        out = made_folder(folder)
-        several = len(self.cameras) > 1
-        own = [f"camera-{i}.json" if several else "camera.json" for i in range(len(self.cameras))]
-        for name, camera in zip(own, self.cameras, strict=True):
-            save_camera(out / name, camera)
-        own.append(self.write_history(folder))
-        return [*own, *self.search.save(folder, figures)]
-
-    def write_history(self, folder: PathLike) -> str:
-        """Write history.json alone, with loss, gradient norms and cameras of each step; return its name. Raises OSError."""
-        write_json(Path(folder) / "history.json", history_rows(self.history))
-        return "history.json"
-
-    def _record(self, number: int, step: Step) -> Record:
-        task = self.search.task
-        assert task is not None
-        sought = [
-            TENSOR_OF[name] for name, entries in STEP_PARTS.items() if any(entry in task.dofs for entry in entries)
-        ]
-        values = {}
-        for i, shot in enumerate(task.shots):
-            camera = moved(task.lens(shot.camera, step.pose), step.pose.matrix)
-            values |= {f"cameras.{i}.{name}": getattr(camera, name).clone() for name in dict.fromkeys(sought)}
-        squares: dict[str, float] = {}
-        for part, norm in step.gradient.items():
-            squares[TENSOR_OF[part]] = squares.get(TENSOR_OF[part], 0.0) + norm**2
-        return Record(number, step.loss, {name: math.sqrt(square) for name, square in squares.items()}, values)
+START = torch.eye(4, dtype=torch.float64)  # Cameras are searched for as poses of the scene.
 
 
 @in_full_precision
@@ -167,67 +87,79 @@ def fit_camera(
     lens = Unknowns(False, check_flag("focal", focal), check_flag("principal", principal), distortion)
     settings = Settings.from_options(options, "fit_camera", (*POSE_OPTIONS, "checkpoint"), steps=60, max_size=512)
     callback = settings.callback
-    watched = replace(settings, callback=None if callback is None else lambda search: callback(fitted(search)))
-    start = torch.eye(4, dtype=torch.float64)
+    watched = replace(settings, callback=None if callback is None else lambda search: callback(fitted([search])))
     names = ArgumentNames("scene")
     found = search_pose(
-        scene, images, given, masks, start, lens, weights, None, names, watched, check_flag("search", search)
+        scene, images, given, masks, START, lens, weights, None, names, watched, check_flag("search", search)
     )
-    return fitted(found) if found.interrupted else finished(found, given, settings)
+    return fitted([found], Ending.INTERRUPTED) if found.interrupted else refined([found], settings)
 
 
-def finished(search: PoseFit, cameras: Sequence[Camera], settings: Settings) -> CameraFit:
-    """Finish a search by some steps of all numbers at once, and add their uncertainty."""
-    began, task = time.perf_counter(), search.task
-    assert task is not None
-    pose, shown = pose_of(search), search.explained >= search.enough
-    source = loss_source(task, pose, settings)
-    # A search by colours holds back numbers that the pictures hardly show; one by photographs is at its end.
-    further = shown and isinstance(source, ColorLoss)
-    try:
-        end = adjust_bundle([source], [pose], min(CAMERA.adjust_steps, settings.steps) if further else 0)
-    except KeyboardInterrupt:
-        return fitted(replace(search, interrupted=True, converged=False))
-    rests = end.short if further else search.converged or search.reason.startswith("directions unknown")
-    loss = end.loss if further else search.loss
-    found = ended(search, source, end.poses[0], end.covariance, cameras, rests, loss, search.explained)
-    whole = replace(found.search, seconds=search.seconds + time.perf_counter() - began)
-    return replace(found, search=whole)
+def refined(searches: Sequence[PoseFit], settings: Settings) -> CameraFit:
+    """Refine the poses of all places and their one lens together, and add how exactly they are known. Ctrl-C ends this with the
+    best so far."""
+    levels, joint, best = list[PoseLevel](), list[Record](), fitted(searches)
+
+    def result(end: Adjustment, ending: Ending, scores: Sequence[tuple[float, float]]) -> CameraFit:
+        places = enumerate(zip(searches, levels, scores, strict=True))
+        # One lens in several places decides between poses that one picture alone leaves open by lenses of their own.
+        shared = {"conflict": ""} if len(searches) > 1 else {}
+        found = [
+            _at_end(
+                level,
+                end,
+                k,
+                replace(search, loss=loss, explained=explained, converged=ending is Ending.FLAT, **shared),
+            )
+            for k, (search, level, (loss, explained)) in places
+        ]
+        return fitted(found, ending, joint)
+
+    def after_step(end: Adjustment) -> None:
+        nonlocal best
+        places = [(level.task, pose) for level, pose in zip(levels, end.poses, strict=True)]
+        dofs = places[0][0].dofs
+        joint.append(record_of(len(joint), end.loss, norms_of(dofs, end.gradient(dofs)), places))
+        scores = zip(end.costs, searches, strict=True)
+        best = result(end, Ending.STEPS, [(cost, search.explained) for cost, search in scores])
+        progress.step(f"loss {end.loss:.3e}")
+
+    progress = settings.progress_of("lens", lambda: best)
+    with progress:
+        starts = [next(step.pose for step in reversed(search.history) if step.best) for search in searches]
+        for k, (search, start) in enumerate(zip(searches, starts, strict=True)):
+            task, own = search.task, replace(settings, seed=(settings.seed + 7919 * k) % 2**32)
+            assert task is not None
+            level = pose_levels(task, start, [None] * len(task.shots), own)[-1]
+            levels.append(level.informed([start]).focused(start))
+        end = adjust_bundle(levels, starts, min(CAMERA.adjust_steps, settings.steps), after_step)
+        ends = zip(levels, end.poses, strict=True)
+        scores = [(float(level.costs([pose])[0]), evidence_of(level, pose).edges) for level, pose in ends]
+        best = result(end, Ending.FLAT if end.short else Ending.STEPS, scores)
+    each = progress.seconds / len(searches)
+    found = [replace(search, seconds=search.seconds + each) for search in best.searches]
+    return replace(best, searches=found, ending=Ending.INTERRUPTED if progress.interrupted else best.ending)
 
 
-def ended(
-    search: PoseFit, source: LossSource, pose: Pose, covariance: Tensor, cameras: Sequence[Camera], rests: bool, loss: float,
-    explained: float,
-) -> CameraFit:  # fmt: skip
-    """Return a fit whose search reached another pose and lens at last, with the covariance of the entries of a step there."""
-    task, known = source.task, CameraUncertainty.from_covariance(source, pose, covariance)
-    lenses = [map_tensors(task.lens(one, pose), Tensor.clone) for one in cameras]
-    last = search.history[-1]
-    history = search.history if pose is last.pose else [*search.history, Step(source.level.size, loss, pose, True, {})]
-    right = rests and explained >= search.enough and not search.conflict and not known.unknown
+def _at_end(level: PoseLevel, end: Adjustment, k: int, search: PoseFit) -> PoseFit:
+    """Return the search of place k with the pose and lens that it reached at last; `converged` says whether it rests."""
+    task, pose = level.task, end.poses[k]
+    known = CameraUncertainty.from_covariance(task, pose, end.covariances[k])
+    lenses = [task.lens(shot.camera, pose) for shot in task.shots]
+    cameras = [
+        seen.replace(K=lens.K.to(seen.K), distortion=None if lens.distortion is None else lens.distortion.to(seen.K))
+        for seen, lens in zip(search.cameras, lenses, strict=True)
+    ]
+    cameras = [map_tensors(camera, Tensor.clone) for camera in cameras]
+    # The last entry is the final comparison.
+    earlier = search.history[:-1] if pose is search.history[-1].pose else search.history
+    history = [*earlier, Step(level.size, search.loss, pose, True, {})]
+    right = search.converged and search.explained >= search.enough and not search.conflict and not known.unknown
     found = replace(
-        search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=lenses[0], cameras=lenses, loss=loss,
-        explained=explained, history=history, steps=len(history), uncertainty=known, converged=right,
+        search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=cameras[0], cameras=cameras,
+        history=history, steps=len(history), uncertainty=known, converged=right,
     )  # fmt: skip
-    return fitted(with_own_history(found), known)
-
-
-def fitted(search: PoseFit, uncertainty: CameraUncertainty | None = None) -> CameraFit:
-    """Return a search that moved the scene before cameras as a fit of the cameras."""
-    return CameraFit([moved(seen, search.matrix) for seen in search.cameras], search, uncertainty)
-
-
-def pose_of(search: PoseFit) -> Pose:
-    """Return the best pose so far, with what was found of the lens."""
-    return next(step.pose for step in reversed(search.history) if step.best)
-
-
-def reason_with(words: str, known: CameraUncertainty) -> str:
-    """Return `words`, or what is not known of poses and lens where the end is right otherwise."""
-    if words != "converged" or not known.unknown:
-        return words
-    fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
-    return f"not known: {known.unknown}; {fix}"
+    return with_own_history(found)
 
 
 def with_coefficients(name: str, camera: object, count: object) -> Camera:
@@ -242,11 +174,4 @@ def with_coefficients(name: str, camera: object, count: object) -> Camera:
     if number <= had:
         return camera
     wanted = min(n for n in counts if n >= number)
-    kept = camera.coefficients[..., :had]
-    return camera.replace(distortion=torch.nn.functional.pad(kept, (0, wanted - had)))
-
-
-def moved(camera: Camera, matrix: Tensor) -> Camera:
-    """Return the camera W M that sees a scene at rest as this one, W, sees it moved by the matrix M (4, 4)."""
-    W = camera.world_to_camera
-    return camera.replace(world_to_camera=(W.detach().double() @ matrix).to(W))
+    return camera.replace(distortion=torch.nn.functional.pad(camera.coefficients[..., :had], (0, wanted - had)))

@@ -1,31 +1,28 @@
 """fit_pose(): the pose of a known mesh in one or several pictures.
 
-An image pyramid is searched from coarse to fine. Photographs are compared by a sum of log likelihoods (likelihood/), from
-several hypotheses (hypotheses.py); colours as they are, or the mask of a plain mesh, by a robust squared difference of blurred
-pictures and renders (color_search.py). In both, what covers the object hardly counts. Each Gauss-Newton step rotates the object
-about its centre, shifts it in units of its size, and changes logarithms of scale and focal length.
+An image pyramid is searched from coarse to fine, from several hypotheses (hypotheses.py), by a sum of log likelihoods
+(likelihood/), in which what covers the object hardly counts. Each damped Gauss-Newton step rotates the object about its centre,
+shifts it in units of its size, and changes logarithms of scale and focal length.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from ...camera.camera import Camera
-from ...check import as_int, as_tensor, check_flag, check_float, check_shape
+from ...check import as_int, check_flag
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
 from ...scene.tree import map_tensors
-from ..by_camera import numbered, one_for_each
 from ..checkpoints import CheckpointFile, traits
+from ..measured import depth_images
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..row_order import warn_of_flipped_rows
@@ -33,7 +30,7 @@ from ..views import PICTURES, Images, cameras_of
 from .confidence import features_of
 from .hypotheses import Mode, probabilities
 from .initial_pose import initial_pose
-from .inputs import ArgumentNames, warn_of_scale, warn_of_units, without_colors
+from .inputs import ArgumentNames, check_in_front, warn_of_scale, warn_of_units, without_colors
 from .pose import Pose, angle, pose_from_matrix
 from .pose_search import Groups, PoseSearch, Report, anywhere, around, everywhere
 from .replay_log import ReplayLog
@@ -114,7 +111,7 @@ def search_pose(
     depths: object, names: ArgumentNames, settings: Settings, search: Search = True, symmetries: Symmetries | None = None,
 ) -> PoseFit:  # fmt: skip
     """Run fit_pose() with any set of sought numbers of the lens."""
-    began, movable = time.perf_counter(), names == ArgumentNames()
+    progress, movable = settings.progress_of("fit", lambda: with_own_history(result())), names == ArgumentNames()
     if images is None:
         if masks is None:
             raise ValueError(f"{names.images}: expected pictures or masks to compare with, got neither")
@@ -127,15 +124,16 @@ def search_pose(
     if movable:  # A camera may stand inside of a scene.
         warn_of_scale(names.mesh, task.scene.transformed(given.R, given.t, given.scale), task.shots[0].camera)
     start = initial_pose(task) if init is None else given
+    check_in_front(names.init, task.shots[0].camera, start, task.center)
     file = CheckpointFile(settings.checkpoint, {
         names.init: None if init is None else given.matrix, names.mesh: mesh, names.images: images, "masks": masks,
         "weights": weights, "cameras": [traits(one) for one in given_cameras], **lens._asdict(), "depths": depths,
         "search": search, **{n: getattr(settings, n) for n in ("max_size", "steps", "spp", "step_tolerance", "seed")},
     })  # fmt: skip
     saved = file.read()
-    log, earlier = (ReplayLog(), 0.0) if saved is None else (ReplayLog(saved["replay_log"]), saved["seconds"])
-    measured = depth_images(depths, task)
+    log = ReplayLog() if saved is None else ReplayLog(saved["values"])
     seen = [shot.camera for shot in task.shots]
+    measured = depth_images(depths, seen)
     if search != "global":
         warn_of_units(task.scene.transformed(start.R, start.t, start.scale), seen, measured, "at the start")
 
@@ -148,14 +146,6 @@ def search_pose(
     state = PoseSearch(
         task, start, measured, settings, log, search is not False, proposals=proposals, symmetries=symmetries
     )  # fmt: skip
-    interrupted = False
-
-    def seconds() -> float:
-        return earlier + time.perf_counter() - began
-
-    def keep() -> None:
-        if settings.checkpoint is not None:
-            file.write({"replay_log": log.state(), "seconds": seconds()})
 
     def result() -> PoseFit:  # A callback may change its tensors in place.
         best: Pose = state.best if symmetries is None else state.best.closest(symmetries, start)
@@ -169,40 +159,32 @@ def search_pose(
             {} if known is None or state.evidence is None else features_of(state.evidence, best_share(modes), known)
         )
         conflict = ambiguity(best, state.ambiguous, symmetries, task)
-        sure = state.converged and not interrupted and not conflict and (known is None or not known.unknown)
+        sure = state.converged and not progress.interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
-            best.R.clone(), best.t.clone(), float(best.scale), cameras[0], state.loss, len(history), seconds(), sure, interrupted,
-            state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough, modes=modes,
-            features=features,
+            best.R.clone(), best.t.clone(), float(best.scale), cameras[0], state.loss, len(history), progress.seconds, sure,
+            progress.interrupted, state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough,
+            modes=modes, features=features,
         )  # fmt: skip
 
-    total = max(state.planned, log.steps)
-    bar = tqdm(total=total, initial=log.steps, desc="fit", unit="step", disable=not settings.progress, leave=False)
+    def keep() -> None:
+        if settings.checkpoint is not None:
+            file.write({"values": log.values, "seconds": progress.seconds})
 
     def after_step() -> None:
         last = state.history[-1]
-        bar.set_postfix_str(f"{last.size[1]} × {last.size[0]} px, loss {last.loss:.2e}", refresh=False)
-        if bar.total is not None and bar.n + 1 >= bar.total:
-            bar.total = None  # The number of later steps is not known.
-        bar.update()
-        if settings.callback is not None:
-            settings.callback(with_own_history(result()))
-        if settings.checkpoint is not None and len(state.history) % settings.checkpoint.every == 0:
-            keep()
+        progress.step(f"{last.size[1]} × {last.size[0]} px, loss {last.loss:.2e}")
 
+    progress.keep, progress.steps, progress.earlier = keep, len(log.values), 0.0 if saved is None else saved["seconds"]
+    progress.total = max(state.planned, progress.steps)
     state.after_step = after_step
-    state.report = bar.set_postfix_str
-    try:
+    with progress:
+        state.report = progress.bar.set_postfix_str
         state.run()
         if search == "global":
             warn_of_units(task.scene.transformed(state.best.R, state.best.t, state.best.scale), seen, measured, "found")
         wrong = not state.converged and state.edge_support < state.enough
         if search and wrong and proposals is None:
             _warn_of_flipped_pictures(task, state, init is None)
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        bar.close()
     keep()
     return result()
 
@@ -231,40 +213,6 @@ def ambiguity(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None,
         f"ambiguous: the pictures hardly separate it from a pose that is {other}; give {colors}"
         "symmetries of the mesh, depth, or another picture"
     )
-
-
-def depth_images(depths: object, task: PoseTask) -> list[Tensor | None]:
-    """Return the depth (H, W) of each picture, NaN where it was not measured. Raises TypeError or ValueError."""
-    n = len(task.shots)
-    given = one_for_each("depths", depths, n, 2)
-    found = [
-        None if one is None else depth_image(numbered("depths", k, n), one, shot.camera.size)
-        for k, (one, shot) in enumerate(zip(given, task.shots, strict=True))
-    ]
-    if depths is not None and not any(one is not None and bool(one.isfinite().any()) for one in found):
-        raise ValueError(
-            "depths: expected distances somewhere, got none in any pixel; 0 and NaN say that there is none"
-        )
-    return found
-
-
-def depth_image(name: str, given: object, size: tuple[int, int]) -> Tensor:
-    """Return the depth (H, W), NaN where it was not measured. Raises TypeError or ValueError."""
-    value = as_tensor(name, given).detach().cpu()
-    if not value.is_floating_point():
-        raise TypeError(
-            f"{name}: expected floating-point numbers in world units, got whole ones; of millimetres, for metres, take "
-            "depth / 1000"
-        )
-    check_float(name, value)
-    check_shape(name, value, size, (*size, 1), fix="it needs the picture's size")
-    value = value.reshape(size).float()
-    if bool((value < 0.0).any()):
-        least = float(value.nan_to_num().min())
-        raise ValueError(
-            f"{name}: expected distances along the camera's axis, 0 or NaN where there is none, got {least:g}"
-        )
-    return torch.where(value.isfinite() & (value > 0.0), value, torch.nan)
 
 
 def _check_search(search: object, init: object, cameras: Sequence[Camera], name: str) -> None:

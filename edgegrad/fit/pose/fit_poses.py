@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from ...camera.camera import Camera
 from ...check import as_tensor, check_flag, check_shape
@@ -17,11 +16,12 @@ from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
 from ...scene.tree import map_tensors
 from ..by_camera import numbered, one_for_each
+from ..measured import depth_images
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
 from .confidence import features_of
-from .fit_pose import ambiguity, best_share, depth_images, modes_of, symmetries_of
+from .fit_pose import ambiguity, best_share, modes_of, symmetries_of
 from .inputs import ArgumentNames, check_in_front, check_seen, warn_of_units
 from .pose import Pose, pose_from_matrix
 from .poses_search import PosesSearch
@@ -80,8 +80,8 @@ def fit_poses(
     TypeError, ValueError
         An argument is wrong, or an object is out of the picture, or inside another one, at the start; the message names it.
     """
-    began = time.perf_counter()
     settings = Settings.from_options(options, "fit_poses", POSE_OPTIONS, steps=40)
+    progress = settings.progress_of("fit", lambda: [with_own_history(one) for one in results()])
     count, views = _counted(meshes), cameras_of(cameras)
     starts = _starts(init, count)
     own_masks = _masks(masks, count, views)
@@ -96,7 +96,7 @@ def fit_poses(
         )
         for k, (mesh, own, start) in enumerate(zip(meshes, own_masks, starts, strict=True))
     ]  # fmt: skip
-    measured = depth_images(depths, tasks[0])
+    measured = depth_images(depths, views)
     for task, start in zip(tasks, starts, strict=True):
         for shot in task.shots:
             check_in_front(task.names.init, shot.camera, start, task.center)
@@ -106,7 +106,6 @@ def fit_poses(
     moved = [mesh for task, start in zip(tasks, starts, strict=True) for mesh in _moved(task, start)]
     warn_of_units(Scene(moved), [shot.camera for shot in tasks[0].shots], measured, "at the start")
     state = PosesSearch(tasks, starts, measured, settings, check_flag("search", search), known_symmetries)
-    interrupted = False
 
     def results() -> list[PoseFit]:  # A callback may change their tensors in place.
         found = []
@@ -120,32 +119,20 @@ def fit_poses(
             unknown = known is not None and bool(known.unknown)
             conflict = _conflict(tasks, state.best, k) if information is not None else ""
             conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
-            sure = state.converged[k] and not interrupted and not conflict and not unknown
+            sure = state.converged[k] and not progress.interrupted and not conflict and not unknown
             seen = [map_tensors(one, Tensor.clone) for one in views]
             modes, evidence = modes_of(state.modes[k]), state.evidence[k]
             features = {} if known is None or evidence is None else features_of(evidence, best_share(modes), known)
             found.append(PoseFit(
-                best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), time.perf_counter() - began,
-                sure, interrupted, state.edge_support[k], history, task, seen, known, state.visible[k], conflict,
+                best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), progress.seconds,
+                sure, progress.interrupted, state.edge_support[k], history, task, seen, known, state.visible[k], conflict,
                 state.needed[k], modes, features,
             ))  # fmt: skip
         return found
 
-    bar = tqdm(total=None, desc="fit", unit="step", disable=not settings.progress, leave=False)
-
-    def after_step() -> None:
-        bar.set_postfix_str(f"meshes[{state.seeking}], loss {state.loss:.2e}", refresh=False)
-        bar.update()
-        if settings.callback is not None:
-            settings.callback([with_own_history(one) for one in results()])
-
-    state.after_step = after_step
-    try:
+    state.after_step = lambda: progress.step(f"meshes[{state.seeking}], loss {state.loss:.2e}")
+    with progress:
         state.run()
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        bar.close()
     return results()
 
 
@@ -227,6 +214,17 @@ def _moved(task: PoseTask, pose: Pose) -> list[Mesh]:
     return list(task.scene.transformed(pose.R, pose.t, pose.scale).meshes)
 
 
+def _share_inside(one: Sequence[Mesh], other: Sequence[Mesh], scale: float) -> float:
+    """Return the share of an object's vertices that lie inside another one; of at most INSIDE of them, with their distances from
+    their mean multiplied. It is 1 of two objects that coincide vertex by vertex."""
+    points, others = (torch.cat([mesh.verts for mesh in body]).double() for body in (one, other))
+    if points.shape == others.shape and torch.allclose(points, others, atol=1e-6 * float(points.abs().max())):
+        return 1.0
+    some = points[:: max(1, len(points) // INSIDE)]
+    some = some.mean(0) + scale * (some - some.mean(0))
+    return float(torch.stack([_inside(some, mesh) for mesh in other]).any(0).double().mean())
+
+
 def _inside(points: Tensor, mesh: Mesh) -> Tensor:
     """Return which points (n, 3) lie inside a closed mesh (n,); none lies inside an open one."""
     import trimesh  # This import takes longer than a step of a fit.
@@ -245,40 +243,20 @@ def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:
     """Return in words whether an object ends where another one is: at least half of its vertices, or of the other's, lie
     inside."""
     bodies = [_moved(task, pose) for task, pose in zip(tasks, poses, strict=True)]
-    for other in range(len(bodies)):
-        for a, b in ((k, other), (other, k)):
-            if a == b:
-                continue
-            points = torch.cat([mesh.verts for mesh in bodies[a]]).double()
-            some = points[:: max(1, len(points) // INSIDE)]
-            # A little smaller, two coinciding objects are inside one another.
-            some = some.mean(0) + INNER_SCALE * (some - some.mean(0))
-            inside = torch.stack([_inside(some, mesh) for mesh in bodies[b]]).any(0)
-            if float(inside.double().mean()) >= 0.5:
-                return (
-                    f"in one place: meshes[{k}] ends where meshes[{other}] does; leave one out, or start them elsewhere"
-                )
+    for other, body in enumerate(bodies):
+        # A little smaller, two coinciding objects are inside one another.
+        pairs = [] if other == k else [(bodies[k], body), (body, bodies[k])]
+        if any(_share_inside(a, b, INNER_SCALE) >= 0.5 for a, b in pairs):
+            return f"in one place: meshes[{k}] ends where meshes[{other}] does; leave one out, or start them elsewhere"
     return ""
 
 
 def _check_apart(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
     """Raise ValueError where an object lies inside another one, or two coincide."""
     bodies = [_moved(task, start) for task, start in zip(tasks, starts, strict=True)]
-    points = [torch.cat([mesh.verts for mesh in body]).double() for body in bodies]
-    for k, own in enumerate(points):
-        some = own[:: max(1, len(own) // INSIDE)]
-        for other, body in enumerate(bodies):
-            if other == k:
-                continue
-            if own.shape == points[other].shape and torch.allclose(own, points[other], atol=1e-6 * tasks[k].size):
-                raise ValueError(
-                    f"init[{k}]: expected the objects apart, got meshes[{k}] where meshes[{other}] is, vertex by vertex"
-                )
-            low, high = points[other].aminmax(dim=0)
-            if not bool(((own > low) & (own < high)).all()):
-                continue
-            if any(bool(_inside(some, mesh).all()) for mesh in body):
-                raise ValueError(
-                    f"init[{k}]: expected the objects next to one another, got meshes[{k}] inside meshes[{other}], where no "
-                    "camera sees it; move one of them, or leave it out"
-                )
+    for k, other in itertools.permutations(range(len(bodies)), 2):
+        if _share_inside(bodies[k], bodies[other], 1.0) == 1.0:
+            raise ValueError(
+                f"init[{k}]: expected the objects next to one another, got meshes[{k}] inside meshes[{other}], or where it is; "
+                "move one of them, or leave it out"
+            )

@@ -20,12 +20,12 @@ from ...optim.levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtS
 from ...scene.symmetries import Symmetries
 from ..options import Settings
 from .camera_motion import moved_poses
-from .color_search import norms_of
 from .likelihood.objective import PoseLevel, pose_levels
 from .pose import Pose, angle
+from .replay_log import Replayed, ReplayLog
 from .result import Step
 from .settings import POSE
-from .task import ROTATION, TRANSLATION, PoseTask
+from .task import ROTATION, STEP_PARTS, TRANSLATION, PoseTask
 
 Round = tuple[int, int]
 
@@ -37,21 +37,27 @@ class Mode(NamedTuple):
     cost: float  # −log likelihood ratio to pictures without the object, nats of independent pixels
     curvature: Tensor  # (n, n), of the cost
     rests: bool  # The last step was short.
+    level: PoseLevel  # with the noise by which this is the cost
+    temperature: float = 1.0  # pixels that count as one
+
+    @property
+    def information(self) -> Tensor:
+        """The inverse covariance (n, n) of the entries of a step."""
+        return self.curvature / self.temperature
 
     @property
     def log_mass(self) -> float:
         """The logarithm of the posterior's mass about the mode (Laplace's approximation), up to a constant. Errors of
         neighbouring pixels have common causes, which a temperature accounts for."""
-        temperature = POSE.correlation_length**2
-        known = self.curvature / temperature + torch.eye(len(self.curvature), dtype=torch.float64)
-        return -self.cost / temperature - 0.5 * float(torch.logdet(known))
+        known = self.information + torch.eye(len(self.curvature), dtype=torch.float64)
+        return -self.cost / self.temperature - 0.5 * float(torch.logdet(known))
 
 
 class Group:
     """Hypotheses that are compared in one part of the pictures, each with the descent that it is on."""
 
-    def __init__(self, levels: list[PoseLevel], poses: Sequence[Pose]) -> None:
-        self.levels, self.poses = levels, list(poses)
+    def __init__(self, levels: list[PoseLevel], poses: Sequence[Pose], log: ReplayLog) -> None:
+        self.levels, self.poses, self.log = levels, list(poses), log
         self.descents: LevenbergMarquardt[Pose] | None = None
         self.level = levels[0]
 
@@ -62,7 +68,7 @@ class Group:
 
     def begin(self, settings: Settings) -> None:
         last = self.level.last
-        self.descents = LevenbergMarquardt(self.level, self.poses, LevenbergMarquardtSettings(
+        self.descents = LevenbergMarquardt(Replayed(self.level, self.log), self.poses, LevenbergMarquardtSettings(
             steps=settings.steps + 1, start_damping=POSE.fine_damping if last else POSE.coarse_damping,
             least_damping=0.1 * POSE.fine_damping, most_damping=POSE.most_damping, unseen_damping=1e-5,
             trust_radius=POSE.longest_step, least_gain=POSE.least_gain,
@@ -99,11 +105,12 @@ class HypothesisSearch:
     def __init__(
         self, task: PoseTask, groups: Sequence[tuple[Pose, Sequence[Pose]]], depths: Sequence[Tensor | None],
         settings: Settings, symmetries: Symmetries | None = None, further: bool = True, coarse: bool = True,
+        log: ReplayLog | None = None,
     ) -> None:  # fmt: skip
         """`groups` have a pose, about which pictures are compared, and hypotheses. `further`: draw more of them. `coarse`: begin
         on the coarsest level, and not on the last one."""
         self.task, self.depths, self.settings, self.symmetries = task, depths, settings, symmetries
-        self.further, self.coarse = further, coarse
+        self.further, self.coarse, self.log = further, coarse, log or ReplayLog()
         self.groups: list[Group] = []
         self.given = groups
         self.likeliest = groups[0][1][0]
@@ -115,7 +122,7 @@ class HypothesisSearch:
     def run(self) -> list[Mode]:
         """Return the modes, the likeliest first; none where nothing in the pictures depends on the poses."""
         for about, poses in self.given:
-            self.groups.append(Group(pose_levels(self.task, about, self.depths, self.settings), poses))
+            self.groups.append(Group(pose_levels(self.task, about, self.depths, self.settings), poses, self.log))
         deepest = max(len(group.levels) for group in self.groups)
         for k in range(deepest - 1 if self.coarse else 0):
             self.report(f"{sum(len(group.poses) for group in self.groups)} hypotheses on level {k + 1} of {deepest}")
@@ -130,10 +137,15 @@ class HypothesisSearch:
         for group in self.groups:
             group.enter(deepest - 1, self.settings)
         self._halve(POSE.last_rounds)
-        for group in self.groups:
-            group.level = group.level.informed(group.poses).focused(group.poses[0])
-            group.begin(self.settings)
-        self._halve(((POSE.last_steps, POSE.modes),))
+        for _ in range(POSE.noise_rounds):
+            noises = [group.level.contour_noises for group in self.groups]
+            for group in self.groups:
+                group.level = group.level.informed(group.poses).focused(group.poses[0])
+            if noises == [group.level.contour_noises for group in self.groups]:
+                break
+            for group in self.groups:
+                group.begin(self.settings)
+            self._halve(((POSE.last_steps, POSE.modes),))
         return self._modes()
 
     def _halve(self, rounds: Sequence[Round]) -> None:
@@ -158,7 +170,8 @@ class HypothesisSearch:
         for cost, g, row in ranked:
             pose = self._descent(g, row).point
             alone = all(self.apart(pose, self._descent(*other).point) > POSE.distinct for other in kept)
-            if math.isfinite(cost) and alone and len(kept) < most:
+            unlikely = self.groups[g].level.last and cost - ranked[0][0] > POSE.unlikely_nats
+            if math.isfinite(cost) and alone and not unlikely and len(kept) < most:
                 kept.append((g, row))
         kept = kept or [(ranked[0][1], ranked[0][2])]
         for g, group in enumerate(self.groups):
@@ -173,11 +186,12 @@ class HypothesisSearch:
     def _note(self, group: Group) -> None:
         """Add the likeliest hypothesis of a group to the history, and make it the answer so far."""
         assert group.descents is not None
-        best = min(group.descents.descents, key=lambda descent: descent.mean_cost)
+        first, descents = not self.history, group.descents.descents  # The history begins with the start.
+        best = descents[0] if first else min(descents, key=lambda descent: descent.mean_cost)
         if not best.accepted:
             return
-        norms = norms_of(list(group.level.dofs), best.gradient)
-        better = best.mean_cost <= min(min(other.costs) for other in self.groups)
+        norms = norms_of(group.level.dofs, best.gradient)
+        better = first or best.mean_cost <= min(min(other.costs) for other in self.groups)
         if better:
             self.likeliest, self.cost = best.point, best.mean_cost
         self.history.append(Step(group.level.size, best.mean_cost, best.point, better, norms))
@@ -191,18 +205,26 @@ class HypothesisSearch:
             for one in group.descents.descents:
                 if one.accepted and one.rest is not Rest.FLAT:
                     rests = one.rest in (Rest.SHORT, Rest.DAMPED)
-                    found.append(Mode(one.point, one.mean_cost, one.curvature, rests))
+                    found.append(Mode(one.point, one.mean_cost, one.curvature, rests, group.level))
         kept: list[Mode] = []
         for mode in sorted(found, key=lambda mode: mode.cost):
             if all(self.apart(mode.pose, other.pose) > POSE.same_mode for other in kept):
                 kept.append(mode)
-        return kept
+        temperature = kept[0].level.temperature(kept[0].pose) if kept else 1.0
+        return [mode._replace(temperature=temperature) for mode in kept]
 
     def apart(self, one: Pose, other: Pose) -> float:
         """Return how far apart two poses are, in radians or object sizes, whichever is more, up to symmetries."""
         if self.symmetries is not None:
             other = other.closest(self.symmetries, one)
         return max(angle(one.R, other.R), self.task.between(one, other))
+
+
+def norms_of(dofs: Sequence[int], gradient: Tensor) -> dict[str, float]:
+    """Return the norm of the gradient by each part of a step whose entries are `dofs`."""
+    squares = dict(zip(dofs, gradient.square().tolist(), strict=True))
+    sums = {name: [squares[entry] for entry in entries if entry in squares] for name, entries in STEP_PARTS.items()}
+    return {name: math.sqrt(sum(part)) for name, part in sums.items() if part}
 
 
 def probabilities(modes: Sequence[Mode]) -> list[float]:

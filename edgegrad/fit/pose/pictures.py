@@ -9,43 +9,30 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from ...files.paths import PathLike, replacing
-from ..plots import comparison, draw_gradients
+from ..plots import comparison, loss_figure
 from ..result import chosen
 from ..views import displayed
 from .photo.overlay import overlay
 from .result import PoseFit, Step
-from .task import PoseTask, PyramidLevel
+from .task import PoseTask
 
-PANEL_SIDE, FRAME_SIDE = 512, 256  # largest side of a panel in pixels, in draw_fit and in draw_animation
+PANEL_SIDE, FRAME_SIDE = 512, 256  # largest side of a panel in pixels, in sheet and in draw_animation
 MAX_FRAMES = 30
 FIGURE_SPP = 64
 GREY = "#c4c4c4"
 
 
-def draw_fit(path: PathLike, fit: PoseFit) -> None:
-    """Write target | start | fit | difference as one image; with a mask all over black, as they were compared. Raises
-    ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written."""
-    figure = sheet(fit)
-    with replacing(path) as temporary:
-        figure.savefig(temporary)
-
-
 def sheet(*fits: PoseFit, most: int | None = None) -> Figure:
-    """Return a row for each picture, of one fit or several, or for at most so many."""
+    """Draw target | start | fit | difference, a row for each picture of one fit or several, or for at most so many; with a mask
+    all over black, as they were compared. Raises ValueError for a fit that did not take a step or came from JSON."""
     rows = []
     for fit in fits:
         task = _task(fit)
-        level = _level(task, PANEL_SIDE)
-        start, end = (overlay(task, level, step.pose) for step in (fit.history[0], _best_steps(fit)[-1]))
-        rows += [(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)]
+        start, end = (
+            overlay(task, PANEL_SIDE, FIGURE_SPP, step.pose) for step in (fit.history[0], _best_steps(fit)[-1])
+        )
+        rows += [(target, a, b) for (target, a), (_, b) in zip(start, end, strict=True)]
     return comparison([rows[k] for k in chosen(len(rows), len(rows) if most is None else most)])
-
-
-def draw_loss(path: PathLike, fit: PoseFit) -> None:
-    """Write what curves_of() draws. Raises ValueError, or OSError when the file cannot be written."""
-    figure = curves_of(fit)
-    with replacing(path) as temporary:
-        figure.savefig(temporary)
 
 
 def curves_of(fit: PoseFit) -> Figure:
@@ -56,8 +43,7 @@ def curves_of(fit: PoseFit) -> Figure:
     history = fit.history[:-1] if len(fit.history) > 1 and not fit.interrupted else fit.history
     begins = [k for k, step in enumerate(history) if k == 0 or step.size != history[k - 1].size]
     sizes = sorted({step.size for step in history})
-    figure = Figure(figsize=(6.4, 4.8), dpi=200, layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
+    figure, above = loss_figure([step.gradient for step in history])
     above.plot(range(1, len(history) + 1), [step.loss for step in history], ".", color=GREY, markersize=4)
     labelled = set()
     for begin, end in zip(begins, [*begins[1:], len(history)], strict=True):
@@ -69,10 +55,7 @@ def curves_of(fit: PoseFit) -> Figure:
         above.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
     if min(step.loss for step in history) > 0.0:  # Log likelihood ratios are not.
         above.set_yscale("log")
-    above.set_ylabel("loss")
-    above.spines[["top", "right"]].set_visible(False)
     above.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)
-    draw_gradients(below, [step.gradient for step in history])
     return figure
 
 
@@ -80,12 +63,10 @@ def draw_animation(path: PathLike, fit: PoseFit) -> None:
     """Write target | fit | difference from start to end as an animated WebP. Raises ValueError for a fit that did not take a
     step or came from JSON, OSError when the file cannot be written."""
     task = _task(fit)
-    level = _level(task, FRAME_SIDE)
-    target = displayed(level.shots[0].target).numpy()
-    font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
     frames = []
     for step in _frames(_best_steps(fit)):
-        image = displayed(overlay(task, level, step.pose)[0]).numpy()
+        target, image = (displayed(one).numpy() for one in overlay(task, FRAME_SIDE, FIGURE_SPP, step.pose)[0])
+        font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
         panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
         frame = Image.fromarray((panels * 255.0).round().astype(np.uint8))
         edge = round(0.03 * frame.height)
@@ -123,9 +104,3 @@ def _frames(steps: list[Step]) -> list[Step]:
         if abs(float(far[k] - far[kept[-1]])) > 2.0 / MAX_FRAMES:
             kept.append(k)
     return [steps[k] for k in kept] + ([steps[-1]] if len(steps) > 1 else [])
-
-
-def _level(task: PoseTask, most: int) -> PyramidLevel:
-    """Return the whole picture, at most so many pixels on its longer side."""
-    size = task.shots[0].camera.size
-    return task.level(min(1.0, most / max(size)), blur=0.0, coarseness=1.0, spp=FIGURE_SPP, dofs=[])

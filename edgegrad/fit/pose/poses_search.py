@@ -28,7 +28,6 @@ from .pose_search import ambiguous
 from .result import Step
 from .settings import CAMERA, POSE
 from .task import PoseTask
-from .uncertainty import information_of
 
 
 class PosesSearch:
@@ -52,7 +51,7 @@ class PosesSearch:
     def needed(self) -> list[float]:
         """The share of its edges that each object must show. The visible part of a covered one is more ambiguous."""
         found = zip(map(enough_support, self.tasks), self.visible, strict=True)
-        return [max(enough, POSE.sure_support) if seen < POSE.unoccluded else enough for enough, seen in found]
+        return [max(enough, POSE.covered_support) if seen < POSE.unoccluded else enough for enough, seen in found]
 
     @property
     def converged(self) -> list[bool]:
@@ -70,7 +69,7 @@ class PosesSearch:
     def information(self, k: int) -> Tensor | None:
         """Return the inverse covariance (n, n) of one object's entries; None before its answer."""
         done = self.modes[k] and not math.isnan(self.edge_support[k])
-        return information_of(self.modes[k][0].curvature) if done else None
+        return self.modes[k][0].information if done else None
 
     def run(self) -> None:
         """Search; raise ValueError when nothing in the pictures depends on the poses."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...camera.poses import rigid
-from ...files.paths import PathLike, write_text
+from ...files.paths import PathLike, write_figures, write_text
 from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..ending import Ending, reason_of
@@ -56,11 +56,8 @@ class PoseFit(FitResult):
     R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given one
     (of several the first), with the focal length found when that was asked for.
 
-    `loss` belongs to the finest level, and compares only fits to the same pictures that ended by the same terms. By colours as
-    they are, or by the mask of a plain mesh, it is the mean over pixels and channels of Geman and McClure's ρ(r) = r² / (1 +
-    r²/c²): r is the difference of a pixel to the picture, in linear radiance of which 1 is the picture's white, and c a tenth
-    of the picture's range. Before an unknown background a reward for what the object covers is subtracted. By the terms for
-    photographs it is −log of how much likelier the pictures are with the object than without, in nats of independent pixels.
+    `loss` is −log of how much likelier the pictures are with the object than without, in nats of independent pixels. It belongs
+    to the finest level, and compares only fits to the same pictures.
     """
 
     R: Tensor
@@ -80,7 +77,7 @@ class PoseFit(FitResult):
     visible: float = 1.0  # share of this object that the others of fit_poses() do not hide; not kept in JSON
     conflict: str = ""  # the other pose or object that may be the right one, in words; not kept in JSON
     enough: float = MIN_EDGE_SUPPORT  # least `explained` of a right pose; not kept in JSON
-    # The poses at which the search came to rest, the likeliest first. Empty where colours as they are were compared alone.
+    # The poses at which the search came to rest, the likeliest first.
     modes: Sequence[PoseMode] = ()
     features: Mapping[str, float] = field(default_factory=dict, repr=False)  # of the fit, on which `confidence` depends
 
@@ -138,11 +135,9 @@ class PoseFit(FitResult):
         write_text(out / "pose.json", self.to_json() + "\n")
         if not self.history or not figures:
             return ["pose.json"]
-        pictures = require("edgegrad.fit.pose.pictures", *DRAWING)
-        draw = {"fit.png": pictures.draw_fit, "loss.png": pictures.draw_loss, "fit.webp": pictures.draw_animation}
-        for name, function in draw.items():
-            function(out / name, self)
-        return ["pose.json", *draw]
+        names = write_figures(out, {"fit.png": self.plot, "loss.png": self.plot_history})
+        require("edgegrad.fit.pose.pictures", *DRAWING).draw_animation(out / "fit.webp", self)
+        return ["pose.json", *names, "fit.webp"]
 
     @property
     def _can_draw(self) -> bool:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ...check import as_tensor, check_finite, check_float, check_shape
@@ -43,19 +40,3 @@ def background_of(value: Tensor | float | None, picture: Tensor) -> Tensor:
 def scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
     """Return the size of a picture whose sides are multiplied by a factor, at least one pixel."""
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-
-
-def blurred(image: Tensor, sigma: float) -> Tensor:
-    """Return a Gaussian blur of images (…, h, w, C) by `sigma` pixels, which repeats the border's pixels outwards."""
-    if sigma == 0.0:
-        return image
-    radius = math.ceil(3.0 * sigma)
-    kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1).to(image) / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    # Channels are groups of one image: as images of a batch, their backward pass takes up to seven times as long.
-    rows = image.movedim(-1, -3).flatten(0, -3)[None]
-    count = rows.shape[1]
-    rows = F.pad(rows, (radius, radius, radius, radius), mode="replicate")
-    for shape in ((-1, 1), (1, -1)):
-        rows = F.conv2d(rows, kernel.reshape(1, 1, *shape).expand(count, -1, -1, -1), groups=count)
-    return rows[0].reshape(*image.movedim(-1, -3).shape).movedim(-3, -1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -11,24 +9,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...aovs import render_aovs
 from ...camera.camera import Camera
-from ...camera.poses import rotation
 from ...check import check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
-from ..options import MIN_PICTURE_SIDE, Settings
+from ..options import MIN_PICTURE_SIDE
 from ..region import VISIBLE
-from ..views import area_mean, check_image, check_without_alpha, has_levels, over_black, warn_of_faint, white_level
-from .inputs import ArgumentNames, depth_of, shots_of
-from .jacobian import Motion, cross_matrices
+from ..views import check_image, check_without_alpha, has_levels, over_black, warn_of_faint, white_level
+from .inputs import ArgumentNames, shots_of
 from .pose import Pose
-from .target_images import background_of, blurred, is_clutter, scaled
+from .target_images import background_of, is_clutter
 
-COARSEST_OBJECT = 24  # Pixels across the object on the coarsest level, where 15 % of its size is a few pixels.
-SMALLEST_SIDE = 12  # pixels on the shorter side of the coarsest level
-PYRAMID_BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on finer ones
-MAX_COARSE_SPP = 64  # samples a pixel on coarse levels
 BACKGROUND_BRIGHTNESS = 0.25  # brightness of the picture behind a render, where the background is unknown
 
 # A step has these entries, and a constant for the first of each: a rotation vector about the centre and a shift, both along
@@ -60,22 +51,6 @@ class TargetView(NamedTuple):
     weight: Tensor | None  # (h, w, 1)
 
 
-class PyramidLevel(NamedTuple):
-    """The task at one resolution."""
-
-    shots: list[TargetView]
-    blur: float  # pixels
-    coarseness: float  # size of a pixel, relative to the finest level's
-    spp: int
-    dofs: list[int]  # sought entries of a step
-    image_blur: float = 0.0  # pixels: blur of the pictures themselves, which renders get, too
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """The size (h, w) of the first picture."""
-        return self.shots[0].camera.size
-
-
 @dataclass(frozen=True)
 class PoseTask:
     """Pictures that are compared with renders, and how a pose moves. Geometry is float64."""
@@ -85,7 +60,6 @@ class PoseTask:
     shots: list[TargetView]  # whole pictures
     clutter: bool  # The background is unknown: where the object is not seen, nothing is compared.
     colorless: bool  # The meshes have no colours, and no mask shows them: pictures show them grey.
-    extent: float  # norm over the channels of the pictures' range, of colours where there are any
     center: Tensor  # (3,) of the bounding box, in the mesh's units
     size: float  # diagonal of the bounding box at the start, world units
     dofs: list[int]  # sought entries of a step
@@ -192,34 +166,7 @@ class PoseTask:
                 f"{names.masks}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
             )
         without_colors = scene.replace(meshes=double, background=None)
-        return PoseTask(
-            without_colors, aovs, shots, clutter, colorless, extent, (low + high) / 2, size, dofs, names, white
-        )
-
-    def pyramid(self, start: Pose, settings: Settings) -> list[PyramidLevel]:
-        """Return the levels from coarse to fine. Raises ValueError when the object is behind the camera."""
-        camera = self.shots[0].camera
-        H, W = camera.size
-        finest, spp = min(1.0, settings.max_size / max(H, W)), settings.spp
-        depth = float(depth_of(camera, start, self.center))
-        perspective = camera.projection != "orthographic"
-        if perspective and depth <= 0:
-            raise ValueError(
-                f"{self.names.init}: expected the object in front of the camera, got its centre at depth {depth:.3g}"
-            )
-        across = finest * focal_of(camera) * self.size / (depth if perspective else 1.0)
-        halvings = round(math.log2(max(1.0, min(across / COARSEST_OBJECT, finest * min(H, W) / SMALLEST_SIDE))))
-        factors = [finest / 2**n for n in range(halvings, -1, -1)]
-        factors += [finest] * (len(PYRAMID_BLURS) + 1 - len(factors))
-        blurs = [*PYRAMID_BLURS, *[0.0] * (len(factors) - len(PYRAMID_BLURS))]
-        # Perspective shows in fine detail only: on a blurred level the focal length would diverge.
-        without_lens = [entry for entry in self.dofs if entry < FOCAL_LENGTH]
-        levels = []
-        for factor, blur in zip(factors, blurs, strict=True):
-            coarseness = finest / factor
-            samples = max(spp, min(MAX_COARSE_SPP, round(spp * coarseness**2)))
-            levels.append(self.level(factor, blur, coarseness, samples, without_lens if blur else self.dofs))
-        return levels
+        return PoseTask(without_colors, aovs, shots, clutter, colorless, (low + high) / 2, size, dofs, names, white)
 
     def turned_over(self) -> PoseTask:
         """Return the task with the pictures upside down."""
@@ -232,77 +179,6 @@ class PoseTask:
             for shot in self.shots
         ]  # fmt: skip
         return replace(self, shots=shots)
-
-    def level(self, factor: float, blur: float, coarseness: float, spp: int, dofs: list[int]) -> PyramidLevel:
-        """Return the task with the pictures' sides multiplied by `factor`."""
-        shots = []
-        for camera, target, behind, weight in self.shots:
-            size = scaled(camera.size, factor)
-            if behind is not None and behind.dim() == 3:
-                behind = area_mean(behind, size)
-            weight = None if weight is None else area_mean(weight, size)
-            shots.append(TargetView(camera.resized(size), blurred(area_mean(target, size), blur), behind, weight))
-        return PyramidLevel(shots, blur, coarseness, spp, dofs)
-
-    def moved(self, pose: Pose, dofs: list[int], p: Tensor) -> Pose:
-        """Return the pose after a step whose entries `dofs` are p, the others zero; differentiable in p."""
-        step = p.new_zeros(STEP_SIZE).index_put((torch.tensor(dofs),), p)
-        camera = self.shots[0].camera
-        view = camera.world_to_camera
-        R = rotation(view[:3, :3].T @ step[ROTATION:TRANSLATION]) @ pose.R
-        center = (
-            view[:3, :3] @ (pose.scale * (pose.R @ self.center) + pose.t)
-            + view[:3, 3]
-            + self.size * step[TRANSLATION:SCALE]
-        )
-        scale, zoom = pose.scale * step[SCALE].exp(), step[FOCAL_LENGTH].exp()
-        perspective = camera.projection != "orthographic"
-        if PRINCIPAL in dofs and perspective:
-            # A shift compensates for the moved point, so that only perspective changes and the entries hardly interact.
-            aside = step[PRINCIPAL:DISTORTION] * camera.size[1] / focal_of(camera) / pose.focal.detach()
-            center = torch.cat([center[:2] - aside * center[2:].detach(), center[2:]])
-        if FOCAL_LENGTH in dofs and perspective:
-            # A longer lens enlarges the object. Distance compensates, or scale where that is sought, so that only
-            # perspective changes.
-            if SCALE in dofs:
-                scale = scale / zoom
-            else:
-                center = torch.cat([center[:2], center[2:] * zoom])
-        t = view[:3, :3].T @ (center - view[:3, 3]) - scale * (R @ self.center)
-        coefficients = pose.distortion + step[DISTORTION:]
-        return Pose(R, t, scale, pose.focal * zoom, pose.principal + step[PRINCIPAL:DISTORTION], coefficients)
-
-    def motion(self, level: PyramidLevel, shot: TargetView, pose: Pose) -> Motion:
-        """Return how each entry of a step that the level seeks moves what the shot sees. These are the derivatives of moved()
-        and lens() at a zero step. The object's centre moves along the first camera's axes, and the object rotates and scales
-        about it."""
-        camera = self.shots[0].camera
-        view = camera.world_to_camera.double()
-        center = pose.matrix[:3, :3] @ self.center + pose.t
-        depth = (view[:3, :3] @ center + view[:3, 3])[2]
-        perspective = camera.projection != "orthographic"
-        linear, path = torch.zeros(STEP_SIZE, 3, 3, dtype=torch.float64), torch.zeros(STEP_SIZE, 3, dtype=torch.float64)
-        K, lens_change = torch.zeros_like(linear), torch.zeros(STEP_SIZE, STEP_SIZE - DISTORTION, dtype=torch.float64)
-        one = torch.eye(3, dtype=torch.float64)
-        linear[ROTATION:TRANSLATION] = cross_matrices(view[:3, :3])
-        path[TRANSLATION:SCALE] = self.size * one
-        linear[SCALE] = one
-        K[FOCAL_LENGTH, :2, :2] = pose.focal * shot.camera.K[:2, :2]
-        if perspective and SCALE in level.dofs:
-            linear[FOCAL_LENGTH] = -one
-        elif perspective:
-            path[FOCAL_LENGTH, 2] = depth
-        for axis in (0, 1):
-            K[PRINCIPAL + axis, axis, 2] = shot.camera.size[1]
-            if perspective:
-                path[PRINCIPAL + axis, axis] = -camera.size[1] / focal_of(camera) / pose.focal * depth
-        lens_change[DISTORTION:] = torch.eye(STEP_SIZE - DISTORTION)
-        dofs = torch.tensor(level.dofs)
-        shift: Tensor = path @ view[:3, :3] - linear @ center
-        lens = {"K": K[dofs]} if bool(K[dofs].any()) else {}
-        if (dofs >= DISTORTION).any():
-            lens["distortion"] = lens_change[dofs]
-        return Motion(linear[dofs], shift[dofs], **lens)
 
     def between(self, one: Pose, other: Pose) -> float:
         """Return the distance of the object's centres at two poses, relative to its size."""
@@ -328,53 +204,6 @@ class PoseTask:
                 change = torch.cat([change, change.new_zeros(len(given) - len(change))])
             fields["distortion"] = change if given is None else change + F.pad(given, (0, len(change) - len(given)))
         return camera.replace(**fields)
-
-    @property
-    def colors(self) -> int:
-        """The number of channels of the pictures that are colours; a mask is the channel after them."""
-        masked = "alpha" in self.aovs and not self.clutter
-        return 0 if self.aovs == ("alpha",) else self.shots[0].target.shape[-1] - masked
-
-    @property
-    def backed(self) -> bool:
-        """Whether a known background that is not black stands behind the object."""
-        return any(shot.background is not None and bool((shot.background != 0.0).any()) for shot in self.shots)
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """The channels to render, from which layers() makes what is compared."""
-        return (*self.aovs, "alpha") if self.backed and "alpha" not in self.aovs else self.aovs
-
-    @property
-    def reverse_alone(self) -> bool:
-        """Whether renders have no forward mode: only torch knows how the radiance of a lit scene changes."""
-        return self.scene.is_shaded and "image" in self.aovs
-
-    def views(self, level: PyramidLevel, pose: Pose, seed: int) -> list[tuple[Scene, Camera, int]]:
-        """Return the scene, the camera and the seed of each render, before black."""
-        moved = self.scene.transformed(pose.R, pose.t, pose.scale)
-        return [(moved, self.lens(shot.camera, pose), (seed + 977 * k) % 2**32) for k, shot in enumerate(level.shots)]
-
-    def layers(
-        self, level: PyramidLevel, shot: TargetView, channels: Mapping[str, Tensor], slopes: bool = False
-    ) -> Tensor:
-        """Return the summands (…, h, w, n) of a picture, blurred like the pictures. These are the object before black, the
-        visible part of a known background, and alpha, if it is compared. `slopes`: the channels are derivatives."""
-        parts = [channels["image"]] if "image" in self.aovs else []
-        if self.backed:
-            covered = channels["alpha"]
-            assert shot.background is not None  # If one picture has a background, all have.
-            seen = -covered if slopes else 1.0 - covered
-            parts.append(seen * shot.background.to(seen))
-        parts += [channels["alpha"]] if "alpha" in self.aovs else []
-        return blurred(torch.cat(parts, -1), math.hypot(level.blur, level.image_blur))
-
-    def images(self, level: PyramidLevel, pose: Pose, spp: int, seed: int) -> list[Tensor]:
-        """Render the layers (h, w, n) of each picture, differentiable in the pose."""
-        return [
-            self.layers(level, shot, render_aovs(scene, camera, self.channels, spp=spp, seed=at))
-            for shot, (scene, camera, at) in zip(level.shots, self.views(level, pose, seed), strict=True)
-        ]
 
 
 def _in_units_of_white(shots: list[TargetView], masked: bool) -> tuple[list[TargetView], float]:

@@ -9,6 +9,7 @@ object is lost, and is searched for in the whole picture.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike as OsPath
@@ -24,13 +25,14 @@ from ...files.paths import PathLike
 from ...optim.levenberg_marquardt import Descent, LevenbergMarquardtSettings, Model, Problem, minimise
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..measured import measured_image
 from ..modes import in_full_precision
 from ..options import FitOptions, Settings
 from ..region import Palette
 from ..views import check_image
-from .fit_pose import depth_image
 from .hypotheses import HypothesisSearch
 from .inputs import ArgumentNames, check_in_front, check_seen, depth_of, warn_of_units
+from .likelihood.contour import ContourNoise
 from .likelihood.light import harmonics_of
 from .likelihood.objective import PoseLevel, pose_levels
 from .likelihood.support import enough_support, evidence_of
@@ -155,17 +157,9 @@ def track(
         raise TypeError(f"camera: expected the one Camera of all frames, got {got}")
     if not isinstance(mesh, Mesh | Scene):
         raise TypeError(f"mesh: expected a Mesh or a Scene, got {type(mesh).__name__}; load one with load_mesh(path)")
-    if isinstance(frames, (str, OsPath)) or not isinstance(frames, (Iterable, Tensor)):
-        raise TypeError(
-            f"frames: expected pictures or paths one after the other, got {type(frames).__name__}; of a folder, give "
-            "sorted(folder.glob('*.png'))"
-        )
-    if isinstance(frames, Tensor) and frames.dim() != 4:
-        raise ValueError(f"frames: expected (T, H, W, C), got {tuple(frames.shape)}; give a list of pictures")
-    if depths is not None and not isinstance(depths, (Iterable, Tensor)):
-        raise TypeError(f"depths: expected one for each frame or None, got {type(depths).__name__}")
-    if isinstance(depths, Tensor) and depths.dim() not in (3, 4):
-        raise ValueError(f"depths: expected (T, H, W), got {tuple(depths.shape)}; give a list of depth images")
+    _check_one_by_one("frames", frames, 4, "pictures or paths one after the other")
+    if depths is not None:
+        _check_one_by_one("depths", depths, 3, "one for each frame or None")
     settings = Settings.from_options(options, "track", ("max_size", "spp"), spp=8)
     start = pose_from_matrix("init", getattr(init, "matrix", init))
     scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu").detach()
@@ -175,18 +169,27 @@ def track(
     return _poses(Tracker(mesh, camera, start, settings), frames, depths)
 
 
+def _check_one_by_one(name: str, given: object, dims: int, expected: str) -> None:
+    """Raise TypeError or ValueError for what has no pictures one after the other; a tensor has so many dimensions, or one more
+    for a single channel."""
+    if isinstance(given, (str, OsPath)) or not isinstance(given, (Iterable, Tensor)):
+        got = type(given).__name__
+        raise TypeError(f"{name}: expected {expected}, got {got}; of a folder, give sorted(folder.glob('*.png'))")
+    if isinstance(given, Tensor) and given.dim() not in (dims, 4):
+        shape = "(T, H, W, C)" if dims == 4 else "(T, H, W)"
+        raise ValueError(f"{name}: expected {shape}, got {tuple(given.shape)}; give a list of pictures")
+
+
 def _poses(
     tracker: Tracker, frames: Iterable[FrameLike], depths: Iterable[Tensor | None] | None
 ) -> Iterator[TrackedPose]:
-    depths = None if depths is None else iter(depths)
+    measured = itertools.repeat(None) if depths is None else iter(depths)
     for index, frame in enumerate(frames):
-        measured = None
-        if depths is not None:
-            try:
-                measured = next(depths)
-            except StopIteration:
-                raise ValueError(f"depths: expected one for each frame, got {index}, and more frames") from None
-        yield tracker.follow(index, frame, measured)
+        try:
+            depth = next(measured)
+        except StopIteration:
+            raise ValueError(f"depths: expected one for each frame, got {index}, and more frames") from None
+        yield tracker.follow(index, frame, depth)
 
 
 class FrameCandidate(NamedTuple):
@@ -248,7 +251,7 @@ class Tracker:
         self.velocity: tuple[Tensor, Tensor] | None = None  # rotation and shift a picture, where they are known
         self.poor = 0  # successive pictures that hardly show the object
         self.task: PoseTask | None = None
-        self.blur: float | None = None  # of the film's contours
+        self.contours: tuple[ContourNoise, ...] | None = None  # of the film
         self.palettes: list[Palette] | None = None  # of the pictures that were last searched
         self.shown: PoseLevel | None = None  # picture that shows the object there
         self.variance = TRACK.deviation**2  # of the prediction
@@ -261,7 +264,7 @@ class Tracker:
         if self.task is None:
             self.task = self._task(name, picture)
         task = replace(self.task, shots=[self.task.shots[0]._replace(target=picture / self.task.white)])
-        depth = None if measured is None else depth_image(f"depths[{index}]", measured, self.camera.size)
+        depth = None if measured is None else measured_image(f"depths[{index}]", measured, self.camera.size)[..., 0]
         if first:
             there = task.scene.transformed(self.pose.R, self.pose.t, self.pose.scale)
             warn_of_units(there, [task.shots[0].camera], [depth], "at the start")
@@ -288,8 +291,8 @@ class Tracker:
         coarse, fine = pose_levels(task, predicted, [depth], self.settings, self.palettes)[-2:]
         deviation = TRACK.deviation if self.velocity is None else self.variance**0.5
         start = _rested(PredictedLevel(coarse, predicted, deviation), predicted).point
-        fine = fine.focused(start) if self.blur is None else replace(fine, contour_blur=self.blur)
-        self.blur, problem = fine.contour_blur, PredictedLevel(fine, predicted, deviation)
+        fine = fine.focused(start) if self.contours is None else replace(fine, contour_noises=self.contours)
+        self.contours, problem = fine.contour_noises, PredictedLevel(fine, predicted, deviation)
         found = _rested(problem, start)
         share, visible, *_ = evidence_of(fine, found.point)
         if self.velocity is not None and share >= enough_support(task):
@@ -364,12 +367,10 @@ class Tracker:
         self.pose = pose
 
     def _task(self, name: str, picture: Tensor) -> PoseTask:
-        task = PoseTask.from_arguments(
-            self.mesh, picture, self.camera, None, None, Unknowns(), float(self.pose.scale), ArgumentNames(images=name)
-        )  # fmt: skip
+        scale, names = float(self.pose.scale), ArgumentNames(images=name)
+        task = PoseTask.from_arguments(self.mesh, picture, self.camera, None, None, Unknowns(), scale, names)
         # The background counts as unknown, since a film shows more than one.
-        task = replace(task, clutter=True, shots=[task.shots[0]._replace(background=None)])
-        return task
+        return replace(task, clutter=True, shots=[task.shots[0]._replace(background=None)])
 
     def _picture(self, name: str, frame: object) -> Tensor:
         """Return the frame (H, W, C). Raises TypeError, ValueError or OSError."""

@@ -1,8 +1,8 @@
 """How exactly the pictures show a pose, from the curvature JᵀJ of the terms at the answer.
 
-Each term of a photograph is a log likelihood in units of its own noise, and residuals of unlit colours are divided by the
-variance found at the answer. So JᵀJ is Fisher's information, and its inverse the covariance that no unbiased estimate can
-undercut (Cramér and Rao, 1946). It is local: it does not know of other poses that match the pictures as well.
+Each term is a log likelihood in units of its own noise, relative to how many pixels count as one. So JᵀJ is Fisher's
+information, and its inverse the covariance that no unbiased estimate can undercut (Cramér and Rao, 1946). It is local: it does
+not know of other poses that match the pictures as well.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...scene.symmetries import Symmetries
 from .pose import Pose
-from .settings import CAMERA, POSE
+from .settings import CAMERA
 from .task import FOCAL_LENGTH, ROTATION, SCALE, PoseTask
 
 
@@ -130,11 +130,6 @@ class Uncertainty:
         )
         most = CAMERA.most_contour_degrees if task.colorless else CAMERA.most_degrees
         return Uncertainty(to_world @ entries @ to_world.T, task.size, spun, focal, most)
-
-
-def information_of(curvature: Tensor) -> Tensor:
-    """Return the inverse covariance for a log likelihood's JᵀJ, which counts the errors of pixels as independent."""
-    return curvature / POSE.correlation_length**2
 
 
 def _widest(block: Tensor) -> tuple[Tensor, Tensor]:

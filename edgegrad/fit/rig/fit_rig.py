@@ -87,8 +87,7 @@ def fit_rig(
     tries = RIG.tries * search if isinstance(search, bool) else check_int("search", search, 0, 10**6)
     scene_of, parameters = appearance if isinstance(appearance, tuple) else (appearance or (lambda scene: scene), {})
     free = FreeParameters.from_arguments(rig, seek, init or {}, parameters)
-    count = sum(p.value.numel() for p in free.parameters.values() if p.value is not None)
-    method = "gauss-newton" if count <= RIG.most_numbers else "adam"
+    method = "gauss-newton" if sum(value.numel() for value in free.start.values()) <= RIG.most_numbers else "adam"
     settings = Settings.from_options(options, "fit_rig", RIG_OPTIONS, method=method, steps=RIG.steps, spp=RIG.spp)
     views = views_of(cameras, images, masks, weights)
     if settings.loss == REGION:
@@ -96,4 +95,4 @@ def fit_rig(
     rest = {name: control.rest for name, control in rig.controls.items()}
     terms = [towards(rest)] if priors is None else checked_priors(priors, free.values(free.start))
     points = None if keypoints is None else keypoint_term(rig, [view.camera for view in views], keypoints)
-    return CoarseToFine(rig, free, views, settings, terms, priors is None, points, tries, scene_of).run()
+    return CoarseToFine(free, views, settings, terms, priors is None, points, tries, scene_of).run()

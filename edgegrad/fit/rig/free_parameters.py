@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -26,7 +26,7 @@ class FreeParameters:
     rig: Rig
     fixed: dict[str, Tensor]  # all values at the start
     parameters: dict[str, Parameter]
-    rows: dict[str, Tensor]  # rows that a parameter has, where not all
+    rows: dict[str, Tensor]  # sought rows of the values that are rotations of joints
     appearance: tuple[str, ...] = ()  # parameters of the appearance
 
     @staticmethod
@@ -65,14 +65,13 @@ class FreeParameters:
             fixed[name] = value
         parameters, rows = {}, {}
         for name in dict.fromkeys(name if name in known else of_joint[name] for name in seek):
-            value, control = fixed[name], rig.controls.get(name, Control(known[name]))
-            low, high = control.low, control.high
-            joints = None if name in seek else [joint for joint in seek if of_joint.get(joint) == name]
-            if _turns(name, control) and (chosen := _free(rig, name, control, joints)) is not None:
-                rows[name] = torch.tensor(chosen)
-                value, low, high = (None if x is None else x[chosen] for x in (value, low, high))
-            assert value is not None
-            parameters[name] = Parameter(_rate(rig, name, control), value.clone(), low, high).checked(name)
+            control = rig.controls.get(name, Control(known[name]))
+            sought = Parameter(_rate(rig, name, control), fixed[name].clone(), control.low, control.high).checked(name)
+            if _turns(name, control):
+                joints = None if name in seek else [joint for joint in seek if of_joint.get(joint) == name]
+                rows[name] = torch.tensor(_free(rig, name, control, joints))
+                sought = rows_of(sought, rows[name])
+            parameters[name] = sought
         for name, parameter in appearance.items():
             if name in known:
                 raise ValueError(
@@ -89,21 +88,20 @@ class FreeParameters:
     def start(self) -> dict[str, Tensor]:
         return {name: p.value for name, p in self.parameters.items() if p.value is not None}
 
+    def starting_at(self, values: Mapping[str, Tensor]) -> dict[str, Parameter]:
+        """Return the parameters with other initial values, clamped to their bounds."""
+        return {name: replace(p, value=p.within(values[name])) for name, p in self.parameters.items()}
+
     @property
     def joints(self) -> dict[str, tuple[str, ...]]:
         """The names of joints, by the sought values that are their rotations."""
-        found = {}
-        for name in self.parameters:
-            control = self.rig.controls.get(name)
-            if control is not None and control.names and _turns(name, control):
-                rows = self.rows.get(name)
-                found[name] = control.names if rows is None else tuple(control.names[k] for k in rows.tolist())
-        return found
+        names = {name: self.rig.controls[name].names for name in self.rows}
+        return {name: tuple(own[k] for k in self.rows[name].tolist()) for name, own in names.items() if own}
 
     def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return all sought values of the rig, of one pose or a batch, with the rows that are fixed; differentiable."""
         return {
-            name: self._whole(name, tensor) if name in self.rows else tensor
+            name: with_rows(self.fixed[name], self.rows[name], tensor) if name in self.rows else tensor
             for name, tensor in tensors.items()
             if name not in self.appearance
         }
@@ -117,26 +115,36 @@ class FreeParameters:
             found[name] = value[index] if index is not None and value.dim() > own.dim() else value
         return found
 
-    def _whole(self, name: str, tensor: Tensor) -> Tensor:
-        fixed = self.fixed[name]
-        at = tensor.dim() - fixed.dim()
-        return fixed.expand(*tensor.shape[:at], *fixed.shape).index_copy(at, self.rows[name], tensor)
-
     def all(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
         """Return all values, as posed() takes them."""
         return {**self.fixed, **self.values(tensors)}
+
+
+def with_rows(value: Tensor, rows: Tensor, part: Tensor) -> Tensor:
+    """Return a value with other rows, or a batch of them; differentiable."""
+    at = part.dim() - value.dim()
+    return value.expand(*part.shape[:at], *value.shape).index_copy(at, rows, part)
+
+
+def rows_of(parameter: Parameter, rows: Tensor) -> Parameter:
+    """Return the parameter of some rows alone."""
+    assert parameter.value is not None
+    whole = parameter.value.shape
+    low, high = (None if b is None else torch.as_tensor(b).expand(whole)[rows] for b in (parameter.low, parameter.high))
+    return replace(parameter, value=parameter.value[rows], low=low, high=high)
 
 
 def _turns(name: str, control: Control) -> bool:
     return control.rotates or name == "angles"
 
 
-def _free(rig: Rig, name: str, control: Control, joints: Sequence[str] | None) -> list[int] | None:
+def _free(rig: Rig, name: str, control: Control, joints: Sequence[str] | None) -> list[int]:
+    """Return the rows of some joints, by default of those that vertices hang on."""
     if joints is not None:
         return sorted(control.row(name, joint) for joint in joints)
     if isinstance(rig.deformer, SkinDeformer):
         return sorted({int(j) for skin in rig.deformer.skins for j in skin.joints})
-    return None
+    return list(range(len(control.rest)))
 
 
 def _rate(rig: Rig, name: str, control: Control) -> float:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -27,18 +26,7 @@ def edge_support_by_joint(
 ) -> dict[str, float]:
     """Return the share, 0 … 1, of its edges that the pictures show, for each joint that they can show. `joints` has the names
     of joints by the values that are their rotations. A loss by regions must be renewed first."""
-    every = list(range(len(objective.views)))
-    with torch.no_grad():
-        scene, cameras = objective.build(tensors)
-        first, second = (
-            {
-                (name, i): image
-                for group, channels in objective.renders(scene, cameras, every, RIG.support_spp, objective.seed(step))
-                for name, images in channels.items()
-                for i, image in zip(group, images, strict=True)
-            }
-            for step in SUPPORT_STEPS
-        )
+    first, second = (objective.images(tensors, RIG.support_spp, step) for step in SUPPORT_STEPS)
     moved: dict[str, dict[tuple[str, int], Tensor]] = {}
     for name, group, _, slopes in derivatives(objective, tensors, SUPPORT_STEPS[0]):
         for i, J in zip(group, slopes, strict=True):
@@ -46,10 +34,9 @@ def edge_support_by_joint(
                 moved.setdefault(joint, {})[name, i] = J[place].abs().sum((0, 3))
     found = {}
     for joint, sizes in moved.items():
-        areas = _areas(sizes)
-        pairs = []
+        areas, pairs = _areas(sizes), []
         for (name, i), area in areas.items():
-            view, one, other = objective.views[i], first[name, i], second[name, i]
+            view, one, other = objective.views[i], first[i][name], second[i][name]
             # Pictures of regions have other colours; the contour alone gives its length.
             picture = view.wanted.get(name, one)
             pairs.append((one, other, picture, area if view.weight is None else area * view.weight))
@@ -58,8 +45,10 @@ def edge_support_by_joint(
         if objective.regions is None:
             found[joint] = edge_support(pairs)
         else:
-            alphas = [0.5 * (first["alpha", i] + second["alpha", i]) for i in every]
-            found[joint] = objective.regions.edge_support(alphas, [areas["alpha", i][..., 0] for i in every])
+            alphas = [0.5 * (one["alpha"] + other["alpha"]) for one, other in zip(first, second, strict=True)]
+            found[joint] = objective.regions.edge_support(
+                alphas, [areas["alpha", i][..., 0] for i in range(len(first))]
+            )
     return found
 
 

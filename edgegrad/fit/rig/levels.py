@@ -6,18 +6,17 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from ...aovs import render_aovs
 from ...optim.history import Ending
 from ...optim.tensors import DescentResult
 from ...rig.function import FunctionDeformer
-from ...rig.rig import Rig
 from ...rig.rotations import roma
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -44,24 +43,30 @@ from .settings import RIG
 from .uncertainty import uncertainty_of
 
 
+@dataclass
 class CoarseToFine:
     """The levels of one fit."""
 
-    def __init__(
-        self, rig: Rig, free: FreeParameters, views: list[Observation], options: Settings, priors: Sequence[Prior],
-        annealed: bool, points: Prior | None, tries: int, appearance: Callable[..., Scene | Mesh],
-    ) -> None:  # fmt: skip
-        self.rig, self.free, self.views, self.options = rig, free, views, options
-        self.priors, self.annealed = priors, annealed
-        self.points, self.tries, self.appearance = points, tries, appearance
-        full = min(min(view.camera.size) for view in views)
-        sizes = [options.coarsest]
+    free: FreeParameters
+    views: list[Observation]
+    options: Settings
+    priors: Sequence[Prior]
+    annealed: bool  # whether priors count less on the last level
+    points: Prior | None  # the keypoints' term
+    tries: int  # of random draws of a limb
+    appearance: Callable[..., Scene | Mesh]
+
+    def __post_init__(self) -> None:
+        self.rig, full = self.free.rig, min(min(view.camera.size) for view in self.views)
+        sizes = [self.options.coarsest]
         while sizes[-1] * 1.4 < full:
             sizes.append(2 * sizes[-1])
         # The last level has more samples, and begins where all but axial rotations is right.
-        self.factors = [size / full for size in sizes[:-1]] + [1.0] * (2 if options.method == "gauss-newton" else 1)
+        self.factors = [size / full for size in sizes[:-1]] + [1.0] * (
+            2 if self.options.method == "gauss-newton" else 1
+        )
         self.searched = [k for k, size in enumerate(sizes) if RIG.least_side <= size <= RIG.most_side] or [0]
-        if options.loss == REGION:
+        if self.options.loss == REGION:
             self.searched = self.searched[-1:]  # Coarse contours show little.
 
     def run(self) -> RigFit:
@@ -76,7 +81,7 @@ class CoarseToFine:
             fit = make_fit(objective, found, objective.build(first)[0], Coordinates({}))
             alphas = [render_aovs(fit.scene, view.camera, ["alpha"], spp=16, seed=0)["alpha"] for view in self.views]
         values = {name: value.detach() for name, value in free.all(found.values).items()}
-        support, uncertainty, features = {}, None, None
+        support, uncertainty, features = {}, None, {}
         if free.joints and sum(value.numel() for value in first.values()) <= MAX_NUMBERS:
             rates = {name: p.lr for name, p in free.parameters.items()}
             with contextlib.suppress(TypeError):  # There may be no forward mode.
@@ -134,18 +139,16 @@ class CoarseToFine:
             self._steps, objective, save=save, title=f"level {level + 1} of {len(self.factors)}", last=last
         )
         found = descend(values, saved=saved)
-        name = next((n for n in ("rotations", "angles") if n in values and n in self.free.joints), None)
+        name = next((n for n in ("rotations", "angles") if n in self.free.joints), None)
         if not self.tries or name is None or saved is not None or found.ending is Ending.INTERRUPTED:
             return found
         try:
             if level in self.searched:
                 tries = math.ceil(RIG.region_share * self.tries) if region else self.tries
-                with tqdm(total=tries, desc="limbs drawn", disable=not options.progress, leave=False) as bar:
-                    search = self._search(objective, name, RIG.refinement_steps, bar.update)
-                    found = found._replace(values=search.draw_limbs(found.values, tries))
+                search = self._search(objective, name, RIG.refinement_steps)
+                found = found._replace(values=search.draw_limbs(found.values, tries, options.progress))
             if last and name == "rotations" and not region:
-                search = self._search(objective, name, RIG.last_refinement_steps)
-                better = search.rotate_about_bones(found.values)
+                better = self._search(objective, name, RIG.last_refinement_steps).rotate_about_bones(found.values)
                 if better is not found.values:
                     more = descend(better, saved=None)
                     whole = continued(found.history, more.history)
@@ -154,13 +157,9 @@ class CoarseToFine:
             return found._replace(ending=Ending.INTERRUPTED)
         return found
 
-    def _search(
-        self, objective: Objective, name: str, count: int, report: Callable[[], Any] = lambda: None
-    ) -> HypothesisSearch:
+    def _search(self, objective: Objective, name: str, count: int) -> HypothesisSearch:
         """Return the search whose descents take so many steps."""
-        options = objective.options
-        few = dataclasses.replace(options, steps=count, loss_tolerance=0.0, progress=False, callback=None)
-        rest = self.rig.controls[name].rest
+        few = dataclasses.replace(objective.options, steps=count, loss_tolerance=0.0, progress=False, callback=None)
 
         def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
             found = descend_views(objective.with_options(few), parameters)
@@ -168,19 +167,16 @@ class CoarseToFine:
                 raise KeyboardInterrupt
             return found.values
 
-        return HypothesisSearch(
-            objective, Proposals(self.rig, self.free, name), self.free.joints[name], self.free.parameters,
-            rest[self.free.rows.get(name, torch.arange(len(rest)))], steps, torch.Generator().manual_seed(options.seed), report,
-        )  # fmt: skip
+        generator = torch.Generator().manual_seed(few.seed)
+        return HypothesisSearch(objective, Proposals(self.rig, self.free, name), steps, generator)
 
     def _steps(
         self, objective: Objective, values: Mapping[str, Tensor], saved: Mapping[str, Any] | None, save: Save, title: str,
         last: bool,
     ) -> DescentResult:  # fmt: skip
-        parameters = {n: dataclasses.replace(p, value=p.within(values[n])) for n, p in self.free.parameters.items()}
         settings = GAUSS_NEWTON
-        if objective.regions is None and last and objective.residual(values) < RIG.nearly_fitted:
-            damping = {"unseen_damping": RIG.nearly_fitted_unseen, "start_damping": RIG.nearly_fitted_damping}
+        if last and objective.regions is None:
+            damping = {"unseen_damping": RIG.last_unseen_damping, "start_damping": RIG.last_damping}
             settings = dataclasses.replace(GAUSS_NEWTON, **damping)
 
         @torch.no_grad()
@@ -188,4 +184,4 @@ class CoarseToFine:
             return self.rig.bones(self.free.all(tensors))
 
         report = reporter(objective.build, objective.views, bones=bones)
-        return descend_views(objective, parameters, save, saved, title, report, settings)
+        return descend_views(objective, self.free.starting_at(values), save, saved, title, report, settings)

@@ -82,16 +82,25 @@ class Proposals:
         """The joints; None where a rig does not say how they hang."""
         return self.rig.deformer.joints if isinstance(self.rig.deformer, SkinDeformer) else None
 
+    @property
+    def places(self) -> Tensor:
+        """The places of the sought rows among all joints."""
+        return self.free.rows[self.name]
+
+    @property
+    def rest(self) -> Tensor:
+        """The sought rows at rest."""
+        return self.rig.controls[self.name].rest[self.places]
+
     @cached_property
     def limbs(self) -> list[Limb]:
         """The limbs of the rows that are sought; each row by itself where a rig does not say what hangs on what."""
-        rows = self.free.parameters[self.name].value
-        assert rows is not None
+        rows = range(len(self.places))
         if not self.rig.deformer.parents:
-            return [Limb([k]) for k in range(len(rows))]
+            return [Limb([k]) for k in rows]
         if self.name == "angles":
-            return [Limb(list(range(k, len(rows)))) for k in range(len(rows))]
-        return limbs(self.rig, self._places({self.name: rows}).tolist())
+            return [Limb([*rows[k:]]) for k in rows]
+        return limbs(self.rig, self.places.tolist())
 
     def exchanged(self, values: Mapping[str, Tensor], one: Sequence[int], other: Sequence[int]) -> Tensor:
         """Put two groups of rows each where the other one is. Without joints, rows take their counterparts' rotation
@@ -102,7 +111,7 @@ class Proposals:
             value[both] = value[[*other, *one]]
             return value
         rotations, every = self._rotations(values), self.free.all(values)
-        ours, theirs = (self._places(values)[list(limb)].tolist() for limb in (one, other))
+        ours, theirs = (self.places[list(limb)].tolist() for limb in (one, other))
         found = exchanged(self.joints, rotations, ours, theirs, every["joint_translations"], every["joint_scales"])
         return self._changed(values, found, both)
 
@@ -110,7 +119,7 @@ class Proposals:
         """Return those of each sought joint on which one other hangs, of those that are sought, or none."""
         if self.joints is None:
             return []
-        places, parents = self._places(values).tolist(), self.joints.parents
+        places, parents = self.places.tolist(), self.joints.parents
         row_of = {place: row for row, place in enumerate(places)}
         moved = {joint for place in places for joint in _above(parents, place)}  # what has a sought joint below it
         found = []
@@ -129,13 +138,13 @@ class Proposals:
     def with_rotation(self, values: Mapping[str, Tensor], rotation: AxialRotation, angle: float) -> Tensor:
         """Rotate by so many radians. What hangs on the child stays as it is."""
         assert self.joints is not None
-        places, rotations = self._places(values), self._rotations(values)
-        at, rows = int(places[rotation.row]), [rotation.row]
+        rotations = self._rotations(values)
+        at, rows = int(self.places[rotation.row]), [rotation.row]
         Q = roma().rotvec_to_rotmat(angle * rotation.axis)
         found = rotations.clone()
         found[at] = rotations[at] @ Q
         if rotation.child is not None:
-            below = int(places[rotation.child])
+            below = int(self.places[rotation.child])
             hung = self.joints.rotations[below]
             found[below] = hung.mT @ Q.mT @ hung @ rotations[below]
             rows.append(rotation.child)
@@ -159,17 +168,13 @@ class Proposals:
                 count += float(weights.sum())
         return total / max(count, 1e-12)
 
-    def _places(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Return the places of the rows among all joints."""
-        return self.free.rows.get(self.name, torch.arange(len(values[self.name])))
-
     def _rotations(self, values: Mapping[str, Tensor]) -> Tensor:
         """Return the rotation matrices (J, 3, 3)."""
         return roma().rotvec_to_rotmat(self.free.all(values)[self.name].double())
 
     def _changed(self, values: Mapping[str, Tensor], rotations: Tensor, rows: list[int]) -> Tensor:
         value = values[self.name].clone()
-        value[rows] = roma().rotmat_to_rotvec(rotations[self._places(values)[rows]]).to(value)
+        value[rows] = roma().rotmat_to_rotvec(rotations[self.places[rows]]).to(value)
         return value
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from dataclasses import dataclass, field
 from typing import Any
@@ -44,7 +45,7 @@ class RigFit(FitResult):
     explained_joints: dict[str, float] = field(default_factory=dict, repr=False)
     uncertainty: JointUncertainty | None = field(default=None, repr=False)
     left_out: float = field(default=0.0, repr=False)
-    features: dict[str, float] | None = field(default=None, repr=False)
+    features: dict[str, float] = field(default_factory=dict, repr=False)
 
     loss, explained, history, steps, seconds, interrupted, plot = delegated(
         "fit", "loss explained history steps seconds interrupted plot"
@@ -86,12 +87,12 @@ class RigFit(FitResult):
         return self.fit.reason
 
     @property
-    def confidence(self) -> float | None:
+    def confidence(self) -> float:
         """Return the calibrated probability, 0 … 1, that the rotations of all sought joints are within 2° of the true ones.
 
-        None: unknown, as of fits by regions and of those without `uncertainty`.
+        NaN: unknown, as of fits by regions and of those without `uncertainty`.
         """
-        return None if self.features is None else RIG_CONFIDENCE.probability(self.features)
+        return RIG_CONFIDENCE.probability(self.features) if self.features else math.nan
 
     @property
     def _unknown(self) -> str:

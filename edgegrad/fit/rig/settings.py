@@ -24,11 +24,10 @@ class RigSettings:
     last_prior: float = (
         0.1  # factor of the default prior at full size; 1 hides axial rotations, and 0.01 everywhere lost poses
     )
-    # With a residual loss below this, in units of its noise, steps have these two dampings, relative to the largest curvature.
-    # They go far where pictures show little: shared axial rotations arrive before the loss seems at rest.
-    nearly_fitted: float = 10.0
-    nearly_fitted_damping: float = 1e-4
-    nearly_fitted_unseen: float = 1e-6
+    # On the last level, losses but those by regions have these two dampings, relative to the largest curvature. Steps then go
+    # far where pictures show little: shared axial rotations arrive before the loss seems at rest.
+    last_damping: float = 1e-4
+    last_unseen_damping: float = 1e-6
 
     # Hypotheses.
     tries: int = 40  # most draws on each level
@@ -50,13 +49,10 @@ class RigSettings:
     far_angles: tuple[float, ...] = (0.35, 0.7)
     axial_angles: tuple[float, ...] = (0.05, 0.1, 0.15, 0.3, 0.5, 0.7)  # about bones, to both sides
     flat_angle: float = 1.5708  # also, where nothing hangs on a limb: both sides of a flat one may be equal
-    deviations: float = 2.0  # A lower cost counts from so many standard errors of its samples.
     most_worse: float = 2.0  # A hypothesis whose refined limb costs more by this factor is dropped.
+    deviations: float = 2.0  # A lower cost counts from so many standard errors of its samples.
     region_gain: float = 0.05  # least decrease of the missing share of contours
-    fitted: float = 1.5  # A residual loss below this, in units of its noise, ends the search,
-    idle_fitted: float = 4.0  # and one below this after `idle` draws that lower it by less than `idle_fall`.
-    idle: int = 6
-    idle_fall: float = 0.05
+    fitted: float = 1.5  # A residual loss below this, in units of its noise, ends the search.
 
     # Keypoints.
     keypoint_width: float = 0.02  # share of the picture's diagonal, beyond which distances count linearly

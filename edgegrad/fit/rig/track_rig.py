@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
@@ -12,8 +11,7 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...check import check_int, check_positive
 from ...rig.rig import Rig
-from ..checkpoints import Checkpoint
-from ..options import FitOptions, Settings
+from ..options import FitOptions, Settings, options_of
 from ..parameter import Parameter
 from ..priors import Prior, near, towards
 from .fit_rig import RIG_OPTIONS, Appearance, fit_rig
@@ -62,8 +60,8 @@ def track_rig(
     """
     check_positive("smooth", smooth, least=0.0, most=1e9)
     check_int("again", again, 0, 10**6)
-    given = FitOptions() if options is None else options
-    of_first = replace(given, checkpoint=_file(given.checkpoint, 0))
+    given = options_of(options)
+    of_first = given.of_part(0)
     # One seed serves all frames, so that the draws of one that is resumed are those of the first time.
     given = replace(given, seed=Settings.from_options(of_first, "track_rig", RIG_OPTIONS).seed)
     before: list[dict[str, Tensor]] = []
@@ -74,7 +72,7 @@ def track_rig(
         if unknown := [name for name in frame if name not in OF_FRAME]:
             raise ValueError(f"frames[{k}]: expected names among {', '.join(OF_FRAME)}, got {unknown[0]!r}")
         pictures = {"images": None, **frame}
-        own = replace(given, checkpoint=_file(given.checkpoint, k))
+        own = given.of_part(k)
         shared: dict[str, Any] = {"cameras": cameras, **pictures, "seek": seek, "appearance": appearance}
         if not before:
             found = fit_rig(rig, **shared, init=init, priors=priors, search=search, options=own)
@@ -96,13 +94,3 @@ def track_rig(
         missed = set(found.missed)
         before = [*before[-1:], found.values]
         yield found
-
-
-def _file(checkpoint: Any, k: int) -> Checkpoint | None:
-    """Return the checkpoint of frame k. Only the first must be there to go on from."""
-    if checkpoint is None:
-        return None
-    whole = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
-    path = Path(whole.path)
-    path = path.with_name(f"{path.stem}-{k + 1:04d}{path.suffix}")
-    return replace(whole, path=path, resume=whole.resume and (k == 0 or path.exists()))

@@ -44,4 +44,4 @@ def depth_term(
     along = s * (torch.einsum("dnk,nkhw->dnhw", dW[..., :3], points) + dW[..., 3, None, None])
     rows = along.float() - (flow * slope(z).movedim(0, 1)).sum(2)
     information = share * weight / (POSE.correlated_depth * deviation.square()) * known[:, None]
-    return Term.from_rows(cost, rows.flatten(2).movedim(0, 1), information, r)
+    return Term.from_rows(cost, rows.flatten(2).movedim(0, 1), information, r, residual.shape[1:])

@@ -130,13 +130,11 @@ class FittedLight(NamedTuple):
         """Return images (…, h, w) of pixels (…, M), zero elsewhere."""
         return _spread(values, self.at, self.inside.shape[1:])
 
-    def change(self) -> Tensor:
-        """Return the relative change (N,) of the mesh's colours by the light: 0 where one number multiplies all of them."""
-        seen = self.scale > 0.0
-        color = torch.where(seen, self.basis[:, :, 0] / self.scale.clamp(min=1e-12), 0.0).flatten(1)
-        lit = torch.where(seen, self.predicted, 0.0).flatten(1)
-        gain = (lit * color).sum(1, keepdim=True) / color.square().sum(1, keepdim=True).clamp(min=1e-30)
-        return (lit - gain * color).abs().sum(1) / (gain * color).abs().sum(1).clamp(min=1e-30)
+    def lit(self, seen: RenderedPoses) -> Tensor:
+        """Return the radiance (N, C, h, w) of the surfaces in their light, times alpha."""
+        assert seen.color is not None and seen.normal is not None
+        Y = harmonics_of(seen.normal, self.coefficients.shape[2])
+        return (seen.color * torch.einsum("nck,nkhw->nchw", self.coefficients, Y)).clamp(min=0.0)
 
     def term(self, flow: Tensor) -> Term:
         """Return the term of the surfaces, whose points move by `flow` (D, N, 2, h, w), with the light's numbers eliminated."""
@@ -146,6 +144,9 @@ class FittedLight(NamedTuple):
         D, N, C = len(flow), len(self.inside), self.residual.shape[1]
         x, y = flow.flatten(3)[..., self.at].movedim(0, 1).unbind(2)  # (N, D, M)
         gradient, curvature = torch.zeros(N, D, dtype=torch.float32), torch.zeros(N, D, D, dtype=torch.float32)
+        kept: list[
+            tuple[Tensor, Tensor]
+        ] = []  # of each channel: derivatives without what the light makes up for, residuals
         for c in range(C):
             moved = -(x * self.slopes[0, :, None, c] + y * self.slopes[1, :, None, c]) * self.scale[:, None, c]
             J = torch.cat([moved, self.basis[:, c]], 1)
@@ -156,8 +157,14 @@ class FittedLight(NamedTuple):
             eliminated = torch.linalg.solve(A[:, D:, D:], torch.cat([A[:, D:, :D], b[:, D:, None]], 2))
             curvature += A[:, :D, :D] - A[:, :D, D:] @ eliminated[..., :D]
             gradient += b[:, :D] - (A[:, :D, D:] @ eliminated[..., D:])[..., 0]
+            kept.append((moved - eliminated[..., :D].mT @ self.basis[:, c], self.robust * self.residual[:, c]))
         information = 1.0 / (POSE.correlated_light * self.deviation.double().square())
-        return Term(cost.double(), information[:, None] * gradient, information[:, None, None] * curvature)
+
+        def summands() -> Tensor:
+            total = sum((rows * pull[:, None] for rows, pull in kept[1:]), kept[0][0] * kept[0][1][:, None])
+            return self.image(information[:, None, None].float() * total)
+
+        return Term(cost.double(), information[:, None] * gradient, information[:, None, None] * curvature, summands)
 
 
 def harmonics_of(normals: Tensor, count: int) -> Tensor:

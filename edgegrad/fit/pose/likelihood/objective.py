@@ -19,7 +19,7 @@ from ..pose import Pose
 from ..settings import POSE
 from ..target_images import scaled
 from ..task import FOCAL_LENGTH, PoseTask, TargetView
-from .contour import contour_term
+from .contour import ContourNoise, Sides, contour_noise, contour_rows, contour_term
 from .depth import depth_term
 from .light import HARMONICS, FittedLight
 from .picture import PictureLevel, RenderedPoses
@@ -41,6 +41,12 @@ class Comparison(NamedTuple):
     light: FittedLight | None
     visible: Tensor  # (N, h, w), of the box: probability that nothing covers a pixel
 
+    def sides(self, noise: ContourNoise) -> Sides:
+        """Return the colours on both sides of the contours."""
+        return Sides.from_picture(
+            self.part, self.seen, self.visible, self.light, self.seen.box.cut(self.colors.every), noise
+        )
+
     @property
     def visible_share(self) -> Tensor:
         """The share (N,) of the object that nothing seems to cover."""
@@ -60,8 +66,8 @@ class PoseLevel(Problem[Pose]):
     alpha_blur: float
     harmonics: int  # 0 for a mesh without colours
     last: bool
-    contour_blur: float = 0.9
-    light_deviations: tuple[float | None, ...] = ()  # of each picture
+    contour_noises: tuple[ContourNoise, ...] = ()  # of each picture
+    light_deviations: tuple[float | None, ...] = ()
 
     @property
     def size(self) -> tuple[int, int]:
@@ -71,8 +77,24 @@ class PoseLevel(Problem[Pose]):
     def model(self, points: Sequence[Pose]) -> Model:
         total = Term.zero(len(points), len(self.dofs))
         for one in self.comparisons(points):
-            total = total.plus(one.term)
+            total = total.plus(one.term._replace(summands=None))
         return Model(total.cost[:, None], total.gradient, total.curvature)
+
+    def scored(self, pose: Pose) -> tuple[Term, Tensor]:
+        """Return the sum of all terms at a pose, and the covariance (D, D) of its gradient by the residuals there."""
+        terms = [one.term for one in self.comparisons([pose])]
+        total, scores = Term.zero(1, len(self.dofs)), torch.zeros(len(self.dofs), len(self.dofs), dtype=torch.float64)
+        for term in terms:
+            total = total.plus(term._replace(summands=None))
+            scores += term.score_covariance(POSE.correlation_length)[0]
+        return total, POSE.common_errors * scores
+
+    def temperature(self, pose: Pose) -> float:
+        """Return how many pixels count as one: the covariance of the gradient relative to Fisher's information."""
+        total, scores = self.scored(pose)
+        H = total.curvature[0]
+        H = H + 1e-9 * H.diagonal().max() * torch.eye(len(H), dtype=torch.float64)
+        return max(1.0, float(torch.linalg.solve(H, scores).trace()) / len(H))
 
     def moved(self, points: Sequence[Pose], steps: Tensor) -> list[Pose]:
         return moved_poses(self.task, points, self.dofs, steps)
@@ -83,10 +105,13 @@ class PoseLevel(Problem[Pose]):
 
     def comparisons(self, poses: Sequence[Pose]) -> list[Comparison]:
         """Compare renders at N poses with each picture."""
-        deviations = self.light_deviations or (None,) * len(self.pictures)
-        return [self._compared(p, poses, d) for p, d in zip(self.pictures, deviations, strict=True)]
+        n = len(self.pictures)
+        columns = self.pictures, self.light_deviations or (None,) * n, self.contour_noises or (ContourNoise(),) * n
+        return [self._compared(poses, *each) for each in zip(*columns, strict=True)]
 
-    def _compared(self, picture: PictureLevel, poses: Sequence[Pose], deviation: float | None) -> Comparison:
+    def _compared(
+        self, poses: Sequence[Pose], picture: PictureLevel, deviation: float | None, noise: ContourNoise
+    ) -> Comparison:
         moving = moving_cameras(self.task, picture.camera, poses, self.dofs)
         colored, measured = self.harmonics > 0, picture.depth is not None
         seen = RenderedPoses.from_cameras(
@@ -107,9 +132,13 @@ class PoseLevel(Problem[Pose]):
             if measured:
                 scale = stacked(poses).scale
                 terms.append(depth_term(part, seen, moving, flow, scale, self.task.size))
-        terms.append(region_term(picture, seen, colors, visible, self.alpha_blur))
+        mixed: Tensor | None = None  # pixels that the contour term explains
         if self.last:
-            terms.append(contour_term(part, seen, visible, self.contour_blur))
+            every = seen.box.cut(colors.every)
+            sides = Sides.from_picture(part, seen, visible, light, every, noise)
+            mixed = sides.band * sides.gain(part.outlined)[1]
+            terms.append(contour_term(part, sides, contour_rows(seen, noise.blur)))
+        terms.append(region_term(picture, seen, colors, visible, mixed, self.alpha_blur))
         total = terms[0]
         for term in terms[1:]:
             total = total.plus(term)
@@ -124,13 +153,18 @@ class PoseLevel(Problem[Pose]):
         return replace(self, light_deviations=tuple(found))
 
     def focused(self, pose: Pose) -> PoseLevel:
-        """Return the level with contours as sharp as the pictures show them at a pose."""
-        compared = replace(self, dofs=(), last=False).comparisons([pose])
-
-        def cost(blur: float) -> float:
-            return sum(float(contour_term(one.part, one.seen, one.visible, blur).cost) for one in compared)
-
-        return replace(self, contour_blur=min(POSE.contour_blurs, key=cost))
+        """Return the level with contours as sharp and as noisy as the pictures show them at a pose."""
+        sharp = replace(self, last=False, spp=max(self.spp, POSE.sharp_spp)).comparisons([pose])
+        found = [
+            contour_noise(one.part, one.seen, one.visible, one.light, one.seen.box.cut(one.colors.every))
+            for one in sharp
+        ]
+        # Samples are enough where their noise is far below the pictures'. Stratified ones leave an error of about spp^(-3/4).
+        excess = 0.0
+        for one, other, noise in zip(replace(self, dofs=(), last=False).comparisons([pose]), sharp, found, strict=True):
+            excess = max(excess, one.sides(noise).distance(other.sides(noise)) / POSE.render_noise)
+        spp = min(max(self.spp, POSE.sharp_spp), math.ceil(self.spp * max(1.0, excess ** (4.0 / 3.0))))
+        return replace(self, contour_noises=tuple(found), spp=spp)
 
 
 class Crop(NamedTuple):

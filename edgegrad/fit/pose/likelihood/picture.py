@@ -14,7 +14,7 @@ from ....aovs import aovs_request, by_name, render_aovs
 from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ....kernel.operators import forward_kernel, jvp_kernel
-from ...contour_colors import PIXEL_NOISE, mask_noise
+from ...contour_colors import mask_noise
 from ...region import Palette
 from ...views import area_mean
 from ..camera_motion import MovingCameras
@@ -39,7 +39,7 @@ class PictureLevel:
     palette: Palette
     labels: Tensor  # (h · w,), of the palette
     extent: float  # pixels across the object
-    noise: float  # standard deviation of mixed pixels of `outlined`
+    noise: float  # standard deviation of mixed pixels of `outlined` that is known: of a mask of zeros and ones
 
     @property
     def size(self) -> tuple[int, int]:
@@ -57,7 +57,7 @@ class PictureLevel:
         """Return the picture of a shot with this size, which shows the object `extent` pixels large. `masked`: its last channel
         is a mask."""
         radiance, mask = area_mean(shot.target, size), None
-        noise = PIXEL_NOISE
+        noise = 0.0
         if masked:
             radiance, mask = radiance[..., :-1], radiance[..., -1].clamp(MASK_ERROR, 1.0 - MASK_ERROR)
             noise = mask_noise(shot.target[..., -1], size[0] / shot.target.shape[0])

@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 
 from ....files.image import linear_to_srgb
-from ...contour_colors import ALONE_INFORMATION, ALONE_SHOWN, COLOUR_WINDOW, CONTOUR_BLUR, CONTRAST, PURE
+from ...contour_colors import ALONE_INFORMATION, ALONE_SHOWN, COLOUR_WINDOW, CONTRAST, PURE
 from ...edge_support import edge_support
 from ...region import information, smoothed
 from ..pose import Pose
 from ..settings import POSE
 from ..task import PoseTask
-from .contour import Sides
+from .contour import ContourNoise, Sides
 from .objective import Comparison, PoseLevel
 
-RESOLVED = 40.0  # Pixels across the object: light and colours fitted to fewer match any picture.
+RESOLVED = 40.0  # Pixels across the object: before unknown things, light and colours fitted to fewer match any picture.
 MIN_SHOWN_CONTOUR = 0.5  # Edge support is reduced if less of the contour shows.
 FULLY_VISIBLE = 0.65  # Of an object that is hidden more, what is left matches something by chance.
 
@@ -44,20 +44,23 @@ def evidence_of(level: PoseLevel, pose: Pose) -> Evidence:
     visible = sum(float((one.seen.alpha * one.visible).sum()) for one in compared) / total
     nats = -sum(float(one.term.cost) for one in compared) / total
     extent = max(picture.extent for picture in level.pictures)
-    edges = _share(compared, extent, level.harmonics > 0, False)
+    least = RESOLVED if level.task.clutter else 1.0
+    edges = _share(compared, extent / least, level.harmonics > 0, False)
     if edges < 1.0 and visible >= FULLY_VISIBLE:
-        edges = max(edges, _share(compared, extent, level.harmonics > 0, True))
+        edges = max(edges, _share(compared, extent / least, level.harmonics > 0, True))
     return Evidence(edges, visible, nats, extent)
 
 
-def _share(compared: list[Comparison], extent: float, colored: bool, uncovered: bool) -> float:
+def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered: bool) -> float:
     pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]] = []
     shown = length = bits = pixels = 0.0
     for one in compared:
         part, seen = one.part, one.seen
         visible = one.visible if uncovered else torch.ones_like(one.visible)
         sides, weight = (
-            Sides.from_picture(part, seen, visible, CONTOUR_BLUR, window=COLOUR_WINDOW),
+            Sides.from_picture(
+                part, seen, visible, None, seen.box.cut(one.colors.every), ContourNoise(), COLOUR_WINDOW
+            ),
             (part.weight * visible)[0],
         )
         on = ((sides.alpha > PURE) & (sides.alpha < 1.0 - PURE)) * part.weight * visible
@@ -81,7 +84,7 @@ def _share(compared: list[Comparison], extent: float, colored: bool, uncovered: 
             pairs.append(_pair(expected, part.display, covered))
     if length == 0.0:
         return 0.0
-    share = edge_support(pairs, softer=True) * min(1.0, extent / RESOLVED)
+    share = edge_support(pairs, softer=True) * min(1.0, resolved)
     if colored:
         return share * min(1.0, shown / length / MIN_SHOWN_CONTOUR)
     # Off the object, both sides of a contour have similar colours, however strong the edges that it follows.

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
+
+Summands = Callable[[], Tensor]
 
 
 class Term(NamedTuple):
@@ -14,6 +18,7 @@ class Term(NamedTuple):
     cost: Tensor  # (N,)
     gradient: Tensor  # (N, D)
     curvature: Tensor  # (N, D, D), Fisher's information
+    summands: Summands | None = None  # of the gradient, (N, D, h, w), by pixels
 
     @staticmethod
     def zero(count: int, dofs: int) -> Term:
@@ -23,12 +28,41 @@ class Term(NamedTuple):
         )  # fmt: skip
 
     def plus(self, other: Term) -> Term:
-        return Term(*(a + b for a, b in zip(self, other, strict=True)))
+        """Return the sum with a term of the same pixels, or of another picture."""
+        parts = [one.summands for one in (self, other) if one.summands is not None]
+
+        def summands() -> Tensor:
+            return sum((part() for part in parts[1:]), parts[0]())
+
+        cost, gradient, curvature = (a + b for a, b in zip(self[:3], other[:3], strict=True))
+        return Term(cost, gradient, curvature, summands if parts else None)
 
     @staticmethod
-    def from_rows(cost: Tensor, rows: Tensor, weight: Tensor, residual: Tensor) -> Term:
+    def from_rows(cost: Tensor, rows: Tensor, weight: Tensor, residual: Tensor, size: tuple[int, ...]) -> Term:
         """Return the term of weighted least squares: derivatives `rows` (N, D, M) of residuals (N, M), each of which counts
-        `weight` (N, M)."""
+        `weight` (N, M), of the pixels of images of this size."""
         weighted = rows * weight[:, None]
         gradient = (weighted @ residual[..., None])[..., 0]
-        return Term(cost.double(), gradient.double(), (weighted @ rows.mT).double())
+
+        def summands() -> Tensor:
+            return (weighted * residual[:, None]).reshape(*rows.shape[:2], *size)
+
+        return Term(cost.double(), gradient.double(), (weighted @ rows.mT).double(), summands)
+
+    @property
+    def predicted_gain(self) -> Tensor:
+        """The decrease (N,) of the cost by an undamped step, by the quadratic model."""
+        unseen = 1e-6 * self.curvature.diagonal(dim1=1, dim2=2).amax(1)[:, None, None] + 1e-30
+        H = self.curvature + unseen * torch.eye(self.gradient.shape[1], dtype=torch.float64)
+        return 0.5 * (self.gradient * torch.linalg.solve(H, self.gradient)).sum(1)
+
+    def score_covariance(self, length: float) -> Tensor:
+        """Return the covariance (N, D, D) of the gradient, Σ E[s_p s_qᵀ] over pairs of pixels less than `length` apart, with
+        Bartlett's weights, which keep it positive (Newey and West, A Simple, Positive Semi-Definite, Heteroskedasticity and
+        Autocorrelation Consistent Covariance Matrix, 1987)."""
+        assert self.summands is not None
+        side = round(length)
+        # Products of sums over windows count a pair of pixels once for each window that holds both: Bartlett's weights.
+        padded = F.pad(self.summands(), (side - 1,) * 4)
+        sums = (side * F.avg_pool2d(padded, side, stride=1)).flatten(2).double()
+        return sums @ sums.mT

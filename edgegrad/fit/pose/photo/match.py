@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import zip_longest
 
 import torch
 import torch.nn.functional as F
@@ -65,10 +64,6 @@ class Matches:
             free[first] = False
         return ranked.select(torch.tensor(kept, dtype=torch.long))
 
-    def best_of(self, one: Round, fewer: int) -> Matches:
-        """Return the distinct matches that a round keeps, fewer by a factor."""
-        return self.distinct(one.kept // fewer, one.turned, one.spacing, TEMPLATES.size_spacing)
-
     def poses(self, task: PoseTask) -> list[Pose]:
         camera = task.shots[0].camera
         found = []
@@ -102,8 +97,11 @@ class Mips:
     def crops(self, positions: Tensor, pixels: Tensor, across: int, side: int) -> Tensor:
         """Return crops (n, C + 1, side, side) around positions (n, 2), `across` of whose pixels are as long as so many (n,)
         of the picture."""
-        wanted = ((self.factor * pixels / across).log() / math.log(TEMPLATES.mip_ratio)).round().clamp(min=0).long()
-        steps = torch.arange(side, dtype=torch.float64) + 0.5 - 0.5 * side
+        # Means of four samples have the blur of pixels, which differences of neighbours depend on.
+        wanted = (
+            ((self.factor * pixels / (2 * across)).log() / math.log(TEMPLATES.mip_ratio)).round().clamp(min=0).long()
+        )
+        steps = 0.5 * (torch.arange(2 * side, dtype=torch.float64) + 0.5 - side)
         H, W = self.size
         found = None
         for level in wanted.unique().tolist():
@@ -120,46 +118,46 @@ class Mips:
                 image[None].expand(len(rows), -1, -1, -1), at, align_corners=False, padding_mode=padding
             )
             if found is None:
-                found = seen.new_empty(len(positions), *seen.shape[1:])
-            found[rows] = seen
+                found = seen.new_empty(len(positions), seen.shape[1], side, side)
+            found[rows] = F.avg_pool2d(seen, 2)
         return torch.empty(0, dtype=torch.float32) if found is None else found
 
 
 def matches(task: PoseTask, seed: int, report: Callable[[str], object]) -> list[Pose]:
     """Return the best poses in the first picture, distinct, the best first. The mask, where there is one, shows where they
     are. `report` is called with what is done next."""
-    mips = Mips(task, max(one.across for one in TEMPLATES.beam_rounds))
+    mips = Mips(task, 2 * max(one.across for one in TEMPLATES.beam_rounds))
     report("views from all sides")
     views = TemplateViews.from_rotations(task, all_sides(), TEMPLATES.view_pixels, seed)
     fewer = TEMPLATES.fewer_with_mask if mips.masked else 1
-    rankings = []
-    for rare in TEMPLATES.rare_weights[:1] if mips.masked else TEMPLATES.rare_weights:
-        found = _in_mask(views, mips) if mips.masked else _everywhere(views, mips, _ratios(views, rare))
-        found = found.best_of(TEMPLATES.coarse_round, fewer)
-        for k, one in enumerate(TEMPLATES.beam_rounds):
-            if len(found.scores):
-                report(f"views nearby, {k + 1} of {len(TEMPLATES.beam_rounds)}")
-                found = closer(task, found, mips, one, rare, seed)
-                found = found.best_of(one, fewer)
-        rankings.append(found.poses(task))
-    return [pose for pair in zip_longest(*rankings) for pose in pair if pose is not None]
+    found = _in_mask(views, mips) if mips.masked else _everywhere(views, mips, _ratios(views))
+    found = found.distinct(TEMPLATES.coarse // fewer, *TEMPLATES.distinct)
+    for k, one in enumerate(TEMPLATES.beam_rounds):
+        if len(found.scores):
+            report(f"views nearby, {k + 1} of {len(TEMPLATES.beam_rounds)}")
+            found = closer(task, found, mips, one, seed).distinct(one.kept // fewer, *TEMPLATES.distinct)
+    return found.poses(task)
 
 
 def places(task: PoseTask, views: TemplateViews, sizes: tuple[float, float], lit: bool) -> list[Pose]:
     """Return the best places of some views in the first picture, distinct, the best first. The object's diagonal is between
     two `sizes`, relative to the picture's shorter side. `lit`: the views are in the light of the picture."""
-    score = _errors(views) if lit else _ratios(views, TEMPLATES.rare_weights[0])
-    return _everywhere(views, Mips(task, views.across), score, sizes).distinct(*TEMPLATES.distinct_places).poses(task)
+    score = _errors(views) if lit else _ratios(views)
+    return (
+        _everywhere(views, Mips(task, views.across), score, sizes)
+        .distinct(TEMPLATES.places, *TEMPLATES.distinct)
+        .poses(task)
+    )
 
 
 # A score takes a picture (C + 1, h, w), and how many pixels of the whole picture are across the object.
 Score = Callable[[Tensor, float], Tensor]
 
 
-def _ratios(views: TemplateViews, rare: float) -> Score:
-    """Return a score by weighted log likelihood ratios: larger objects have more pixels, and these correlate."""
-    templates = Templates(views, rare)
-    return lambda picture, pixels: templates.everywhere(picture, TEMPLATES.stride) * pixels
+def _ratios(views: TemplateViews) -> Score:
+    """Return a score by log likelihood ratios: larger objects have more pixels, and these correlate."""
+    templates = Templates(views)
+    return lambda picture, pixels: templates.scores(picture[None], TEMPLATES.stride) * pixels
 
 
 def _errors(views: TemplateViews) -> Score:
@@ -217,31 +215,30 @@ def _in_mask(views: TemplateViews, mips: Mips) -> Matches:
     ratio = (mass.clamp(min=1e-3) / area).sqrt()  # pixels of the picture in one of the view
     positions = (middle + (0.5 * T - offset) * ratio[:, None]).double()
     pixels = views.across * ratio.double()
-    scores = Templates(views, 0.0).near(mips.crops(positions, pixels, views.across, T), True)[:, 0, 0]
+    scores = Templates(views).scores(mips.crops(positions, pixels, views.across, T), masked=True)[:, 0, 0]
     return Matches(views.rotations, positions, pixels, scores)
 
 
-def closer(task: PoseTask, found: Matches, mips: Mips, one: Round, rare: float, seed: int) -> Matches:
+def closer(task: PoseTask, found: Matches, mips: Mips, one: Round, seed: int) -> Matches:
     """Move each match to the best of the poses around it."""
     turns = [torch.zeros(3, dtype=torch.float64)]
     for axis in range(3):
         for sign in (one.turn, -one.turn):
             turns.append(torch.zeros(3, dtype=torch.float64).index_fill(0, torch.tensor([axis]), sign))
     n, k = len(found.scores), len(turns)
-    best = fitted(task, found.turned(torch.stack([rotation(turn) for turn in turns])), mips, one, rare, seed)
+    best = fitted(task, found.turned(torch.stack([rotation(turn) for turn in turns])), mips, one, seed)
     return best.select(torch.arange(n) * k + best.scores.reshape(n, k).argmax(1))
 
 
-def fitted(task: PoseTask, given: Matches, mips: Mips, one: Round, rare: float, seed: int) -> Matches:
+def fitted(task: PoseTask, given: Matches, mips: Mips, one: Round, seed: int) -> Matches:
     """Move each match to the best of the places and sizes around it, with its rotation."""
     views = TemplateViews.from_rotations(task, given.rotations, one.across, seed)
-    templates, T = Templates(views, rare), views.alpha.shape[-1]
+    templates, T = Templates(views), views.alpha.shape[-1]
     best = given
     for factor in (1.0 - one.grow, 1.0, 1.0 + one.grow):
         pixels = factor * given.pixels
-        scores = templates.near(
-            mips.crops(given.positions, pixels, one.across, T + 2 * TEMPLATES.shift_pixels), mips.masked
-        )
+        crops = mips.crops(given.positions, pixels, one.across, T + 2 * TEMPLATES.shift_pixels)
+        scores = templates.scores(crops, masked=mips.masked)
         values, places = scores.flatten(1).max(1)
         if not mips.masked:
             values = values * pixels.float()

@@ -1,42 +1,43 @@
-"""Renders for display: in photographs, the render in the fitted light, with its outline, over the faded picture."""
+"""Renders for display: the mesh in the fitted light before what stands behind it, or outlined over the faded photograph."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from ....files.image import srgb_to_linear
 from ...contour_colors import draw_contour
-from ..likelihood.light import harmonics_of
 from ..likelihood.objective import Comparison, whole_level
+from ..likelihood.picture import Box
 from ..pose import Pose
-from ..robust_loss import Comparison as ColorComparison
-from ..task import BACKGROUND_BRIGHTNESS, PoseTask, PyramidLevel
+from ..target_images import scaled
+from ..task import BACKGROUND_BRIGHTNESS, PoseTask
 
 
-def overlay(task: PoseTask, level: PyramidLevel, pose: Pose) -> list[Tensor]:
-    """Return linear pictures (h, w, C) of the level with the mesh at a pose. A mesh without colours shows its outline
-    alone."""
-    if not task.clutter:
-        with torch.no_grad():
-            return ColorComparison(task, level, task.images(level, pose, level.spp, 0)).renders
-    found = []
-    objective = whole_level(task, [shot.camera.size for shot in level.shots], level.spp)
-    for shot, one in zip(level.shots, objective.comparisons([pose]), strict=True):
-        alpha = torch.zeros(*shot.camera.size, 1, dtype=torch.float32)
-        image = torch.zeros_like(shot.target)
-        one.seen.box.cut(alpha.movedim(-1, 0)).copy_(one.seen.alpha)
-        one.seen.box.cut(image.movedim(-1, 0)).copy_(_shown(one))
-        image = image + (1.0 - alpha) * BACKGROUND_BRIGHTNESS * shot.target
-        found.append(draw_contour(image, alpha))
+def overlay(task: PoseTask, longest: int, spp: int, pose: Pose) -> list[tuple[Tensor, Tensor]]:
+    """Return each picture (h, w, C), of at most so many pixels on its longest side, and the same with the mesh at a pose. A mesh
+    without colours shows its outline alone."""
+    factor = min(1.0, longest / max(task.shots[0].camera.size))
+    level, found = whole_level(task, [scaled(shot.camera.size, factor) for shot in task.shots], spp), []
+    for picture, one in zip(level.pictures, level.comparisons([pose]), strict=True):
+        target = picture.outlined if picture.mask is not None and not len(picture.radiance) else picture.radiance
+        h, w = picture.size
+        whole = Box(slice(0, h), slice(0, w))
+        alpha = one.seen.box.pasted(one.seen.alpha, whole)
+        shown = one.seen.box.pasted(_shown(one), whole)
+        if picture.background is not None:
+            behind = srgb_to_linear(picture.background)
+        else:
+            behind = torch.zeros_like(target) if picture.mask is not None else BACKGROUND_BRIGHTNESS * target
+        image, alpha = (shown + (1.0 - alpha) * behind).movedim(0, -1), alpha.movedim(0, -1)
+        found.append((target.movedim(0, -1), draw_contour(image, alpha) if task.clutter else image))
     return found
 
 
 def _shown(one: Comparison) -> Tensor:
     """Return the radiance (C, h, w) times alpha: in the fitted light where there is one."""
-    seen, light = one.seen, one.light
-    if seen.color is None or seen.normal is None:
-        return one.part.radiance * seen.alpha
-    if light is None:
-        return seen.color[0]
-    L = light.coefficients[0]
-    return (seen.color[0] * torch.einsum("cn,nhw->chw", L, harmonics_of(seen.normal, L.shape[1])[0])).clamp(min=0.0)
+    if one.light is not None:
+        return one.light.lit(one.seen)[0]
+    if one.seen.color is not None:
+        return one.seen.color[0]
+    return one.part.radiance * one.seen.alpha if len(one.part.radiance) else one.seen.alpha

@@ -1,11 +1,14 @@
 """Views of an object as templates: how likely parts of a picture show them, in unknown light.
 
-A view predicts a part of a picture by the mesh's colours in the light that fits best there. With the basis B of colours times
-harmonics inside the silhouette, the squared error is Σy² − bᵀA⁻¹b, with b = Σ B y and A = Σ B Bᵀ (a matched subspace filter,
-Scharf and Friedlander 1994). A does not depend on the place, and b is a correlation, so all places are computed at once.
+A view predicts a part of a picture by the mesh's colours in the light that fits best there, with a basis B of colours times
+harmonics inside the silhouette. Neighbouring pixels correlate, in pictures as in what a view leaves of them: shadows, blur and
+the distance to the next view. So the residual r = y − B L is a Gaussian Markov random field: r' Q r is the sum of the squared
+differences of neighbours, and of λ r² (Rue and Held, Gaussian Markov Random Fields, 2005). Its least value over L is y' Q y −
+b' A⁻¹ b, with b = B' Q y and A = B' Q B. A does not depend on the place, and b is a correlation, so all places are computed at
+once (a matched subspace filter, Scharf and Friedlander 1994).
 
-A view competes with one colour for the whole part, while it has one for its surroundings, and with pixels drawn from the
-colours of the whole picture. The first finds contours and patterns, the second rare colours.
+The picture without the object is such a field, too, about its mean. Across a contour, object and background are independent:
+there a field would pay for each step. A part of the picture's pixels is drawn from its colours, which finds rare ones.
 """
 
 from __future__ import annotations
@@ -23,94 +26,72 @@ from .template_views import TemplateViews
 class Templates:
     """Views as filters of pictures with the channels C, which may be none."""
 
-    def __init__(self, views: TemplateViews, rare: float) -> None:
-        """`rare` weights the ratio to the picture's colours against that to one colour."""
-        self.rare = rare
-        alpha, colors, normals = views.alpha, views.colors, views.normals
-        self.C = colors.shape[-1]
-        self.alpha = alpha
-        self.inside = torch.where(alpha > 0.5, alpha, torch.zeros_like(alpha))
-        near = F.max_pool2d((alpha > 0.02).float()[:, None], 2 * views.ring + 1, 1, views.ring)[:, 0]
-        self.around = near * (alpha < 0.02)
-        Y = torch.cat([torch.ones_like(normals[..., :1]), normals], -1)
-        basis = colors[..., None] * Y[..., None, :]  # (n, T, T, C, 4)
-        weighted = basis * self.inside[..., None, None]
-        A = torch.einsum("nijck,nijcl->nckl", weighted, basis)
+    def __init__(self, views: TemplateViews) -> None:
+        self.alpha, self.C, level = views.alpha, views.colors.shape[-1], TEMPLATES.residual_level
+        inside = (views.alpha > 0.5).float()
+        self.area = inside.sum((1, 2)).clamp(min=1.0)[:, None, None]
+        # Pairs of neighbours, at the first one: both inside, and one of them.
+        both = torch.stack([inside * _next(inside, axis) for axis in (2, 1)], 1)
+        across = torch.stack([(inside - _next(inside, axis)).abs() for axis in (2, 1)], 1)
+        harmonics = torch.cat([torch.ones_like(views.normals[..., :1]), views.normals], -1)
+        basis = (views.colors[..., None] * harmonics[..., None, :]).permute(0, 3, 4, 1, 2) * inside[:, None, None]
+        filters = level * basis  # Q B
+        for k, axis in enumerate((4, 3)):
+            steps = (_next(basis, axis) - basis) * both[:, None, None, k]
+            filters = filters - steps + steps.roll(1, axis)
+        A = torch.einsum("ncijk,ncljk->ncil", filters, basis)
         self.inverse = torch.linalg.inv(_with_prior(A.double())).float()  # (n, 4C, 4C)
-        self.filters = weighted.permute(0, 3, 4, 1, 2)  # (n, C, 4, T, T)
+        # Of each channel; of squares of differences and values; and of logarithms of both.
+        self.filters = torch.cat([filters, inside[:, None, None].expand(-1, self.C, -1, -1, -1)], 2)[:, :, :, None]
+        self.squares = torch.cat([both, level * inside[:, None]], 1)[:, None]
+        self.linear = torch.cat([across, TEMPLATES.rare_weight * inside[:, None]], 1)[:, None]
 
-    def everywhere(self, picture: Tensor, stride: int) -> Tensor:
-        """Return log likelihood ratios (n, h, w), of a picture (C + 1, H, W) whose last channel is surprise()."""
-        parts = []
-        sides = torch.stack([self.inside, self.around], 1)
-        colors, surprise = picture[:-1], picture[-1]
-        for at in range(0, len(self.inside), 2 * TEMPLATES.batch):
-            rows = slice(at, at + 2 * TEMPLATES.batch)
-            n = len(self.inside[rows])
-            b, sums = [], []
-            for c in range(self.C):
-                both = torch.cat([self.filters[rows, c], sides[rows]], 1).flatten(0, 1)[:, None]
-                out = F.conv2d(colors[None, c : c + 1], both, stride=stride)[0]
-                out = out.reshape(n, 6, *out.shape[1:])
-                b.append(out[:, :4])
-                sums.append(out[:, 4:])
-            squares = F.conv2d(colors.square().sum(0)[None, None], sides[rows].flatten(0, 1)[:, None], stride=stride)
-            squares = squares[0].reshape(n, 2, *squares.shape[2:])
-            rare = F.conv2d(surprise[None, None], self.inside[rows, None], stride=stride)[0]
-            parts.append(self._ratios(torch.cat(b, 1), torch.stack(sums, 2), squares, rare, rows))
-        return torch.cat(parts)
+    def scores(self, pictures: Tensor, stride: int = 1, masked: bool = False) -> Tensor:
+        """Return log likelihood ratios (n, h, w) at the places of one picture (1, C + 1, H, W) or of one for each view.
 
-    def near(self, crops: Tensor, masked: bool) -> Tensor:
-        """Return the scores (n, k, k) of a crop (n, C + 1, T + k − 1, T + k − 1) for each view, at k × k shifts. The last
-        channel is surprise(), or a mask. With a mask, the score is the likelihood of colours and mask, for a view of the same
-        size."""
-        parts = []
-        for at in range(0, len(crops), TEMPLATES.batch):
+        The last channel is surprise() or, with `masked`, a mask. Then the score is the likelihood of colours and mask.
+        """
+        colors, last = pictures[:, :-1], pictures[:, -1:]
+        steps = [(_next(colors, axis) - colors).square().sum(1, keepdim=True) for axis in (3, 2)]
+        squares = torch.cat([*steps, colors.square().sum(1, keepdim=True)], 1)
+        variance, parts = max(self.C, 1) * TEMPLATES.noise**2, []
+        # A field without a pair has a smaller determinant, by half in a lattice.
+        edges = [0.5 * self.C * (torch.log1p(step / variance) - math.log(2.0)) for step in steps]
+        linear = torch.cat([*edges, last], 1)
+        for at in range(0, len(self.alpha), TEMPLATES.batch):
             rows = slice(at, at + TEMPLATES.batch)
-            colors, last = crops[rows, :-1], crops[rows, -1:]
-            sides = torch.stack([self.inside[rows], self.around[rows]], 1)
-            n, k = len(sides), crops.shape[-1] - sides.shape[-1] + 1
-            filters = torch.cat([self.filters[rows], sides[:, None].expand(-1, self.C, -1, -1, -1)], 2)
-            out = _one_by_one(colors.flatten(0, 1), filters.flatten(0, 1)).reshape(n, self.C, 6, k, k)
-            b, sums = out[:, :, :4].reshape(n, 4 * self.C, k, k), out[:, :, 4:].transpose(1, 2)
-            squares = _one_by_one(colors.square().sum(1), sides)
+            own = slice(0, 1) if len(pictures) == 1 else rows
+            shown = [_correlated(colors[own, c, None], self.filters[rows, c], stride) for c in range(self.C)]
+            whole = _correlated(squares[own], self.squares[rows], stride)[:, 0]
+            area, even, error = self.area[rows], whole, whole
+            if shown:
+                b = torch.cat([one[:, :4] for one in shown], 1)
+                error = whole - (b * torch.einsum("nkl,nlhw->nkhw", self.inverse[rows], b)).sum(1)
+                sums = torch.stack([one[:, 4] for one in shown])
+                even = whole - TEMPLATES.residual_level * sums.square().sum(0) / area
+            error, even = error.clamp(min=0.0) + variance * area, even.clamp(min=0.0) + variance * area
             if masked:  # Σ(m − α)² = Σm² − 2Σmα + Σα²
-                alpha = self.alpha[rows, None]
-                of_masks = _one_by_one(last[:, 0].square(), torch.ones_like(alpha))
-                shape = of_masks - 2.0 * _one_by_one(last[:, 0], alpha) + alpha.square().sum((2, 3), keepdim=True)
-                error = self._error(b, squares[:, 0], rows) + TEMPLATES.mask_weight * shape[:, 0].clamp(min=0.0)
-                parts.append(
-                    -torch.log(error / self.alpha[rows].sum((1, 2)).clamp(min=1.0)[:, None, None] + TEMPLATES.noise**2)
-                )
+                alpha = self.alpha[rows, None, None]
+                ones = torch.ones_like(alpha)
+                shape = _correlated(last[own].square(), ones, stride) - 2.0 * _correlated(last[own], alpha, stride)
+                shape = (shape[:, 0] + alpha.square().sum((3, 4))).clamp(min=0.0)
+                parts.append(-torch.log((error + TEMPLATES.mask_weight * shape) / area))
                 continue
-            rare = _one_by_one(last[:, 0], sides[:, :1])[:, 0]
-            parts.append(self._ratios(b, sums, squares, rare, rows))
+            colored = (error / (self.C * area)).log() + math.log(2.0 * math.pi) + 1.0
+            ratio = (even / error).log() - TEMPLATES.rare_weight * colored
+            parts.append(0.5 * self.C * area * ratio + _correlated(linear[own], self.linear[rows], stride)[:, 0])
         return torch.cat(parts)
 
-    def _error(self, b: Tensor, squares: Tensor, rows: slice) -> Tensor:
-        """Return the squared error (n, h, w) inside."""
-        return (squares - (b * torch.einsum("nkl,nlhw->nkhw", self.inverse[rows], b)).sum(1)).clamp(min=0.0)
 
-    def _ratios(self, b: Tensor, sums: Tensor, squares: Tensor, rare: Tensor, rows: slice) -> Tensor:
-        """Return the ratios from b (n, 4C, h, w); sums (n, 2, C, h, w) and squares (n, 2, h, w) inside and around; rare (n,
-        h, w)."""
-        inside, around = (x[rows].sum((1, 2)).clamp(min=1e-3)[:, None, None] for x in (self.inside, self.around))
-        error = self._error(b, squares[:, 0], rows)
-        outside = (squares[:, 1] - sums[:, 1].square().sum(1) / around).clamp(min=0.0)
-        even = (squares.sum(1) - sums.sum(1).square().sum(1) / (inside + around)).clamp(min=0.0)
-        noise = TEMPLATES.noise**2 * self.C * (inside + around)
-        to_one = 0.5 * self.C * (inside + around) * torch.log((even + noise) / (error + outside + noise))
-        variance = error / (self.C * inside) + TEMPLATES.noise**2
-        to_all = rare - 0.5 * self.C * inside * (variance.log() + math.log(2.0 * math.pi) + 1.0)
-        return to_one + self.rare * to_all
+def _next(values: Tensor, axis: int) -> Tensor:
+    """Return for each pixel the next one along an axis; the last one for itself."""
+    size = values.shape[axis]
+    return values.index_select(axis, torch.arange(1, size + 1).clamp(max=size - 1))
 
 
-def _one_by_one(pictures: Tensor, filters: Tensor) -> Tensor:
-    """Return the correlations (n, f, k, k) of each picture (n, h, w) with its own filters (n, f, T, T)."""
-    if not len(pictures):  # Masks without colours have no pictures.
-        k = pictures.shape[-1] - filters.shape[-1] + 1
-        return pictures.new_zeros(*filters.shape[:2], k, k)
-    found = F.conv2d(pictures[None], filters.flatten(0, 1)[:, None], groups=len(pictures))
+def _correlated(pictures: Tensor, filters: Tensor, stride: int) -> Tensor:
+    """Return the correlations (n, f, h, w) of filters (n, f, M, T, T) with one picture (1, M, H, W), or with one for each."""
+    found = F.conv2d(pictures.flatten(0, 1)[None], filters.flatten(0, 1), stride=stride, groups=len(pictures))
     return found[0].unflatten(0, filters.shape[:2])
 
 

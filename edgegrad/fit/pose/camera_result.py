@@ -1,0 +1,214 @@
+"""The result of fits of cameras, of one place or of several with one lens."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from ...camera.camera import Camera
+from ...files.cameras import save_camera
+from ...files.paths import PathLike, write_figures, write_json
+from ...optional import DRAWING, require
+from ..ending import Ending
+from ..history import Record, history_rows, number_or_none
+from ..result import FitResult, chosen, made_folder
+from .camera_uncertainty import CameraUncertainty
+from .pose import Pose
+from .result import PoseFit
+from .task import STEP_PARTS, PoseTask
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Each part of a step moves one tensor of a camera.
+TENSOR_OF = {
+    "rotation": "world_to_camera", "shift": "world_to_camera", "focal": "K", "principal": "K", "distortion": "distortion",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFit(FitResult):
+    """The result of fit_camera() and of calibrate(), a FitResult: cameras, and how exactly each number is known.
+
+    Attributes
+    ----------
+    cameras : the camera of each picture
+    searches : a PoseFit of each place, in which the scene moved before cameras at rest
+        fit_camera() has one place, and calibrate() one for each picture. `searches[0].history` has the size of the level of each
+        step, and marks the best steps so far.
+    ending : why the fit took no more steps
+    joint : a Record of each step of all numbers at once
+    """
+
+    cameras: list[Camera]
+    searches: list[PoseFit] = field(repr=False)
+    ending: Ending
+    joint: list[Record] = field(repr=False)
+
+    @property
+    def camera(self) -> Camera:
+        """Return the first camera."""
+        return self.cameras[0]
+
+    @property
+    def uncertainty(self) -> CameraUncertainty | None:
+        """Return the standard deviations of the first place and of the lens; None until the searches have ended."""
+        return self.uncertainties[0]
+
+    @property
+    def uncertainties(self) -> list[CameraUncertainty | None]:
+        """Return the uncertainty of each place."""
+        known = [search.uncertainty for search in self.searches]
+        return [one if isinstance(one, CameraUncertainty) else None for one in known]
+
+    @property
+    def history(self) -> list[Record]:
+        """Return a Record of each step of one place, or of all numbers at once of several.
+
+        It has the loss, comparable within one level of the image pyramid, and the cameras, float64, by the names that
+        fit_scene() has for them: "cameras.0.world_to_camera", and "cameras.0.K" and "cameras.0.distortion" where they are
+        sought. Norms of the gradient are by "world_to_camera" (in radians and sizes of the scene), "K" (logarithm of the focal
+        length, widths of the image) and "distortion", which all cameras share. There are none where the loss rose and the step
+        was taken back. The last record of one place is the final comparison.
+        """
+        (search, *others) = self.searches
+        if others or search.task is None:
+            return self.joint
+        steps = enumerate(search.history)
+        return [record_of(k, step.loss, step.gradient, [(search.task, step.pose)]) for k, step in steps]
+
+    @property
+    def loss(self) -> float:
+        """Return the mean loss over the places."""
+        return sum(search.loss for search in self.searches) / len(self.searches)
+
+    @property
+    def explained(self) -> float:
+        """Return the least share over the places, 0 … 1, of the render's edges that the pictures show, too."""
+        return min(search.explained for search in self.searches)
+
+    @property
+    def steps(self) -> int:
+        """Return the number of records of the history."""
+        return len(self.searches[0].history) if len(self.searches) == 1 else len(self.joint)
+
+    @property
+    def seconds(self) -> float:
+        return sum(search.seconds for search in self.searches)
+
+    @property
+    def converged(self) -> bool:
+        """Return whether further steps lead no further, pictures show the render's edges, and all that was sought is known."""
+        return self.ending is Ending.FLAT and all(search.converged for search in self.searches)
+
+    @property
+    def interrupted(self) -> bool:
+        return self.ending is Ending.INTERRUPTED
+
+    @property
+    def reason(self) -> str:
+        """Return "converged", or what kept the fit from that, in words.
+
+        These are reasons as PoseFit has them, of several places "images[2]: edges not explained: …", and "not known: …" with
+        numbers of pose and lens that the pictures hardly show.
+        """
+        if self.interrupted:
+            return "interrupted"
+        for k, (search, known) in enumerate(zip(self.searches, self.uncertainties, strict=True)):
+            words = search.reason if known is None else _reason(search, known)
+            if words != "converged":
+                of_lens = words.startswith("not known") and known is not None and known.vague
+                return words if of_lens or len(self.searches) == 1 else f"images[{k}]: {words}"
+        return "converged"
+
+    def plot(self, most: int = 4) -> Figure:
+        """Draw target | start | fit | difference of at most so many pictures, as they were compared."""
+        shown = [self.searches[k] for k in chosen(len(self.searches), most)]
+        return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(*shown, most=most)
+
+    def plot_history(self) -> Figure:
+        return self.searches[0].plot_history() if len(self.searches) == 1 else super().plot_history()
+
+    def save(self, folder: PathLike, figures: bool = True) -> list[str]:
+        """Write the result to a folder, which is made where it is missing, and return the files' names.
+
+        - camera.json, of several camera-0.json and so on: the cameras, as load_camera reads them
+        - calibration.json: focal length, principal point and distortion with their standard deviations, those of the poses,
+          loss and reason
+        - history.json: loss, gradient norms and cameras of each step
+        - of one place what PoseFit.save writes; else fit.png and loss.png, plot() and plot_history(), not with figures=False
+
+        Each file is written whole or not at all. Raises OSError, or at last ImportError when matplotlib or pillow is missing.
+        """
+        out = made_folder(folder)
+        names = [f"camera-{k}.json" for k in range(len(self.cameras))] if len(self.cameras) > 1 else ["camera.json"]
+        for name, camera in zip(names, self.cameras, strict=True):
+            save_camera(out / name, camera)
+        write_json(out / "calibration.json", self._summary())
+        write_json(out / "history.json", history_rows(self.history))
+        names += ["calibration.json", "history.json"]
+        if len(self.searches) == 1:
+            return [*names, *self.searches[0].save(folder, figures)]
+        draw = {"fit.png": self.plot} | ({"loss.png": self.plot_history} if self.joint else {})
+        return names + (write_figures(out, draw) if figures else [])
+
+    def _summary(self) -> dict[str, Any]:
+        camera = self.camera
+        found: dict[str, Any] = {
+            "K": camera.K.tolist(), "distortion": camera.coefficients.tolist(), "size": list(camera.size),
+            "projection": camera.projection,
+        }  # fmt: skip
+        if (known := self.uncertainty) is not None:
+            found["standard_deviations"] = {
+                "focal": known.focal * float(camera.K[0, 0]), "principal": known.principal.tolist(),
+                "distortion": known.distortion.tolist(),
+                "poses": [{"degrees": one.degrees, "shift": one.shift} for one in self.uncertainties if one is not None],
+            }  # fmt: skip
+        return found | {
+            "reason": self.reason, "converged": self.converged, "loss": number_or_none(self.loss),
+            "explained": [search.explained for search in self.searches], "steps": self.steps,
+            "seconds": round(self.seconds, 3),
+        }  # fmt: skip
+
+    @property
+    def _can_draw(self) -> bool:
+        return all(search.history for search in self.searches)
+
+
+def fitted(searches: Sequence[PoseFit], ending: Ending = Ending.STEPS, joint: Sequence[Record] = ()) -> CameraFit:
+    """Return searches that moved the scene before cameras as a fit of the cameras."""
+    cameras = [_moved(seen, search.matrix) for search in searches for seen in search.cameras]
+    return CameraFit(cameras, list(searches), ending, list(joint))
+
+
+def record_of(
+    number: int, loss: float, gradient: Mapping[str, float], places: Sequence[tuple[PoseTask, Pose]]
+) -> Record:
+    """Return the record of a step from norms of its gradient by the parts of a step, and from the pose of each place."""
+    values, norms = dict[str, Tensor](), dict[str, float]()
+    cameras = [_moved(task.lens(shot.camera, pose), pose.matrix) for task, pose in places for shot in task.shots]
+    for part, entries in STEP_PARTS.items():
+        if not set(entries).isdisjoint(places[0][0].dofs):
+            values |= {f"cameras.{k}.{TENSOR_OF[part]}": getattr(one, TENSOR_OF[part]) for k, one in enumerate(cameras)}
+    for part, norm in gradient.items():
+        norms[TENSOR_OF[part]] = math.hypot(norms.get(TENSOR_OF[part], 0.0), norm)
+    return Record(number, loss, norms, {name: value.clone() for name, value in values.items()})
+
+
+def _reason(search: PoseFit, known: CameraUncertainty) -> str:
+    """Return the reason of a place whose pose and lens are known to these deviations."""
+    words = replace(search, uncertainty=None, converged=search.converged or bool(known.unknown)).reason
+    if words != "converged" or not known.unknown:
+        return words
+    fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
+    return f"not known: {known.unknown}; {fix}"
+
+
+def _moved(camera: Camera, matrix: Tensor) -> Camera:
+    """Return the camera W M that sees a scene at rest as this one, W, sees it moved by the matrix M (4, 4)."""
+    W = camera.world_to_camera
+    return camera.replace(world_to_camera=(W.detach().double() @ matrix).to(W))
