@@ -198,20 +198,24 @@ class HypothesisSearch:
         self.after_step()
 
     def _modes(self) -> list[Mode]:
-        """Return the ends of all descents that differ, the likeliest first."""
-        found: list[Mode] = []
+        """Return the ends of all descents that differ, the likeliest first. Steps that gain less than errors of the pictures do
+        are short, too: where nothing shows a direction, descents wander along it."""
+        found: list[tuple[Mode, float]] = []
         for group in self.groups:
             assert group.descents is not None
             for one in group.descents.descents:
                 if one.accepted and one.rest is not Rest.FLAT:
                     rests = one.rest in (Rest.SHORT, Rest.DAMPED)
-                    found.append(Mode(one.point, one.mean_cost, one.curvature, rests, group.level))
-        kept: list[Mode] = []
-        for mode in sorted(found, key=lambda mode: mode.cost):
-            if all(self.apart(mode.pose, other.pose) > POSE.same_mode for other in kept):
-                kept.append(mode)
-        temperature = kept[0].level.temperature(kept[0].pose) if kept else 1.0
-        return [mode._replace(temperature=temperature) for mode in kept]
+                    mode = Mode(one.point, one.mean_cost, one.curvature, rests, group.level)
+                    found.append((mode, one.predicted))
+        kept: list[tuple[Mode, float]] = []
+        for mode, gain in sorted(found, key=lambda pair: pair[0].cost):
+            if all(self.apart(mode.pose, other.pose) > POSE.same_mode for other, _ in kept):
+                kept.append((mode, gain))
+        T = kept[0][0].level.temperature(kept[0][0].pose) if kept else 1.0
+        return [
+            mode._replace(temperature=T, rests=mode.rests or gain < POSE.least_gain * T) for mode, gain in kept
+        ]  # fmt: skip
 
     def apart(self, one: Pose, other: Pose) -> float:
         """Return how far apart two poses are, in radians or object sizes, whichever is more, up to symmetries."""
