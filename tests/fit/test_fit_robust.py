@@ -66,7 +66,7 @@ def test_blur_and_compression_cost_no_second_search(kind):
     view = camera(80)
     fit = fit_pose(before_sky(), WORN[kind](picture(view)), view, init=START, options=quiet())
     degrees, percent = errors(fit)
-    limit = {"sharp": 0.1, "soft": 0.5}.get(kind, 1.0)  # blurs are tried in steps of a fifth of a pixel
+    limit = {"sharp": 0.1, "soft": 0.5}.get(kind, 1.0)  # of 1.0 pixels, wider than the blurs that are tried
     shown = 0.9 if kind in ("sharp", "soft") else 0.75  # what compression makes stronger is not the render's
     assert degrees < limit and percent < limit and fit.converged and fit.explained > shown, (degrees, percent)
     sizes = [step.size for step in fit.history]

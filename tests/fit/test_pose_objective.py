@@ -24,6 +24,7 @@ from edgegrad.fit.pose.likelihood.light import FittedLight
 from edgegrad.fit.pose.likelihood.objective import pose_levels
 from edgegrad.fit.pose.likelihood.picture import Box, PictureLevel, RenderedPoses
 from edgegrad.fit.pose.likelihood.region import Frequencies, region_term
+from edgegrad.fit.pose.likelihood.term import Term
 from edgegrad.fit.pose.pose import Pose
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.fit.pose.task import PoseTask, TargetView, Unknowns
@@ -325,6 +326,16 @@ def test_noise_and_blur_are_those_of_the_likeliest_pose(blur):
     assert bool((known == known[0]).all()) and float(known[0]) == pytest.approx(informed.light_deviations[0])
     (noise,) = level.focused(RIGHT).contour_noises
     assert noise.blur == pytest.approx(blur, abs=0.21) and 0.007 < noise.deviation < 0.04
+
+
+@pytest.mark.quick
+def test_scores_of_pixels_nearby_have_bartletts_weights():
+    s = torch.randn(1, 2, 6, 7, generator=torch.Generator().manual_seed(0))
+    found = Term.zero(1, 2)._replace(summands=lambda: s).score_covariance(3.0)[0]
+    at = torch.cartesian_prod(torch.arange(6), torch.arange(7)).to(F64)
+    weight = (1.0 - (at[:, None] - at).abs() / 3.0).clamp(min=0.0).prod(-1)
+    rows = s[0].flatten(1).double()
+    torch.testing.assert_close(found, rows @ weight @ rows.T, rtol=1e-5, atol=1e-5)
 
 
 UNUSUAL = {

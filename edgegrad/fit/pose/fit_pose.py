@@ -81,8 +81,8 @@ def fit_pose(
     weights, depths : Tensor or sequence of Tensor, optional
         (H, W): how much a pixel counts, ≥ 0; and distances along the camera's axis +Z, 0 or NaN where none was measured.
     search : bool, int or "global", default True
-        False: `init` alone is refined. True: other poses are tried where the pictures do not show the render's edges. A number
-        of starts, rotated around `init`, or in all ways without one. "global": the whole picture is searched.
+        False: `init` alone is refined. True: poses turned from it are compared, too. A number of starts, rotated around `init`,
+        or in all ways without one. "global": the whole picture is searched.
     symmetries : Symmetries or "find", optional
         Of the mesh. Of the poses that they make equal, the one nearest to the start is returned.
     options : FitOptions, optional

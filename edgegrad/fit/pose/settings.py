@@ -33,7 +33,7 @@ class PoseSettings:
     )
     light_rounds: int = 6  # of iteratively reweighted least squares
     min_light_pixels: int = 60  # Fewer pixels inside do not show the light.
-    min_light_noise: float = 0.004  # least standard deviation of a difference
+    min_light_noise: float = 0.004  # least standard deviation of a difference; renders of 16 samples leave about that
     clipped: float = 0.95  # linear radiance: brighter pixels may be of any brighter colour
     tail: float = 3.0  # standard deviations beyond which a difference hardly counts (Geman and McClure 1987)
     occluded: float = 0.1  # prior probability that something covers a pixel of the object
@@ -76,7 +76,7 @@ class PoseSettings:
     # Nats of independent pixels by which hypotheses on the last level may be less likely. Some 60 pixels count as one, so the
     # others have less than e^-16 of the mass.
     unlikely_nats: float = 1000.0
-    last_steps: int = 20  # most steps then
+    last_steps: int = 20  # most steps on the last level, once its noise and blur are known
     noise_rounds: int = 4  # most times that noise and blur are estimated anew, and that descents go on by these
     weak_directions: int = 3  # of the likeliest mode, along which hypotheses are drawn for the next level
     weak_deviations: float = 2.0  # standard deviations of the level's posterior at which they are drawn

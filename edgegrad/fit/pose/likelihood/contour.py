@@ -73,10 +73,8 @@ class Sides(NamedTuple):
         mixed, step = back + a * (front - back), front - back
         if curved:
             inside, outside = (srgb_to_linear(side.clamp(0.0, 1.0)) for side in (front, back))
-            mixed, step = outside + a * (inside - outside), inside - outside
-        if curved:
-            mixed = linear_to_srgb(mixed.clamp(0.0, 1.0))
-            step = srgb_slope(mixed) * step
+            mixed = linear_to_srgb((outside + a * (inside - outside)).clamp(0.0, 1.0))
+            step = srgb_slope(mixed) * (inside - outside)
         band = ((alpha > PURE) & (alpha < 1.0 - PURE) & known) * near
         kernel = POSE.color_kernel * math.sqrt(2.0 * math.pi)
         density = every.log() - (len(image) * math.log(kernel) if curved else 0.0)
@@ -96,7 +94,7 @@ class Sides(NamedTuple):
 
     def gain(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return the log likelihood ratio (N, h, w) of an image (C, h, w) to one whose pixels show the one side, the other, or
-        any colour nearby, whichever is likeliest; and the probability that a pixel is none of something else."""
+        any colour nearby, whichever is likeliest; and the probability that a pixel shows the mixture and nothing else."""
         e = POSE.occluded
         pure = [log_normal(image - side, self.variance) for side in (self.front, self.back)]
         reference = torch.maximum(torch.maximum(*pure), self.density)
