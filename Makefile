@@ -5,9 +5,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt)
 
-# Tests start Python some hundred times, and each would compile all that it imports where it may not keep it.
-unexport PYTHONDONTWRITEBYTECODE
-
 .PHONY: demo test quick test-slow test-browser mutants coverage sanitize sanitize-all sanitize-threads bench report lint docs wheel format
 .PHONY: calibrate clean
 .DELETE_ON_ERROR:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -17,6 +18,10 @@ FOLDERS = sorted(path for path in Path(__file__).parent.iterdir() if path.is_dir
 sys.path += map(str, (ROOT, ROOT / "examples", *FOLDERS))
 torch.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # what started the tests may have it ignored, as nohup does
+# Tests start Python some hundred times, and each would compile all that it imports where it may not keep it.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+gc.disable()  # until tests are collected: there is no garbage among them, and each look at so many objects takes 0.3 s
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -56,6 +61,11 @@ def pytest_configure(config: pytest.Config) -> None:
         config, "workerinput"
     ):  # the workers of xdist send their reports to one process
         config.pluginmanager.register(Failures(config, path))
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def processor_time() -> float:
