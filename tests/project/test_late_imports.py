@@ -28,38 +28,10 @@ def test_libraries_that_are_missing_are_named(tmp_path, monkeypatch):
         save_mesh(tmp_path / "a.ply", mesh)
 
 
-LAZY = """
-import pickle, sys
-import edgegrad as eg
-assert not {"torch", "numpy", "edgegrad._core"} & set(sys.modules)
-assert {"render", "Mesh", "fit", "points"} <= set(dir(eg)) and set(eg.__all__) == set(dir(eg))
-for wrong in ("rendr", "fit.fit_pos"):
-    try: eval(f"eg.{wrong}")
-    except AttributeError as error: assert wrong.split(".")[-1] in str(error) and error.obj is not None
-assert "torch" not in sys.modules
-import edgegrad.render
-assert callable(eg.render) and callable(eg.plan) and callable(eg.profile) and callable(eg.textures.bake)
-assert "edgegrad.fit.rig" not in sys.modules and callable(eg.fit.fit_pose)
-assert pickle.loads(pickle.dumps(eg.Camera)) is eg.Camera
-from edgegrad import *
-from edgegrad.fit import *
-assert render is eg.render and fit_rig is eg.fit.fit_rig
-import edgegrad.bop
-for part in (eg, eg.bop, eg.fit, eg.points, eg.rig):
-    assert set(part.__all__) == set(dir(part)) and all(hasattr(part, name) for name in part.__all__), part
-assert callable(eg.points.trace) and callable(eg.rig.load) and callable(eg.shapes.box) and callable(eg.bop.evaluate)
-"""
-
-
 def alone(code: str) -> subprocess.CompletedProcess[str]:
     """Run the code in a process of its own."""
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, env=env)
-
-
-def test_names_are_imported_on_first_use() -> None:
-    done = alone(LAZY)
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_wrong_name_is_corrected() -> None:

@@ -53,7 +53,26 @@ def test_a_circle_has_no_layers() -> None:
 
 
 FIRST_STEP = """
-import sys, torch, edgegrad as eg
+import pickle, sys
+import edgegrad as eg
+assert not {"torch", "numpy", "edgegrad._core"} & set(sys.modules)
+assert {"render", "Mesh", "fit", "points"} <= set(dir(eg)) and set(eg.__all__) == set(dir(eg))
+for wrong in ("rendr", "fit.fit_pos"):
+    try: eval(f"eg.{wrong}")
+    except AttributeError as error: assert wrong.split(".")[-1] in str(error) and error.obj is not None
+assert "torch" not in sys.modules
+import edgegrad.render
+assert callable(eg.render) and callable(eg.plan) and callable(eg.profile) and callable(eg.textures.bake)
+assert "edgegrad.fit.rig" not in sys.modules and callable(eg.fit.fit_pose)
+assert pickle.loads(pickle.dumps(eg.Camera)) is eg.Camera
+from edgegrad import *
+from edgegrad.fit import *
+assert render is eg.render and fit_rig is eg.fit.fit_rig
+import edgegrad.bop
+for part in (eg, eg.bop, eg.fit, eg.points, eg.rig):
+    assert set(part.__all__) == set(dir(part)) and all(hasattr(part, name) for name in part.__all__), part
+assert callable(eg.points.trace) and callable(eg.rig.load) and callable(eg.shapes.box) and callable(eg.bop.evaluate)
+import torch
 verts = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 mesh = eg.Mesh(verts, torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), colors=verts)
 camera = eg.Camera.look_at((0.8, 0.6, 3.0), (0.3, 0.3, 0.3), (0.0, 1.0, 0.0), 40.0, (32, 32))
@@ -76,7 +95,7 @@ for path in sys.argv[1:]:
 
 def test_a_fit_imports_no_compiler(tmp_path: Path) -> None:
     """torch's compiler takes longer to import than torch itself, and than a fit; its rules of forward mode take
-    seconds. Libraries for files are imported late, and errors say how to get them."""
+    seconds. Names of the package are imported on first use, libraries for files late, and errors say how to get them."""
     box = trimesh.creation.box()
     box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2], image=Image.new("RGB", (2, 2)))
     files = [tmp_path / "a.glb", tmp_path / "a.obj"]
