@@ -27,7 +27,9 @@ def gradients(scene: NoiseScene, spp: int, seeds: range) -> list[Tensor]:
     return [torch.autograd.grad(scene.loss(scene.render(spp, seed)), scene.leaf)[0] for seed in seeds]
 
 
-@pytest.mark.parametrize("name", NOISE_SCENES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if "texel" in name else name for name in NOISE_SCENES]
+)
 def test_four_times_spp_halve_the_noise_of_a_gradient(name):
     """Sixteen times, in two steps of at most 0.6."""
     scene = NOISE_SCENES[name]()

@@ -33,7 +33,7 @@ class NoiseScene(NamedTuple):
         return (adjoint * image).sum()
 
 
-def camera(size: int = 32) -> eg.Camera:
+def camera(size: int = 16) -> eg.Camera:
     return eg.Camera.look_at((1.2, 1.4, 3.4), (0, 0, 0), (0.0, 1.0, 0.01), 35.0, (size, size)).to(F64)
 
 
@@ -77,7 +77,7 @@ def shaded_sheet() -> NoiseScene:
     return moving(own.replace(verts=1.4 * own.verts), [ground()], (point_light(),))
 
 
-def bouncing(scene: Any, name: str, size: int = 16) -> NoiseScene:
+def bouncing(scene: Any, name: str, size: int = 8) -> NoiseScene:
     """Return a room of which one mesh moves as a whole, with light that is scattered twice."""
     shift = torch.zeros(3, dtype=F64, requires_grad=True)
     own = scene.meshes[name]
@@ -95,5 +95,5 @@ NOISE_SCENES: dict[str, Callable[[], NoiseScene]] = {
     "declared discontinuities": lambda: moving(coloured_block(), [], shader=stripes)._replace(seeds=24),
     "bounces": lambda: bouncing(cornell(), "block"),
     "bounces, alpha edges": lambda: bouncing(leaf(), "leaf"),
-    "bounces, texel edges": lambda: bouncing(texels(), "block"),
+    "bounces, texel edges": lambda: bouncing(texels(), "block", 16),
 }
