@@ -185,7 +185,9 @@ TRANSFORMED: dict[str, Callable[[Callable[[Tensor], Tensor], Tensor], Tensor]] =
 }
 
 
-@pytest.mark.parametrize("name", TRANSFORMED)
+@pytest.mark.parametrize(
+    "name", ["forward mode", "vmap of gradients", pytest.param("gradient of vmap", marks=pytest.mark.slow)]
+)
 def test_transforms_that_compile_would_take_for_zero_are_refused_or_run_as_they_are(name: str):
     """torch.compile traces no derivative of an operator within forward mode or nested transforms: it would be zero."""
 

@@ -103,7 +103,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fork() as on Linux")
-@pytest.mark.parametrize("forks, more", [(2, 20), pytest.param(40, 500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("forks, more", [(1, 10), pytest.param(40, 500, marks=pytest.mark.slow)])
 def test_forked_children_render(forks, more, tmp_path):
     """Children render before and after the parent did with several threads, with threads of their own, and as workers of a
     DataLoader.

@@ -173,13 +173,13 @@ def render_too(*_):
     if time.monotonic() < end:  # only now, or a busy machine would have one handler interrupt the other, without end
         signal.setitimer(signal.ITIMER_REAL, 0.02)
 
-alone = step(size=16), [step(k, size=256) for k in range(3)]
+alone = step(size=16), [step(k, size=128) for k in range(3)]
 signal.signal(signal.SIGALRM, render_too)
-end = time.monotonic() + 1.0
+end = time.monotonic() + 0.5
 signal.setitimer(signal.ITIMER_REAL, 0.02)
 wrong = rounds = 0
 while time.monotonic() < end:
-    wrong += [step(k, size=256) for k in range(3)] != alone[1]
+    wrong += [step(k, size=128) for k in range(3)] != alone[1]
     rounds += 1
 signal.signal(signal.SIGALRM, signal.SIG_IGN)
 found |= {"rendered": len(rendered), "wrong": wrong + sum(r != alone[0] for r in rendered), "rounds": rounds}
@@ -226,7 +226,7 @@ import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests with SIGINT ignored
 
 def interrupted(kind):
-    "What becomes of a long render into which Ctrl-C comes after half a second."
+    "What becomes of a long render into which Ctrl-C comes after 0.3 s."
     before, sent = step(), []
     mesh, camera = SPHERE.replace(verts=SPHERE.verts.clone().requires_grad_()), front_camera(512 if kind == "image" else 64)
     many = {"surface samples": eg.Sampling(surface=1 << 26), "edge samples": eg.Sampling(edges=1 << 26)}.get(kind)
@@ -243,7 +243,7 @@ def interrupted(kind):
         sent.append(time.time())
         os.kill(os.getpid(), signal.SIGINT)
 
-    after, timer = None, threading.Timer(0.5, press)
+    after, timer = None, threading.Timer(0.3, press)
     timer.start()
     try:
         if image is None:
