@@ -11,9 +11,15 @@ import pytest
 import torch
 
 from benchmarks.poses import __main__ as command
+from benchmarks.poses import cases as drawing
 from benchmarks.poses import runs, sensitivity, summary
 from benchmarks.poses.kinds import cases
 from benchmarks.poses.objects import OBJECTS, Sources
+
+
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "SIDES", (72, 97))
 
 
 @pytest.mark.parametrize("kind", ["easy15", "covered", "two", "beside"])
