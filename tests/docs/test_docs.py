@@ -37,7 +37,7 @@ from edgegrad.fit.pose.result import PoseFit
 pytestmark = pytest.mark.unsanitized
 
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
-LONG = ("how-to/shape-from-depth.md", "how-to/bop.md", "how-to/training-loop.md")
+LONG = ("how-to/shape-from-depth.md", "how-to/bop.md", "how-to/calibrate.md", "how-to/training-loop.md")
 NUMBER = re.compile(r"[-−+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 TOLERANCE = 0.2
 
