@@ -82,8 +82,8 @@ def check_scene(folder: Path, file: DrawnFile) -> None:
         compare(mesh, shaded, expected, np.abs(expected.corners).max())
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(25, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("kind", "examples"), [*((kind, 40) for kind in TEXT_FORMATS), ("gltf", 60), ("3mf", 40)])
+@pytest.mark.parametrize("count", [1, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("kind", "examples"), [*((kind, 15) for kind in TEXT_FORMATS), ("gltf", 25), ("3mf", 15)])
 def test_unusual_files(tmp_path: Path, kind: str, examples: int, count: int) -> None:
     @settings(
         max_examples=count * examples, deadline=None, database=None, derandomize=True, suppress_health_check=QUIET
