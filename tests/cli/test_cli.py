@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 from cli_fixtures import run
@@ -15,7 +16,8 @@ pytestmark = [pytest.mark.quick, pytest.mark.unsanitized]
 
 def test_demo_prints_errors_and_writes_pictures(tmp_path, capsys, monkeypatch):
     pytest.importorskip("pyvista", reason="needs the extra edgegrad[demo]")
-    monkeypatch.setattr(demo, "SIZE", 96)
+    monkeypatch.setattr(demo, "SIZE", 64)
+    monkeypatch.setattr(demo, "fit_pose", partial(demo.fit_pose, search=False))
     assert run("demo", "--runs", 1, "--out", tmp_path / "demo") == 0
     said = capsys.readouterr().out
     assert "1 of 1 within 0.5° and 0.5 %" in said

@@ -1,6 +1,7 @@
 """`edgegrad fit-pose` end to end, and errors of its arguments in one line each."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import edgegrad as eg
 from edgegrad import cli
 from edgegrad.cli import outputs
 from edgegrad.files.image import linear_to_srgb, read_image, write_image
+from edgegrad.fit import fit_pose
 from edgegrad.fit.pose.result import PoseFit
 
 pytestmark = [pytest.mark.quick, pytest.mark.unsanitized]
@@ -107,12 +109,13 @@ def test_fit_pose_is_written_when_interrupted_and_resumes(files, capsys, monkeyp
         if fit.steps == 9 and not fit.interrupted:
             raise KeyboardInterrupt
 
+    monkeypatch.setattr("edgegrad.fit.fit_pose", partial(fit_pose, search=False))
     said = ["--init", files / "init.json", "--steps", 4]
     assert fit(files, *said, "--out", files / "whole") == 0
     write = outputs.write_pose
-    monkeypatch.setattr(outputs, "write_pose", write_pose)
-    assert fit(files, *said, "--resume", "--out", files / "half") == cli.INTERRUPTED
-    monkeypatch.undo()
+    with monkeypatch.context() as only_now:
+        only_now.setattr(outputs, "write_pose", write_pose)
+        assert fit(files, *said, "--resume", "--out", files / "half") == cli.INTERRUPTED
     assert found("half")["steps"] == 9 and found("half")["interrupted"] and "interrupted" in capsys.readouterr().out
     assert (files / "half" / "fit.webp").exists()
     assert fit(files, *said, "--resume", "--out", files / "half") == 0

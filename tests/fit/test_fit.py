@@ -8,19 +8,17 @@ from brackets import (
     BACKGROUND,
     CENTER,
     START,
-    about_center,
     before_sky,
     bracket,
     camera,
     errors,
     picture,
-    rotation,
     silhouette,
 )
 from quiet_fits import quiet
 
 import edgegrad as eg
-from edgegrad.fit import FitOptions, fit_pose
+from edgegrad.fit import fit_pose
 from edgegrad.fit.pose.result import PoseFit, pose_from_json
 
 pytestmark = pytest.mark.unsanitized
@@ -32,13 +30,13 @@ pytestmark = pytest.mark.unsanitized
     ids=["colour", "border", "image"],
 )
 def test_finds_the_pose(background, capsys):
-    view = camera()
+    view = camera(48)
     if background == "image":
-        background = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
+        background = torch.rand(48, 48, 3, generator=torch.Generator().manual_seed(0))
     target = picture(view, background=BACKGROUND if background is None else background)
     fit = fit_pose(eg.Scene([bracket()], background), target, view, init=START, options=quiet())
     degrees, percent = errors(fit)
-    # 64² pixels: a tenth of a pixel is 0.25 % of the size.
+    # 48² pixels: a tenth of a pixel is 0.33 % of the size.
     assert degrees < 0.5 and percent < 0.5
     assert fit.converged and not fit.interrupted and fit.scale == pytest.approx(1.0, abs=1e-9)
     assert fit.steps == len(fit.history) and fit.seconds > 0
@@ -51,8 +49,8 @@ def test_finds_the_pose(background, capsys):
 
 def test_a_start_that_is_the_answer_is_converged():
     """More steps would not find a better one."""
-    target = picture(camera())
-    fit = fit_pose(before_sky(), target, camera(), options=quiet(steps=12))
+    view = camera(48)
+    fit = fit_pose(before_sky(), picture(view), view, search=False, options=quiet(steps=12))
     assert fit.converged and errors(fit)[0] < 0.2 and errors(fit)[1] < 0.5
 
 
@@ -75,12 +73,14 @@ def test_where_gradients_are_off(mode):
         assert not torch.is_grad_enabled()
     assert torch.equal(found.R, expected.R) and torch.equal(found.t, expected.t) and found.loss == expected.loss
     assert expected.loss < 0.3 * expected.history[0].loss
+    K, start = expected.camera.K, camera(size=24).K
+    assert K[0, 0] != start[0, 0] and torch.equal(K[:2, 2], start[:2, 2].to(K))  # only the focal length was sought
 
 
 @pytest.mark.parametrize("plain", [pytest.param(False, marks=pytest.mark.slow), True], ids=["coloured", "plain"])
 def test_finds_the_pose_with_a_mask(plain):
-    view = camera()
-    clutter = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
+    view = camera(48)
+    clutter = torch.rand(48, 48, 3, generator=torch.Generator().manual_seed(0))
     fit = fit_pose(
         bracket(plain), picture(view, background=clutter), view, silhouette(view), START, options=quiet(steps=12)
     )
@@ -90,55 +90,38 @@ def test_finds_the_pose_with_a_mask(plain):
 
 
 def test_finds_the_scale():
-    view = camera()
+    view = camera(48)
     start = START.clone()
     # A larger object further away looks the same, so the depth is not fitted. Here it is right.
     forward = view.world_to_camera[2, :3]
     off = forward @ (START[:3, :3] @ CENTER + START[:3, 3] - CENTER)
     start[:3, 3] -= off * forward
     larger = bracket().transformed(torch.eye(3).double(), -0.12 * CENTER, 1.12)
-    fit = fit_pose(before_sky(), picture(view, larger), view, init=start, scale=True, options=quiet(steps=12))
+    fit = fit_pose(
+        before_sky(), picture(view, larger), view, init=start, scale=True, search=False, options=quiet(steps=12)
+    )
     degrees, percent = errors(fit)
     assert fit.scale == pytest.approx(1.12, rel=0.005)
     assert degrees < 0.5 and percent < 0.5
 
 
-def test_finds_the_focal_length():
-    near = camera(96, distance=2.6)  # perspective shows
-    K = near.K.clone()
-    K[:2, :2] *= 1.1
-    start = about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05))
-    fit = fit_pose(
-        before_sky(), picture(near.replace(K=K)), near, init=start, focal=True,
-        options=FitOptions(steps=12, seed=1, progress=False),
-    )  # fmt: skip
-    degrees, percent = errors(fit)
-    assert float(fit.camera.K[0, 0] / K[0, 0]) == pytest.approx(1.0, abs=0.02)
-    assert float(fit.camera.K[0, 2]) == float(near.K[0, 2])
-    assert degrees < 0.5 and percent < 2.0
-
-
 def test_orthographic_camera_leaves_the_depth():
-    view = eg.Camera.orthographic(CENTER + torch.tensor([1.4, 1.2, 3.5]).double(), CENTER, height=3.5, size=(64, 64))
-    fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(steps=10))
+    view = eg.Camera.orthographic(CENTER + torch.tensor([1.4, 1.2, 3.5]).double(), CENTER, height=3.5, size=(40, 40))
+    fit = fit_pose(before_sky(), picture(view), view, init=START, search=False, options=quiet(steps=10))
     degrees, _ = errors(fit)
     q = view.world_to_camera[:3, :3] @ (fit.R @ CENTER + fit.t - CENTER)
     started = view.world_to_camera[:3, :3] @ (START[:3, :3] @ CENTER + START[:3, 3] - CENTER)
     assert degrees < 0.5 and float(q[:2].norm()) < 0.01 and float(q[2] - started[2]) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_scene_of_several_meshes_moves_together():
-    view, mesh = camera(), bracket()
+def test_several_meshes_move_together_in_a_picture_larger_than_max_size():
+    view, mesh = camera(64), bracket()
     parts = [mesh.replace(faces=mesh.faces[k], face_colors=mesh.face_colors[k]) for k in (slice(0, 9), slice(9, 20))]
-    fit = fit_pose(eg.Scene(parts, BACKGROUND), picture(view), view, init=START, options=quiet(steps=10))
+    fit = fit_pose(
+        eg.Scene(parts, BACKGROUND), picture(view), view, init=START, search=False, options=quiet(max_size=32, steps=12)
+    )
+    assert max(max(step.size) for step in fit.history) == 32
     assert max(errors(fit)) < 0.5
-
-
-def test_a_picture_larger_than_max_size_is_reduced():
-    view = camera(96)
-    fit = fit_pose(before_sky(), picture(view), view, init=START, options=quiet(max_size=48, steps=12))
-    assert max(max(step.size) for step in fit.history) == 48
-    assert max(errors(fit)) < 1.0
     assert torch.equal(fit.camera.K, view.K) and fit.camera.size == view.size
 
 

@@ -16,13 +16,13 @@ from edgegrad.fit.descent.result import Fit
 from edgegrad.fit.pose.result import PoseFit, Step
 
 pytestmark = pytest.mark.unsanitized
-PICTURE = picture(camera(96))
+PICTURE = picture(camera(64))
 
 
 def small_fit(**options):
     target = options.get("images", PICTURE)
-    given = {"mesh": bracket(), "images": target, "cameras": camera(len(target)), "init": START, "steps": 6} | options
-    return fit_pose(**arranged(**given))
+    shown = {"mesh": bracket(), "images": target, "cameras": camera(len(target))}
+    return fit_pose(**arranged(**{**shown, "init": START, "search": False, "steps": 6, **options}))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def placed(rate=0.02, **options):
 
 def region(**options):
     """It may stop between two counts of the colours."""
-    view = camera(64)
+    view = camera(48)
     wanted = {"pose": PoseParameter(about_center(rotation(0.05, -0.04, 0.03), (0.1, 0.0, 0.0)))}
     given = {"loss": "region", "method": "gauss-newton", "spp": 4, "steps": 8, **options}
     return fit_scene(bracket(True), photograph(view), view, wanted, **arranged(**given))
@@ -90,9 +90,9 @@ def in_photograph(**options):
 
 
 def one_camera(**options):
-    true = camera(48)
+    true = camera(32)
     start = true.replace(world_to_camera=true.world_to_camera @ about_center(rotation(-0.05, 0.06, -0.04)))
-    return fit_camera(before_sky(), picture(true), start, **arranged(**{"steps": 4, **options}))
+    return fit_camera(before_sky(), picture(true), start, search=False, **arranged(**{"steps": 2, **options}))
 
 
 def one_lens(**options):
@@ -110,7 +110,7 @@ def after(count):
     ("fit", "stop"),
     [
         (colors, after(14)), (placed, after(6)), (partial(placed, method="gauss-newton"), after(6)), (region, after(5)),
-        (shape, after(9)), (in_photograph, after(5)), (one_camera, after(8)),
+        (shape, after(9)), (one_camera, after(4)), pytest.param(in_photograph, after(5), marks=pytest.mark.slow),
         pytest.param(one_lens, after(1), marks=pytest.mark.slow, id="first picture"),
         pytest.param(one_lens, lambda seen: len(seen[-1].searches) == 2, marks=pytest.mark.slow, id="second picture"),
     ],
@@ -140,7 +140,7 @@ def test_fits_of_every_kind_stop_and_go_on(fit, stop, tmp_path):
 
 # -- poses ------------------------------------------------------------------------------------------------------------
 
-SECOND_OPINION = {"images": picture(camera(32)).flip(1), "steps": 21, "focal": True, "seed": 3}
+SECOND_OPINION = {"images": picture(camera(32)).flip(1), "search": True, "steps": 21, "focal": True, "seed": 3}
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, uninterru
     whole = small_fit(**options) if options else uninterrupted
     if not options:
         sizes = [step.size[0] for step in whole.history]
-        assert set(sizes) == {48, 96} and sizes.count(48) > 4 and len(sizes) > 14
+        assert set(sizes) == {32, 64} and sizes.count(32) > 4 and len(sizes) > 14
     for stop in stops:
         stop %= whole.steps  # −1: the last step but the final comparison
 
@@ -190,16 +190,16 @@ def test_a_fit_that_was_killed_goes_on_from_its_last_checkpoint(uninterrupted, t
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     file = tmp_path / "fit.ckpt"
-    quick = {"steps": 1, "search": False}
+    quick = {"images": picture(camera(24)), "steps": 1}
     fit = small_fit(**quick, checkpoint=file)
-    view = camera(size=96)
+    view = camera(size=24)
     for name, value in {
         "mesh": bracket().transformed(scale=1.01),
-        "images": PICTURE + 0.01,
-        "cameras": camera(size=96, distance=4.6),
+        "images": quick["images"] + 0.01,
+        "cameras": camera(size=24, distance=4.6),
         "masks": silhouette(view),
-        "weights": torch.ones(96, 96).numpy(),
-        "depths": torch.ones(96, 96),
+        "weights": torch.ones(24, 24).numpy(),
+        "depths": torch.ones(24, 24),
         "init": torch.eye(4),
         "scale": True,
         "spp": 4,
@@ -243,5 +243,5 @@ def test_a_checkpoint_that_cannot_be_written_ends_no_fit(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.replace", replace)
     with pytest.warns(UserWarning, match=r"checkpoint: expected to write .*fit\.ckpt, got: No space left on device;"):
-        fit = small_fit(steps=1, search=False, checkpoint=tmp_path / "fit.ckpt", every=1)
+        fit = small_fit(steps=1, checkpoint=tmp_path / "fit.ckpt", every=1)
     assert fit.steps > 3 and list(tmp_path.iterdir()) == []

@@ -31,7 +31,7 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals
 
 @pytest.fixture
 def files(tmp_path):
-    return write_bracket(tmp_path, 32)
+    return write_bracket(tmp_path, 24)
 
 
 def arguments(files, out="out", steps=None):

@@ -22,14 +22,16 @@ from edgegrad.fit.views import has_levels, white_level
 @pytest.fixture(scope="module")
 def expected() -> PoseFit:
     view = camera(48)
-    return fit_pose(before_sky(), picture(view), view, init=START, options=quiet())
+    return fit_pose(before_sky(), picture(view), view, init=START, search=False, options=quiet())
 
 
-@pytest.mark.parametrize("gain", [1 / 256, pytest.param(16.0, marks=pytest.mark.slow), 256.0])
+@pytest.mark.parametrize(
+    "gain", [pytest.param(1 / 256, marks=pytest.mark.slow), pytest.param(16.0, marks=pytest.mark.slow), 256.0]
+)
 def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> None:
     """The background is given in the unit of the mesh's colours."""
     view = camera(48)
-    fit = fit_pose(before_sky(), gain * picture(view), view, init=START, options=quiet())
+    fit = fit_pose(before_sky(), gain * picture(view), view, init=START, search=False, options=quiet())
     off = errors(fit)
     assert off[0] < 0.1 and off[1] < 0.15 and fit.converged and fit.explained > 0.95, (off, fit.explained)
     assert errors(expected)[0] < 0.1 and fit.loss == pytest.approx(expected.loss, rel=0.3)
@@ -40,7 +42,7 @@ def test_a_broken_pixel_does_not_stop_a_fit() -> None:
     view = camera(48)
     image = picture(view)
     image[3, 3] = 1e5
-    fit = fit_pose(before_sky(), image, view, init=START, options=quiet())
+    fit = fit_pose(before_sky(), image, view, init=START, search=False, options=quiet())
     off = errors(fit)
     assert off[0] < 0.2 and off[1] < 0.2 and fit.converged, off
 
@@ -87,7 +89,7 @@ def test_the_deviation_that_noise_leaves() -> None:
     """The root mean square of errors over the stated deviations is 1 where these are right."""
     view, ratios = camera(32), []
     clean = picture(view)
-    for seed in range(4):
+    for seed in range(3):
         noise = 0.05 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed))
         fit = fit_pose(before_sky(), clean + noise, view, init=torch.eye(4), search=False, options=quiet())
         assert fit.uncertainty is not None and fit.task is not None

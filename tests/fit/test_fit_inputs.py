@@ -166,7 +166,7 @@ def test_what_is_not_explained_is_not_blamed_on_steps(taken):
 
 @pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_picture_from_the_bottom_up_is_named(masked):
-    view = camera(64)
+    view = camera(40)
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
     options = {"masks": mask} if masked else {}
     with pytest.warns(UserWarning, match=r"^images: expected the upper row first.*image\.flip\(0\)"):

@@ -27,9 +27,9 @@ MODES = {
 }
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_pose_is_the_same_in_all_modes(masked):
-    view, mesh = camera(32), bracket()
+    view, mesh = camera(24), bracket()
     image, masks = picture(view), silhouette(view)[..., 0] if masked else None
 
     def found():
@@ -55,7 +55,7 @@ def test_colours_are_the_same_in_all_modes(mode):
 
 
 def test_a_callback_may_change_what_it_gets():
-    view, mesh = camera(24), bracket()
+    view, mesh = camera(16), bracket()
     image = picture(view)
 
     def pose(fit):
@@ -69,13 +69,13 @@ def test_a_callback_may_change_what_it_gets():
             tensor.mul_(2.0)
 
     def found(callback):
-        options = quiet(steps=2, spp=4, callback=callback)
+        options = quiet(steps=1, spp=4, callback=callback)
         return fit_pose(mesh, image, view, init=START, search=False, options=options).matrix
 
     assert torch.equal(found(pose), found(None))
 
     def several(callback):
-        options = quiet(steps=2, spp=4, callback=callback)
+        options = quiet(steps=1, spp=4, callback=callback)
         return fit_poses([mesh], image, view, init=[START], search=False, options=options)[0].matrix
 
     assert torch.equal(several(lambda fits: pose(fits[0])), several(None))

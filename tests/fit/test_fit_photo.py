@@ -105,9 +105,9 @@ def test_a_camera_in_a_photograph(taken):
 
 
 def test_a_photograph_of_something_else_is_not_converged():
-    view = camera(64)
+    view = camera(40)
     for seed in (1, 3):
-        fit = fit_pose(bracket(), clutter(64, seed), view, init=START, search=False, options=quiet())
+        fit = fit_pose(bracket(), clutter(40, seed), view, init=START, search=False, options=quiet())
         assert not fit.converged and fit.reason != "converged"
 
 

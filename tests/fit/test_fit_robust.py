@@ -40,7 +40,7 @@ def test_a_quarter_covered(how, steps):
     view = camera(64)
     image, free = covered(view, picture(view))
     weights = free if how == "weight" else None
-    fit = fit_pose(before_sky(), image, view, init=START, weights=weights, options=quiet(steps=steps))
+    fit = fit_pose(before_sky(), image, view, init=START, weights=weights, search=False, options=quiet(steps=steps))
     degrees, percent = errors(fit)
     assert degrees < 1.0 and percent < 1.0, (degrees, percent)
     assert fit.converged and fit.explained > 0.5
@@ -59,7 +59,7 @@ WORN = {
 
 
 @pytest.mark.parametrize(
-    "kind", ["soft", "both", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("sharp", "compressed"))]
+    "kind", ["soft", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("sharp", "compressed", "both"))]
 )
 def test_blur_and_compression_cost_no_second_search(kind):
     """One descent is enough and ends as near."""
@@ -87,7 +87,7 @@ def lit():
 @pytest.mark.parametrize("further", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_an_unlit_mesh_in_a_lit_picture_stays_near_its_start(further):
     """The loss alone is lowest where the object is out of view: 69° and three sizes away."""
-    view = camera(64)
+    view = camera(48)
     target = picture(view, lit())
     start = about_center(rotation(0.03, -0.03, 0.02), (0.02, 0.01, 0.0))
     fit = fit_pose(before_sky(), target, view, init=start, search=further, options=quiet())
@@ -126,12 +126,12 @@ def test_what_is_not_in_the_picture_is_not_found(size, steps, most):
 
 def test_several_pictures_share_the_pose():
     """Two views separate the scale from the distance; one cannot."""
-    first = camera(48)
-    second = eg.Camera.look_at(CENTER + torch.tensor([4.0, 1.0, 0.5]).double(), CENTER, fov_y=45.0, size=(36, 48))
+    first = camera(32)
+    second = eg.Camera.look_at(CENTER + torch.tensor([4.0, 1.0, 0.5]).double(), CENTER, fov_y=45.0, size=(24, 32))
     larger = bracket().transformed(torch.eye(3).double(), -0.08 * CENTER, 1.08)
     views = [first, second]
     images = [picture(view, larger) for view in views]
-    fit = fit_pose(before_sky(), images, views, init=START, scale=True, options=quiet(steps=12))
+    fit = fit_pose(before_sky(), images, views, init=START, scale=True, search=False, options=quiet(steps=12))
     assert max(errors(fit)) < 0.5 and fit.scale == pytest.approx(1.08, rel=0.01) and fit.converged
     figure = fit.plot()
     assert len(figure.axes) == 8

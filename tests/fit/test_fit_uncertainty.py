@@ -21,7 +21,7 @@ from edgegrad.scene.symmetries import Symmetries
 
 pytestmark = pytest.mark.quick
 
-SIZE = 160
+SIZE = 128
 
 
 def vase() -> eg.Mesh:

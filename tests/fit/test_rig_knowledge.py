@@ -104,7 +104,7 @@ def test_what_no_picture_shows_is_unknown() -> None:
 
 
 def test_light_is_found_with_the_pose() -> None:
-    rig, cameras = arm(2, colored=True), views(32, 2)
+    rig, cameras = arm(2, colored=True), views(24, 2)
 
     def lit(posed: eg.Mesh, light: torch.Tensor) -> eg.Scene:
         normals = posed.vertex_normals()
@@ -117,7 +117,7 @@ def test_light_is_found_with_the_pose() -> None:
     pictures = [eg.render(lit(rig.posed(truth), light), camera, 64, 9) for camera in cameras]
     start = torch.zeros_like(light)
     start[0] = 2.0
-    options = {"seek": ["rotations"], "search": 0, "coarsest": 32, "steps": 12}
+    options = {"seek": ["rotations"], "search": 0, "coarsest": 24, "steps": 9}
     sought = {"light": Parameter(0.2, start)}
     found = fit_rig(rig, pictures, cameras, appearance=(lit, sought), **arranged(**options))
     assert math.degrees(float((found.values["rotations"] - truth).norm(dim=1).max())) < 5.0

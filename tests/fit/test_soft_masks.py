@@ -22,10 +22,10 @@ def of_object(kind, image, alpha):
     "kind", ["straight", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("before black", "photograph"))]
 )
 def test_what_a_picture_holds_at_a_soft_mask_does_not_matter(kind):
-    view = camera(64)
+    view = camera(48)
     seen = eg.render_aovs(bracket(), view, ["image", "alpha"], spp=256, seed=1 << 40)
     image = of_object(kind, seen["image"], seen["alpha"])
-    fit = fit_pose(bracket(), image, view, seen["alpha"], START, options=quiet(spp=128))
+    fit = fit_pose(bracket(), image, view, seen["alpha"], START, search=False, options=quiet(spp=128))
     degrees, percent = errors(fit)
     assert degrees < 0.08 and percent < 0.15, (degrees, percent)  # mostly 0.02 and 0.01; a hard mask: 0.7 and 0.8
 

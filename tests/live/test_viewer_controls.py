@@ -6,6 +6,7 @@ import socket
 import sys
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from live_fixtures import colour_fit, page
 
 import edgegrad as eg
 from edgegrad import cli
+from edgegrad.fit import fit_pose
 from edgegrad.live import snapshot, view
 from edgegrad.live.browser import Browser
 
@@ -172,6 +174,7 @@ def test_the_command_line_opens_it_and_saves_before_it_waits(tmp_path, monkeypat
         waited.append(np.allclose(saved, shown) and (out / "fit.png").exists())
 
     monkeypatch.setattr(view.Viewer, "wait", wait)
+    monkeypatch.setattr("edgegrad.fit.fit_pose", partial(fit_pose, search=False))
     arguments = ["fit-pose", "mesh.ply", "target.png", "--camera", "camera.json", "--steps", "3", "--size", "32"]
     monkeypatch.chdir(tmp_path)
     assert cli.main([*arguments, "--out", "out", "--view", "--port", "0"]) == 0
