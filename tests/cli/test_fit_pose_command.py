@@ -110,6 +110,7 @@ def test_fit_pose_is_written_when_interrupted_and_resumes(files, capsys, monkeyp
             raise KeyboardInterrupt
 
     monkeypatch.setattr("edgegrad.fit.fit_pose", partial(fit_pose, search=False))
+    monkeypatch.setattr("edgegrad.fit.pose.pictures.draw_animation", lambda path, fit: path.touch())  # takes long
     said = ["--init", files / "init.json", "--steps", 4]
     assert fit(files, *said, "--out", files / "whole") == 0
     write = outputs.write_pose

@@ -153,7 +153,7 @@ def test_probabilities_of_modes_are_ratios_of_gaussian_integrals():
 
 
 def test_the_same_seed_gives_the_same_modes():
-    view = camera(32)
+    view = camera(24)
     task = task_of(photograph(view), view)
 
     def modes(seed):

@@ -61,7 +61,7 @@ def test_a_pose_moves_the_mesh_and_keeps_the_camera(viewer):
 
 
 def test_a_camera_moves_before_a_scene_at_rest(viewer):
-    at = camera(48)
+    at = camera(32)
     away = at.world_to_camera.clone()
     away[0, 3] += 0.1
     fit = fit_camera(
