@@ -50,9 +50,7 @@ def test_the_history_of_a_camera(tmp_path):
     # The focal length is not fitted on blurred levels, and the last record is no step.
     assert set(history[0].gradient) == {"world_to_camera"} and not history[-1].gradient
     assert any(set(record.gradient) == {"world_to_camera", "K"} for record in history)
-    for record, step in zip(
-        history, whole.searches[0].history, strict=True
-    ):  # Norms are those of the camera's tensors.
+    for record, step in zip(history, whole.searches[0].history, strict=True):  # norms of the camera's tensors
         if step.gradient:
             both = math.hypot(step.gradient["rotation"], step.gradient["shift"])
             assert record.gradient["world_to_camera"] == pytest.approx(both)

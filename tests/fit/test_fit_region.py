@@ -71,7 +71,7 @@ def test_finds_a_camera(taken):
         world_to_camera=VIEW.world_to_camera + torch.tensor([[0.0, 0.0, 0.0, 0.15]] * 2 + [[0.0] * 4] * 2)
     )
     given = {"cameras.0.pose": PoseParameter(rotation=0.005, shift=0.005)}
-    fit = fit_scene(vase(RADII), taken, moved, given, options=quiet(loss="region", spp=4))
+    fit = fit_scene(vase(RADII), taken, moved, given, options=quiet(loss="region", spp=8))
     corners = vase(RADII).verts
     off = (fit.cameras[0].project(corners) - VIEW.project(corners)).norm(dim=-1)
     assert float((moved.project(corners) - VIEW.project(corners)).norm(dim=-1).mean()) > 4.0

@@ -83,6 +83,7 @@ def test_found_again_elsewhere_and_rotated(film):
 def test_a_broken_frame_is_named(spoil, words):
     film, found = Film.turning(32, 2, spp=8), []
     given = [film.frame(0), spoil(film.frame(1))]
+    assert not list(track(film.mesh, [], film.camera, film.poses[0], options=FitOptions(seed=0)))
     with pytest.raises((ValueError, OSError)) as caught:
         for pose in track(film.mesh, given, film.camera, film.poses[0], options=FitOptions(seed=0, spp=2)):
             found.append(pose)
