@@ -55,7 +55,7 @@ def before_cameras(scene: NoiseScene) -> NoiseScene:
     return scene._replace(camera=eg.Camera.stack([scene.camera, other]))
 
 
-@pytest.mark.parametrize("name", ["faces", "batch", "point light", "shader"])
+@pytest.mark.parametrize("name", ["faces", "batch", pytest.param("point light", marks=pytest.mark.slow), "shader"])
 def test_noise_is_that_of_many_gradients(name):
     scene = before_cameras(NOISE_SCENES["faces"]()) if name == "batch" else NOISE_SCENES[name]()
     truth = relative_noise(gradients(scene, 4, range(64)))
