@@ -4,17 +4,7 @@ import pickle
 
 import pytest
 import torch
-from brackets import (
-    BACKGROUND,
-    CENTER,
-    START,
-    before_sky,
-    bracket,
-    camera,
-    errors,
-    picture,
-    silhouette,
-)
+from brackets import BACKGROUND, CENTER, START, before_sky, bracket, camera, errors, picture, silhouette
 from quiet_fits import quiet
 
 import edgegrad as eg

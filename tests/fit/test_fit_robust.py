@@ -4,18 +4,7 @@ import warnings
 
 import pytest
 import torch
-from brackets import (
-    CENTER,
-    START,
-    about_center,
-    before_sky,
-    bracket,
-    camera,
-    errors,
-    picture,
-    rotation,
-    silhouette,
-)
+from brackets import CENTER, START, about_center, before_sky, bracket, camera, errors, picture, rotation, silhouette
 from photographs import compressed
 from quiet_fits import quiet
 
