@@ -14,11 +14,11 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import FitOptions, calibrate, fit_camera
-from edgegrad.fit.ending import Ending
 from edgegrad.fit.pose.camera_result import CameraFit, fitted
-from edgegrad.fit.pose.camera_uncertainty import CameraUncertainty, reach
 from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, PRINCIPAL
+from edgegrad.fit.pose.uncertainty import Uncertainty, reach
+from edgegrad.optim.history import Ending
 
 LENS = torch.tensor([-0.15, 0.05, 0.0, 0.0], dtype=torch.float64)
 SIMPLE = torch.tensor([-0.15, 0.0, 0.0, 0.0], dtype=torch.float64)
@@ -117,7 +117,7 @@ def checked(fit: CameraFit, true: list[eg.Camera], focal: float, center: float) 
     assert 0.02 < sum(squares) / len(squares) < 4.0
 
 
-def chi_square(found: eg.Camera, true: eg.Camera, known: CameraUncertainty | None) -> float:
+def chi_square(found: eg.Camera, true: eg.Camera, known: Uncertainty | None) -> float:
     """Return χ² / 6 of a camera's error about the middle of the bracket."""
     assert known is not None
     low, high = bracket().verts.double().aminmax(dim=0)
@@ -154,7 +154,7 @@ def test_a_calibration_that_ran_out_of_steps_names_what_is_not_known() -> None:
     """No more steps can be had, so numbers that the pictures hardly show are the reason."""
     words = "k2 known to ±1 only"
     (view,), zeros, eye = taken(1, 16), torch.zeros(2), torch.eye(3).double()
-    known = CameraUncertainty(
+    known = Uncertainty(
         torch.eye(6).double(), 1.0, torch.empty(0, 3).double(), 0.0, 5.0, principal=zeros, distortion=zeros, names=("k1", "k2"),
         vague=(words,), at_lens=1e-9 * torch.eye(6).double(),
     )  # fmt: skip

@@ -13,11 +13,11 @@ import torch
 
 from ...camera.camera import Camera
 from ...check import check_flag
+from ...optim.history import Ending
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..by_camera import one_for_each
 from ..checkpoints import checkpoint_of
-from ..ending import Ending
 from ..modes import in_full_precision
 from ..options import MIN_PICTURE_SIDE, POSE_OPTIONS, FitOptions, Settings, options_of
 from ..views import Images, cameras_of, check_image

@@ -12,14 +12,13 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...files.cameras import save_camera
 from ...files.paths import PathLike, write_figures, write_json
+from ...optim.history import Ending, Record
 from ...optional import DRAWING, require
-from ..ending import Ending
-from ..history import Record, history_rows, number_or_none
-from ..result import FitResult, chosen, made_folder
-from .camera_uncertainty import CameraUncertainty
+from ..result import FitResult, chosen, history_rows, made_folder, number_or_none
 from .pose import Pose
 from .result import PoseFit
 from .task import STEP_PARTS, PoseTask
+from .uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,15 +54,15 @@ class CameraFit(FitResult):
         return self.cameras[0]
 
     @property
-    def uncertainty(self) -> CameraUncertainty | None:
+    def uncertainty(self) -> Uncertainty | None:
         """Return the standard deviations of the first place and of the lens; None until the searches have ended."""
         return self.uncertainties[0]
 
     @property
-    def uncertainties(self) -> list[CameraUncertainty | None]:
+    def uncertainties(self) -> list[Uncertainty | None]:
         """Return the uncertainty of each place."""
         known = [search.uncertainty for search in self.searches]
-        return [one if isinstance(one, CameraUncertainty) else None for one in known]
+        return [None if one is None or one.at_lens is None else one for one in known]
 
     @property
     def history(self) -> list[Record]:
@@ -199,7 +198,7 @@ def record_of(
     return Record(number, loss, norms, {name: value.clone() for name, value in values.items()})
 
 
-def _reason(search: PoseFit, known: CameraUncertainty) -> str:
+def _reason(search: PoseFit, known: Uncertainty) -> str:
     """Return the reason of a place whose pose and lens are known to these deviations."""
     words = replace(search, uncertainty=None, converged=search.converged or bool(known.unknown)).reason
     if words != "converged" or not known.unknown:

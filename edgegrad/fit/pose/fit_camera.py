@@ -11,25 +11,24 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.lens import COEFFICIENT_COUNTS
 from ...check import check_flag, check_int
+from ...optim.history import Ending, Record
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
-from ..ending import Ending
-from ..history import Record
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
 from .bundle_adjustment import Adjustment, adjust_bundle
 from .camera_result import CameraFit, fitted, record_of
-from .camera_uncertainty import CameraUncertainty
 from .fit_pose import search_pose
 from .hypotheses import norms_of
 from .inputs import ArgumentNames
 from .likelihood.objective import PoseLevel, pose_levels
 from .likelihood.support import evidence_of
-from .result import PoseFit, Step, with_own_history
+from .result import PoseFit, Step
 from .settings import CAMERA
 from .task import Unknowns
+from .uncertainty import Uncertainty
 
 START = torch.eye(4, dtype=torch.float64)  # Cameras are searched for as poses of the scene.
 
@@ -144,7 +143,7 @@ def refined(searches: Sequence[PoseFit], settings: Settings) -> CameraFit:
 def _at_end(level: PoseLevel, end: Adjustment, k: int, search: PoseFit) -> PoseFit:
     """Return the search of place k with the pose and lens that it reached at last; `converged` says whether it rests."""
     task, pose = level.task, end.poses[k]
-    known = CameraUncertainty.from_covariance(task, pose, end.covariances[k])
+    known = Uncertainty.from_covariance(task, pose, end.covariances[k])
     lenses = [task.lens(shot.camera, pose) for shot in task.shots]
     cameras = [
         seen.replace(K=lens.K.to(seen.K), distortion=None if lens.distortion is None else lens.distortion.to(seen.K))
@@ -155,11 +154,10 @@ def _at_end(level: PoseLevel, end: Adjustment, k: int, search: PoseFit) -> PoseF
     earlier = search.history[:-1] if pose is search.history[-1].pose else search.history
     history = [*earlier, Step(level.size, search.loss, pose, True, {})]
     right = search.converged and search.explained >= search.enough and not search.conflict and not known.unknown
-    found = replace(
+    return replace(
         search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=cameras[0], cameras=cameras,
-        history=history, steps=len(history), uncertainty=known, converged=right,
+        history=map_tensors(history, Tensor.clone), steps=len(history), uncertainty=known, converged=right,
     )  # fmt: skip
-    return with_own_history(found)
 
 
 def with_coefficients(name: str, camera: object, count: object) -> Camera:

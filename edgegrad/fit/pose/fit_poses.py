@@ -14,20 +14,17 @@ from ...check import as_tensor, check_flag, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
-from ...scene.tree import map_tensors
 from ..by_camera import numbered, one_for_each
 from ..measured import depth_images
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
-from .confidence import features_of
-from .fit_pose import ambiguity, best_share, modes_of, symmetries_of
+from .fit_pose import fit_of, symmetries_of
 from .inputs import ArgumentNames, check_in_front, check_seen, warn_of_units
 from .pose import Pose, pose_from_matrix
-from .poses_search import PosesSearch
-from .result import PoseFit, with_own_history
+from .poses_search import ObjectSearch, PosesSearch
+from .result import PoseFit
 from .task import PoseTask, Unknowns
-from .uncertainty import Uncertainty
 
 INSIDE = 64  # Number of vertices of a mesh that are tested for lying in another.
 INNER_SCALE = 0.9  # At the end, they are tested at this share of their distance from their mean.
@@ -81,7 +78,7 @@ def fit_poses(
         An argument is wrong, or an object is out of the picture, or inside another one, at the start; the message names it.
     """
     settings = Settings.from_options(options, "fit_poses", POSE_OPTIONS, steps=40)
-    progress = settings.progress_of("fit", lambda: [with_own_history(one) for one in results()])
+    progress = settings.progress_of("fit", lambda: results())
     count, views = _counted(meshes), cameras_of(cameras)
     starts = _starts(init, count)
     own_masks = _masks(masks, count, views)
@@ -105,32 +102,19 @@ def fit_poses(
         check_seen(task.names.init, task.scene, [shot.camera for shot in task.shots], start)
     moved = [mesh for task, start in zip(tasks, starts, strict=True) for mesh in _moved(task, start)]
     warn_of_units(Scene(moved), [shot.camera for shot in tasks[0].shots], measured, "at the start")
-    state = PosesSearch(tasks, starts, measured, settings, check_flag("search", search), known_symmetries)
+    searches = [
+        ObjectSearch(task, start, measured, settings, further=check_flag("search", search), symmetries=own)
+        for task, start, own in zip(tasks, starts, known_symmetries, strict=True)
+    ]
+    state = PosesSearch(searches)
 
-    def results() -> list[PoseFit]:  # A callback may change their tensors in place.
-        found = []
-        for k, task in enumerate(tasks):
-            own = known_symmetries[k]
-            best = state.best[k] if own is None else state.best[k].closest(own, starts[k])
-            history, information = list(state.history[k]), state.information(k)
-            known = (
-                None if information is None else Uncertainty.from_information(task, best, information, task.dofs, own)
-            )
-            unknown = known is not None and bool(known.unknown)
-            conflict = _conflict(tasks, state.best, k) if information is not None else ""
-            conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
-            sure = state.converged[k] and not progress.interrupted and not conflict and not unknown
-            seen = [map_tensors(one, Tensor.clone) for one in views]
-            modes, evidence = modes_of(state.modes[k]), state.evidence[k]
-            features = {} if known is None or evidence is None else features_of(evidence, best_share(modes), known)
-            found.append(PoseFit(
-                best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), progress.seconds,
-                sure, progress.interrupted, state.edge_support[k], history, task, seen, known, state.visible[k], conflict,
-                state.needed[k], modes, features,
-            ))  # fmt: skip
-        return found
+    def results() -> list[PoseFit]:
+        poses = [one.best for one in searches]
+        conflicts = ["" if one.information is None else _conflict(tasks, poses, k) for k, one in enumerate(searches)]
+        return [fit_of(one, progress, views, said, one.visible) for one, said in zip(searches, conflicts, strict=True)]
 
-    state.after_step = lambda: progress.step(f"meshes[{state.seeking}], loss {state.loss:.2e}")
+    for one in searches:
+        one.after_step = lambda: progress.step(f"meshes[{state.seeking}], loss {searches[state.seeking].loss:.2e}")
     with progress:
         state.run()
     return results()

@@ -7,126 +7,97 @@ until they stay, since each pose decides what the others show.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from ...render import render
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
-from ...scene.symmetries import Symmetries
-from ..options import Settings
-from .hypotheses import HypothesisSearch, Mode, turned
+from .hypotheses import HypothesisSearch, turned
 from .likelihood.objective import pose_levels
-from .likelihood.support import Evidence, enough_support, evidence_of
+from .likelihood.support import evidence_of
 from .pose import Pose, angle
-from .pose_search import ambiguous
+from .pose_search import PoseSearch
 from .result import Step
 from .settings import CAMERA, POSE
 from .task import PoseTask
 
 
-class PosesSearch:
-    """The state of a search; lists have an entry for each object. `best` poses are valid after each step."""
+class ObjectSearch(PoseSearch):
+    """The search for one object among others."""
 
-    def __init__(
-        self, tasks: Sequence[PoseTask], starts: Sequence[Pose], depths: Sequence[Tensor | None], settings: Settings,
-        further: bool, symmetries: Sequence[Symmetries | None],
-    ) -> None:  # fmt: skip
-        self.tasks, self.starts, self.depths = tasks, list(starts), depths
-        self.settings, self.further, self.symmetries = settings, further, symmetries
-        n = len(tasks)
-        self.best, self.loss, self.seeking = list(starts), math.nan, 0
-        self.modes: list[list[Mode]] = [[] for _ in tasks]
-        self.evidence: list[Evidence | None] = [None] * n
-        self.edge_support, self.visible = [math.nan] * n, [math.nan] * n
-        self.history: list[list[Step]] = [[] for _ in tasks]
-        self.after_step: Callable[[], Any] = lambda: None
+    visible = math.nan  # share of it that the others do not hide
 
     @property
-    def needed(self) -> list[float]:
-        """The share of its edges that each object must show. The visible part of a covered one is more ambiguous."""
-        found = zip(map(enough_support, self.tasks), self.visible, strict=True)
-        return [max(enough, POSE.covered_support) if seen < POSE.unoccluded else enough for enough, seen in found]
+    def converged(self) -> bool:
+        return super().converged and self.visible >= CAMERA.least_visible
 
-    @property
-    def converged(self) -> list[bool]:
-        found = zip(self.modes, self.edge_support, self.needed, self.visible, strict=True)
-        return [
-            bool(modes) and modes[0].rests and share >= needed and seen >= CAMERA.least_visible
-            for modes, share, needed, seen in found
-        ]  # fmt: skip
-
-    @property
-    def ambiguous(self) -> list[list[Pose]]:
-        """Poses that may be the answer, too."""
-        return [ambiguous(modes) if modes else [] for modes in self.modes]
-
-    def information(self, k: int) -> Tensor | None:
-        """Return the inverse covariance (n, n) of one object's entries; None before its answer."""
-        done = self.modes[k] and not math.isnan(self.edge_support[k])
-        return self.modes[k][0].information if done else None
-
-    def run(self) -> None:
-        """Search; raise ValueError when nothing in the pictures depends on the poses."""
-        everything = range(len(self.tasks))
-        for count in range(POSE.rounds_of_objects):
-            before = list(self.best)
-            for k in everything:
-                self._seek(k, first=count == 0)
-            if all(self._near(k, before[k]) for k in everything):
-                break
-        if not any(self.modes):
-            raise ValueError("init: expected poses at which the picture changes when the objects move, got none")
-        seen = [self._uncovered(k) for k in everything]
-        for k, (task, visible) in enumerate(seen):
-            level = pose_levels(task, self.best[k], self.depths, self.settings)[-1].informed([self.best[k]])
-            self.visible[k] = visible
-            evidence = evidence_of(level.focused(self.best[k]), self.best[k])
-            self.evidence[k], self.edge_support[k] = evidence, evidence.edges
-            self.history[k].append(Step(level.size, self.loss, self.best[k], True, {}))
-
-    def _near(self, k: int, pose: Pose) -> bool:
-        apart = max(angle(self.best[k].R, pose.R), self.tasks[k].between(self.best[k], pose))
-        return apart < POSE.distinct
-
-    def _seek(self, k: int, first: bool) -> None:
-        """Find the pose of one object, while the others stay. After the `first` time it is refined on the last level alone."""
-        self.seeking = k
-        task, visible = self._uncovered(k)
-        if visible < CAMERA.least_visible:
-            return
-        poses = turned(task, self.best[k]) if first and self.further else [self.best[k]]
+    def seek(self, task: PoseTask, first: bool) -> None:
+        """Find the pose while the others stay. After the `first` time it is refined on the last level alone."""
+        poses = turned(task, self.best) if first and self.further else [self.best]
         search = HypothesisSearch(
-            task, [(self.best[k], poses)], self.depths, self.settings, self.symmetries[k], first and self.further,
+            task,
+            [(self.best, poses)],
+            self.depths,
+            self.settings,
+            self.symmetries,
+            first and self.further,
             coarse=first,
-        )  # fmt: skip
-        earlier = [step._replace(best=False) for step in self.history[k]] if self.history[k] else []
+        )
+        earlier = [step._replace(best=False) for step in self.history]
 
         def after_step() -> None:
-            self.history[k] = [*earlier, *search.history]
-            self.best[k], self.loss = search.likeliest, search.cost
+            self.history, self.best, self.loss = [*earlier, *search.history], search.likeliest, search.cost
             self.after_step()
 
         search.after_step = after_step
-        self.modes[k] = search.run() or self.modes[k]
-        if self.modes[k]:
-            self.best[k], self.loss = self.modes[k][0].pose, self.modes[k][0].cost
+        self.modes = search.run() or self.modes
+        if self.modes:
+            self.best, self.loss = self.modes[0].pose, self.modes[0].cost
+
+    def judge(self, task: PoseTask, visible: float) -> None:
+        """Say what speaks for the answer, with the others at theirs. The visible part of a covered object is more ambiguous."""
+        level = pose_levels(task, self.best, self.depths, self.settings)[-1].informed([self.best])
+        found = evidence_of(level.focused(self.best), self.best)
+        self.visible, self.edge_support, self.evidence = visible, found.edges, found if self.modes else None
+        if visible < POSE.unoccluded:
+            self.enough = max(self.enough, POSE.covered_support)
+        self.history.append(Step(level.size, self.loss, self.best, True, {}))
+
+
+class PosesSearch:
+    """The state of a search. Each object's `best` pose is valid after each step."""
+
+    def __init__(self, objects: Sequence[ObjectSearch]) -> None:
+        self.objects, self.seeking = objects, 0
+
+    def run(self) -> None:
+        """Search; raise ValueError when nothing in the pictures depends on the poses."""
+        for count in range(POSE.rounds_of_objects):
+            before = [one.best for one in self.objects]
+            for k, one in enumerate(self.objects):
+                self.seeking = k
+                task, visible = self._uncovered(k)
+                if visible >= CAMERA.least_visible:
+                    one.seek(task, first=count == 0)
+            if all(_near(one, pose) for one, pose in zip(self.objects, before, strict=True)):
+                break
+        if not any(one.modes for one in self.objects):
+            raise ValueError("init: expected poses at which the picture changes when the objects move, got none")
+        for one, seen in zip(self.objects, [self._uncovered(k) for k in range(len(self.objects))], strict=True):
+            one.judge(*seen)
 
     def _uncovered(self, k: int) -> tuple[PoseTask, float]:
         """Return the task of one object, with a weight of 0 where others that cover a part of it are seen, with a margin; and
         the share of its pixels that they leave."""
-        moved = [
-            task.scene.transformed(pose.R, pose.t, pose.scale)
-            for task, pose in zip(self.tasks, self.best, strict=True)
-        ]  # fmt: skip
-        spp, seed = self.settings.spp, self.settings.seed
+        moved = [one.task.scene.transformed(*one.best[:3]) for one in self.objects]
+        task, settings = self.objects[k].task, self.objects[k].settings
+        spp, seed = settings.spp, settings.seed
         shots, own, whole = [], 0.0, 0.0
-        for shot in self.tasks[k].shots:
+        for shot in task.shots:
             with torch.no_grad():
                 seen = render(_labelled(moved), shot.camera, spp, seed)
                 alone = render(_labelled(moved[k : k + 1]), shot.camera, spp, seed)[..., 0]
@@ -138,7 +109,11 @@ class PosesSearch:
             before = F.max_pool2d(before, 2 * margin + 1, 1, margin)[0, 0, ..., None].float()
             weight = 1.0 - before if shot.weight is None else shot.weight * (1.0 - before)
             shots.append(shot._replace(weight=weight.clamp(min=0.0)))
-        return replace(self.tasks[k], shots=shots), min(1.0, own / whole) if whole > 0.0 else 0.0
+        return replace(task, shots=shots), min(1.0, own / whole) if whole > 0.0 else 0.0
+
+
+def _near(search: ObjectSearch, pose: Pose) -> bool:
+    return max(angle(search.best.R, pose.R), search.task.between(search.best, pose)) < POSE.distinct
 
 
 def _labelled(scenes: Sequence[Scene]) -> Scene:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -14,11 +14,10 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.poses import rigid
 from ...files.paths import PathLike, write_figures, write_text
+from ...optim.history import Ending
 from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
-from ..ending import Ending, reason_of
-from ..history import number_or_none
-from ..result import FitResult, made_folder
+from ..result import FitResult, made_folder, number_or_none, reason_of
 from .confidence import POSE_CONFIDENCE
 from .pose import Pose, pose_from_matrix
 from .settings import CAMERA
@@ -195,12 +194,6 @@ class PoseFit(FitResult):
             uncertainty=known,
             features=features,
         )
-
-
-def with_own_history(fit: PoseFit) -> PoseFit:
-    """Return the fit with copies of its history's poses: a fit that goes on needs them, and a callback may change them."""
-    steps = [step._replace(pose=Pose(*(part.clone() for part in step.pose))) for step in fit.history]
-    return replace(fit, history=steps)
 
 
 def pose_from_json(text: str) -> Pose:

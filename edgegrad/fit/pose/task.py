@@ -10,13 +10,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...check import check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..by_camera import numbered
 from ..options import MIN_PICTURE_SIDE
 from ..region import VISIBLE
-from ..views import check_image, check_without_alpha, has_levels, over_black, warn_of_faint, white_level
-from .inputs import ArgumentNames, shots_of
+from ..views import check_without_alpha, has_levels, views_of, white_level
+from .inputs import ArgumentNames, without_colors
 from .pose import Pose
 from .target_images import background_of, is_clutter
 
@@ -78,48 +78,37 @@ class PoseTask:
             )
         # Autograd does not keep tensors that were made in torch.inference_mode(), so they are copied.
         scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu", copy=True)
+        scene = without_colors(scene) if images is None else scene
         plain = all(part.channels is None for part in scene.meshes)
         masked = masks is not None
-        shots, shapes, clutter, levels = [], [], False, True
-        for name, view, picture, shape, count in shots_of(images, cameras, masks, weights, names):
-            image = check_image(f"{names.images}{name}", picture, view.size)
-            levels = levels and has_levels(image)
-            if min(view.size) < MIN_PICTURE_SIDE:
+        views = views_of(cameras, images, masks, weights, names=(names.images, names.masks))
+        shots, clutter, levels = [], False, True
+        for k, view in enumerate(views):
+            name = numbered(names.masks if images is None else names.images, k, len(views))
+            if (view.image is None) != (images is None) or (view.mask is None) == masked:
+                raise ValueError(f"{name}: expected pictures, and masks, for all cameras or for none, got None for one")
+            if min(view.camera.size) < MIN_PICTURE_SIDE:
                 raise ValueError(
-                    f"{names.images}{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
-                    f"{view.size[1]} × {view.size[0]}; take a larger one"
+                    f"{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
+                    f"{view.camera.size[1]} × {view.camera.size[0]}; take a larger one"
                 )
-            if plain and not masked:
-                check_without_alpha(f"{names.images}{name}", image)
-            C = image.shape[-1] if plain else scene.channels
-            if image.shape[-1] != C:
-                raise ValueError(
-                    f"{names.images}{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
-                    f"read it with read_image(path, channels={C}), or give its alpha as the mask"
-                )
-            if count is not None:
-                count = check_image(f"weights{name}", count, view.size)
-                check_shape(f"weights{name}", count, (*view.size, 1))
-                if not bool((count >= 0).all()):
-                    raise ValueError(f"weights{name}: expected numbers from 0 up, got {float(count.min()):g}")
-            behind = None
-            if masked:
-                shape = check_image(f"{names.masks}{name}", shape, view.size)
-                check_shape(f"{names.masks}{name}", shape, (*view.size, 1))
-                shapes.append(shape)
-                image = shape if plain else torch.cat([over_black(image, shape)[0], shape], -1)
-            else:
-                behind = scene.background
-                clutter = clutter or plain  # Unknown colours cannot be compared.
-                if behind is None:
-                    clutter = clutter or is_clutter(image)
-                behind = background_of(behind, image)
-            shots.append(TargetView(view.to("cpu", torch.float64, copy=True), image, behind, count))
-        warn_of_faint(names.masks, shapes)
-        if all(shot.weight is not None and not bool((shot.weight > 0).any()) for shot in shots):
-            raise ValueError(
-                "weights: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
-            )
+            target, behind = view.mask, None
+            if (image := view.image) is not None:
+                levels = levels and has_levels(image if view.sure is None else image[view.sure[..., 0] > 0.0])
+                if plain and not masked:
+                    check_without_alpha(name, image)
+                if not plain and image.shape[-1] != (C := scene.channels):
+                    raise ValueError(
+                        f"{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
+                        f"read it with read_image(path, channels={C}), or give its alpha as the mask"
+                    )
+                if not masked:
+                    target, behind = image, background_of(scene.background, image)
+                    # Unknown colours cannot be compared.
+                    clutter = clutter or plain or (scene.background is None and is_clutter(image))
+                elif not plain:
+                    target = torch.cat([image, view.mask], -1)
+            shots.append(TargetView(view.camera.to(torch.float64), target, behind, view.weight))
         if colorless := plain and not masked:
             scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
         if clutter:
@@ -151,22 +140,18 @@ class PoseTask:
         colors = seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
         # A black object before black has no range of colours, but its mask has.
         extent = next((r for x in (colors, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
-        if shapes and not any(bool((one > 0.0).any()) for one in shapes):
-            raise ValueError(
-                f"{names.masks}: expected 1 on the object, got a mask that is black, 0 in every pixel; is it the object's mask?"
-            )
         if extent == 0.0:
             given = names.masks if masked else names.images
             raise ValueError(
                 f"{given}: expected a picture of the object, got the same in every pixel; "
                 "was it read or rendered right?"
             )
-        if shapes and (most := max(int((one > 0.0).sum()) for one in shapes)) < VISIBLE:
+        if masked and (most := max(int((shot.target[..., -1] > 0.0).sum()) for shot in shots)) < VISIBLE:
             raise ValueError(
                 f"{names.masks}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
             )
-        without_colors = scene.replace(meshes=double, background=None)
-        return PoseTask(without_colors, aovs, shots, clutter, colorless, (low + high) / 2, size, dofs, names, white)
+        bare = scene.replace(meshes=double, background=None)
+        return PoseTask(bare, aovs, shots, clutter, colorless, (low + high) / 2, size, dofs, names, white)
 
     def turned_over(self) -> PoseTask:
         """Return the task with the pictures upside down."""
