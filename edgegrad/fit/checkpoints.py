@@ -17,8 +17,8 @@ import torch
 from ..camera.camera import Camera
 from ..check import check_flag, check_positive_int
 from ..files.paths import PathLike, replacing
+from ..optim.parameter import Parameter
 from ..warnings import warn
-from .parameter import Parameter
 from .placement import Placement
 from .views import Observation
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...optim.history import Record
+from ...optim.parameter import Parameter
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
@@ -17,7 +18,6 @@ from ..checkpoints import CheckpointFile
 from ..losses import REGION
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
-from ..parameter import Parameter
 from ..placement import Coordinates, Placement, PoseParameter
 from ..row_order import check_mask_rows
 from ..views import Images, Observation, region_views, views_of

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
+from ...optim.parameter import Parameter
 from ...optim.tensors import DescentResult
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -20,7 +21,6 @@ from ..losses import REGION
 from ..measured import Measured
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
-from ..parameter import Parameter
 from ..placement import Coordinates
 from ..remeshing import count_nonmanifold_edges, remeshed
 from ..row_order import check_mask_rows

@@ -13,10 +13,10 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.poses import rigid
 from ...check import as_tensor, check_shape
+from ...optim.parameter import Parameter
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors, named_tensors, with_named
-from ..parameter import Parameter
 from ..placement import Placement, Pose, PoseParameter
 
 Values = dict[str, Any]  # tensors, and poses

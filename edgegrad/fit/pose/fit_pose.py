@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import as_int, check_flag
-from ...optim.progress import Progress
+from ...optim.loop import Progress
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_int
+from ...optim.parameter import Parameter
 from ...rig.rig import Rig
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -16,7 +17,6 @@ from ..losses import REGION
 from ..measured import Measured
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
-from ..parameter import Parameter
 from ..priors import Prior, checked_priors, towards
 from ..views import Images, region_views, views_of
 from .free_parameters import FreeParameters

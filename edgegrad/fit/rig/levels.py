@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ...aovs import render_aovs
 from ...optim.history import Ending
+from ...optim.parameter import Parameter
 from ...optim.tensors import DescentResult
 from ...rig.function import FunctionDeformer
 from ...rig.rotations import roma
@@ -29,7 +30,6 @@ from ..descent.result import RESULT_SPP, make_fit
 from ..descent.scene_builder import Built, whole_scene
 from ..losses import REGION
 from ..options import Settings
-from ..parameter import Parameter
 from ..placement import Coordinates
 from ..priors import Prior
 from ..views import Observation
