@@ -6,8 +6,7 @@ from .descent.fit_texture import fit_texture
 from .measured import Measured
 from .options import FitOptions
 from .placement import Parameter, PoseParameter
-from .pose.calibrate import calibrate
-from .pose.fit_camera import fit_camera
+from .pose.fit_camera import calibrate, fit_camera
 from .pose.fit_pose import fit_pose
 from .pose.fit_poses import fit_poses
 from .pose.track import track

@@ -68,7 +68,7 @@ class PoseTask:
 
     @staticmethod
     def from_arguments(
-        mesh: Mesh | Scene, images: Any, cameras: object, masks: Any, weights: Any, lens: Unknowns, scale: float,
+        mesh: Mesh | Scene, images: Any, cameras: Any, masks: Any, weights: Any, lens: Unknowns, scale: float,
         names: ArgumentNames,
     ) -> PoseTask:  # fmt: skip
         """Check a fit's arguments; `scale` is the mesh's at the start. Raises TypeError or ValueError."""
@@ -85,15 +85,15 @@ class PoseTask:
         shots, clutter, levels = [], False, True
         for k, view in enumerate(views):
             name = numbered(names.masks if images is None else names.images, k, len(views))
-            if (view.image is None) != (images is None) or (view.mask is None) == masked:
+            image, mask = view.image, view.mask
+            if (image is None) != (images is None) or (mask is None) == masked:
                 raise ValueError(f"{name}: expected pictures, and masks, for all cameras or for none, got None for one")
             if min(view.camera.size) < MIN_PICTURE_SIDE:
                 raise ValueError(
                     f"{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
                     f"{view.camera.size[1]} × {view.camera.size[0]}; take a larger one"
                 )
-            target, behind = view.mask, None
-            if (image := view.image) is not None:
+            if image is not None:
                 levels = levels and has_levels(image if view.sure is None else image[view.sure[..., 0] > 0.0])
                 if plain and not masked:
                     check_without_alpha(name, image)
@@ -102,12 +102,13 @@ class PoseTask:
                         f"{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
                         f"read it with read_image(path, channels={C}), or give its alpha as the mask"
                     )
-                if not masked:
-                    target, behind = image, background_of(scene.background, image)
-                    # Unknown colours cannot be compared.
-                    clutter = clutter or plain or (scene.background is None and is_clutter(image))
-                elif not plain:
-                    target = torch.cat([image, view.mask], -1)
+            if mask is None:
+                assert image is not None
+                target, behind = image, background_of(scene.background, image)
+                # Unknown colours cannot be compared.
+                clutter = clutter or plain or (scene.background is None and is_clutter(image))
+            else:
+                target, behind = mask if plain or image is None else torch.cat([image, mask], -1), None
             shots.append(TargetView(view.camera.to(torch.float64), target, behind, view.weight))
         if colorless := plain and not masked:
             scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
