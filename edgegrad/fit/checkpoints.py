@@ -127,7 +127,7 @@ class CheckpointFile:
         except OSError as error:
             warn(
                 f"checkpoint {path}",
-                f"checkpoint: expected to write {path}, got: {error.strerror or error}; the fit goes on without",
+                f"checkpoint: {path}: {error.strerror or error}; the fit goes on without",
             )
 
 

@@ -187,7 +187,7 @@ def refined(searches: Sequence[PoseFit], settings: Settings) -> CameraFit:
 
     def result(end: Adjustment) -> CameraFit:
         places = zip(searches, levels, end.poses, end.covariances, end.costs, supports, strict=True)
-        found = [_at_end(*place, ending is Ending.FLAT, alone=len(searches) == 1) for place in places]
+        found = [_at_end(*place, rests=ending is Ending.FLAT, alone=len(searches) == 1) for place in places]
         return fitted(found, ending, joint)
 
     def after_step(descents: LevenbergMarquardt[Poses]) -> None:

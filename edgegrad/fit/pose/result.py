@@ -122,9 +122,6 @@ class PoseFit(FitResult):
         """
         return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(self, most=most)
 
-    def plot_history(self) -> Figure:
-        return require("edgegrad.fit.pose.pictures", *DRAWING).curves_of(self)
-
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write pose.json, fit.png, loss.png (plot_history()) and fit.webp to a folder, and return their names.
 
