@@ -71,14 +71,15 @@ def pose_lines(fit: PoseFit) -> list[str]:
     return ["mesh to world:", *rows, *known]
 
 
-def finish(fit: Fit | CameraFit | RigFit, folder: Path) -> int:
-    """Print how a fit ended, save it, and return the exit code. Raises OSError."""
+def finish(fit: Fit | CameraFit | RigFit, folder: Path, view: Viewer | None) -> int:
+    """Print how a fit ended, save it, show it in the live view, and return the exit code. Raises OSError."""
     from . import INTERRUPTED
     from .arguments import CHECKPOINT
 
     print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", flush=True)
     written = [*fit.save(folder, figures=can_draw()), CHECKPOINT]
-    print(f"wrote {', '.join(written)} in {folder}")
+    print(f"wrote {', '.join(written)} in {folder}", flush=True)
+    wait_for_close(view, fit)
     return INTERRUPTED if fit.interrupted else 0
 
 

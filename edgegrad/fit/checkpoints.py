@@ -17,7 +17,6 @@ import torch
 from ..camera.camera import Camera
 from ..check import check_flag, check_positive_int
 from ..files.paths import PathLike, replacing
-from ..optim.parameter import Parameter
 from ..warnings import warn
 from .placement import Placement
 from .views import Observation
@@ -182,8 +181,6 @@ def _parts(value: Any) -> Any:
         for name in sorted(value):
             yield name.encode()
             yield from _parts(value[name])
-    elif isinstance(value, Parameter):
-        yield from _parts((value.lr, value.value, value.low, value.high, value.uniform))
     elif isinstance(value, Placement):
         yield from _parts((value.coordinates, value.start, value.center, value.size))
     elif isinstance(value, (tuple, list)):

@@ -213,14 +213,9 @@ def _inside(points: Tensor, mesh: Mesh) -> Tensor:
     """Return which points (n, 3) lie inside a closed mesh (n,); none lies inside an open one."""
     import trimesh  # This import takes longer than a step of a fit.
 
-    low, high = mesh.verts.double().aminmax(dim=0)
-    inside = ((points > low) & (points < high)).all(1)
     solid = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
-    if not solid.is_watertight:
-        return torch.zeros_like(inside)
-    if bool(inside.any()):
-        inside[inside.clone()] = torch.from_numpy(solid.contains(points[inside].numpy()))
-    return inside
+    inside = solid.contains(points.numpy()) if solid.is_watertight else [False] * len(points)
+    return torch.as_tensor(inside)
 
 
 def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:

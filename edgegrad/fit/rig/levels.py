@@ -33,14 +33,13 @@ from ..options import Settings
 from ..placement import Coordinates
 from ..priors import Prior
 from ..views import Observation
-from .confidence import features_of
 from .free_parameters import FreeParameters
 from .joint_support import edge_support_by_joint, left_out
 from .proposals import Proposals
 from .result import RigFit
 from .search import HypothesisSearch
 from .settings import RIG
-from .uncertainty import uncertainty_of
+from .uncertainty import features_of, uncertainty_of
 
 
 @dataclass
