@@ -89,9 +89,8 @@ class CheckpointFile:
             "images": [view.image for view in views],
             "masks": [view.mask for view in views],
             "weights": [view.weight for view in views],
+            "measured": [dict(view.measured) for view in views],
         }
-        if any(view.measured for view in views):
-            of_views["measured"] = [dict(view.measured) for view in views]
         return CheckpointFile(checkpoint, {**given, **of_views})
 
     def read(self) -> dict[str, Any] | None:

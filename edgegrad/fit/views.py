@@ -106,6 +106,7 @@ def views_of(
     weights: Images | None = None,
     measured: Mapping[str, Any] | None = None,
     names: tuple[str, str] = ("images", "masks"),
+    by_region: bool = False,
 ) -> list[Observation]:
     """Return one observation for each camera. Raises TypeError or ValueError that names the argument.
 
@@ -115,6 +116,7 @@ def views_of(
     weights   (H, W) or (H, W, 1) each, ≥ 0: how much a pixel counts
     measured  "depths", "normals" and "positions", each as measurements() takes it
     names     of the arguments images and masks
+    by_region whether the loss "region" compares them
 
     In a sequence of any of them None stands where a camera has none.
     """
@@ -144,7 +146,7 @@ def views_of(
                 f"{name}: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
             )
     warn_of_faint(names[1], [mask for mask in shapes if mask is not None])
-    return views
+    return region_views(views) if by_region else views
 
 
 def region_views(views: Sequence[Observation]) -> list[Observation]:

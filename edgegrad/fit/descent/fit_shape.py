@@ -24,7 +24,7 @@ from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..placement import Coordinates
 from ..remeshing import count_nonmanifold_edges, remeshed
 from ..row_order import check_mask_rows
-from ..views import Images, region_views, views_of
+from ..views import Images, views_of
 from .descend import Save, descend_levels, descend_views
 from .fit_scene import reporter
 from .objective import Objective
@@ -124,9 +124,7 @@ def fit_shape(
             "give Refinement(levels=1), or a sphere around the object"
         )
     measured = {"depths": depths, "normals": normals, "positions": positions}
-    views = views_of(cameras, images, masks, weights, measured)
-    if settings.loss == REGION:
-        views = region_views(views)
+    views = views_of(cameras, images, masks, weights, measured, by_region=settings.loss == REGION)
     compared = settings.loss != REGION and any(view.image is not None for view in views)
     if compared and appearance is None and mesh.channels is not None:
         warn(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -118,7 +118,7 @@ class CameraFit(FitResult):
         if self.interrupted:
             return "interrupted"
         for k, (search, known) in enumerate(zip(self.searches, self.uncertainties, strict=True)):
-            words = search.reason if known is None else _reason(search, known)
+            words = search.reason
             if words != "converged":
                 of_lens = words.startswith("not known") and known is not None and known.vague
                 return words if of_lens or len(self.searches) == 1 else f"images[{k}]: {words}"
@@ -196,15 +196,6 @@ def record_of(
     for part, norm in gradient.items():
         norms[TENSOR_OF[part]] = math.hypot(norms.get(TENSOR_OF[part], 0.0), norm)
     return Record(number, loss, norms, {name: value.clone() for name, value in values.items()})
-
-
-def _reason(search: PoseFit, known: Uncertainty) -> str:
-    """Return the reason of a place whose pose and lens are known to these deviations."""
-    words = replace(search, uncertainty=None, converged=search.converged or bool(known.unknown)).reason
-    if words != "converged" or not known.unknown:
-        return words
-    fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
-    return f"not known: {known.unknown}; {fix}"
 
 
 def _moved(camera: Camera, matrix: Tensor) -> Camera:

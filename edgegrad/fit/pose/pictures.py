@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
@@ -38,7 +37,8 @@ def draw_animation(path: PathLike, fit: PoseFit) -> None:
     step or came from JSON, OSError when the file cannot be written."""
     task = _task(fit)
     frames = []
-    for step in _frames(_best_steps(fit)):
+    best = _best_steps(fit)
+    for step in (best[k] for k in chosen(len(best), MAX_FRAMES)):
         target, image = (displayed(one).numpy() for one in overlay(task, FRAME_SIDE, FIGURE_SPP, step.pose)[0])
         font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
         panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
@@ -64,17 +64,3 @@ def _task(fit: PoseFit) -> PoseTask:
 def _best_steps(fit: PoseFit) -> list[Step]:
     """Return the best poses in turn; the last one is what the fit returned."""
     return [step for step in fit.history if step.best]
-
-
-def _frames(steps: list[Step]) -> list[Step]:
-    """Return the ends, and the steps between that moved the mesh by more than a MAX_FRAMES-th of the whole."""
-    poses = torch.stack([step.pose.matrix[:3] for step in steps])
-    remaining = poses - poses[-1]
-    # Rotation and translation count equally, each in proportion to the whole motion.
-    turn, shift = (part.flatten(1).norm(dim=1) for part in (remaining[..., :3], remaining[..., 3:]))
-    far = turn / (turn.max() + 1e-30) + shift / (shift.max() + 1e-30)
-    kept = [0]
-    for k in range(1, len(steps) - 1):
-        if abs(float(far[k] - far[kept[-1]])) > 2.0 / MAX_FRAMES:
-            kept.append(k)
-    return [steps[k] for k in kept] + ([steps[-1]] if len(steps) > 1 else [])

@@ -156,14 +156,14 @@ class PoseTask:
 
     def turned_over(self) -> PoseTask:
         """Return the task with the pictures upside down."""
+
+        def flipped(image: Tensor | None) -> Tensor | None:
+            return image if image is None or image.dim() < 3 else image.flip(0)
+
         shots = [
-            TargetView(
-                shot.camera, shot.target.flip(0),
-                shot.background.flip(0) if shot.background is not None and shot.background.dim() == 3 else shot.background,
-                None if shot.weight is None else shot.weight.flip(0),
-            )
+            TargetView(shot.camera, shot.target.flip(0), flipped(shot.background), flipped(shot.weight))
             for shot in self.shots
-        ]  # fmt: skip
+        ]
         return replace(self, shots=shots)
 
     def between(self, one: Pose, other: Pose) -> float:
