@@ -157,9 +157,5 @@ def _placement(name: str, given: PoseParameter, known: SceneTensors | None) -> P
 def build_detached(build: Build, values: Values) -> Built:
     """Build without gradients."""
     with torch.no_grad():
-        scene, cameras = build({name: _detached(value) for name, value in values.items()})
-        return scene.detach(), [map_tensors(camera, Tensor.detach) for camera in cameras]
-
-
-def _detached(value: Any) -> Any:
-    return Pose(*(part.detach() for part in value)) if isinstance(value, Pose) else value.detach()
+        built = build({name: map_tensors(value, Tensor.detach) for name, value in values.items()})
+        return map_tensors(built, Tensor.detach)

@@ -22,7 +22,7 @@ from ..views import Images, cameras_of
 from .fit_pose import fit_of, symmetries_of
 from .inputs import ArgumentNames, check_in_front, check_seen, warn_of_units
 from .pose import Pose, pose_from_matrix
-from .poses_search import ObjectSearch, PosesSearch
+from .poses_search import ObjectSearch, search_objects
 from .result import PoseFit
 from .task import PoseTask, Unknowns
 
@@ -106,17 +106,16 @@ def fit_poses(
         ObjectSearch(task, start, measured, settings, further=check_flag("search", search), symmetries=own)
         for task, start, own in zip(tasks, starts, known_symmetries, strict=True)
     ]
-    state = PosesSearch(searches)
 
     def results() -> list[PoseFit]:
         poses = [one.best for one in searches]
         conflicts = ["" if one.information is None else _conflict(tasks, poses, k) for k, one in enumerate(searches)]
         return [fit_of(one, progress, views, said, one.visible) for one, said in zip(searches, conflicts, strict=True)]
 
-    for one in searches:
-        one.after_step = lambda: progress.step(f"meshes[{state.seeking}], loss {searches[state.seeking].loss:.2e}")
+    for k, one in enumerate(searches):
+        one.after_step = lambda k=k, one=one: progress.step(f"meshes[{k}], loss {one.loss:.2e}")
     with progress:
-        state.run()
+        search_objects(searches)
     return results()
 
 

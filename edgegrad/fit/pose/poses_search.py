@@ -38,15 +38,8 @@ class ObjectSearch(PoseSearch):
     def seek(self, task: PoseTask, first: bool) -> None:
         """Find the pose while the others stay. After the `first` time it is refined on the last level alone."""
         poses = turned(task, self.best) if first and self.further else [self.best]
-        search = HypothesisSearch(
-            task,
-            [(self.best, poses)],
-            self.depths,
-            self.settings,
-            self.symmetries,
-            first and self.further,
-            coarse=first,
-        )
+        groups, further = [(self.best, poses)], first and self.further
+        search = HypothesisSearch(task, groups, self.depths, self.settings, self.symmetries, further, coarse=first)
         earlier = [step._replace(best=False) for step in self.history]
 
         def after_step() -> None:
@@ -68,48 +61,42 @@ class ObjectSearch(PoseSearch):
         self.history.append(Step(level.size, self.loss, self.best, True, {}))
 
 
-class PosesSearch:
-    """The state of a search. Each object's `best` pose is valid after each step."""
+def search_objects(objects: Sequence[ObjectSearch]) -> None:
+    """Search for all; raise ValueError when nothing in the pictures depends on the poses."""
+    for count in range(POSE.rounds_of_objects):
+        before = [one.best for one in objects]
+        for k, one in enumerate(objects):
+            task, visible = _uncovered(objects, k)
+            if visible >= CAMERA.least_visible:
+                one.seek(task, first=count == 0)
+        if all(_near(one, pose) for one, pose in zip(objects, before, strict=True)):
+            break
+    if not any(one.modes for one in objects):
+        raise ValueError("init: expected poses at which the picture changes when the objects move, got none")
+    for one, seen in zip(objects, [_uncovered(objects, k) for k in range(len(objects))], strict=True):
+        one.judge(*seen)
 
-    def __init__(self, objects: Sequence[ObjectSearch]) -> None:
-        self.objects, self.seeking = objects, 0
 
-    def run(self) -> None:
-        """Search; raise ValueError when nothing in the pictures depends on the poses."""
-        for count in range(POSE.rounds_of_objects):
-            before = [one.best for one in self.objects]
-            for k, one in enumerate(self.objects):
-                self.seeking = k
-                task, visible = self._uncovered(k)
-                if visible >= CAMERA.least_visible:
-                    one.seek(task, first=count == 0)
-            if all(_near(one, pose) for one, pose in zip(self.objects, before, strict=True)):
-                break
-        if not any(one.modes for one in self.objects):
-            raise ValueError("init: expected poses at which the picture changes when the objects move, got none")
-        for one, seen in zip(self.objects, [self._uncovered(k) for k in range(len(self.objects))], strict=True):
-            one.judge(*seen)
-
-    def _uncovered(self, k: int) -> tuple[PoseTask, float]:
-        """Return the task of one object, with a weight of 0 where others that cover a part of it are seen, with a margin; and
-        the share of its pixels that they leave."""
-        moved = [one.task.scene.transformed(*one.best[:3]) for one in self.objects]
-        task, settings = self.objects[k].task, self.objects[k].settings
-        spp, seed = settings.spp, settings.seed
-        shots, own, whole = [], 0.0, 0.0
-        for shot in task.shots:
-            with torch.no_grad():
-                seen = render(_labelled(moved), shot.camera, spp, seed)
-                alone = render(_labelled(moved[k : k + 1]), shot.camera, spp, seed)[..., 0]
-            own, whole = own + float(seen[..., k].sum()), whole + float(alone.sum())
-            hidden = alone - seen[..., k] > 0.5
-            fronts = [j for j in range(len(moved)) if j != k and float(seen[hidden][:, j].sum()) > 1.0]
-            before = seen[..., fronts].sum(-1)[None, None]
-            margin = POSE.cover_margin
-            before = F.max_pool2d(before, 2 * margin + 1, 1, margin)[0, 0, ..., None].float()
-            weight = 1.0 - before if shot.weight is None else shot.weight * (1.0 - before)
-            shots.append(shot._replace(weight=weight.clamp(min=0.0)))
-        return replace(task, shots=shots), min(1.0, own / whole) if whole > 0.0 else 0.0
+def _uncovered(objects: Sequence[ObjectSearch], k: int) -> tuple[PoseTask, float]:
+    """Return the task of one object, with a weight of 0 where others that cover a part of it are seen, with a margin; and
+    the share of its pixels that they leave."""
+    moved = [one.task.scene.transformed(*one.best[:3]) for one in objects]
+    task, settings = objects[k].task, objects[k].settings
+    spp, seed = settings.spp, settings.seed
+    shots, own, whole = [], 0.0, 0.0
+    for shot in task.shots:
+        with torch.no_grad():
+            seen = render(_labelled(moved), shot.camera, spp, seed)
+            alone = render(_labelled(moved[k : k + 1]), shot.camera, spp, seed)[..., 0]
+        own, whole = own + float(seen[..., k].sum()), whole + float(alone.sum())
+        hidden = alone - seen[..., k] > 0.5
+        fronts = [j for j in range(len(moved)) if j != k and float(seen[hidden][:, j].sum()) > 1.0]
+        before = seen[..., fronts].sum(-1)[None, None]
+        margin = POSE.cover_margin
+        before = F.max_pool2d(before, 2 * margin + 1, 1, margin)[0, 0, ..., None].float()
+        weight = 1.0 - before if shot.weight is None else shot.weight * (1.0 - before)
+        shots.append(shot._replace(weight=weight.clamp(min=0.0)))
+    return replace(task, shots=shots), min(1.0, own / whole) if whole > 0.0 else 0.0
 
 
 def _near(search: ObjectSearch, pose: Pose) -> bool:

@@ -111,7 +111,9 @@ class PoseTask:
                 target, behind = mask if plain or image is None else torch.cat([image, mask], -1), None
             shots.append(TargetView(view.camera.to(torch.float64), target, behind, view.weight))
         if colorless := plain and not masked:
-            scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
+            grey = torch.full((1, shots[0].target.shape[-1]), 0.5, dtype=torch.float32)
+            meshes = [part.replace(colors=grey.repeat(len(part.verts), 1)) for part in scene.meshes]
+            scene = scene.replace(meshes=meshes)
         if clutter:
             shots = [shot._replace(background=None) for shot in shots]
         white = 1.0
@@ -203,10 +205,6 @@ def _in_units_of_white(shots: list[TargetView], masked: bool) -> tuple[list[Targ
         behind = None if shot.background is None else shot.background / white
         found.append(shot._replace(target=target, background=behind))
     return found, white
-
-
-def _grey(mesh: Mesh, channels: int) -> Mesh:
-    return mesh.replace(colors=mesh.verts.new_full((len(mesh.verts), channels), 0.5, dtype=torch.float32))
 
 
 def focal_of(camera: Camera) -> float:

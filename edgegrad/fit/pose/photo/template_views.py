@@ -31,11 +31,6 @@ class TemplateViews:
     colors: Tensor  # (n, T, T, C), sRGB values; 1 where the mesh has no colours
     normals: Tensor  # (n, T, T, 3), in mesh axes
 
-    @property
-    def ring(self) -> int:
-        """The number of pixels around the object's box."""
-        return round(TEMPLATES.ring * self.across)
-
     @staticmethod
     def from_rotations(task: PoseTask, rotations: Tensor, pixels: int, seed: int) -> TemplateViews:
         """Render the object so many pixels large, as on the axis of the first picture's camera."""
