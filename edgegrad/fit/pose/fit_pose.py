@@ -144,8 +144,7 @@ def search_pose(
     )  # fmt: skip
 
     def keep() -> None:
-        if settings.checkpoint is not None:
-            file.write({"values": log.values, "seconds": progress.seconds})
+        file.write({"values": log.values, "seconds": progress.seconds})
 
     def after_step() -> None:
         last = state.history[-1]
@@ -205,18 +204,18 @@ def ambiguity(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None,
 
 def _check_search(search: object, init: object, cameras: Sequence[Camera], name: str) -> None:
     """Raise TypeError or ValueError for a search that does not go with the other arguments."""
-    if isinstance(search, str):
-        if search != "global":
-            raise ValueError(f"search: expected {SEARCHES}, got {search!r}")
+    if search == "global":
         if init is not None:
             raise ValueError(
                 f'search: expected a number with {name}, got "global", which searches for the object in the whole picture; '
                 f"leave {name} out, or give a number of starts around it"
             )
-        if cameras[0].projection not in ("perspective", "orthographic"):
+        if (projection := cameras[0].projection) not in ("perspective", "orthographic"):
             raise ValueError(
-                f'search: expected a perspective or orthographic camera for "global", got a {cameras[0].projection}; give {name}'
+                f'search: expected a perspective or orthographic camera for "global", got a {projection}; give {name}'
             )
+    elif isinstance(search, str):
+        raise ValueError(f"search: expected {SEARCHES}, got {search!r}")
     elif not isinstance(search, bool):
         try:
             number = as_int("search", search)

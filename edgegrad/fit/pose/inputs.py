@@ -59,8 +59,7 @@ def warn_of_scale(name: str, scene: Scene, camera: Camera) -> None:
     """Warn where a placed mesh has units other than its camera's, so that it is hardly visible."""
     verts = torch.cat([mesh.verts.double() for mesh in scene.meshes])
     low, high = verts.aminmax(dim=0)
-    view = camera.world_to_camera.double()
-    eye = -(view[:3, :3].T @ view[:3, 3])
+    eye = camera.eye.double()
     size, away = float((high - low).norm()), float((0.5 * (low + high) - eye).norm())
     where = f"it is {size:.3g} across, and its middle is {away:.3g} from the camera"
     fix = "do both have the same units? Mesh.transformed(scale=…) changes those of the mesh"

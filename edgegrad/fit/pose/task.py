@@ -82,45 +82,48 @@ class PoseTask:
         plain = all(part.channels is None for part in scene.meshes)
         masked = masks is not None
         views = views_of(cameras, images, masks, weights, names=(names.images, names.masks))
-        shots, clutter, levels = [], False, True
+        levels, pixels = True, list[Tensor]()
         for k, view in enumerate(views):
             name = numbered(names.masks if images is None else names.images, k, len(views))
-            image, mask = view.image, view.mask
-            if (image is None) != (images is None) or (mask is None) == masked:
+            if (view.image is None) != (images is None) or (view.mask is None) == masked:
                 raise ValueError(f"{name}: expected pictures, and masks, for all cameras or for none, got None for one")
             if min(view.camera.size) < MIN_PICTURE_SIDE:
                 raise ValueError(
                     f"{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
                     f"{view.camera.size[1]} × {view.camera.size[0]}; take a larger one"
                 )
-            if image is not None:
-                levels = levels and has_levels(image if view.sure is None else image[view.sure[..., 0] > 0.0])
-                if plain and not masked:
-                    check_without_alpha(name, image)
-                if not plain and image.shape[-1] != (C := scene.channels):
-                    raise ValueError(
-                        f"{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
-                        f"read it with read_image(path, channels={C}), or give its alpha as the mask"
-                    )
-            if mask is None:
-                assert image is not None
-                target, behind = image, background_of(scene.background, image)
+            if (image := view.image) is None:
+                continue
+            levels = levels and has_levels(image if view.sure is None else image[view.sure[..., 0] > 0.0])
+            pixels.append(image.flatten(0, 1) if view.mask is None else image[view.mask[..., 0] > 0.0])
+            if plain and not masked:
+                check_without_alpha(name, image)
+            if not plain and image.shape[-1] != (C := scene.channels):
+                raise ValueError(
+                    f"{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
+                    f"read it with read_image(path, channels={C}), or give its alpha as the mask"
+                )
+        # Radiance may have any unit.
+        white = 1.0 if levels or (plain and masked) else white_level(torch.cat(pixels))
+        most = max((float(view.weight.max()) for view in views if view.weight is not None), default=1.0)
+        shots, clutter = [], False
+        for view in views:
+            image, target, behind = None if view.image is None else view.image / white, view.mask, None
+            if target is None:
+                assert image is not None and view.image is not None
+                target, behind = image, background_of(scene.background, view.image) / white
                 # Unknown colours cannot be compared.
                 clutter = clutter or plain or (scene.background is None and is_clutter(image))
-            else:
-                target, behind = mask if plain or image is None else torch.cat([image, mask], -1), None
-            shots.append(TargetView(view.camera.to(torch.float64), target, behind, view.weight))
+            elif image is not None and not plain:
+                target = torch.cat([image, target], -1)
+            weight = None if view.weight is None else view.weight / most
+            shots.append(TargetView(view.camera.to(torch.float64), target, behind, weight))
+        if clutter:
+            shots = [shot._replace(background=None) for shot in shots]
         if colorless := plain and not masked:
             grey = torch.full((1, shots[0].target.shape[-1]), 0.5, dtype=torch.float32)
             meshes = [part.replace(colors=grey.repeat(len(part.verts), 1)) for part in scene.meshes]
             scene = scene.replace(meshes=meshes)
-        if clutter:
-            shots = [shot._replace(background=None) for shot in shots]
-        white = 1.0
-        if not levels and not (plain and masked):
-            shots, white = _in_units_of_white(shots, masked)
-        most = max((float(shot.weight.max()) for shot in shots if shot.weight is not None), default=1.0)
-        shots = [shot if shot.weight is None else shot._replace(weight=shot.weight / most) for shot in shots]
         aovs = ("image", "alpha") if clutter or (masked and not plain) else ("image",)
         aovs = ("alpha",) if masked and plain else aovs
 
@@ -138,12 +141,9 @@ class PoseTask:
             raise ValueError("focal: expected False with scale and an orthographic camera, where both are one")
         dofs = [0, 1, 2, 3, 4] + [5] * depth + [SCALE] * lens.scale + [FOCAL_LENGTH] * lens.focal
         dofs += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(DISTORTION, DISTORTION + lens.distortion))
-        # Pixels brighter than white, as of a light source or a defect, say nothing of the range of the others, nor does a mask.
+        # Pixels brighter than white, as of a light source or a defect, say nothing of the range of the others.
         seen = torch.cat([shot.target.flatten(0, 1) for shot in shots]).clamp(max=1.0)
-        colors = seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
-        # A black object before black has no range of colours, but its mask has.
-        extent = next((r for x in (colors, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
-        if extent == 0.0:
+        if bool((seen.amax(0) == seen.amin(0)).all()):
             given = names.masks if masked else names.images
             raise ValueError(
                 f"{given}: expected a picture of the object, got the same in every pixel; "
@@ -192,19 +192,6 @@ class PoseTask:
                 change = torch.cat([change, change.new_zeros(len(given) - len(change))])
             fields["distortion"] = change if given is None else change + F.pad(given, (0, len(change) - len(given)))
         return camera.replace(**fields)
-
-
-def _in_units_of_white(shots: list[TargetView], masked: bool) -> tuple[list[TargetView], float]:
-    """Return pictures whose white is 1, and its radiance before. `masked`: the last channel is a mask."""
-    pixels = torch.cat([shot.target.flatten(0, 1) for shot in shots])
-    white = white_level(pixels[pixels[:, -1] > 0.0, :-1] if masked else pixels)
-    found = []
-    for shot in shots:
-        target = shot.target / white
-        target = torch.cat([target[..., :-1], shot.target[..., -1:]], -1) if masked else target
-        behind = None if shot.background is None else shot.background / white
-        found.append(shot._replace(target=target, background=behind))
-    return found, white
 
 
 def focal_of(camera: Camera) -> float:
