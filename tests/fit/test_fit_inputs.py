@@ -78,12 +78,10 @@ def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
         (masks, several), ([[m] for m in masks], several), ([m[None].numpy() for m in masks], several),
     ):  # fmt: skip
         for own, expected in zip(_masks(mask, 2, [view]), masks, strict=True):
-            picture = torch.zeros(SIZE, SIZE, 3)
-            (found,) = views_of(cameras, picture, own)
+            (found,) = views_of(cameras, torch.zeros(SIZE, SIZE, 3), own)
             assert torch.equal(found.mask[..., 0], expected), (type(mask), cameras)
     for target in (torch.zeros(SIZE, SIZE, 3), np.zeros((1, SIZE, SIZE, 3)), [np.zeros((SIZE, SIZE, 3))]):
-        (found,) = views_of([view], target)
-        assert found.image.shape == (SIZE, SIZE, 3)
+        assert views_of([view], target)[0].image.shape == (SIZE, SIZE, 3)
 
 
 def test_poses_to_start_from_may_be_an_array(taken):

@@ -103,9 +103,8 @@ def test_an_unknown_focal_length_is_named() -> None:
     known = Uncertainty.from_information(given, standing(), information)
     assert known.focal == pytest.approx(0.08, rel=0.01) and known.unknown == "focal length known to ±8% only"
     information[5, 6] = information[6, 5] = 0.9 * (information[5, 5] * information[6, 6]).sqrt()
-    assert Uncertainty.from_information(given, standing(), information).focal == pytest.approx(
-        0.08 / 0.19**0.5, rel=0.03
-    )
+    known = Uncertainty.from_information(given, standing(), information)
+    assert known.focal == pytest.approx(0.08 / 0.19**0.5, rel=0.03)
     information[6, 6], information[5, 6], information[6, 5] = 1e6, 0.0, 0.0
     assert Uncertainty.from_information(given, standing(), information).unknown == ""
     assert Uncertainty.from_information(pose_alone, standing(), information[:6, :6]).focal == 0.0
