@@ -6,7 +6,7 @@
 
 A seed draws rig, pose, distance of the start, number of views, masks or pictures, their size, and whether limbs are drawn anew.
 A fit is right where all sought joints are within 2°. Seeds below 1000 train; --train prints what stands in
-edgegrad/fit/rig/confidence.py. --sensitivity prints how results change at half and twice each number of RigSettings.
+edgegrad/fit/rig/uncertainty.py. --sensitivity prints how results change at half and twice each number of RigSettings.
 """
 
 from __future__ import annotations

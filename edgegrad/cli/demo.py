@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .arguments import count, number
-from .outputs import make_folder, write_outputs
+from .outputs import can_draw, make_folder
 
 if TYPE_CHECKING:
     from ..demo import Run
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         if run.fit.interrupted:
             break
         if k == 0:
-            write_outputs(args.out, run.fit)
+            run.fit.save(args.out, figures=can_draw())
     good = sum(run.end.degrees <= demo.FOUND_WITHIN and run.end.percent <= demo.FOUND_WITHIN for run in runs)
     print(
         f"\n{good} of {len(runs)} within {demo.FOUND_WITHIN}° and {demo.FOUND_WITHIN} %; pictures of the first in {args.out}"

@@ -8,7 +8,7 @@ from typing import Any
 
 from .arguments import CHECKPOINT, add_background, add_live, add_mesh, add_out, add_resume, add_steps, add_view, number
 from .inputs import read_background, read_options, read_picture, read_scene, read_view, seen_by
-from .outputs import finish, live_view, make_folder, wait_for_close
+from .outputs import finish, live_view, make_folder
 
 
 def add(commands: Any) -> None:
@@ -55,6 +55,4 @@ def run(args: argparse.Namespace) -> int:
         print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
         if fit.uncertainty is not None:
             print(f"standard deviation: {fit.uncertainty.words}", flush=True)
-        code = finish(fit, args.out)
-        wait_for_close(view, fit)
-    return code
+        return finish(fit, args.out, view)

@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
         try:
             _print_fit(fit, args.focal)
         finally:
-            written = [*outputs.write_outputs(args.out, fit), CHECKPOINT]
+            written = [*fit.save(args.out, figures=outputs.can_draw()), CHECKPOINT]
         print(f"wrote {', '.join(written)} in {args.out}")
         outputs.wait_for_close(view, fit)
     return INTERRUPTED if fit.interrupted else 0

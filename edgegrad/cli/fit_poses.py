@@ -69,8 +69,7 @@ def run(args: argparse.Namespace) -> int:
             _print_fit(path, fit)
     finally:
         for folder, fit in zip(folders, fits, strict=True):
-            outputs.make_folder(folder)
-            outputs.write_outputs(folder, fit)
+            fit.save(folder, figures=outputs.can_draw())
     print(f"wrote {', '.join(map(str, folders))}")
     return INTERRUPTED if fits[0].interrupted else 0
 

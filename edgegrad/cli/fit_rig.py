@@ -8,7 +8,7 @@ from typing import Any
 
 from .arguments import add_descent, add_label, add_live, add_views, count, number
 from .inputs import read_coverage, read_options, read_views
-from .outputs import finish, live_view, make_folder, wait_for_close
+from .outputs import finish, live_view, make_folder
 
 
 def add(commands: Any) -> None:
@@ -42,9 +42,7 @@ def run(args: argparse.Namespace) -> int:
     with live_view(args) as view:
         options = read_options(args, view, spp=args.spp, coarsest=args.coarsest)
         found = fit_rig(rig, None, cameras, masks=masks, seek=args.seek, search=args.search, options=options)
-        code = finish(found, args.out)
         unknown = "" if found.uncertainty is None else found.uncertainty.unknown
         if unknown and unknown not in found.reason:
             print(f"not determined by the masks: {unknown}", flush=True)
-        wait_for_close(view, found)
-    return code
+        return finish(found, args.out, view)

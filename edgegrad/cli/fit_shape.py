@@ -8,7 +8,7 @@ from typing import Any
 
 from .arguments import add_descent, add_label, add_live, add_views, count
 from .inputs import read_coverage, read_options, read_views
-from .outputs import finish, live_view, make_folder, wait_for_close
+from .outputs import finish, live_view, make_folder
 
 
 def add(commands: Any) -> None:
@@ -37,6 +37,4 @@ def run(args: argparse.Namespace) -> int:
         refinement = Refinement(args.levels, args.faces)
         options = read_options(args, view, spp=args.spp)
         fit = fit_shape(mesh, None, cameras, masks=masks, refinement=refinement, options=options)
-        code = finish(fit, args.out)
-        wait_for_close(view, fit)
-    return code
+        return finish(fit, args.out, view)

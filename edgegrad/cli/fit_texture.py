@@ -7,7 +7,7 @@ from typing import Any
 
 from .arguments import add_descent, add_live, add_mesh, add_views, count
 from .inputs import read_background, read_mesh, read_options, read_views
-from .outputs import finish, live_view, make_folder, wait_for_close
+from .outputs import finish, live_view, make_folder
 
 
 def add(commands: Any) -> None:
@@ -41,6 +41,4 @@ def run(args: argparse.Namespace) -> int:
             mesh, pictures, cameras, args.size, masks=masks or None, background=background,
             options=read_options(args, view, spp=args.spp),
         )  # fmt: skip
-        code = finish(fit, args.out)
-        wait_for_close(view, fit)
-    return code
+        return finish(fit, args.out, view)

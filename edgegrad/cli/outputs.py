@@ -71,41 +71,20 @@ def pose_lines(fit: PoseFit) -> list[str]:
     return ["mesh to world:", *rows, *known]
 
 
-def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
-    """Write the result and return the names of the files; without the libraries of figures the pose alone. Raises OSError that
-    names the file."""
-    from ..files.paths import write_figures
-
-    names = ["pose.json"] + ["fit.png", "loss.png", "fit.webp"] * bool(fit.history and _can_draw())
-    for name in names:
-        try:
-            if name == "pose.json":
-                write_pose(folder, fit)
-            elif name == "fit.webp":
-                from ..fit.pose.pictures import draw_animation  # matplotlib takes a while to import
-
-                draw_animation(folder / name, fit)
-            else:
-                write_figures(folder, {name: fit.plot if name == "fit.png" else fit.plot_history})
-        except OSError as error:
-            raise OSError(
-                f"{folder / name}: expected to write it, got: {error.strerror or error}; make room or rights"
-            ) from error
-    return names
-
-
-def finish(fit: Fit | CameraFit | RigFit, folder: Path) -> int:
-    """Print how a fit ended, save it, and return the exit code. Raises OSError."""
+def finish(fit: Fit | CameraFit | RigFit, folder: Path, view: Viewer | None) -> int:
+    """Print how a fit ended, save it, show it in the live view, and return the exit code. Raises OSError."""
     from . import INTERRUPTED
     from .arguments import CHECKPOINT
 
     print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", flush=True)
-    written = [*fit.save(folder, figures=_can_draw()), CHECKPOINT]
-    print(f"wrote {', '.join(written)} in {folder}")
+    written = [*fit.save(folder, figures=can_draw()), CHECKPOINT]
+    print(f"wrote {', '.join(written)} in {folder}", flush=True)
+    wait_for_close(view, fit)
     return INTERRUPTED if fit.interrupted else 0
 
 
-def _can_draw() -> bool:
+def can_draw() -> bool:
+    """Return whether the libraries of figures are there; else say so."""
     from ..optional import require
 
     try:

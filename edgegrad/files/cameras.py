@@ -36,15 +36,14 @@ def save_camera(path: PathLike, camera: Camera) -> None:
     file = check_suffix(path, (".json",))
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
-    fields = {
-        "world_to_camera": camera.world_to_camera.tolist(),
-        "K": camera.K.tolist(),
-        "size": list(camera.size),
-        "projection": camera.projection,
-    }
-    if camera.distortion is not None:
-        fields["distortion"] = camera.distortion.tolist()
-    write_json(file, fields, indent=1)
+    write_json(file, camera_fields(camera), indent=1)
+
+
+def camera_fields(camera: Camera) -> dict[str, Any]:
+    """Return a camera as JSON has it."""
+    fields = {"world_to_camera": camera.world_to_camera.tolist(), "K": camera.K.tolist(), "size": list(camera.size)}
+    lens = {} if camera.distortion is None else {"distortion": camera.distortion.tolist()}
+    return {**fields, "projection": camera.projection, **lens}
 
 
 def load_camera(
@@ -72,7 +71,7 @@ def load_camera(
             f"{path}: expected neither size nor index for a JSON file, which says its size; leave them out"
         )
     with errors_with_path(path):
-        camera = _gltf_camera(path, size, index) if is_gltf else _our_camera(_json(file))
+        camera = _gltf_camera(path, size, index) if is_gltf else camera_from_fields(_json(file))
     return _typed(path, [camera], dtype, UnreadLog())[0]
 
 
@@ -87,7 +86,7 @@ def _json(file: Path) -> Any:
         raise FormatError(f"expected JSON, got something else ({error}); export it again") from error
 
 
-def _our_camera(fields: Any) -> Camera:
+def camera_from_fields(fields: Any) -> Camera:
     """Return the camera of save_camera()'s keys in float64. Raises FormatError."""
     known = {"world_to_camera", "K", "size", "projection", "distortion"}
     try:
@@ -204,7 +203,7 @@ def _views(path: PathLike, size: tuple[int, int] | None, images: PathLike | None
         if isinstance(fields, dict) and "frames" in fields:
             return transforms.read(fields, file.parent, None if images is None else Path(images), whole, unread)
         _check_no_images(images)
-        camera = _our_camera(fields)
+        camera = camera_from_fields(fields)
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
 
 

@@ -61,7 +61,7 @@ def check_suffix(path: PathLike, suffixes: Collection[str]) -> Path:
 @contextmanager
 def replacing(path: PathLike) -> Iterator[Path]:
     """Yield a temporary file in the same folder that replaces `path` when the block succeeds and vanishes when it fails.
-    Missing folders are made. Raises OSError when that fails, ValueError when `path` is a directory."""
+    Missing folders are made. Raises OSError with the path where something fails, ValueError when `path` is a directory."""
     file = Path(path)
     if file.is_dir():
         raise ValueError(f"{path}: expected a file name, got a directory; add a name to it")
@@ -74,6 +74,9 @@ def replacing(path: PathLike) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, file)
+    except OSError as error:
+        said = f"expected to write it, got: {error.strerror or error}; make room or rights"
+        raise type(error)(error.errno, said, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -5,10 +5,8 @@ from .descent.fit_shape import Refinement, fit_shape
 from .descent.fit_texture import fit_texture
 from .measured import Measured
 from .options import FitOptions
-from .parameter import Parameter
-from .placement import PoseParameter
-from .pose.calibrate import calibrate
-from .pose.fit_camera import fit_camera
+from .placement import Parameter, PoseParameter
+from .pose.fit_camera import calibrate, fit_camera
 from .pose.fit_pose import fit_pose
 from .pose.fit_poses import fit_poses
 from .pose.track import track

@@ -18,7 +18,6 @@ from ..camera.camera import Camera
 from ..check import check_flag, check_positive_int
 from ..files.paths import PathLike, replacing
 from ..warnings import warn
-from .parameter import Parameter
 from .placement import Placement
 from .views import Observation
 
@@ -90,9 +89,8 @@ class CheckpointFile:
             "images": [view.image for view in views],
             "masks": [view.mask for view in views],
             "weights": [view.weight for view in views],
+            "measured": [dict(view.measured) for view in views],
         }
-        if any(view.measured for view in views):
-            of_views["measured"] = [dict(view.measured) for view in views]
         return CheckpointFile(checkpoint, {**given, **of_views})
 
     def read(self) -> dict[str, Any] | None:
@@ -127,7 +125,7 @@ class CheckpointFile:
         except OSError as error:
             warn(
                 f"checkpoint {path}",
-                f"checkpoint: expected to write {path}, got: {error.strerror or error}; the fit goes on without",
+                f"checkpoint: {path}: {error.strerror or error}; the fit goes on without",
             )
 
 
@@ -182,8 +180,6 @@ def _parts(value: Any) -> Any:
         for name in sorted(value):
             yield name.encode()
             yield from _parts(value[name])
-    elif isinstance(value, Parameter):
-        yield from _parts((value.lr, value.value, value.low, value.high, value.uniform))
     elif isinstance(value, Placement):
         yield from _parts((value.coordinates, value.start, value.center, value.size))
     elif isinstance(value, (tuple, list)):

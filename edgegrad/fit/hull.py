@@ -87,29 +87,26 @@ def _checked(bounds: object) -> tuple[Tensor, Tensor]:
 
 def _where_cameras_look(views: Sequence[Observation]) -> tuple[Tensor, Tensor]:
     """Return a cube around the point nearest to all optical axes, as large as what the cameras see there."""
-    eyes, axes = [], []
-    for view in views:
-        pose = view.camera.world_to_camera.double()
-        R, t = pose[:3, :3], pose[:3, 3]
-        eyes.append(-R.T @ t)
-        axes.append(R[2])
-    eye, axis = torch.stack(eyes), F.normalize(torch.stack(axes), dim=1)
+    cameras = [view.camera for view in views]
+    eye = torch.stack([camera.eye.double() for camera in cameras])
+    axis = torch.stack([camera.world_to_camera[2, :3].double() for camera in cameras])
     # The point x nearest to lines through e along a solves Σ (I − a aᵀ)(x − e) = 0.
     across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
     total = across.sum(0)
     if float(torch.linalg.eigvalsh(total)[0]) < 1e-4 * len(views):
         raise ValueError("cameras: expected some that look in different directions, got parallel ones; give bounds")
     middle = torch.linalg.solve(total, (across @ eye[:, :, None]).sum(0)[:, 0])
-    half = 0.0
-    for view in views:
-        camera = view.camera
-        depth = float(camera.world_to_camera[2, :3].double() @ middle + camera.world_to_camera[2, 3].double())
-        if camera.projection in ("perspective", "orthographic"):
-            span = max(camera.size[0] / float(camera.K[1, 1]), camera.size[1] / float(camera.K[0, 0]))
-            half = max(half, 0.5 * span * (abs(depth) if camera.projection == "perspective" else 1.0))
-        else:
-            half = max(half, abs(depth))
+    depths = (axis * (middle - eye)).sum(1).abs().tolist()
+    half = max(_half_width(camera, depth) for camera, depth in zip(cameras, depths, strict=True))
     return middle - half, middle + half
+
+
+def _half_width(camera: Camera, depth: float) -> float:
+    """Return half the width of what a camera sees at a depth."""
+    if camera.projection not in ("perspective", "orthographic"):
+        return depth
+    span = max(camera.size[0] / float(camera.K[1, 1]), camera.size[1] / float(camera.K[0, 0]))
+    return 0.5 * span * (depth if camera.projection == "perspective" else 1.0)
 
 
 def _occupied(views: Sequence[Observation], box: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

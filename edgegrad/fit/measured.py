@@ -19,9 +19,8 @@ from ..camera.camera import Camera
 from ..check import as_tensor, check_float, check_positive, check_shape
 from .by_camera import numbered, one_for_each
 
-# Arguments stand for these channels of render_aovs().
-CHANNELS = {"depths": "depth", "normals": "shading_normal", "positions": "position"}
-WIDTHS = {"depth": 1, "shading_normal": 3, "position": 3}
+# Arguments stand for these channels of render_aovs(), of so many numbers.
+CHANNELS = {"depths": ("depth", 1), "normals": ("shading_normal", 3), "positions": ("position", 3)}
 NORMAL_SCALE = 0.1  # about 6°
 SIZE_FIX = "the camera must have the picture's size: camera.resized((H, W))"
 MAD = 1.4826  # standard deviation of Gaussian noise over the median of its sizes
@@ -94,29 +93,30 @@ def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[di
     for name, value in given.items():
         if value is None:
             continue
-        trust = value if isinstance(value, Measured) else Measured(value)
-        dims = 2 if WIDTHS[CHANNELS[name]] == 1 else 3
-        pictures = one_for_each(name, trust.values, len(cameras), dims)
+        trust, (channel, width) = value if isinstance(value, Measured) else Measured(value), CHANNELS[name]
+        pictures = one_for_each(name, trust.values, len(cameras), 2 if width == 1 else 3)
         weights = one_for_each(f"weights of {name}", trust.weights, len(cameras), 2)
         checked: dict[int, tuple[Tensor, Tensor]] = {}
         for i, (picture, weight, camera) in enumerate(zip(pictures, weights, cameras, strict=True)):
             where = numbered(name, i, len(cameras))
             if picture is not None:
-                checked[i] = _checked(where, picture, weight, WIDTHS[CHANNELS[name]], camera.size)
+                checked[i] = _checked(where, picture, weight, width, camera.size)
             elif weight is not None:
                 raise ValueError(f"{where}: expected a picture with its weights, got None")
         if not any(bool((weight > 0).any()) for _, weight in checked.values()):
             raise ValueError(
                 f"{name}: expected a pixel that was measured, got none: all are 0, not finite, or have the weight 0"
             )
-        if name == "normals":
-            _check_lengths(checked)
-        scale = trust.scale
-        if scale is None:
-            scale = NORMAL_SCALE if name == "normals" else _pixel_width(name, checked, cameras)
-        for i, (picture, weight) in checked.items():
-            metric = trust.scale is None and name != "normals"
-            found[i][CHANNELS[name]] = Measurement(picture, weight, trust.factor, scale, metric)
+        longest = max(float(picture.norm(dim=-1).max()) for picture, _ in checked.values())
+        if name == "normals" and not 0.5 < longest < 1.01:
+            raise ValueError(
+                f"normals: expected vectors of length 1 in world axes, got lengths up to {longest:g}; of 8-bit numbers take "
+                "x / 127.5 − 1"
+            )
+        metric = trust.scale is None and name != "normals"
+        scale = _pixel_width(name, checked, cameras) if metric else trust.scale or NORMAL_SCALE
+        for i, measured in checked.items():
+            found[i][channel] = Measurement(*measured, trust.factor, scale, metric)
     return found
 
 
@@ -159,15 +159,6 @@ def _checked(name: str, picture: Any, weight: Any, width: int, size: tuple[int, 
         raise ValueError(f"weights of {name}: expected finite numbers from 0 up, got {float(count.min()):g}")
     known = known & (count.reshape(*size, 1) > 0)
     return value * known, count.reshape(*size, 1) * known
-
-
-def _check_lengths(pictures: Mapping[int, tuple[Tensor, Tensor]]) -> None:
-    longest = max(float(value.norm(dim=-1).max()) for value, _ in pictures.values())
-    if not 0.5 < longest < 1.01:
-        raise ValueError(
-            f"normals: expected vectors of length 1 in world axes, got lengths up to {longest:g}; of 8-bit numbers take "
-            "x / 127.5 − 1"
-        )
 
 
 def _pixel_width(name: str, pictures: Mapping[int, tuple[Tensor, Tensor]], cameras: Sequence[Camera]) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..check import check_flag, check_int, check_positive
 from ..files.paths import PathLike
-from ..optim.progress import Progress, nothing
+from ..optim.loop import Progress, nothing
 from ..sampling import Sampling, drawn_seed
 from .checkpoints import Checkpoint, checkpoint_of, saved_seed
 from .losses import REGION, Loss, loss_of

@@ -12,10 +12,10 @@ from torch import Tensor
 from ..camera.poses import check_rotation, rigid, rotation
 from ..check import as_tensor, check_finite, check_positive, check_shape
 from ..optim.history import Record
+from ..optim.parameter import Parameter as Parameter
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..scene.symmetries import Symmetries
-from .parameter import Parameter
 
 
 class Pose(NamedTuple):
@@ -176,40 +176,33 @@ class Coordinates:
     """The tensors in which a fit takes its steps, and the values, some of them poses, of which a scene is made."""
 
     def __init__(self, parameters: Mapping[str, Parameter | Placement]) -> None:
-        self.parameters: dict[str, Parameter] = {}
         self.placements = {name: p for name, p in parameters.items() if isinstance(p, Placement)}
-        for name, parameter in parameters.items():
-            if isinstance(parameter, Placement):
-                self.parameters |= {f"{name}.{part}": p for part, p in parameter.coordinates.items()}
-            else:
-                self.parameters[name] = parameter
+        self.parameters = {name: p for name, p in parameters.items() if isinstance(p, Parameter)}
+        for name, placement in self.placements.items():
+            self.parameters |= {f"{name}.{part}": p for part, p in placement.coordinates.items()}
 
     def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
         """Return a tensor, or a Pose for each PoseParameter, by the parameters' names; differentiable."""
-        poses = {name: self._pose(name, tensors) for name in self.placements}
-        typed = {n: Pose(*(part.to(self.placements[n].dtype) for part in pose[:3])) for n, pose in poses.items()}
-        return {**self._others(tensors), **typed}
+        poses = self.poses(tensors).items()
+        typed = {n: Pose(*(part.to(self.placements[n].dtype) for part in pose[:3])) for n, pose in poses}
+        return self._others(tensors) | typed
 
-    @torch.no_grad()
     def result_values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the values without gradients, poses as matrices (4, 4) float64, as results and histories hold them."""
-        others = {name: tensor.detach() for name, tensor in self._others(tensors).items()}
-        return {**others, **{name: pose.matrix for name, pose in self.poses(tensors).items()}}
+        matrices = {name: pose.matrix for name, pose in self.poses(tensors).items()}
+        return {name: value.detach() for name, value in (self._others(tensors) | matrices).items()}
 
     def recorded(self, record: Record) -> Record:
         """Return the record as histories hold it."""
         return record._replace(values=self.result_values(record.values)) if self.placements else record
 
-    @torch.no_grad()
     def poses(self, tensors: Mapping[str, Tensor]) -> dict[str, Pose]:
         """Return the poses by name, in float64."""
-        return {name: self._pose(name, tensors) for name in self.placements}
-
-    def _pose(self, name: str, tensors: Mapping[str, Tensor]) -> Pose:
-        placement = self.placements[name]
-        return placement.pose({part: tensors[f"{name}.{part}"] for part in placement.coordinates})
+        return {
+            name: placement.pose({part: tensors[f"{name}.{part}"] for part in placement.coordinates})
+            for name, placement in self.placements.items()
+        }
 
     def _others(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the tensors that are no coordinates of poses."""
-        parts = {f"{name}.{part}" for name, placement in self.placements.items() for part in placement.coordinates}
-        return {name: tensor for name, tensor in tensors.items() if name not in parts}
+        return {name: tensor for name, tensor in tensors.items() if name.rpartition(".")[0] not in self.placements}

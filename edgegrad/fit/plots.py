@@ -1,19 +1,19 @@
-"""Figures of fits by descent."""
+"""Figures of fits."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ..optim.history import Record
 from .views import displayed
 
-INK = "#303030"
+INK, GREY = "#303030", "#c4c4c4"
 
 
 def comparison(rows: Sequence[tuple[Tensor, Tensor, Tensor]], differences: bool = True) -> Figure:
@@ -38,26 +38,34 @@ def comparison(rows: Sequence[tuple[Tensor, Tensor, Tensor]], differences: bool 
     return figure
 
 
-def curves(history: Sequence[Record]) -> Figure:
-    """Draw the loss, and the norm of the gradient by each parameter."""
-    figure, axes = loss_figure([record.gradient for record in history])
-    axes.plot([record.step + 1 for record in history], [record.loss for record in history], color=INK, linewidth=1)
-    if min(record.loss for record in history) > 0.0:  # Log likelihood ratios are not.
-        axes.set_yscale("log")
-    return figure
-
-
-def loss_figure(gradients: Sequence[Mapping[str, float]]) -> tuple[Figure, Axes]:
-    """Return a figure with each norm of the gradient from step 1 on, and the axes above for the loss."""
+def curves(history: Sequence[Any]) -> Figure:
+    """Draw the loss, one colour a level of resolution, and the norm of the gradient by each parameter. Steps that did not lead to
+    the best so far are grey. Raises ValueError without a step."""
+    if not history:
+        raise ValueError("fit: expected one that took a step, got one without; draw what a fit returns, not from_json")
     figure = Figure(figsize=(6.4, 4.6), dpi=200, layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
-    for name in dict.fromkeys(name for gradient in gradients for name in gradient):
-        norms = [gradient.get(name, math.nan) for gradient in gradients]  # There are gaps where a step has none.
+    losses, steps = [record.loss for record in history], range(1, len(history) + 1)
+    levels: dict[Any, list[int]] = {}
+    for k, record in enumerate(history):
+        if getattr(record, "best", True):
+            levels.setdefault(getattr(record, "size", None), []).append(k)
+    above.plot(steps, losses, ".", color=GREY, markersize=3)
+    for at, (size, rows) in enumerate(levels.items()):
+        color = INK if size is None else colormaps["viridis"](0.85 * at / max(1, len(levels) - 1))
+        label = None if size is None else f"{size[1]} × {size[0]} px"
+        above.plot([steps[k] for k in rows], [losses[k] for k in rows], ".-", ms=3, lw=1, color=color, label=label)
+    if set(levels) != {None}:
+        above.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)
+    for name in dict.fromkeys(name for record in history for name in record.gradient):
+        norms = [record.gradient.get(name, math.nan) for record in history]  # There are gaps where a step has none.
         # A step between gaps has no line, so it is drawn as a point.
-        below.plot(range(1, len(norms) + 1), norms, ".-", markersize=3, linewidth=1, label=name)
+        below.plot(steps, norms, ".-", markersize=3, linewidth=1, label=name)
+    if min(losses) > 0.0:  # Log likelihood ratios are not.
+        above.set_yscale("log")
     below.set(yscale="log", ylabel="|gradient|", xlabel="step")
     below.legend(frameon=False, fontsize=8)
     above.set_ylabel("loss")
     for axes in (above, below):
         axes.spines[["top", "right"]].set_visible(False)
-    return figure, above
+    return figure

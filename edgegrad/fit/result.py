@@ -1,15 +1,19 @@
-"""The base of the results of all fits."""
+"""The base of the results of all fits, how they ended in words, and their steps as JSON holds them."""
 
 from __future__ import annotations
 
 import io
+import math
 import os
+from collections.abc import Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..files.paths import PathLike
+from ..optim.history import Ending, Record
 from ..optional import DRAWING, require
+from .edge_support import MIN_EDGE_SUPPORT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,3 +87,38 @@ def made_folder(folder: object) -> Path:
     except OSError as error:
         raise OSError(f"folder: expected a folder to write to, got {path} ({error.strerror})") from error
     return path
+
+
+def reason_of(
+    ending: Ending, explained: float, suspects: str = "scene, cameras or pictures", enough: float = MIN_EDGE_SUPPORT
+) -> str:
+    """Return "converged", or what kept the fit from it and, after a colon, how to mend it."""
+    if ending is Ending.INTERRUPTED:
+        return "interrupted"
+    if ending is Ending.FALLING:
+        return "loss still falling: give it more steps, or larger learning rates"
+    if explained < enough:
+        return (
+            f"edges not explained: the pictures show {explained:.0%} of the render's edges; start nearer, or look for what is "
+            f"wrong in {suspects}"
+        )
+    if ending is Ending.STEPS:
+        return "steps ran out: what is sought has not come to rest; give it more steps"
+    return "converged"
+
+
+def history_rows(history: Sequence[Record]) -> list[dict[str, Any]]:
+    """Return the records for history.json."""
+    return [
+        {
+            "step": record.step, "loss": number_or_none(record.loss),
+            "gradient": {name: number_or_none(norm) for name, norm in record.gradient.items()},
+            "values": {name: value.tolist() for name, value in record.values.items()}, "rate": record.rate,
+        }
+        for record in history
+    ]  # fmt: skip
+
+
+def number_or_none(value: float) -> float | None:
+    """Replace NaN and infinity, which JSON does not have, by None."""
+    return value if math.isfinite(value) else None

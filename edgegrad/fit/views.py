@@ -105,6 +105,8 @@ def views_of(
     masks: Images | None = None,
     weights: Images | None = None,
     measured: Mapping[str, Any] | None = None,
+    names: tuple[str, str] = ("images", "masks"),
+    by_region: bool = False,
 ) -> list[Observation]:
     """Return one observation for each camera. Raises TypeError or ValueError that names the argument.
 
@@ -113,6 +115,8 @@ def views_of(
     masks     (H, W) or (H, W, 1) each, 1 on the object and 0 elsewhere
     weights   (H, W) or (H, W, 1) each, ≥ 0: how much a pixel counts
     measured  "depths", "normals" and "positions", each as measurements() takes it
+    names     of the arguments images and masks
+    by_region whether the loss "region" compares them
 
     In a sequence of any of them None stands where a camera has none.
     """
@@ -123,26 +127,26 @@ def views_of(
             None if one is None else check_image(numbered(name, k, n), one, split[k].size)
             for k, one in enumerate(one_for_each(name, value, n, dims))
         ]
-        for name, value, dims in (("images", images, 3), ("masks", masks, 2), ("weights", weights, 2))
+        for name, value, dims in ((names[0], images, 3), (names[1], masks, 2), ("weights", weights, 2))
     )
     by_camera = measurements(measured or {}, split)
     views = []
     for i, (camera, image, mask, weight) in enumerate(zip(split, pictures, shapes, counts, strict=True)):
         if image is None and mask is None and not by_camera[i]:
             which = f" for cameras[{i}]" if any(x is not None for x in (*pictures, *shapes)) or any(by_camera) else ""
-            raise ValueError(f"images: expected pictures or masks to compare with, got neither{which}")
+            raise ValueError(f"{names[0]}: expected pictures or masks to compare with, got neither{which}")
         sure = None
         if image is not None and mask is not None:
             image, sure = over_black(image, mask)
         views.append(Observation(camera, image, mask, weight, sure, _counted(by_camera[i], mask, weight)))
-    for name, values in (("masks", shapes), ("weights", counts)):
+    for name, values in ((names[1], shapes), ("weights", counts)):
         given = [value for value in values if value is not None]
         if given and not any(bool((value > 0).any()) for value in given):
             raise ValueError(
                 f"{name}: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
             )
-    warn_of_faint("masks", [mask for mask in shapes if mask is not None])
-    return views
+    warn_of_faint(names[1], [mask for mask in shapes if mask is not None])
+    return region_views(views) if by_region else views
 
 
 def region_views(views: Sequence[Observation]) -> list[Observation]:

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from .convergence import Settling
-from .tensors import Objective, Parameter, TensorDescent, detached, gradients_of
+from .parameter import Parameter
+from .tensors import Objective, TensorDescent, detached, gradients_of
 
 BETAS = 0.9, 0.999  # decay of the means of gradients and of their squares, as the paper has them
 

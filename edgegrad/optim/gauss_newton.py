@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from .levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtSettings, Model, Problem, Rows
-from .tensors import Objective, Parameter, TensorDescent, Tensors, detached, flat, gradients_of, named
+from .parameter import Parameter
+from .tensors import Objective, TensorDescent, Tensors, detached, flat, gradients_of, named
 
 Curvature = Callable[[Tensors, int], Tensor]
 

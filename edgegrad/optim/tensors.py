@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,22 +11,11 @@ from torch import Tensor
 from .convergence import Settling
 from .history import Ending, Record
 from .loop import Loop, run
+from .parameter import Parameter
 
 COMPARISON_STEP = 2**20  # The first that gives losses which are compared their samples: no descent reaches it.
 MAX_RECORDED = 64  # numbers of a parameter whose values the history holds
 Tensors = Mapping[str, Tensor]
-
-
-class Parameter(Protocol):
-    """A tensor to find: its learning rate, where it starts, whether all its numbers have one step size, and its bounds."""
-
-    @property
-    def lr(self) -> float: ...
-    @property
-    def value(self) -> Tensor | None: ...
-    @property
-    def uniform(self) -> bool: ...
-    def within(self, value: Tensor) -> Tensor: ...
 
 
 class Objective:

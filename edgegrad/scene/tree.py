@@ -91,7 +91,7 @@ def _mapped(thing: Any, function: Callable[[Tensor], Tensor]) -> Any:
     if isinstance(thing, (tuple, list)):
         parts = [_mapped(part, function) for part in thing]
         same = all(new is old for new, old in zip(parts, thing, strict=True))
-        return thing if same else type(thing)(parts)
+        return thing if same else getattr(thing, "_make", type(thing))(parts)  # of a NamedTuple
     if not dataclasses.is_dataclass(thing) or isinstance(thing, type):
         return thing
     fields = {}

@@ -6,7 +6,8 @@ import pytest
 import small_fits
 from small_fits import RIGHT, WRONG
 
-from edgegrad.fit.ending import Ending, reason_of
+from edgegrad.fit.result import reason_of
+from edgegrad.optim.history import Ending
 
 MOST = {"adam": 260, "gauss-newton": 40}  # steps
 QUICK = {

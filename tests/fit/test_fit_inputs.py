@@ -16,8 +16,9 @@ import edgegrad as eg
 from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
 from edgegrad.fit.options import DESCENT_OPTIONS, POSE_OPTIONS, UNUSED, Settings
 from edgegrad.fit.pose.fit_poses import _masks
-from edgegrad.fit.pose.inputs import ArgumentNames, shots_of, warn_of_units
+from edgegrad.fit.pose.inputs import warn_of_units
 from edgegrad.fit.pose.settings import POSE
+from edgegrad.fit.views import views_of
 
 SIZE = 48
 QUICK = {"init": START, "search": False, "progress": False, "steps": 1, "spp": 2, "max_size": 24}
@@ -77,12 +78,10 @@ def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
         (masks, several), ([[m] for m in masks], several), ([m[None].numpy() for m in masks], several),
     ):  # fmt: skip
         for own, expected in zip(_masks(mask, 2, [view]), masks, strict=True):
-            picture = torch.zeros(SIZE, SIZE, 3)
-            ((_, _, _, found, _),) = shots_of(picture, cameras, own, None, ArgumentNames())
-            assert torch.equal(torch.as_tensor(found).reshape(SIZE, SIZE), expected), (type(mask), cameras)
+            (found,) = views_of(cameras, torch.zeros(SIZE, SIZE, 3), own)
+            assert torch.equal(found.mask[..., 0], expected), (type(mask), cameras)
     for target in (torch.zeros(SIZE, SIZE, 3), np.zeros((1, SIZE, SIZE, 3)), [np.zeros((SIZE, SIZE, 3))]):
-        ((_, _, found, _, _),) = shots_of(target, [view], None, None, ArgumentNames())
-        assert found.shape == (SIZE, SIZE, 3)
+        assert views_of([view], target)[0].image.shape == (SIZE, SIZE, 3)
 
 
 def test_poses_to_start_from_may_be_an_array(taken):

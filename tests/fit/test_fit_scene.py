@@ -13,8 +13,8 @@ from small_scenes import QUIET, pictures, views
 
 import edgegrad as eg
 from edgegrad.fit import Checkpoint, Parameter, fit_scene, losses
-from edgegrad.fit.ending import Ending
 from edgegrad.fit.laplacian import LaplacianSolver
+from edgegrad.optim.history import Ending
 
 
 def test_smooth_coordinates_have_their_gradient():

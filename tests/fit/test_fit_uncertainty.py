@@ -4,6 +4,7 @@ gives."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -63,7 +64,7 @@ def test_a_covariance_is_the_inverse_of_the_information_in_the_worlds_axes() -> 
     given = task()
     axes = camera().world_to_camera[:3, :3].double()
     deviations = torch.tensor([0.01, 0.02, 0.12, 0.001, 0.002, 0.08], dtype=torch.float64)
-    known = Uncertainty.from_information(given, standing(), torch.diag(1.0 / deviations**2), list(range(6)), None)
+    known = Uncertainty.from_information(given, standing(), torch.diag(1.0 / deviations**2))
     assert known.degrees == pytest.approx(math.degrees(0.12), rel=0.02)
     assert abs(float(known.axis @ axes[2])) == pytest.approx(1.0, abs=1e-6)
     assert known.shift == pytest.approx(0.08 * given.size, rel=0.02)
@@ -72,7 +73,7 @@ def test_a_covariance_is_the_inverse_of_the_information_in_the_worlds_axes() -> 
     # Of two directions that belong together, each is known less exactly than its entry alone says.
     information = torch.diag(1.0 / deviations**2)
     information[0, 3] = information[3, 0] = 0.9 * (information[0, 0] * information[3, 3]).sqrt()
-    both = Uncertainty.from_information(given, standing(), information, list(range(6)), None)
+    both = Uncertainty.from_information(given, standing(), information)
     expected = 0.01 / math.sqrt(1.0 - 0.9**2)
     assert float((axes @ both.covariance[:3, :3] @ axes.T)[0, 0].sqrt()) == pytest.approx(expected, rel=0.02)
 
@@ -84,30 +85,29 @@ def test_a_continuous_symmetry_makes_its_axis_known() -> None:
     information = torch.zeros(6, 6, dtype=torch.float64)
     information[:3, :3] = 1e6 * (torch.eye(3) - torch.outer(up, up))  # nothing of turns about y
     information[3:, 3:] = 1e6 * torch.eye(3)
-    known = Uncertainty.from_information(given, standing(), information, list(range(6)), None)
+    known = Uncertainty.from_information(given, standing(), information)
     assert known.degrees > 45.0 and abs(float(known.axis[1])) > 0.999
     spun = Symmetries(continuous=[Symmetries.Axis(torch.tensor([0.0, 1.0, 0.0]))])
-    free = Uncertainty.from_information(given, standing(), information, list(range(6)), spun)
+    free = Uncertainty.from_information(given, standing(), information, spun)
     assert free.degrees < 1.0 and free.unknown == ""
     other = Symmetries(continuous=[Symmetries.Axis(torch.tensor([1.0, 0.0, 0.0]))])
-    assert Uncertainty.from_information(given, standing(), information, list(range(6)), other).unknown != ""
+    assert Uncertainty.from_information(given, standing(), information, other).unknown != ""
 
 
 def test_an_unknown_focal_length_is_named() -> None:
     """Where perspective hardly shows, the focal length has the information of the distance."""
-    given = task()
-    free = [*range(6), FOCAL_LENGTH]
+    pose_alone = task()
+    given = replace(pose_alone, dofs=[*range(6), FOCAL_LENGTH])
     information = 1e6 * torch.eye(7, dtype=torch.float64)
     information[6, 6] = 1.0 / 0.08**2
-    known = Uncertainty.from_information(given, standing(), information, free, None)
+    known = Uncertainty.from_information(given, standing(), information)
     assert known.focal == pytest.approx(0.08, rel=0.01) and known.unknown == "focal length known to ±8% only"
     information[5, 6] = information[6, 5] = 0.9 * (information[5, 5] * information[6, 6]).sqrt()
-    assert Uncertainty.from_information(given, standing(), information, free, None).focal == pytest.approx(
-        0.08 / 0.19**0.5, rel=0.03
-    )
+    known = Uncertainty.from_information(given, standing(), information)
+    assert known.focal == pytest.approx(0.08 / 0.19**0.5, rel=0.03)
     information[6, 6], information[5, 6], information[6, 5] = 1e6, 0.0, 0.0
-    assert Uncertainty.from_information(given, standing(), information, free, None).unknown == ""
-    assert Uncertainty.from_information(given, standing(), information[:6, :6], free[:6], None).focal == 0.0
+    assert Uncertainty.from_information(given, standing(), information).unknown == ""
+    assert Uncertainty.from_information(pose_alone, standing(), information[:6, :6]).focal == 0.0
 
 
 def test_a_vase_is_not_converged_about_its_axis_unless_that_is_a_symmetry() -> None:

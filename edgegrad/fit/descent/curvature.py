@@ -60,7 +60,7 @@ def _weighted(
             score = (render - torch.stack([objective.views[i].wanted[name] for i in group])) * weight
         else:
             weight = regions.curvature(group, render)
-            slopes = [regions.blurred(J) for J in slopes]
+            slopes = tuple(regions.blurred(J) for J in slopes)
             # The mean of a log likelihood's squared score is its curvature.
             score = (weight * regions.shares(group)).sqrt()
         for w, s, J in zip(weight / count, score / count, slopes, strict=True):
@@ -82,30 +82,24 @@ def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> di
 
 def derivatives(
     objective: Objective, tensors: Mapping[str, Tensor], step: int
-) -> Iterator[tuple[str, list[int], Tensor, list[Tensor]]]:
+) -> Iterator[tuple[str, list[int], Tensor, tuple[Tensor, ...]]]:
     """Yield for each batch of views and channel its name, the views' indices, the channel (B, H, W, c), and its derivatives (n,
     H, W, c) by all numbers, one tensor a view. Raises TypeError where something has no forward mode."""
     options = objective.options
     try:
         (scene, cameras), tangents = _tangents(objective, {name: value.detach() for name, value in tensors.items()})
-        for group in objective.groups(objective.picks(step)):
-            aovs = objective.views[group[0]].aovs
-            images: dict[str, list[Tensor]] = {name: [] for name in aovs}
-            slopes: dict[str, list[Tensor]] = {name: [] for name in aovs}
-            for some in _together(cameras, group, tangents):
-                whole = cameras[some[0]] if len(some) == 1 else Camera.stack([cameras[i] for i in some])
-                held = {id(tensor) for tensor in (*tensors_in(scene), *tensors_in(whole))}
-                own = {tensor: tangent for tensor, tangent in tangents if id(tensor) in held}
-                if not own:
-                    continue
-                seed = objective.seed(step) + some[0]
-                found = jvp(scene, whole, own, options.spp, seed % 2**32, aovs=aovs, **options.render)
-                for name in aovs:
-                    image, J = (x if len(some) > 1 else x.unsqueeze(-4) for x in (found[0][name], found[1][name]))
-                    images[name] += image.unbind(0)
-                    slopes[name] += J.unbind(1)
-            for name in aovs if images[aovs[0]] else ():
-                yield name, group, torch.stack(images[name]), slopes[name]
+        groups = objective.groups(objective.picks(step))
+        for some in (some for group in groups for some in _together(cameras, group, tangents)):
+            whole = cameras[some[0]] if len(some) == 1 else Camera.stack([cameras[i] for i in some])
+            held = {id(tensor) for tensor in (*tensors_in(scene), *tensors_in(whole))}
+            own = {tensor: tangent for tensor, tangent in tangents if id(tensor) in held}
+            if not own:
+                continue
+            seed, aovs = (objective.seed(step) + some[0]) % 2**32, objective.views[some[0]].aovs
+            images, slopes = jvp(scene, whole, own, options.spp, seed, aovs=aovs, **options.render)
+            for name in aovs:
+                image, J = (x if len(some) > 1 else x.unsqueeze(-4) for x in (images[name], slopes[name]))
+                yield name, some, image, J.unbind(1)
     except (NotImplementedError, RuntimeError) as error:
         if "forward" not in str(error):
             raise

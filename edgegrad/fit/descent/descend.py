@@ -14,10 +14,10 @@ from ...optim.gauss_newton import GaussNewtonDescent
 from ...optim.history import Ending, Record
 from ...optim.levenberg_marquardt import LevenbergMarquardtSettings
 from ...optim.loop import Loop, nothing
+from ...optim.parameter import Parameter
 from ...optim.tensors import DescentResult, TensorDescent, descend
 from ..checkpoints import CheckpointFile
 from ..losses import REGION
-from ..parameter import Parameter
 from .curvature import MAX_NUMBERS, check_pointwise, curvature
 from .objective import Objective
 from .settings import DESCENT

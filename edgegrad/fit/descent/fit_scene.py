@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...optim.history import Record
+from ...optim.parameter import Parameter
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
@@ -17,10 +18,9 @@ from ..checkpoints import CheckpointFile
 from ..losses import REGION
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
-from ..parameter import Parameter
 from ..placement import Coordinates, Placement, PoseParameter
 from ..row_order import check_mask_rows
-from ..views import Images, Observation, region_views, views_of
+from ..views import Images, Observation, views_of
 from .descend import descend_views
 from .objective import Objective
 from .result import Fit, make_fit
@@ -122,9 +122,7 @@ def fit_scene(
         An argument is wrong; the message names it.
     """
     settings = Settings.from_options(options, "fit_scene", DESCENT_OPTIONS)
-    views = views_of(cameras, images, masks, weights)
-    if settings.loss == REGION:
-        views = region_views(views)
+    views = views_of(cameras, images, masks, weights, by_region=settings.loss == REGION)
     build, known = builder(scene, [view.camera for view in views], drop_background=masks is not None)
     wanted = checked_parameters(parameters, known)
     return fit_views(build, views, wanted, settings, {"scene": scene, "parameters": wanted}, regularizer)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
+from ...optim.parameter import Parameter
 from ...optim.tensors import DescentResult
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -20,16 +21,15 @@ from ..losses import REGION
 from ..measured import Measured
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
-from ..parameter import Parameter
 from ..placement import Coordinates
 from ..remeshing import count_nonmanifold_edges, remeshed
 from ..row_order import check_mask_rows
-from ..views import Images, Observation, region_views, views_of
+from ..views import Images, views_of
 from .descend import Save, descend_levels, descend_views
 from .fit_scene import reporter
 from .objective import Objective
 from .result import Fit, make_fit
-from .scene_builder import whole_scene
+from .scene_builder import Built, whole_scene
 from .settings import DESCENT
 
 
@@ -124,9 +124,7 @@ def fit_shape(
             "give Refinement(levels=1), or a sphere around the object"
         )
     measured = {"depths": depths, "normals": normals, "positions": positions}
-    views = views_of(cameras, images, masks, weights, measured)
-    if settings.loss == REGION:
-        views = region_views(views)
+    views = views_of(cameras, images, masks, weights, measured, by_region=settings.loss == REGION)
     compared = settings.loss != REGION and any(view.image is not None for view in views)
     if compared and appearance is None and mesh.channels is not None:
         warn(
@@ -135,68 +133,49 @@ def fit_shape(
             "by appearance=, as a function of it, or give masks in place of images",
         )
     bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())
-    return _ShapeFit(views, settings, how, appearance or (lambda mesh: mesh), masks is not None, regularizer).run(bare)
+    masked, made = masks is not None, appearance or (lambda mesh: mesh)
 
-
-class _ShapeFit:
-    """The levels of one fit."""
-
-    def __init__(
-        self, views: list[Observation], options: Settings, how: Refinement, appearance: Callable[[Mesh], Scene | Mesh],
-        masked: bool, regularizer: Callable[[Scene], Tensor] | None,
-    ) -> None:  # fmt: skip
-        self.views, self.options, self.how, self.appearance = views, options, how, appearance
-        self.masked, self.regularizer = masked, regularizer
-
-    def run(self, mesh: Mesh) -> Fit:
-        given = {"mesh": mesh, "refinement": self.how, **self.options.of_steps}
-        checkpoint = CheckpointFile.from_views(self.options.checkpoint, self.views, given)
-        last = self.how.faces or len(mesh.faces) * 4 ** (self.how.levels - 1)
-
-        def finer(values: dict[str, Tensor], level: int) -> dict[str, Tensor]:
-            made = remeshed(_mesh_of(values), round(last / 4 ** (self.how.levels - 1 - level)))
-            return {"verts": made.verts, "faces": made.faces}
-
-        whole = descend_levels(
-            checkpoint, {"verts": mesh.verts, "faces": mesh.faces}, self.how.levels, self.descend, finer
-        )
-        found = _mesh_of(whole.values)
-
-        def build(values: Mapping[str, Tensor]) -> tuple[Scene, list[Camera]]:
-            return self.scene(found.replace(verts=values["verts"])), [view.camera for view in self.views]
-
-        whole = whole._replace(values={"verts": found.verts})
-        return make_fit(Objective(build, self.views, self.options), whole, self.scene(mesh), Coordinates({}))
+    def scene(mesh: Mesh) -> Scene:
+        return whole_scene(made(mesh), masked)
 
     def descend(
-        self, values: dict[str, Tensor], level: int, save: Save, saved: Mapping[str, Any] | None
+        values: dict[str, Tensor], level: int, save: Save, saved: Mapping[str, Any] | None
     ) -> DescentResult:  # fmt: skip
         """Run one level from a mesh's `verts` and `faces`, and return the best as its values."""
-        mesh = _mesh_of(values)
+        mesh = Mesh(values["verts"], values["faces"])
         if level == 0 and saved is None:
-            check_mask_rows(self.views, self.scene(mesh), [view.camera for view in self.views])
-        smooth = LaplacianSolver(mesh.faces, len(mesh.verts), self.how.smoothness)
-        smallest = min(min(view.camera.size) for view in self.views)
-        factor = min(1.0, max(0.5 ** (self.how.levels - 1 - level), DESCENT.coarsest_pixels / smallest))
-        views = [view.resized(factor) for view in self.views]
+            check_mask_rows(views, scene(mesh), [view.camera for view in views])
+        smooth = LaplacianSolver(mesh.faces, len(mesh.verts), how.smoothness)
+        smallest = min(min(view.camera.size) for view in views)
+        factor = min(1.0, max(0.5 ** (how.levels - 1 - level), DESCENT.coarsest_pixels / smallest))
+        small = [view.resized(factor) for view in views]
         low, high = mesh.verts.aminmax(dim=0)
-        rate = self.how.lr * float((high - low).norm()) * 0.5**level
+        rate = how.lr * float((high - low).norm()) * 0.5**level
 
-        def build(values: Mapping[str, Tensor]) -> tuple[Scene, list[Camera]]:
-            return self.scene(mesh.replace(verts=smooth(values["verts"]))), [view.camera for view in views]
+        def build(values: Mapping[str, Tensor]) -> Built:
+            return scene(mesh.replace(verts=smooth(values["verts"]))), [view.camera for view in small]
 
-        objective = Objective(build, views, self.options, self.regularizer, builder="appearance")
+        objective = Objective(build, small, settings, regularizer, builder="appearance")
         first = smooth.to_differential(mesh.verts)
         if level == 0 and saved is None:
             objective.check({"verts": first})
+        title = f"level {level + 1} of {how.levels}"
         parameters = {"verts": Parameter(rate, first, uniform=True)}
-        title = f"level {level + 1} of {self.how.levels}"
-        found = descend_views(objective, parameters, save, saved, title, reporter(build, views))
+        found = descend_views(objective, parameters, save, saved, title, reporter(build, small))
         return found._replace(values={"verts": smooth(found.values["verts"]), "faces": mesh.faces})
 
-    def scene(self, mesh: Mesh) -> Scene:
-        return whole_scene(self.appearance(mesh), self.masked)
+    def finer(values: dict[str, Tensor], level: int) -> dict[str, Tensor]:
+        last = how.faces or len(bare.faces) * 4 ** (how.levels - 1)
+        found = remeshed(Mesh(values["verts"], values["faces"]), round(last / 4 ** (how.levels - 1 - level)))
+        return {"verts": found.verts, "faces": found.faces}
 
+    given = {"mesh": bare, "refinement": how, **settings.of_steps}
+    checkpoint = CheckpointFile.from_views(settings.checkpoint, views, given)
+    found = descend_levels(checkpoint, {"verts": bare.verts, "faces": bare.faces}, how.levels, descend, finer)
+    last = Mesh(found.values["verts"], found.values["faces"])
 
-def _mesh_of(values: Mapping[str, Tensor]) -> Mesh:
-    return Mesh(values["verts"], values["faces"])
+    def build(values: Mapping[str, Tensor]) -> Built:
+        return scene(last.replace(verts=values["verts"])), [view.camera for view in views]
+
+    found = found._replace(values={"verts": last.verts})
+    return make_fit(Objective(build, views, settings), found, scene(bare), Coordinates({}))

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
+from ...optim.parameter import Parameter
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..losses import REGION
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
-from ..parameter import Parameter
 from ..views import Images, views_of
 from .fit_scene import fit_views
 from .result import Fit

@@ -105,22 +105,28 @@ class RegionLoss:
 
     def loss(self, group: Sequence[int], alpha: Tensor) -> Tensor:
         """Return the sum of these views' losses at their alpha (B, H, W, 1)."""
-        P, soft = self._posteriors(group), self.blurred(alpha)
-        found = -likelihood(P, soft).double().log()
-        if (contour := self._contours(group)) is not None:
-            squares = contour.squares(soft, self._displays(group))
-            found = found + 0.5 * contour.band * (squares / (1.0 + squares / TOLERANCE)).double()
-        return (self.shares(group) * found).sum()
+        return self._terms(group, alpha)[0].sum()
 
     def curvature(self, group: Sequence[int], alpha: Tensor) -> Tensor:
         """Return the curvature (B, H, W) of loss() by each pixel's blurred alpha: Fisher's information of the region term, and
         the squared slopes of the mixture in the contour term."""
-        P, soft = self._posteriors(group), self.blurred(alpha)
-        found = slope(P, soft).square()
-        if (contour := self._contours(group)) is not None:
-            robust = (1.0 + contour.squares(soft, self._displays(group)) / TOLERANCE).pow(-2)
-            found = found + contour.band * robust * (contour.slope(soft).square() / contour.variance).sum(1)
-        return self.shares(group) * found
+        return self._terms(group, alpha)[1]
+
+    def _terms(self, group: Sequence[int], alpha: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the costs (B, H, W) of these views' pixels and their curvature. The contour counts once alpha is no longer
+        blurred widely, and all of the views have shown the object."""
+        P, soft = torch.cat([self.colors[i].posterior for i in group]), self.blurred(alpha)
+        cost, curvature = -likelihood(P, soft).double().log(), slope(P, soft).square()
+        found = [contour for i in group if (contour := self.colors[i].contour) is not None]
+        if not self.narrows and len(found) == len(group):
+            contour = ContourColors(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+            squares = contour.squares(soft, torch.cat([self.displays[i] for i in group]))
+            robust = 1.0 + squares / TOLERANCE
+            cost = cost + 0.5 * contour.band * (squares / robust).double()
+            square = (contour.slope(soft).square() / contour.variance).sum(1)
+            curvature = curvature + contour.band * robust.pow(-2) * square
+        shares = self.shares(group)
+        return shares * cost, shares * curvature
 
     def blurred(self, images: Tensor) -> Tensor:
         """Blur alpha or its derivatives (n, H, W, 1) as the loss does; return (n, H, W)."""
@@ -173,17 +179,3 @@ class RegionLoss:
                 'images: expected the object before something of another colour, as loss="region" needs, got one colour alone '
                 "where it is at the start and around it; start nearer, or look for what made the pictures black or white"
             )
-
-    def _posteriors(self, group: Sequence[int]) -> Tensor:
-        return torch.cat([self.colors[i].posterior for i in group])
-
-    def _displays(self, group: Sequence[int]) -> Tensor:
-        return torch.cat([self.displays[i] for i in group])
-
-    def _contours(self, group: Sequence[int]) -> ContourColors | None:
-        """Return the contour colours of these views; None while alpha is blurred widely, or if some view has not shown the
-        object."""
-        found = [contour for i in group if (contour := self.colors[i].contour) is not None]
-        if self.narrows or len(found) < len(group):
-            return None
-        return ContourColors(*(torch.cat(parts) for parts in zip(*found, strict=True)))

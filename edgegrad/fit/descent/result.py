@@ -22,11 +22,9 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..contour_colors import draw_contour
 from ..edge_support import MIN_EDGE_SUPPORT, edge_support
-from ..ending import reason_of
-from ..history import history_rows, number_or_none
 from ..measured import comparable
 from ..placement import Coordinates, Pose
-from ..result import FitResult, chosen, made_folder
+from ..result import FitResult, chosen, history_rows, made_folder, number_or_none, reason_of
 from ..views import Observation
 from .objective import Objective
 from .region_loss import FINAL_STEP

@@ -13,10 +13,10 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.poses import rigid
 from ...check import as_tensor, check_shape
+from ...optim.parameter import Parameter
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors, named_tensors, with_named
-from ..parameter import Parameter
 from ..placement import Placement, Pose, PoseParameter
 
 Values = dict[str, Any]  # tensors, and poses
@@ -157,9 +157,5 @@ def _placement(name: str, given: PoseParameter, known: SceneTensors | None) -> P
 def build_detached(build: Build, values: Values) -> Built:
     """Build without gradients."""
     with torch.no_grad():
-        scene, cameras = build({name: _detached(value) for name, value in values.items()})
-        return scene.detach(), [map_tensors(camera, Tensor.detach) for camera in cameras]
-
-
-def _detached(value: Any) -> Any:
-    return Pose(*(part.detach() for part in value)) if isinstance(value, Pose) else value.detach()
+        built = build({name: map_tensors(value, Tensor.detach) for name, value in values.items()})
+        return map_tensors(built, Tensor.detach)

@@ -7,22 +7,19 @@ of single pictures have lenses of their own; a step of all their models finds th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ...optim.levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtSettings, Model, Problem, Rest, minimise
+from ...optim.levenberg_marquardt import LevenbergMarquardtSettings, Model, Problem
 from .likelihood.objective import PoseLevel
 from .pose import Pose
 from .settings import CAMERA
 from .task import FOCAL_LENGTH
 
-# Poses move by at most 0.1 radians or object sizes in one step. The damping is that of steps that are taken back.
-ADJUST = LevenbergMarquardtSettings(start_damping=1e-3, least_damping=1e-6, unseen_damping=0.0, trust_radius=0.1)
 Poses = tuple[Pose, ...]
 
 
@@ -33,7 +30,6 @@ class Adjustment(NamedTuple):
     costs: list[float]  # of each place
     gradients: list[Tensor]  # (m,) of each place by its pose and the lens, the entries that its task seeks
     covariances: list[Tensor]  # (m, m)
-    short: bool = False  # The last step was short.
 
     @property
     def loss(self) -> float:
@@ -67,6 +63,15 @@ class Bundle(Problem[Poses]):
         self.entries = [torch.cat([rows, shared]) for rows in own]  # (m, n), the entries of each place's step
         self.last: Adjustment | None = None  # what was evaluated last
         self.noise: float | None = None  # pixels that count as one, at the first poses
+
+    def settings(self, most: int) -> LevenbergMarquardtSettings:
+        """Return how a descent goes on, by at most so many steps."""
+        # Poses move by at most 0.1 radians or object sizes in one step. The damping is that of steps that are taken back. The
+        # expected decrease of the cost by a step is half its square in standard deviations.
+        return LevenbergMarquardtSettings(
+            steps=most + 1, start_damping=1e-3, least_damping=1e-6, unseen_damping=0.0, trust_radius=0.1,
+            least_gain=0.5 * CAMERA.short_step**2 * self.n,
+        )  # fmt: skip
 
     def model(self, points: Sequence[Poses]) -> Model:
         (poses,) = points
@@ -125,24 +130,3 @@ class Bundle(Problem[Poses]):
         """Return the sum, by all numbers, of gradients (m,) or curvatures (m, m) by the entries of each place."""
         pairs = zip(self.entries, parts, strict=True)
         return torch.stack([E.T @ part if part.dim() == 1 else E.T @ part @ E for E, part in pairs]).sum(0)
-
-
-def adjust_bundle(
-    levels: Sequence[PoseLevel], poses: Sequence[Pose], most: int, after_step: Callable[[Adjustment], Any]
-) -> Adjustment:  # fmt: skip
-    """Return the most likely poses and lens near the given ones, after at most so many steps. `after_step` is called with the
-    best so far. Raises KeyboardInterrupt."""
-    bundle, best = Bundle(levels), []
-
-    def note(descents: LevenbergMarquardt[Poses]) -> None:
-        if bundle.last is not None and descents.descents[0].point is bundle.last.poses:
-            best[:] = [bundle.last]
-        after_step(best[0])
-
-    # The expected decrease of the cost by a step is half its square in standard deviations.
-    short = 0.5 * CAMERA.short_step**2 * bundle.n
-    settings = replace(ADJUST, steps=most + 1, least_gain=short)
-    found = minimise(bundle, [bundle.agreed(poses)], settings, note)
-    if found.interrupted:
-        raise KeyboardInterrupt
-    return best[0]._replace(short=found.descents[0].rest is Rest.SHORT)

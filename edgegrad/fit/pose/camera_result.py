@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -12,14 +12,13 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...files.cameras import save_camera
 from ...files.paths import PathLike, write_figures, write_json
+from ...optim.history import Ending, Record
 from ...optional import DRAWING, require
-from ..ending import Ending
-from ..history import Record, history_rows, number_or_none
-from ..result import FitResult, chosen, made_folder
-from .camera_uncertainty import CameraUncertainty
+from ..result import FitResult, chosen, history_rows, made_folder, number_or_none
 from .pose import Pose
 from .result import PoseFit
 from .task import STEP_PARTS, PoseTask
+from .uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,15 +54,15 @@ class CameraFit(FitResult):
         return self.cameras[0]
 
     @property
-    def uncertainty(self) -> CameraUncertainty | None:
+    def uncertainty(self) -> Uncertainty | None:
         """Return the standard deviations of the first place and of the lens; None until the searches have ended."""
         return self.uncertainties[0]
 
     @property
-    def uncertainties(self) -> list[CameraUncertainty | None]:
+    def uncertainties(self) -> list[Uncertainty | None]:
         """Return the uncertainty of each place."""
         known = [search.uncertainty for search in self.searches]
-        return [one if isinstance(one, CameraUncertainty) else None for one in known]
+        return [None if one is None or one.at_lens is None else one for one in known]
 
     @property
     def history(self) -> list[Record]:
@@ -119,7 +118,7 @@ class CameraFit(FitResult):
         if self.interrupted:
             return "interrupted"
         for k, (search, known) in enumerate(zip(self.searches, self.uncertainties, strict=True)):
-            words = search.reason if known is None else _reason(search, known)
+            words = search.reason
             if words != "converged":
                 of_lens = words.startswith("not known") and known is not None and known.vague
                 return words if of_lens or len(self.searches) == 1 else f"images[{k}]: {words}"
@@ -197,15 +196,6 @@ def record_of(
     for part, norm in gradient.items():
         norms[TENSOR_OF[part]] = math.hypot(norms.get(TENSOR_OF[part], 0.0), norm)
     return Record(number, loss, norms, {name: value.clone() for name, value in values.items()})
-
-
-def _reason(search: PoseFit, known: CameraUncertainty) -> str:
-    """Return the reason of a place whose pose and lens are known to these deviations."""
-    words = replace(search, uncertainty=None, converged=search.converged or bool(known.unknown)).reason
-    if words != "converged" or not known.unknown:
-        return words
-    fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
-    return f"not known: {known.unknown}; {fix}"
 
 
 def _moved(camera: Camera, matrix: Tensor) -> Camera:

@@ -1,4 +1,8 @@
-"""fit_camera(): where a picture of a known scene was taken, and through which lens."""
+"""fit_camera() and calibrate(): where pictures of a known scene were taken, and through which lens.
+
+Of several places, each is first searched alone, at half the resolution. Then Gauss-Newton steps move all poses and the one lens
+together (bundle_adjustment.py).
+"""
 
 from __future__ import annotations
 
@@ -11,26 +15,30 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.lens import COEFFICIENT_COUNTS
 from ...check import check_flag, check_int
+from ...optim.history import Ending, Record
+from ...optim.levenberg_marquardt import LevenbergMarquardt, Rest, minimise
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
-from ..ending import Ending
-from ..history import Record
+from ..by_camera import one_for_each
+from ..checkpoints import checkpoint_of
 from ..modes import in_full_precision
-from ..options import POSE_OPTIONS, FitOptions, Settings
-from ..views import Images, cameras_of
-from .bundle_adjustment import Adjustment, adjust_bundle
+from ..options import MIN_PICTURE_SIDE, POSE_OPTIONS, FitOptions, Settings, options_of
+from ..views import Images, cameras_of, check_image
+from .bundle_adjustment import Adjustment, Bundle, Poses
 from .camera_result import CameraFit, fitted, record_of
-from .camera_uncertainty import CameraUncertainty
 from .fit_pose import search_pose
 from .hypotheses import norms_of
 from .inputs import ArgumentNames
 from .likelihood.objective import PoseLevel, pose_levels
 from .likelihood.support import evidence_of
-from .result import PoseFit, Step, with_own_history
+from .pose import Pose
+from .result import PoseFit, Step
 from .settings import CAMERA
 from .task import Unknowns
+from .uncertainty import Uncertainty
 
+PROJECTIONS = "perspective", "fisheye"
 START = torch.eye(4, dtype=torch.float64)  # Cameras are searched for as poses of the scene.
 
 
@@ -95,71 +103,149 @@ def fit_camera(
     return fitted([found], Ending.INTERRUPTED) if found.interrupted else refined([found], settings)
 
 
+@in_full_precision
+def calibrate(
+    mesh: Mesh | Scene,
+    images: Images | None,
+    cameras: Camera | Sequence[Camera],
+    *,
+    masks: Images | None = None,
+    principal: bool = True,
+    distortion: int = 4,
+    options: FitOptions | None = None,
+) -> CameraFit:
+    """Find the lens that took several pictures of a known object, and the place of each.
+
+    Parameters
+    ----------
+    mesh : Mesh or Scene
+        What the pictures show, with its colours; the background of a Scene is known, if it has one.
+    images, masks
+        As of fit_pose(), of one size.
+    cameras : Camera or sequence of Camera
+        One for each picture, with one K and distortion: where the fit starts, each within about 30° and 15 % of the mesh's
+        size.
+    principal, distortion
+        As of fit_camera(). The focal length is always found.
+    options : FitOptions, optional
+        Of its defaults, `steps` is 60 on each level of a search, `step_tolerance` 3e-4, `spp` 16 and `max_size` 512. A
+        checkpoint has a file for the search of each picture, with its number in the name.
+
+    Returns
+    -------
+    CameraFit
+        `cameras`, `uncertainty` with the standard deviation of each number of the first camera, and `uncertainties` of all.
+
+    Raises
+    ------
+    TypeError, ValueError
+        An argument is wrong; the message names it.
+
+    Notes
+    -----
+    Pictures that were cropped or zoomed have another lens than the others. The object should fill the pictures, lie near their
+    corners in some, and be seen from several sides. Where a number is hardly known, the fit has not `converged`, and `reason`
+    names it.
+    """
+    given = _cameras(cameras, distortion)
+    lens = Unknowns(False, True, check_flag("principal", principal), distortion)
+    parts = options_of(options)
+    settings = Settings.from_options(
+        parts.of_part(0), "calibrate", (*POSE_OPTIONS, "checkpoint"), steps=60, max_size=512
+    )
+    if images is None and masks is None:
+        raise ValueError("images: expected pictures or masks to compare with, got neither")
+    n = len(given)
+    pictures, shapes = one_for_each("images", images, n, 3), one_for_each("masks", masks, n, 2)
+    name = "masks" if images is None else "images"
+    for k, (camera, picture) in enumerate(
+        zip(given, shapes if images is None else pictures, strict=True)
+    ):  # All are checked before the first search.
+        check_image(f"{name}[{k}]", picture, camera.size)
+    searches: list[PoseFit] = []
+    callback = settings.callback
+
+    for k, (camera, picture, shape) in enumerate(zip(given, pictures, shapes, strict=True)):
+        names = ArgumentNames(images=f"images[{k}]", masks=f"masks[{k}]")
+        alone = replace(
+            settings, max_size=max(MIN_PICTURE_SIDE, min(settings.max_size, max(camera.size)) // 2),
+            callback=None if callback is None else lambda now: callback(fitted([*searches, now])),
+            checkpoint=checkpoint_of(parts.of_part(k).checkpoint),
+        )  # fmt: skip
+        searches.append(search_pose(mesh, picture, camera, shape, START, lens, None, None, names, alone))
+        if searches[-1].interrupted:
+            return fitted(searches, Ending.INTERRUPTED)
+    return refined(searches, settings)
+
+
 def refined(searches: Sequence[PoseFit], settings: Settings) -> CameraFit:
     """Refine the poses of all places and their one lens together, and add how exactly they are known. Ctrl-C ends this with the
     best so far."""
-    levels, joint, best = list[PoseLevel](), list[Record](), fitted(searches)
+    joint, best, end = list[Record](), fitted(searches), None
+    supports, ending = [search.explained for search in searches], Ending.STEPS
+    progress = settings.progress_of("lens", lambda: best)
 
-    def result(end: Adjustment, ending: Ending, scores: Sequence[tuple[float, float]]) -> CameraFit:
-        places = enumerate(zip(searches, levels, scores, strict=True))
-        # One lens in several places decides between poses that one picture alone leaves open by lenses of their own.
-        shared = {"conflict": ""} if len(searches) > 1 else {}
-        found = [
-            _at_end(
-                level,
-                end,
-                k,
-                replace(search, loss=loss, explained=explained, converged=ending is Ending.FLAT, **shared),
-            )
-            for k, (search, level, (loss, explained)) in places
-        ]
+    def result(end: Adjustment) -> CameraFit:
+        places = zip(searches, levels, end.poses, end.covariances, end.costs, supports, strict=True)
+        found = [_at_end(*place, rests=ending is Ending.FLAT, alone=len(searches) == 1) for place in places]
         return fitted(found, ending, joint)
 
-    def after_step(end: Adjustment) -> None:
-        nonlocal best
-        places = [(level.task, pose) for level, pose in zip(levels, end.poses, strict=True)]
-        dofs = places[0][0].dofs
+    def after_step(descents: LevenbergMarquardt[Poses]) -> None:
+        nonlocal best, end
+        if bundle.last is not None and descents.descents[0].point is bundle.last.poses:
+            end = bundle.last
+        assert end is not None
+        places, dofs = [(level.task, pose) for level, pose in zip(levels, end.poses, strict=True)], levels[0].task.dofs
         joint.append(record_of(len(joint), end.loss, norms_of(dofs, end.gradient(dofs)), places))
-        scores = zip(end.costs, searches, strict=True)
-        best = result(end, Ending.STEPS, [(cost, search.explained) for cost, search in scores])
+        best = result(end)
         progress.step(f"loss {end.loss:.3e}")
 
-    progress = settings.progress_of("lens", lambda: best)
     with progress:
-        starts = [next(step.pose for step in reversed(search.history) if step.best) for search in searches]
-        for k, (search, start) in enumerate(zip(searches, starts, strict=True)):
+        levels, starts = list[PoseLevel](), list[Pose]()
+        for k, search in enumerate(searches):
             task, own = search.task, replace(settings, seed=(settings.seed + 7919 * k) % 2**32)
             assert task is not None
-            level = pose_levels(task, start, [None] * len(task.shots), own)[-1]
-            levels.append(level.informed([start]).focused(start))
-        end = adjust_bundle(levels, starts, min(CAMERA.adjust_steps, settings.steps), after_step)
-        ends = zip(levels, end.poses, strict=True)
-        scores = [(float(level.costs([pose])[0]), evidence_of(level, pose).edges) for level, pose in ends]
-        best = result(end, Ending.FLAT if end.short else Ending.STEPS, scores)
+            starts.append(next(step.pose for step in reversed(search.history) if step.best))
+            level = pose_levels(task, starts[k], [None] * len(task.shots), own)[-1]
+            levels.append(level.informed([starts[k]]).focused(starts[k]))
+        bundle = Bundle(levels)
+        most = min(CAMERA.adjust_steps, settings.steps)
+        found = minimise(bundle, [bundle.agreed(starts)], bundle.settings(most), after_step)
+        if found.interrupted:
+            raise KeyboardInterrupt
+        assert end is not None
+        ends = list(zip(levels, end.poses, strict=True))
+        end = end._replace(costs=[float(level.costs([pose])[0]) for level, pose in ends])
+        supports = [evidence_of(level, pose).edges for level, pose in ends]
+        ending = Ending.FLAT if found.descents[0].rest is Rest.SHORT else Ending.STEPS
+        best = result(end)
     each = progress.seconds / len(searches)
-    found = [replace(search, seconds=search.seconds + each) for search in best.searches]
-    return replace(best, searches=found, ending=Ending.INTERRUPTED if progress.interrupted else best.ending)
+    places = [replace(search, seconds=search.seconds + each) for search in best.searches]
+    return replace(best, searches=places, ending=Ending.INTERRUPTED if progress.interrupted else best.ending)
 
 
-def _at_end(level: PoseLevel, end: Adjustment, k: int, search: PoseFit) -> PoseFit:
-    """Return the search of place k with the pose and lens that it reached at last; `converged` says whether it rests."""
-    task, pose = level.task, end.poses[k]
-    known = CameraUncertainty.from_covariance(task, pose, end.covariances[k])
+def _at_end(
+    search: PoseFit, level: PoseLevel, pose: Pose, covariance: Tensor, loss: float, explained: float, rests: bool, alone: bool
+) -> PoseFit:  # fmt: skip
+    """Return the search of one place with the pose and lens that it reached at last."""
+    task = level.task
+    known = Uncertainty.from_covariance(task, pose, covariance)
     lenses = [task.lens(shot.camera, pose) for shot in task.shots]
     cameras = [
         seen.replace(K=lens.K.to(seen.K), distortion=None if lens.distortion is None else lens.distortion.to(seen.K))
         for seen, lens in zip(search.cameras, lenses, strict=True)
     ]
-    cameras = [map_tensors(camera, Tensor.clone) for camera in cameras]
+    cameras = map_tensors(cameras, Tensor.clone)
     # The last entry is the final comparison.
     earlier = search.history[:-1] if pose is search.history[-1].pose else search.history
-    history = [*earlier, Step(level.size, search.loss, pose, True, {})]
-    right = search.converged and search.explained >= search.enough and not search.conflict and not known.unknown
-    found = replace(
-        search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=cameras[0], cameras=cameras,
-        history=history, steps=len(history), uncertainty=known, converged=right,
+    history = map_tensors([*earlier, Step(level.size, loss, pose, True, {})], Tensor.clone)
+    # One lens in several places decides between poses that one picture alone leaves open by lenses of their own.
+    conflict = search.conflict if alone else ""
+    right = rests and explained >= search.enough and not conflict and not known.unknown
+    return replace(
+        search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=cameras[0], cameras=cameras, loss=loss,
+        explained=explained, conflict=conflict, history=history, steps=len(history), uncertainty=known, converged=right,
     )  # fmt: skip
-    return with_own_history(found)
 
 
 def with_coefficients(name: str, camera: object, count: object) -> Camera:
@@ -175,3 +261,26 @@ def with_coefficients(name: str, camera: object, count: object) -> Camera:
         return camera
     wanted = min(n for n in counts if n >= number)
     return camera.replace(distortion=torch.nn.functional.pad(camera.coefficients[..., :had], (0, wanted - had)))
+
+
+def _cameras(cameras: object, distortion: object) -> list[Camera]:
+    """Return the cameras one by one, with one lens. Raises TypeError or ValueError."""
+    found = [with_coefficients(f"cameras[{k}]", camera, distortion) for k, camera in enumerate(cameras_of(cameras))]
+    first = found[0]
+    for k, camera in enumerate(found):
+        if camera.projection not in PROJECTIONS:
+            raise ValueError(
+                f"cameras[{k}]: expected a perspective or a fisheye camera, got {camera.projection}, which has no lens to find"
+            )
+        if camera.size != first.size or camera.projection != first.projection:
+            raise ValueError(
+                f"cameras[{k}]: expected {first.projection}, {first.size[0]} × {first.size[1]} pixels, like cameras[0], got "
+                f"{camera.projection}, {camera.size[0]} × {camera.size[1]}; calibrate pictures of one size and lens at a time"
+            )
+        same = torch.equal(camera.K.double(), first.K.double())
+        if not same or not torch.equal(camera.coefficients.double(), first.coefficients.double()):
+            raise ValueError(
+                f"cameras[{k}]: expected the K and distortion of cameras[0], got others; the pictures are of one lens: start all "
+                "from the same guess of it"
+            )
+    return found

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import as_int, check_flag
+from ...optim.loop import Progress
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
@@ -28,13 +29,13 @@ from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..row_order import warn_of_flipped_rows
 from ..views import PICTURES, Images, cameras_of
 from .confidence import features_of
-from .hypotheses import Mode, probabilities
+from .hypotheses import probabilities
 from .initial_pose import initial_pose
-from .inputs import ArgumentNames, check_in_front, warn_of_scale, warn_of_units, without_colors
+from .inputs import ArgumentNames, check_in_front, warn_of_scale, warn_of_units
 from .pose import Pose, angle, pose_from_matrix
 from .pose_search import Groups, PoseSearch, Report, anywhere, around, everywhere
 from .replay_log import ReplayLog
-from .result import PoseFit, PoseMode, with_own_history
+from .result import PoseFit, PoseMode
 from .settings import CAMERA, POSE
 from .task import PoseTask, Unknowns
 from .uncertainty import Uncertainty
@@ -111,17 +112,12 @@ def search_pose(
     depths: object, names: ArgumentNames, settings: Settings, search: Search = True, symmetries: Symmetries | None = None,
 ) -> PoseFit:  # fmt: skip
     """Run fit_pose() with any set of sought numbers of the lens."""
-    progress, movable = settings.progress_of("fit", lambda: with_own_history(result())), names == ArgumentNames()
-    if images is None:
-        if masks is None:
-            raise ValueError(f"{names.images}: expected pictures or masks to compare with, got neither")
-        mesh = without_colors(mesh) if isinstance(mesh, Mesh | Scene) else mesh
-        images, names = masks, names._replace(images=names.masks)
+    progress = settings.progress_of("fit", lambda: fit_of(state, progress, given_cameras))
     given_cameras = cameras_of(cameras)
     _check_search(search, init, given_cameras, names.init)
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.from_arguments(mesh, images, given_cameras, masks, weights, lens, float(given.scale), names)
-    if movable:  # A camera may stand inside of a scene.
+    if names == ArgumentNames():  # A camera may stand inside of a scene.
         warn_of_scale(names.mesh, task.scene.transformed(given.R, given.t, given.scale), task.shots[0].camera)
     start = initial_pose(task) if init is None else given
     check_in_front(names.init, task.shots[0].camera, start, task.center)
@@ -147,28 +143,8 @@ def search_pose(
         task, start, measured, settings, log, search is not False, proposals=proposals, symmetries=symmetries
     )  # fmt: skip
 
-    def result() -> PoseFit:  # A callback may change its tensors in place.
-        best: Pose = state.best if symmetries is None else state.best.closest(symmetries, start)
-        history = list(state.history)
-        cameras = [map_tensors(task.lens(one, best), Tensor.clone) for one in given_cameras]
-        known = None
-        if state.information is not None:
-            known = Uncertainty.from_information(task, best, state.information, task.dofs, symmetries)
-        modes = modes_of(state.modes)
-        features = (
-            {} if known is None or state.evidence is None else features_of(state.evidence, best_share(modes), known)
-        )
-        conflict = ambiguity(best, state.ambiguous, symmetries, task)
-        sure = state.converged and not progress.interrupted and not conflict and (known is None or not known.unknown)
-        return PoseFit(
-            best.R.clone(), best.t.clone(), float(best.scale), cameras[0], state.loss, len(history), progress.seconds, sure,
-            progress.interrupted, state.edge_support, history, task, cameras, known, conflict=conflict, enough=state.enough,
-            modes=modes, features=features,
-        )  # fmt: skip
-
     def keep() -> None:
-        if settings.checkpoint is not None:
-            file.write({"values": log.values, "seconds": progress.seconds})
+        file.write({"values": log.values, "seconds": progress.seconds})
 
     def after_step() -> None:
         last = state.history[-1]
@@ -186,18 +162,29 @@ def search_pose(
         if search and wrong and proposals is None:
             _warn_of_flipped_pictures(task, state, init is None)
     keep()
-    return result()
+    return fit_of(state, progress, given_cameras)
 
 
-def modes_of(found: Sequence[Mode]) -> list[PoseMode]:
-    """Return the modes that a search has found, with their probabilities."""
-    pairs = zip(found, probabilities(found), strict=True)
-    return [PoseMode(mode.pose.matrix.clone(), share) for mode, share in pairs]
-
-
-def best_share(modes: Sequence[PoseMode]) -> float:
-    """Return the probability of the likeliest mode; 1 where no other was sought."""
-    return modes[0].probability if modes else 1.0
+def fit_of(
+    state: PoseSearch, progress: Progress, cameras: Sequence[Camera], conflict: str = "", visible: float = 1.0
+) -> PoseFit:  # fmt: skip
+    """Return what a search has found so far, in tensors of its own, which a callback may change."""
+    task, symmetries = state.task, state.symmetries
+    best: Pose = state.best if symmetries is None else state.best.closest(symmetries, state.start)
+    shares = zip(state.modes, probabilities(state.modes), strict=True)
+    modes = [PoseMode(mode.pose.matrix.clone(), share) for mode, share in shares]
+    known, features = None, dict[str, float]()
+    if state.information is not None and state.evidence is not None:
+        known = Uncertainty.from_information(task, best, state.information, symmetries)
+        features = features_of(state.evidence, modes[0].probability, known)
+    conflict = conflict or ambiguity(best, state.ambiguous, symmetries, task)
+    sure = state.converged and not progress.interrupted and not conflict and (known is None or not known.unknown)
+    seen = [map_tensors(task.lens(one, best), Tensor.clone) for one in cameras]
+    history = map_tensors(list(state.history), Tensor.clone)
+    return PoseFit(
+        best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), progress.seconds, sure,
+        progress.interrupted, state.edge_support, history, task, seen, known, visible, conflict, state.enough, modes, features,
+    )  # fmt: skip
 
 
 def ambiguity(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None, task: PoseTask) -> str:
@@ -217,18 +204,18 @@ def ambiguity(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None,
 
 def _check_search(search: object, init: object, cameras: Sequence[Camera], name: str) -> None:
     """Raise TypeError or ValueError for a search that does not go with the other arguments."""
-    if isinstance(search, str):
-        if search != "global":
-            raise ValueError(f"search: expected {SEARCHES}, got {search!r}")
+    if search == "global":
         if init is not None:
             raise ValueError(
                 f'search: expected a number with {name}, got "global", which searches for the object in the whole picture; '
                 f"leave {name} out, or give a number of starts around it"
             )
-        if cameras[0].projection not in ("perspective", "orthographic"):
+        if (projection := cameras[0].projection) not in ("perspective", "orthographic"):
             raise ValueError(
-                f'search: expected a perspective or orthographic camera for "global", got a {cameras[0].projection}; give {name}'
+                f'search: expected a perspective or orthographic camera for "global", got a {projection}; give {name}'
             )
+    elif isinstance(search, str):
+        raise ValueError(f"search: expected {SEARCHES}, got {search!r}")
     elif not isinstance(search, bool):
         try:
             number = as_int("search", search)

@@ -1,33 +1,42 @@
-"""fit_poses(): poses of several known meshes in a photograph in which they may cover one another."""
+"""fit_poses(): poses of several known meshes in a photograph in which they may cover one another.
+
+Each object is sought in turn, where the others leave it to be seen: what covers it at the present poses counts for nothing. Poses
+of all objects are sought anew until they stay, since each pose decides what the others show.
+"""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import as_tensor, check_flag, check_shape
+from ...render import render
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
-from ...scene.tree import map_tensors
 from ..by_camera import numbered, one_for_each
 from ..measured import depth_images
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
 from ..views import Images, cameras_of
-from .confidence import features_of
-from .fit_pose import ambiguity, best_share, modes_of, symmetries_of
+from .fit_pose import fit_of, symmetries_of
+from .hypotheses import HypothesisSearch, turned
 from .inputs import ArgumentNames, check_in_front, check_seen, warn_of_units
-from .pose import Pose, pose_from_matrix
-from .poses_search import PosesSearch
-from .result import PoseFit, with_own_history
+from .likelihood.objective import pose_levels
+from .likelihood.support import evidence_of
+from .pose import Pose, angle, pose_from_matrix
+from .pose_search import PoseSearch
+from .result import PoseFit, Step
+from .settings import CAMERA, POSE
 from .task import PoseTask, Unknowns
-from .uncertainty import Uncertainty
 
 INSIDE = 64  # Number of vertices of a mesh that are tested for lying in another.
 INNER_SCALE = 0.9  # At the end, they are tested at this share of their distance from their mean.
@@ -81,7 +90,7 @@ def fit_poses(
         An argument is wrong, or an object is out of the picture, or inside another one, at the start; the message names it.
     """
     settings = Settings.from_options(options, "fit_poses", POSE_OPTIONS, steps=40)
-    progress = settings.progress_of("fit", lambda: [with_own_history(one) for one in results()])
+    progress = settings.progress_of("fit", lambda: results())
     count, views = _counted(meshes), cameras_of(cameras)
     starts = _starts(init, count)
     own_masks = _masks(masks, count, views)
@@ -105,35 +114,107 @@ def fit_poses(
         check_seen(task.names.init, task.scene, [shot.camera for shot in task.shots], start)
     moved = [mesh for task, start in zip(tasks, starts, strict=True) for mesh in _moved(task, start)]
     warn_of_units(Scene(moved), [shot.camera for shot in tasks[0].shots], measured, "at the start")
-    state = PosesSearch(tasks, starts, measured, settings, check_flag("search", search), known_symmetries)
+    searches = [
+        ObjectSearch(task, start, measured, settings, further=check_flag("search", search), symmetries=own)
+        for task, start, own in zip(tasks, starts, known_symmetries, strict=True)
+    ]
 
-    def results() -> list[PoseFit]:  # A callback may change their tensors in place.
-        found = []
-        for k, task in enumerate(tasks):
-            own = known_symmetries[k]
-            best = state.best[k] if own is None else state.best[k].closest(own, starts[k])
-            history, information = list(state.history[k]), state.information(k)
-            known = (
-                None if information is None else Uncertainty.from_information(task, best, information, task.dofs, own)
-            )
-            unknown = known is not None and bool(known.unknown)
-            conflict = _conflict(tasks, state.best, k) if information is not None else ""
-            conflict = conflict or ("" if unknown else ambiguity(best, state.ambiguous[k], own, task))
-            sure = state.converged[k] and not progress.interrupted and not conflict and not unknown
-            seen = [map_tensors(one, Tensor.clone) for one in views]
-            modes, evidence = modes_of(state.modes[k]), state.evidence[k]
-            features = {} if known is None or evidence is None else features_of(evidence, best_share(modes), known)
-            found.append(PoseFit(
-                best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), progress.seconds,
-                sure, progress.interrupted, state.edge_support[k], history, task, seen, known, state.visible[k], conflict,
-                state.needed[k], modes, features,
-            ))  # fmt: skip
-        return found
+    def results() -> list[PoseFit]:
+        poses = [one.best for one in searches]
+        conflicts = ["" if one.information is None else _conflict(tasks, poses, k) for k, one in enumerate(searches)]
+        return [fit_of(one, progress, views, said, one.visible) for one, said in zip(searches, conflicts, strict=True)]
 
-    state.after_step = lambda: progress.step(f"meshes[{state.seeking}], loss {state.loss:.2e}")
+    for k, one in enumerate(searches):
+        one.after_step = lambda k=k, one=one: progress.step(f"meshes[{k}], loss {one.loss:.2e}")
     with progress:
-        state.run()
+        search_objects(searches)
     return results()
+
+
+class ObjectSearch(PoseSearch):
+    """The search for one object among others."""
+
+    visible = math.nan  # share of it that the others do not hide
+
+    @property
+    def converged(self) -> bool:
+        return super().converged and self.visible >= CAMERA.least_visible
+
+    def seek(self, task: PoseTask, first: bool) -> None:
+        """Find the pose while the others stay. After the `first` time it is refined on the last level alone."""
+        poses = turned(task, self.best) if first and self.further else [self.best]
+        groups, further = [(self.best, poses)], first and self.further
+        search = HypothesisSearch(task, groups, self.depths, self.settings, self.symmetries, further, coarse=first)
+        earlier = [step._replace(best=False) for step in self.history]
+
+        def after_step() -> None:
+            self.history, self.best, self.loss = [*earlier, *search.history], search.likeliest, search.cost
+            self.after_step()
+
+        search.after_step = after_step
+        self.modes = search.run() or self.modes
+        if self.modes:
+            self.best, self.loss = self.modes[0].pose, self.modes[0].cost
+
+    def judge(self, task: PoseTask, visible: float) -> None:
+        """Say what speaks for the answer, with the others at theirs. The visible part of a covered object is more ambiguous."""
+        level = pose_levels(task, self.best, self.depths, self.settings)[-1].informed([self.best])
+        found = evidence_of(level.focused(self.best), self.best)
+        self.visible, self.edge_support, self.evidence = visible, found.edges, found if self.modes else None
+        if visible < POSE.unoccluded:
+            self.enough = max(self.enough, POSE.covered_support)
+        self.history.append(Step(level.size, self.loss, self.best, True, {}))
+
+
+def search_objects(objects: Sequence[ObjectSearch]) -> None:
+    """Search for all; raise ValueError when nothing in the pictures depends on the poses."""
+    for count in range(POSE.rounds_of_objects):
+        before = [one.best for one in objects]
+        for k, one in enumerate(objects):
+            task, visible = _uncovered(objects, k)
+            if visible >= CAMERA.least_visible:
+                one.seek(task, first=count == 0)
+        if all(_near(one, pose) for one, pose in zip(objects, before, strict=True)):
+            break
+    if not any(one.modes for one in objects):
+        raise ValueError("init: expected poses at which the picture changes when the objects move, got none")
+    for one, seen in zip(objects, [_uncovered(objects, k) for k in range(len(objects))], strict=True):
+        one.judge(*seen)
+
+
+def _uncovered(objects: Sequence[ObjectSearch], k: int) -> tuple[PoseTask, float]:
+    """Return the task of one object, with a weight of 0 where others that cover a part of it are seen, with a margin; and
+    the share of its pixels that they leave."""
+    moved = [one.task.scene.transformed(*one.best[:3]) for one in objects]
+    task, settings = objects[k].task, objects[k].settings
+    spp, seed = settings.spp, settings.seed
+    shots, own, whole = [], 0.0, 0.0
+    for shot in task.shots:
+        with torch.no_grad():
+            seen = render(_labelled(moved), shot.camera, spp, seed)
+            alone = render(_labelled(moved[k : k + 1]), shot.camera, spp, seed)[..., 0]
+        own, whole = own + float(seen[..., k].sum()), whole + float(alone.sum())
+        hidden = alone - seen[..., k] > 0.5
+        fronts = [j for j in range(len(moved)) if j != k and float(seen[hidden][:, j].sum()) > 1.0]
+        before = seen[..., fronts].sum(-1)[None, None]
+        margin = POSE.cover_margin
+        before = F.max_pool2d(before, 2 * margin + 1, 1, margin)[0, 0, ..., None].float()
+        weight = 1.0 - before if shot.weight is None else shot.weight * (1.0 - before)
+        shots.append(shot._replace(weight=weight.clamp(min=0.0)))
+    return replace(task, shots=shots), min(1.0, own / whole) if whole > 0.0 else 0.0
+
+
+def _near(search: ObjectSearch, pose: Pose) -> bool:
+    return max(angle(search.best.R, pose.R), search.task.between(search.best, pose)) < POSE.distinct
+
+
+def _labelled(scenes: Sequence[Scene]) -> Scene:
+    """Return all objects in one scene, each with a channel of its own, which is 1 on it."""
+    labels = torch.eye(len(scenes), dtype=torch.float64)
+    return Scene([
+        Mesh(mesh.verts, mesh.faces, colors=label.expand(len(mesh.verts), -1))
+        for scene, label in zip(scenes, labels, strict=True) for mesh in scene.meshes
+    ])  # fmt: skip
 
 
 def _counted(meshes: object) -> int:
@@ -229,14 +310,9 @@ def _inside(points: Tensor, mesh: Mesh) -> Tensor:
     """Return which points (n, 3) lie inside a closed mesh (n,); none lies inside an open one."""
     import trimesh  # This import takes longer than a step of a fit.
 
-    low, high = mesh.verts.double().aminmax(dim=0)
-    inside = ((points > low) & (points < high)).all(1)
     solid = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
-    if not solid.is_watertight:
-        return torch.zeros_like(inside)
-    if bool(inside.any()):
-        inside[inside.clone()] = torch.from_numpy(solid.contains(points[inside].numpy()))
-    return inside
+    inside = solid.contains(points.numpy()) if solid.is_watertight else [False] * len(points)
+    return torch.as_tensor(inside)
 
 
 def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:

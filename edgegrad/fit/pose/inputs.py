@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,9 +14,7 @@ from ...camera.camera import Camera
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...warnings import warn
-from ..by_camera import numbered, one_for_each
 from ..region import VISIBLE
-from ..views import cameras_of
 from .pose import Pose
 from .settings import CAMERA, POSE
 
@@ -28,20 +26,6 @@ class ArgumentNames(NamedTuple):
     images: str = "images"
     init: str = "init"
     masks: str = "masks"
-
-
-def shots_of(
-    images: Any, cameras: object, masks: Any, weights: Any, names: ArgumentNames
-) -> list[tuple[str, Camera, Any, Any, Any]]:
-    """Return the suffix of the arguments' names, camera, picture, mask and weight of each view. Raises TypeError or
-    ValueError."""
-    views = [one if one.world_to_camera.dtype == one.K.dtype else one.to(torch.float64) for one in cameras_of(cameras)]
-    n = len(views)
-    columns = [
-        one_for_each(name, given, n, dims)
-        for name, given, dims in ((names.images, images, 3), (names.masks, masks, 2), ("weights", weights, 2))
-    ]
-    return list(zip([numbered("", k, n) for k in range(n)], views, *columns, strict=True))
 
 
 def without_colors(scene: Mesh | Scene) -> Scene:
@@ -75,8 +59,7 @@ def warn_of_scale(name: str, scene: Scene, camera: Camera) -> None:
     """Warn where a placed mesh has units other than its camera's, so that it is hardly visible."""
     verts = torch.cat([mesh.verts.double() for mesh in scene.meshes])
     low, high = verts.aminmax(dim=0)
-    view = camera.world_to_camera.double()
-    eye = -(view[:3, :3].T @ view[:3, 3])
+    eye = camera.eye.double()
     size, away = float((high - low).norm()), float((0.5 * (low + high) - eye).norm())
     where = f"it is {size:.3g} across, and its middle is {away:.3g} from the camera"
     fix = "do both have the same units? Mesh.transformed(scale=…) changes those of the mesh"

@@ -5,20 +5,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
 from ...camera.poses import rigid
+from ...files.cameras import camera_fields, camera_from_fields
+from ...files.formats.part import FormatError
 from ...files.paths import PathLike, write_figures, write_text
+from ...optim.history import Ending
 from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
-from ..ending import Ending, reason_of
-from ..history import number_or_none
-from ..result import FitResult, made_folder
+from ..result import FitResult, made_folder, number_or_none, reason_of
 from .confidence import POSE_CONFIDENCE
 from .pose import Pose, pose_from_matrix
 from .settings import CAMERA
@@ -110,6 +110,9 @@ class PoseFit(FitResult):
         words = reason_of(ending, self.explained, "mesh, camera or picture", self.enough)
         if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < self.enough:
             return words
+        if self.uncertainty.at_lens is not None:
+            fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
+            return f"not known: {self.uncertainty.unknown}; {fix}"
         fix = "give the mesh's colours, symmetries of the mesh, depth, or another picture"
         if self.uncertainty.focal > CAMERA.most_focal:
             fix = "give a picture from nearer, where perspective shows, or the lens as it was calibrated"
@@ -121,9 +124,6 @@ class PoseFit(FitResult):
         With a mask they are all over black, as they were compared.
         """
         return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(self, most=most)
-
-    def plot_history(self) -> Figure:
-        return require("edgegrad.fit.pose.pictures", *DRAWING).curves_of(self)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write pose.json, fit.png, loss.png (plot_history()) and fit.webp to a folder, and return their names.
@@ -145,14 +145,8 @@ class PoseFit(FitResult):
 
     def to_json(self) -> str:
         """Return JSON text with the pose, `mesh_to_world` 4 × 4 by rows for column vectors, the camera, and figures."""
-        camera = self.camera
         content = {
-            "mesh_to_world": self.matrix.tolist(), "scale": self.scale,
-            "camera": {
-                "world_to_camera": camera.world_to_camera.tolist(), "K": camera.K.tolist(), "size": list(camera.size),
-                "projection": camera.projection,
-                "distortion": None if camera.distortion is None else camera.distortion.tolist(),
-            },
+            "mesh_to_world": self.matrix.tolist(), "scale": self.scale, "camera": camera_fields(self.camera),
             "loss": number_or_none(self.loss), "steps": self.steps, "seconds": round(self.seconds, 3),
             "converged": self.converged, "reason": self.reason, "interrupted": self.interrupted,
             "explained": number_or_none(self.explained), "confidence": number_or_none(self.confidence),
@@ -168,39 +162,16 @@ class PoseFit(FitResult):
         _check_entries(data, "mesh_to_world", "camera", "loss", "steps", "seconds", "converged", "interrupted")
         pose = pose_from_matrix("mesh_to_world", data["mesh_to_world"])
         try:
-            camera = data["camera"]
-            M, K = (torch.tensor(camera[key], dtype=torch.float64) for key in ("world_to_camera", "K"))
-            view = Camera(M, K, camera["size"], camera["projection"], camera.get("distortion"))
-            loss = math.nan if data["loss"] is None else float(data["loss"])
-            steps, seconds = int(data["steps"]), float(data["seconds"])
-            share = data.get("explained")
-            share = math.nan if share is None else float(share)
-            known = data.get("uncertainty")
-            known = None if known is None else Uncertainty.from_dict(known)
-            given = dict(data.get("features") or {})
-            features = {name: float(given[name]) for name in POSE_CONFIDENCE.names} if given else {}
-        except (KeyError, TypeError, ValueError) as error:
+            known, given = data.get("uncertainty"), dict(data.get("features") or {})
+            loss, explained = (math.nan if (x := data.get(name)) is None else x for name in ("loss", "explained"))
+            return PoseFit(
+                pose.R, pose.t, float(pose.scale), camera_from_fields(data["camera"]), float(loss), int(data["steps"]),
+                float(data["seconds"]), bool(data["converged"]), bool(data["interrupted"]), float(explained),
+                uncertainty=None if known is None else Uncertainty.from_dict(known),
+                features={name: float(given[name]) for name in POSE_CONFIDENCE.names} if given else {},
+            )  # fmt: skip
+        except (FormatError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
-        flags = bool(data["converged"]), bool(data["interrupted"])
-        return PoseFit(
-            pose.R,
-            pose.t,
-            float(pose.scale),
-            view,
-            loss,
-            steps,
-            seconds,
-            *flags,
-            share,
-            uncertainty=known,
-            features=features,
-        )
-
-
-def with_own_history(fit: PoseFit) -> PoseFit:
-    """Return the fit with copies of its history's poses: a fit that goes on needs them, and a callback may change them."""
-    steps = [step._replace(pose=Pose(*(part.clone() for part in step.pose))) for step in fit.history]
-    return replace(fit, history=steps)
 
 
 def pose_from_json(text: str) -> Pose:

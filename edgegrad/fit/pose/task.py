@@ -10,13 +10,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...check import check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..by_camera import numbered
 from ..options import MIN_PICTURE_SIDE
 from ..region import VISIBLE
-from ..views import check_image, check_without_alpha, has_levels, over_black, warn_of_faint, white_level
-from .inputs import ArgumentNames, shots_of
+from ..views import check_without_alpha, has_levels, views_of, white_level
+from .inputs import ArgumentNames, without_colors
 from .pose import Pose
 from .target_images import background_of, is_clutter
 
@@ -68,7 +68,7 @@ class PoseTask:
 
     @staticmethod
     def from_arguments(
-        mesh: Mesh | Scene, images: Any, cameras: object, masks: Any, weights: Any, lens: Unknowns, scale: float,
+        mesh: Mesh | Scene, images: Any, cameras: Any, masks: Any, weights: Any, lens: Unknowns, scale: float,
         names: ArgumentNames,
     ) -> PoseTask:  # fmt: skip
         """Check a fit's arguments; `scale` is the mesh's at the start. Raises TypeError or ValueError."""
@@ -78,57 +78,52 @@ class PoseTask:
             )
         # Autograd does not keep tensors that were made in torch.inference_mode(), so they are copied.
         scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu", copy=True)
+        scene = without_colors(scene) if images is None else scene
         plain = all(part.channels is None for part in scene.meshes)
         masked = masks is not None
-        shots, shapes, clutter, levels = [], [], False, True
-        for name, view, picture, shape, count in shots_of(images, cameras, masks, weights, names):
-            image = check_image(f"{names.images}{name}", picture, view.size)
-            levels = levels and has_levels(image)
-            if min(view.size) < MIN_PICTURE_SIDE:
+        views = views_of(cameras, images, masks, weights, names=(names.images, names.masks))
+        levels, pixels = True, list[Tensor]()
+        for k, view in enumerate(views):
+            name = numbered(names.masks if images is None else names.images, k, len(views))
+            if (view.image is None) != (images is None) or (view.mask is None) == masked:
+                raise ValueError(f"{name}: expected pictures, and masks, for all cameras or for none, got None for one")
+            if min(view.camera.size) < MIN_PICTURE_SIDE:
                 raise ValueError(
-                    f"{names.images}{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
-                    f"{view.size[1]} × {view.size[0]}; take a larger one"
+                    f"{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "
+                    f"{view.camera.size[1]} × {view.camera.size[0]}; take a larger one"
                 )
+            if (image := view.image) is None:
+                continue
+            levels = levels and has_levels(image if view.sure is None else image[view.sure[..., 0] > 0.0])
+            pixels.append(image.flatten(0, 1) if view.mask is None else image[view.mask[..., 0] > 0.0])
             if plain and not masked:
-                check_without_alpha(f"{names.images}{name}", image)
-            C = image.shape[-1] if plain else scene.channels
-            if image.shape[-1] != C:
+                check_without_alpha(name, image)
+            if not plain and image.shape[-1] != (C := scene.channels):
                 raise ValueError(
-                    f"{names.images}{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
+                    f"{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
                     f"read it with read_image(path, channels={C}), or give its alpha as the mask"
                 )
-            if count is not None:
-                count = check_image(f"weights{name}", count, view.size)
-                check_shape(f"weights{name}", count, (*view.size, 1))
-                if not bool((count >= 0).all()):
-                    raise ValueError(f"weights{name}: expected numbers from 0 up, got {float(count.min()):g}")
-            behind = None
-            if masked:
-                shape = check_image(f"{names.masks}{name}", shape, view.size)
-                check_shape(f"{names.masks}{name}", shape, (*view.size, 1))
-                shapes.append(shape)
-                image = shape if plain else torch.cat([over_black(image, shape)[0], shape], -1)
-            else:
-                behind = scene.background
-                clutter = clutter or plain  # Unknown colours cannot be compared.
-                if behind is None:
-                    clutter = clutter or is_clutter(image)
-                behind = background_of(behind, image)
-            shots.append(TargetView(view.to("cpu", torch.float64, copy=True), image, behind, count))
-        warn_of_faint(names.masks, shapes)
-        if all(shot.weight is not None and not bool((shot.weight > 0).any()) for shot in shots):
-            raise ValueError(
-                "weights: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
-            )
-        if colorless := plain and not masked:
-            scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
+        # Radiance may have any unit.
+        white = 1.0 if levels or (plain and masked) else white_level(torch.cat(pixels))
+        most = max((float(view.weight.max()) for view in views if view.weight is not None), default=1.0)
+        shots, clutter = [], False
+        for view in views:
+            image, target, behind = None if view.image is None else view.image / white, view.mask, None
+            if target is None:
+                assert image is not None and view.image is not None
+                target, behind = image, background_of(scene.background, view.image) / white
+                # Unknown colours cannot be compared.
+                clutter = clutter or plain or (scene.background is None and is_clutter(image))
+            elif image is not None and not plain:
+                target = torch.cat([image, target], -1)
+            weight = None if view.weight is None else view.weight / most
+            shots.append(TargetView(view.camera.to(torch.float64), target, behind, weight))
         if clutter:
             shots = [shot._replace(background=None) for shot in shots]
-        white = 1.0
-        if not levels and not (plain and masked):
-            shots, white = _in_units_of_white(shots, masked)
-        most = max((float(shot.weight.max()) for shot in shots if shot.weight is not None), default=1.0)
-        shots = [shot if shot.weight is None else shot._replace(weight=shot.weight / most) for shot in shots]
+        if colorless := plain and not masked:
+            grey = torch.full((1, shots[0].target.shape[-1]), 0.5, dtype=torch.float32)
+            meshes = [part.replace(colors=grey.repeat(len(part.verts), 1)) for part in scene.meshes]
+            scene = scene.replace(meshes=meshes)
         aovs = ("image", "alpha") if clutter or (masked and not plain) else ("image",)
         aovs = ("alpha",) if masked and plain else aovs
 
@@ -146,38 +141,31 @@ class PoseTask:
             raise ValueError("focal: expected False with scale and an orthographic camera, where both are one")
         dofs = [0, 1, 2, 3, 4] + [5] * depth + [SCALE] * lens.scale + [FOCAL_LENGTH] * lens.focal
         dofs += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(DISTORTION, DISTORTION + lens.distortion))
-        # Pixels brighter than white, as of a light source or a defect, say nothing of the range of the others, nor does a mask.
+        # Pixels brighter than white, as of a light source or a defect, say nothing of the range of the others.
         seen = torch.cat([shot.target.flatten(0, 1) for shot in shots]).clamp(max=1.0)
-        colors = seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
-        # A black object before black has no range of colours, but its mask has.
-        extent = next((r for x in (colors, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
-        if shapes and not any(bool((one > 0.0).any()) for one in shapes):
-            raise ValueError(
-                f"{names.masks}: expected 1 on the object, got a mask that is black, 0 in every pixel; is it the object's mask?"
-            )
-        if extent == 0.0:
+        if bool((seen.amax(0) == seen.amin(0)).all()):
             given = names.masks if masked else names.images
             raise ValueError(
                 f"{given}: expected a picture of the object, got the same in every pixel; "
                 "was it read or rendered right?"
             )
-        if shapes and (most := max(int((one > 0.0).sum()) for one in shapes)) < VISIBLE:
+        if masked and (most := max(int((shot.target[..., -1] > 0.0).sum()) for shot in shots)) < VISIBLE:
             raise ValueError(
                 f"{names.masks}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
             )
-        without_colors = scene.replace(meshes=double, background=None)
-        return PoseTask(without_colors, aovs, shots, clutter, colorless, (low + high) / 2, size, dofs, names, white)
+        bare = scene.replace(meshes=double, background=None)
+        return PoseTask(bare, aovs, shots, clutter, colorless, (low + high) / 2, size, dofs, names, white)
 
     def turned_over(self) -> PoseTask:
         """Return the task with the pictures upside down."""
+
+        def flipped(image: Tensor | None) -> Tensor | None:
+            return image if image is None or image.dim() < 3 else image.flip(0)
+
         shots = [
-            TargetView(
-                shot.camera, shot.target.flip(0),
-                shot.background.flip(0) if shot.background is not None and shot.background.dim() == 3 else shot.background,
-                None if shot.weight is None else shot.weight.flip(0),
-            )
+            TargetView(shot.camera, shot.target.flip(0), flipped(shot.background), flipped(shot.weight))
             for shot in self.shots
-        ]  # fmt: skip
+        ]
         return replace(self, shots=shots)
 
     def between(self, one: Pose, other: Pose) -> float:
@@ -204,23 +192,6 @@ class PoseTask:
                 change = torch.cat([change, change.new_zeros(len(given) - len(change))])
             fields["distortion"] = change if given is None else change + F.pad(given, (0, len(change) - len(given)))
         return camera.replace(**fields)
-
-
-def _in_units_of_white(shots: list[TargetView], masked: bool) -> tuple[list[TargetView], float]:
-    """Return pictures whose white is 1, and its radiance before. `masked`: the last channel is a mask."""
-    pixels = torch.cat([shot.target.flatten(0, 1) for shot in shots])
-    white = white_level(pixels[pixels[:, -1] > 0.0, :-1] if masked else pixels)
-    found = []
-    for shot in shots:
-        target = shot.target / white
-        target = torch.cat([target[..., :-1], shot.target[..., -1:]], -1) if masked else target
-        behind = None if shot.background is None else shot.background / white
-        found.append(shot._replace(target=target, background=behind))
-    return found, white
-
-
-def _grey(mesh: Mesh, channels: int) -> Mesh:
-    return mesh.replace(colors=mesh.verts.new_full((len(mesh.verts), channels), 0.5, dtype=torch.float32))
 
 
 def focal_of(camera: Camera) -> float:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_int
+from ...optim.parameter import Parameter
 from ...rig.rig import Rig
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -16,9 +17,8 @@ from ..losses import REGION
 from ..measured import Measured
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
-from ..parameter import Parameter
 from ..priors import Prior, checked_priors, towards
-from ..views import Images, region_views, views_of
+from ..views import Images, views_of
 from .free_parameters import FreeParameters
 from .keypoints import keypoint_term
 from .levels import CoarseToFine
@@ -89,9 +89,7 @@ def fit_rig(
     free = FreeParameters.from_arguments(rig, seek, init or {}, parameters)
     method = "gauss-newton" if sum(value.numel() for value in free.start.values()) <= RIG.most_numbers else "adam"
     settings = Settings.from_options(options, "fit_rig", RIG_OPTIONS, method=method, steps=RIG.steps, spp=RIG.spp)
-    views = views_of(cameras, images, masks, weights)
-    if settings.loss == REGION:
-        views = region_views(views)
+    views = views_of(cameras, images, masks, weights, by_region=settings.loss == REGION)
     rest = {name: control.rest for name, control in rig.controls.items()}
     terms = [towards(rest)] if priors is None else checked_priors(priors, free.values(free.start))
     points = None if keypoints is None else keypoint_term(rig, [view.camera for view in views], keypoints)

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ...check import as_tensor, check_finite, check_shape
+from ...optim.parameter import Parameter
 from ...rig.control import Control
 from ...rig.rig import Rig
 from ...rig.skinned import SkinDeformer
-from ..parameter import Parameter
 from .settings import RIG
 
 F64 = torch.float64

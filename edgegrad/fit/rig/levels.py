@@ -7,7 +7,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from ...aovs import render_aovs
 from ...optim.history import Ending
+from ...optim.parameter import Parameter
 from ...optim.tensors import DescentResult
 from ...rig.function import FunctionDeformer
 from ...rig.rotations import roma
@@ -29,18 +29,16 @@ from ..descent.result import RESULT_SPP, make_fit
 from ..descent.scene_builder import Built, whole_scene
 from ..losses import REGION
 from ..options import Settings
-from ..parameter import Parameter
 from ..placement import Coordinates
 from ..priors import Prior
 from ..views import Observation
-from .confidence import features_of
 from .free_parameters import FreeParameters
 from .joint_support import edge_support_by_joint, left_out
 from .proposals import Proposals
 from .result import RigFit
 from .search import HypothesisSearch
 from .settings import RIG
-from .uncertainty import uncertainty_of
+from .uncertainty import features_of, uncertainty_of
 
 
 @dataclass
@@ -135,10 +133,22 @@ class CoarseToFine:
         objective = self.objective([view.resized(factor) for view in self.views], options, prior)
         if level == 0 and saved is None:
             objective.check(values)
-        descend = partial(
-            self._steps, objective, save=save, title=f"level {level + 1} of {len(self.factors)}", last=last
-        )
-        found = descend(values, saved=saved)
+        title, gauss_newton = f"level {level + 1} of {len(self.factors)}", GAUSS_NEWTON
+        if last and not region:
+            damping = {"unseen_damping": RIG.last_unseen_damping, "start_damping": RIG.last_damping}
+            gauss_newton = dataclasses.replace(GAUSS_NEWTON, **damping)
+
+        @torch.no_grad()
+        def bones(tensors: Mapping[str, Tensor]) -> Tensor | None:
+            return self.rig.bones(self.free.all(tensors))
+
+        report = reporter(objective.build, objective.views, bones=bones)
+
+        def descend(values: Mapping[str, Tensor], saved: Mapping[str, Any] | None) -> DescentResult:
+            starting = self.free.starting_at(values)
+            return descend_views(objective, starting, save, saved, title, report, gauss_newton)
+
+        found = descend(values, saved)
         name = next((n for n in ("rotations", "angles") if n in self.free.joints), None)
         if not self.tries or name is None or saved is not None or found.ending is Ending.INTERRUPTED:
             return found
@@ -150,7 +160,7 @@ class CoarseToFine:
             if last and name == "rotations" and not region:
                 better = self._search(objective, name, RIG.last_refinement_steps).rotate_about_bones(found.values)
                 if better is not found.values:
-                    more = descend(better, saved=None)
+                    more = descend(better, None)
                     whole = continued(found.history, more.history)
                     found = more._replace(history=whole, seconds=found.seconds + more.seconds)
         except KeyboardInterrupt:
@@ -169,19 +179,3 @@ class CoarseToFine:
 
         generator = torch.Generator().manual_seed(few.seed)
         return HypothesisSearch(objective, Proposals(self.rig, self.free, name), steps, generator)
-
-    def _steps(
-        self, objective: Objective, values: Mapping[str, Tensor], saved: Mapping[str, Any] | None, save: Save, title: str,
-        last: bool,
-    ) -> DescentResult:  # fmt: skip
-        settings = GAUSS_NEWTON
-        if last and objective.regions is None:
-            damping = {"unseen_damping": RIG.last_unseen_damping, "start_damping": RIG.last_damping}
-            settings = dataclasses.replace(GAUSS_NEWTON, **damping)
-
-        @torch.no_grad()
-        def bones(tensors: Mapping[str, Tensor]) -> Tensor | None:
-            return self.rig.bones(self.free.all(tensors))
-
-        report = reporter(objective.build, objective.views, bones=bones)
-        return descend_views(objective, self.free.starting_at(values), save, saved, title, report, settings)

@@ -17,9 +17,8 @@ from ...scene.scene import Scene
 from ..descent.result import Fit
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..result import FitResult, delegated, made_folder
-from .confidence import RIG_CONFIDENCE
 from .settings import RIG
-from .uncertainty import JointUncertainty
+from .uncertainty import RIG_CONFIDENCE, JointUncertainty
 
 
 @dataclass(frozen=True, eq=False)

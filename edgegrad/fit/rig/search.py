@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ...optim.parameter import Parameter
 from ..descent.curvature import misfit
 from ..descent.objective import Objective
 from ..descent.region_loss import FINAL_STEP
 from ..edge_support import MIN_EDGE_SUPPORT
-from ..parameter import Parameter
 from .free_parameters import rows_of, with_rows
 from .joint_support import edge_support_by_joint
 from .proposals import Limb, Proposals

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_int, check_positive
+from ...optim.parameter import Parameter
 from ...rig.rig import Rig
 from ..options import FitOptions, Settings, options_of
-from ..parameter import Parameter
 from ..priors import Prior, near, towards
 from .fit_rig import RIG_OPTIONS, Appearance, fit_rig
 from .result import RigFit

@@ -1,4 +1,4 @@
-"""How exactly pictures show what a fit of a rig sought, joint by joint.
+"""How exactly pictures show what a fit of a rig sought, joint by joint, and how likely the fit is right.
 
 With the loss L = Σ ρ(r_p) over pixels p, its curvature H = Σ w_p J_p J_pᵀ and the score s_p = w_p r_p J_p of each, the
 numbers have the covariance H⁻¹ (Σ s_p s_pᵀ) H⁻¹ (Huber, The Behavior of Maximum Likelihood Estimates under Nonstandard
@@ -17,8 +17,18 @@ from torch import Tensor
 
 from ..descent.curvature import scores
 from ..descent.objective import Objective
+from ..logistic import Logistic
 from .joint_support import SUPPORT_STEPS, places_of
 from .settings import RIG
+
+# By `python -m benchmarks.rig_confidence --train --count 350`.
+RIG_CONFIDENCE = Logistic(
+    names=("support", "residual", "deviation"),
+    weights=(0.4907, -2.3461, -3.3842),
+    bias=-1.3662,
+    mean=(0.962, 0.6404, 0.2849),
+    deviation=(0.1483, 0.8012, 0.9344),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,3 +91,12 @@ def uncertainty_of(
         if len(size) == 3:
             axes[joint] = directions[:, -1] * float(directions[directions[:, -1].abs().argmax(), -1].sign())
     return JointUncertainty(covariance, degrees, axes)
+
+
+def features_of(support: Mapping[str, float], uncertainty: JointUncertainty, residual: float) -> dict[str, float]:
+    """Return the features. `support` and `residual`, the loss over the noise of its samples, are those of the last pose."""
+    return {
+        "support": min(support.values(), default=0.0),  # share of edges, of the joint that shows the smallest
+        "residual": math.log10(max(residual, 0.1)),
+        "deviation": math.log10(max(uncertainty.degrees.values(), default=180.0) + 1e-3),  # degrees, of the worst joint
+    }

@@ -8,25 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ....camera.poses import rotation
 from ....files.image import linear_to_srgb
 from ...views import area_mean
 from ..pose import Pose
 from ..settings import TEMPLATES, Round
 from ..target_images import scaled
 from ..task import PoseTask
-from .template_views import TemplateViews, across, all_sides, pose_at
+from .template_views import TemplateViews, across, all_sides, pose_at, rotations
 from .templates import Templates, surprise
 
 
-@dataclass(frozen=True)
-class Matches:
+class Matches(NamedTuple):
     """Views at places of a picture."""
 
     rotations: Tensor  # (n, 3, 3) float64, as TemplateViews have them
@@ -35,7 +33,7 @@ class Matches:
     scores: Tensor  # (n,)
 
     def select(self, rows: Tensor) -> Matches:
-        return Matches(self.rotations[rows], self.positions[rows], self.pixels[rows], self.scores[rows])
+        return Matches(*(field[rows] for field in self))
 
     def turned(self, turns: Tensor) -> Matches:
         """Rotate each match by all rotations (k, 3, 3), without comparing."""
@@ -180,7 +178,9 @@ def _everywhere(
 ) -> Matches:
     (H, W), T = mips.size, views.alpha.shape[-1]
     margin = T // 3
-    rotations, positions, extents, values = [], [], [], []
+    found = [
+        Matches(torch.empty(0, 3, 3).double(), torch.empty(0, 2).double(), torch.empty(0).double(), torch.empty(0))
+    ]
     for k in range(1 + math.floor(math.log(sizes[1] / sizes[0]) / math.log(TEMPLATES.size_ratio))):
         pixels = sizes[0] * TEMPLATES.size_ratio**k * min(H, W)  # across the object, in the picture
         picture = mips.reduced(min(1.0, views.across / pixels))
@@ -191,15 +191,11 @@ def _everywhere(
         columns = scores.shape[-1]
         best, at = scores.flatten(1).topk(min(TEMPLATES.places_per_view, scores[0].numel()))
         middle = torch.stack([at % columns, at // columns], -1).double() * TEMPLATES.stride + 0.5 * T - margin
-        positions.append((middle * torch.tensor([W / w, H / h], dtype=torch.float64)).flatten(0, 1))
-        rotations.append(views.rotations.repeat_interleave(best.shape[1], 0))
-        extents.append(torch.full((best.numel(),), pixels, dtype=torch.float64))
-        values.append(best.flatten())
-    if not values:
-        return Matches(
-            torch.empty(0, 3, 3).double(), torch.empty(0, 2).double(), torch.empty(0).double(), torch.empty(0)
-        )
-    return Matches(torch.cat(rotations), torch.cat(positions), torch.cat(extents), torch.cat(values))
+        positions = (middle * torch.tensor([W / w, H / h], dtype=torch.float64)).flatten(0, 1)
+        rotations = views.rotations.repeat_interleave(best.shape[1], 0)
+        extents = torch.full((best.numel(),), pixels, dtype=torch.float64)
+        found.append(Matches(rotations, positions, extents, best.flatten()))
+    return Matches(*(torch.cat(fields) for fields in zip(*found, strict=True)))
 
 
 def _in_mask(views: TemplateViews, mips: Mips) -> Matches:
@@ -221,12 +217,10 @@ def _in_mask(views: TemplateViews, mips: Mips) -> Matches:
 
 def closer(task: PoseTask, found: Matches, mips: Mips, one: Round, seed: int) -> Matches:
     """Move each match to the best of the poses around it."""
-    turns = [torch.zeros(3, dtype=torch.float64)]
-    for axis in range(3):
-        for sign in (one.turn, -one.turn):
-            turns.append(torch.zeros(3, dtype=torch.float64).index_fill(0, torch.tensor([axis]), sign))
+    axes = one.turn * torch.eye(3, dtype=torch.float64)
+    turns = rotations(torch.cat([torch.zeros_like(axes[:1]), axes, -axes]))
     n, k = len(found.scores), len(turns)
-    best = fitted(task, found.turned(torch.stack([rotation(turn) for turn in turns])), mips, one, seed)
+    best = fitted(task, found.turned(turns), mips, one, seed)
     return best.select(torch.arange(n) * k + best.scores.reshape(n, k).argmax(1))
 
 
@@ -243,13 +237,11 @@ def fitted(task: PoseTask, given: Matches, mips: Mips, one: Round, seed: int) ->
         if not mips.masked:
             values = values * pixels.float()
         side = 2 * TEMPLATES.shift_pixels + 1
-        shift = (
-            torch.stack([places % side - TEMPLATES.shift_pixels, places // side - TEMPLATES.shift_pixels], -1)
-            * (pixels / one.across)[:, None]
-        )
+        shift = torch.stack([places % side, places // side], -1) - TEMPLATES.shift_pixels
+        moved = given.positions + shift * (pixels / one.across)[:, None]
         up = values > best.scores
-        best = replace(
-            best, positions=torch.where(up[:, None], given.positions + shift, best.positions),
-            pixels=torch.where(up, pixels, best.pixels), scores=torch.where(up, values, best.scores),
+        best = Matches(
+            best.rotations, torch.where(up[:, None], moved, best.positions), torch.where(up, pixels, best.pixels),
+            torch.where(up, values, best.scores),
         )  # fmt: skip
     return best

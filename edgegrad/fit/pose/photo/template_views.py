@@ -15,6 +15,7 @@ from ....camera.poses import rotation
 from ....files.image import linear_to_srgb
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
+from ..camera_motion import cross_matrices
 from ..pose import Pose
 from ..settings import TEMPLATES
 from ..task import PoseTask, focal_of
@@ -29,11 +30,6 @@ class TemplateViews:
     alpha: Tensor  # (n, T, T)
     colors: Tensor  # (n, T, T, C), sRGB values; 1 where the mesh has no colours
     normals: Tensor  # (n, T, T, 3), in mesh axes
-
-    @property
-    def ring(self) -> int:
-        """The number of pixels around the object's box."""
-        return round(TEMPLATES.ring * self.across)
 
     @staticmethod
     def from_rotations(task: PoseTask, rotations: Tensor, pixels: int, seed: int) -> TemplateViews:
@@ -88,14 +84,11 @@ def pose_at(task: PoseTask, R: Tensor, position: Tensor, depth: float) -> Pose:
 
 def all_sides() -> Tensor:
     """Return the rotations (directions · rolls, 3, 3): directions on Fibonacci's sphere, each rotated about itself."""
-    k = torch.arange(TEMPLATES.directions, dtype=torch.float64)
-    z = 1.0 - (2.0 * k + 1.0) / TEMPLATES.directions
-    longitude = math.pi * (3.0 - math.sqrt(5.0)) * k
-    first = _rotations(torch.stack([torch.zeros_like(k), torch.acos(z), torch.zeros_like(k)], -1))
-    second = _rotations(torch.stack([torch.zeros_like(k), torch.zeros_like(k), longitude], -1))
-    turn = torch.arange(TEMPLATES.rolls, dtype=torch.float64) * (2.0 * math.pi / TEMPLATES.rolls)
-    turns = _rotations(torch.stack([torch.zeros_like(turn), torch.zeros_like(turn), turn], -1))
-    return (turns[None] @ (first @ second)[:, None]).flatten(0, 1)
+    z, longitude = _sphere(TEMPLATES.directions)
+    _, y, axis = torch.eye(3, dtype=torch.float64)
+    first, second = rotations(torch.acos(z)[:, None] * y), rotations(longitude[:, None] * axis)
+    roll = torch.arange(TEMPLATES.rolls, dtype=torch.float64) * (2.0 * math.pi / TEMPLATES.rolls)
+    return (rotations(roll[:, None] * axis)[None] @ (first @ second)[:, None]).flatten(0, 1)
 
 
 def spread(count: int) -> Tensor:
@@ -107,20 +100,18 @@ def spread(count: int) -> Tensor:
     x, y, z, w = inner * a.sin(), inner * a.cos(), outer * b.sin(), outer * b.cos()
     half = torch.stack([x, y, z], -1)
     length = half.norm(dim=-1, keepdim=True)
-    return _rotations(half / length.clamp(min=1e-12) * 2.0 * torch.atan2(length, w[:, None]))
+    return rotations(half / length.clamp(min=1e-12) * 2.0 * torch.atan2(length, w[:, None]))
 
 
 def ball(count: int, radius: float) -> Tensor:
     """Return rotations (count, 3, 3) by up to `radius` radians, the first by none, the others evenly. Axes lie on Fibonacci's
     sphere, and angles follow the growth of volume."""
-    k = torch.arange(count, dtype=torch.float64)
-    z = 1.0 - (2.0 * k + 1.0) / count
+    k, (z, longitude) = torch.arange(count, dtype=torch.float64), _sphere(count)
     around = (1.0 - z * z).sqrt()
-    longitude = math.pi * (3.0 - math.sqrt(5.0)) * k
     axes = torch.stack([around * longitude.cos(), around * longitude.sin(), z], -1)
     # Multiples of the golden ratio make angles independent of axes.
     share = torch.where(k > 0, (k * 0.6180339887498949) % 1.0, torch.zeros_like(k))
-    return _rotations(axes * (radius * share.pow(1.0 / 3.0))[:, None])
+    return rotations(axes * (radius * share.pow(1.0 / 3.0))[:, None])
 
 
 def _towards(ray: Tensor) -> Tensor:
@@ -130,5 +121,12 @@ def _towards(ray: Tensor) -> Tensor:
     return rotation(axis * torch.atan(aside))
 
 
-def _rotations(vectors: Tensor) -> Tensor:
-    return torch.stack([rotation(vector) for vector in vectors])
+def rotations(vectors: Tensor) -> Tensor:
+    """Return the rotations (n, 3, 3) by rotation vectors (n, 3)."""
+    return torch.linalg.matrix_exp(cross_matrices(vectors))
+
+
+def _sphere(count: int) -> tuple[Tensor, Tensor]:
+    """Return height and longitude (n,) of points on Fibonacci's sphere."""
+    k = torch.arange(count, dtype=torch.float64)
+    return 1.0 - (2.0 * k + 1.0) / count, math.pi * (3.0 - math.sqrt(5.0)) * k

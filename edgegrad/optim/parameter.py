@@ -1,4 +1,4 @@
-"""Tensors that a fit by descent finds."""
+"""Tensors that a descent finds."""
 
 from __future__ import annotations
 
