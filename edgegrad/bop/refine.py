@@ -81,7 +81,7 @@ def refine(
         )  # fmt: skip
     except ValueError as error:
         return kept(f"no fit: {error}")
-    if not fit.converged and not unconverged:
+    if fit.reason != "converged" and not unconverged:
         return kept(fit.reason, fit)
     turned = math.degrees(angle(_orthonormal(estimate.pose)[:3, :3], fit.R))
     moved = float((fit.t - estimate.pose[:3, 3]).norm())

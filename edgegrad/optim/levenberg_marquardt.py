@@ -121,7 +121,7 @@ class Descent(Settling, Generic[Point]):
     gradient: Tensor = EMPTY  # (n,)
     curvature: Tensor = EMPTY  # (n, n)
     step: Tensor = EMPTY  # (n,), the next one
-    predicted: float = 0.0  # decrease of the cost by it
+    predicted: float = 0.0  # decrease of the cost by it; at rest, by an undamped one
     path: tuple[Tensor, ...] = ()  # (n,) each, where steps since the last fall led, from the point of that
 
     @property
@@ -287,8 +287,8 @@ class LevenbergMarquardt(Generic[Point]):
             descent.rest = Rest.FLAT
             return
         newton = self._solved(descent, 0.0)
-        short = float(newton.abs().max()) < self.settings.shortest_step
-        if (short or _decrease(descent, newton) < self.settings.least_gain) and not self.problem.provisional:
+        short, descent.predicted = float(newton.abs().max()) < self.settings.shortest_step, _decrease(descent, newton)
+        if (short or descent.predicted < self.settings.least_gain) and not self.problem.provisional:
             descent.rest = Rest.SHORT
             return
         step = self._solved(descent, descent.damping)

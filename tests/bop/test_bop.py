@@ -262,6 +262,9 @@ def test_command_line_writes_errors_and_refined_poses(
     assert content["objects"]["1"]["bop19_average_recall"] > 0.9
 
 
+REASONS = ("steps ran out", "edges not explained", "ambiguous", "directions unknown")
+
+
 def test_refine_keeps_poses_whose_fit_fails(made: Path) -> None:
     data = bop.Dataset(made)
     off_image = bop.files.Estimate(3, 0, 1, 1.0, pose((0.1, 0, 0), (5000.0, 0.0, 400.0)))
@@ -269,7 +272,7 @@ def test_refine_keeps_poses_whose_fit_fails(made: Path) -> None:
     assert found.kept and found.fit is None and "does not show" in found.why and found.estimate is off_image
     start = replace(estimates()[0], pose=pose_off(TRUTHS[0][0][1]))
     early = bop.refine(data, start, options=quiet(max_size=32, steps=1))
-    assert early.kept and early.estimate is start and early.why.startswith(("steps ran out", "edges not", "ambiguous"))
+    assert early.kept and early.estimate is start and early.why.split(":")[0] in REASONS
     with pytest.raises(ValueError, match="expected object 7 in it, got 1, 5"):
         bop.refine(data, bop.files.Estimate(3, 0, 7, 1.0, TRUTHS[0][0][1]))
 

@@ -25,7 +25,7 @@ def test_fit_pose(files, capsys):
     out = files / "new" / "out"
     assert fit(files, "--init", files / "init.json", "--steps", 20, "--out", out) == 0
     found = PoseFit.from_json((out / "pose.json").read_text())
-    assert max(errors(found)) < 1.0 and found.converged
+    assert max(errors(found)) < 1.0 and found.reason == "converged"
     said = capsys.readouterr()
     assert (
         "converged" in said.out

@@ -41,7 +41,7 @@ def test_a_start_that_is_the_answer_is_converged():
     """More steps would not find a better one."""
     view = camera(48)
     fit = fit_pose(before_sky(), picture(view), view, search=False, options=quiet(steps=12))
-    assert fit.converged and errors(fit)[0] < 0.2 and errors(fit)[1] < 0.5
+    assert fit.reason == "converged" and errors(fit)[0] < 0.2 and errors(fit)[1] < 0.5
 
 
 @pytest.mark.parametrize("mode", [pytest.param(torch.no_grad, marks=pytest.mark.slow), torch.inference_mode])

@@ -159,18 +159,18 @@ def test_what_is_not_explained_is_not_blamed_on_steps(taken):
     view, image = taken
     start = about_center(rotation(0.4, -0.4, 0.3), (0.1, -0.1, 0.1))
     fit = fit_pose(bracket(True), image, view, init=start, search=False, options=quiet(steps=1))
-    assert fit.explained < POSE.plain_support and not fit.converged, fit.explained
+    assert fit.explained < POSE.plain_support and fit.reason != "converged", fit.explained
     assert fit.reason.startswith("edges not explained"), fit.reason
 
 
 @pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_picture_from_the_bottom_up_is_named(masked):
-    view = camera(40)
+    view = camera(64)
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
     options = {"masks": mask} if masked else {}
     with pytest.warns(UserWarning, match=r"^images: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(before_sky(), target, view, init=START, **arranged(steps=3, **options))
-    assert not fit.converged
+        fit = fit_pose(before_sky(), target, view, init=START, **arranged(steps=1, **options))
+    assert fit.reason != "converged"
 
 
 def test_masks_from_the_bottom_up_are_named():

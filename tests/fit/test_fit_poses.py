@@ -138,9 +138,9 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
         if kind == "plain" and known > 2.0:  # the contour of the covered one shows its rotation to about as much
             assert fit.reason.startswith("directions unknown: ") and off[0] < known < 2.5, (off, known)
         elif kind == "plain":  # a plain box shows nearly the same contour in a pose that is turned by 10°
-            assert fit.converged or fit.reason.startswith("ambiguous: "), (off, fit.reason)
+            assert fit.reason == "converged" or fit.reason.startswith("ambiguous: "), (off, fit.reason)
         else:
-            assert fit.converged and fit.reason == "converged", (kind, off, fit.explained)
+            assert fit.reason == "converged", (kind, off, fit.explained)
     assert 0.5 < fits[0].visible < 0.7 and fits[1].visible > 0.98
 
 
@@ -151,7 +151,7 @@ def test_three_objects():
     fits = fit_poses(MESHES, image, view, init=STARTS, depths=depth_of(view, *scene_of(3)), options=quiet())
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=True):
         off = errors(fit, mesh, truth)
-        assert off[0] < 0.3 and off[1] < 0.1 and fit.converged, (off, fit.explained)
+        assert off[0] < 0.3 and off[1] < 0.1 and fit.reason == "converged", (off, fit.explained)
 
 
 @pytest.mark.slow
@@ -159,7 +159,7 @@ def test_a_mesh_that_is_not_there_makes_no_other_wrong(two):
     view, image = two
     absent = at(rotation(0.2, 0.3, 0.1), CENTER + torch.tensor([-1.2, -1.0, 0.2]).double())
     fits = fit_poses(MESHES, image, view, init=[*STARTS[:2], absent], search=False, options=quiet())
-    assert fits[0].converged and fits[1].converged and not fits[2].converged, [fit.explained for fit in fits]
+    assert [fit.reason == "converged" for fit in fits] == [True, True, False], [fit.explained for fit in fits]
     assert fits[2].explained < 0.65 and fits[2].reason.startswith(("edges not explained", "steps ran out"))
     assert errors(fits[1], MESHES[1], TRUTHS[1])[0] < 1.5
 
@@ -173,7 +173,7 @@ def test_a_hidden_mesh_is_said_to_be_hidden(two):
     small = box((0.3, 0.3, 0.3), seed=5)
     hidden = at(torch.eye(3).double(), CENTER + ASIDE + 1.3 * away)
     fits = fit_poses([*MESHES[:2], small], image, view, init=[*STARTS[:2], hidden], search=False, options=quiet())
-    assert fits[0].converged and fits[1].converged and not fits[2].converged
+    assert [fit.reason == "converged" for fit in fits] == [True, True, False]
     assert fits[2].visible < 0.1 and fits[2].reason.startswith("hidden: the other objects leave"), fits[2].reason
     torch.testing.assert_close(fits[2].matrix, hidden, atol=0.05, rtol=0.0)
 
@@ -303,7 +303,7 @@ def test_a_quarter_covered(covered):
     view, image, _, _ = covered
     fit = fit_pose(bracket(), image, view, init=STARTS[0], options=quiet())
     off = errors(fit, MESHES[0], TRUTHS[0])
-    assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, (off, fit.explained)
+    assert off[0] < 1.5 and off[1] < 1.0 and fit.reason == "converged", (off, fit.explained)
 
 
 def test_white_may_be_any_brighter_colour():
@@ -329,11 +329,9 @@ def test_of_two_meshes_in_one_place_the_one_behind_is_hidden():
     starts = [TRUTHS[0], neighbour]
     fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, search=False, options=quiet(spp=8, steps=2))
     assert fits[0].reason == "converged" or fits[0].reason.startswith(
-        ("in one place: meshes[0]", "edges not explained", "steps ran out")
+        ("in one place: meshes[0]", "edges not explained", "steps ran out", "directions unknown")
     )
-    assert not fits[1].converged and fits[1].reason.startswith(
-        ("hidden: the other objects leave", "in one place: meshes[1]")
-    )
+    assert fits[1].reason.startswith(("hidden: the other objects leave", "in one place: meshes[1]"))
 
 
 @pytest.mark.slow
@@ -341,5 +339,5 @@ def test_a_direction_that_contours_do_not_show_is_unknown():
     view = view_of(96)
     plain = [mesh.replace(face_colors=None) for mesh in MESHES[:2]]
     first, _ = fit_poses(plain, photograph(view, *scene_of(2), seed=2), view, init=STARTS[:2], options=quiet(spp=8))
-    assert not first.converged and first.uncertainty is not None and first.uncertainty.unknown
+    assert first.reason != "converged" and first.uncertainty is not None and first.uncertainty.unknown
     assert first.reason.startswith("directions unknown")

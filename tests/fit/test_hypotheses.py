@@ -30,16 +30,14 @@ class KnownMinima(Problem):
 
     def __init__(self, task, minima, last):
         self.task, self.minima, self.last, self.dofs = task, minima, last, tuple(task.dofs) if task else ()
-        self.contour_noises = ()
+        self.contour_noises, self.temperature = (), 1.0
 
     def informed(self, poses):
         return self
 
     def focused(self, pose):
+        self.temperature = T
         return self
-
-    def temperature(self, pose):
-        return T
 
     def moved(self, points, steps):
         return moved_poses(self.task, points, self.dofs, steps)

@@ -62,7 +62,7 @@ class Bundle(Problem[Poses]):
         *own, shared = units.diag().split([m - lens] * places + [lens])
         self.entries = [torch.cat([rows, shared]) for rows in own]  # (m, n), the entries of each place's step
         self.last: Adjustment | None = None  # what was evaluated last
-        self.noise: float | None = None  # pixels that count as one, at the first poses
+        self.noise = fmean(level.temperature for level in self.levels)  # pixels that count as one
 
     def settings(self, most: int) -> LevenbergMarquardtSettings:
         """Return how a descent goes on, by at most so many steps."""
@@ -77,7 +77,7 @@ class Bundle(Problem[Poses]):
         (poses,) = points
         costs, gradients, curvatures = self._models(poses)
         lens, known = self._lens(0, poses[0]), CAMERA.prior_deviation**-2
-        noise = self._noise(poses)
+        noise = self.noise
         cost = sum(costs) / noise + 0.5 * known * float(lens.square().sum())
         gradient = self._sum(gradients) / noise + known * self.entries[0].T @ lens
         curvature = self._sum(curvatures) / noise + self.prior
@@ -99,14 +99,9 @@ class Bundle(Problem[Poses]):
             return tuple(poses)
         _, gradients, curvatures = self._models(poses)
         slopes = [g - H @ x for g, H, x in zip(gradients, curvatures, here, strict=True)]
-        H = self._sum(curvatures) + self._noise(poses) * self.prior
+        H = self._sum(curvatures) + self.noise * self.prior
         end = -torch.linalg.solve(H, self._sum(slopes))
         return self._moved(poses, [own @ end - x for own, x in zip(self.entries, here, strict=True)])
-
-    def _noise(self, poses: Sequence[Pose]) -> float:
-        if self.noise is None:
-            self.noise = fmean(level.temperature(pose) for level, pose in zip(self.levels, poses, strict=True))
-        return self.noise
 
     def _models(self, poses: Sequence[Pose]) -> tuple[list[float], list[Tensor], list[Tensor]]:
         """Return cost, gradient (m,) and curvature (m, m) of each place at its pose."""

@@ -102,7 +102,7 @@ class CameraFit(FitResult):
     @property
     def converged(self) -> bool:
         """Return whether further steps lead no further, pictures show the render's edges, and all that was sought is known."""
-        return self.ending is Ending.FLAT and all(search.converged for search in self.searches)
+        return self.ending is Ending.FLAT and all(search.reason == "converged" for search in self.searches)
 
     @property
     def interrupted(self) -> bool:

@@ -241,10 +241,9 @@ def _at_end(
     history = map_tensors([*earlier, Step(level.size, loss, pose, True, {})], Tensor.clone)
     # One lens in several places decides between poses that one picture alone leaves open by lenses of their own.
     conflict = search.conflict if alone else ""
-    right = rests and explained >= search.enough and not conflict and not known.unknown
     return replace(
         search, R=pose.R.clone(), t=pose.t.clone(), scale=float(pose.scale), camera=cameras[0], cameras=cameras, loss=loss,
-        explained=explained, conflict=conflict, history=history, steps=len(history), uncertainty=known, converged=right,
+        explained=explained, conflict=conflict, history=history, steps=len(history), uncertainty=known, converged=rests,
     )  # fmt: skip
 
 

@@ -158,8 +158,8 @@ def search_pose(
         state.run()
         if search == "global":
             warn_of_units(task.scene.transformed(state.best.R, state.best.t, state.best.scale), seen, measured, "found")
-        wrong = not state.converged and state.edge_support < state.enough
-        if search and wrong and proposals is None:
+        doubtful = fit_of(state, progress, given_cameras).reason != "converged"
+        if search and doubtful and proposals is None:
             _warn_of_flipped_pictures(task, state, init is None)
     keep()
     return fit_of(state, progress, given_cameras)
@@ -178,11 +178,11 @@ def fit_of(
         known = Uncertainty.from_information(task, best, state.information, symmetries)
         features = features_of(state.evidence, modes[0].probability, known)
     conflict = conflict or ambiguity(best, state.ambiguous, symmetries, task)
-    sure = state.converged and not progress.interrupted and not conflict and (known is None or not known.unknown)
+    rests = state.rests and not progress.interrupted
     seen = [map_tensors(task.lens(one, best), Tensor.clone) for one in cameras]
     history = map_tensors(list(state.history), Tensor.clone)
     return PoseFit(
-        best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), progress.seconds, sure,
+        best.R.clone(), best.t.clone(), float(best.scale), seen[0], state.loss, len(history), progress.seconds, rests,
         progress.interrupted, state.edge_support, history, task, seen, known, visible, conflict, state.enough, modes, features,
     )  # fmt: skip
 

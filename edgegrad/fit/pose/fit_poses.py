@@ -81,8 +81,8 @@ def fit_poses(
     Returns
     -------
     list of PoseFit
-        One for each mesh, with `visible`, the share of it that the others do not hide. Each is `converged` by itself, and not
-        if less than a tenth is visible, or if it ends inside another one.
+        One for each mesh, with `visible`, the share of it that the others do not hide. `reason` says so where less than a
+        tenth is visible, or where it ends inside another one.
 
     Raises
     ------
@@ -135,10 +135,6 @@ class ObjectSearch(PoseSearch):
     """The search for one object among others."""
 
     visible = math.nan  # share of it that the others do not hide
-
-    @property
-    def converged(self) -> bool:
-        return super().converged and self.visible >= CAMERA.least_visible
 
     def seek(self, task: PoseTask, first: bool) -> None:
         """Find the pose while the others stay. After the `first` time it is refined on the last level alone."""

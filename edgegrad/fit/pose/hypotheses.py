@@ -71,7 +71,7 @@ class Group:
         self.descents = LevenbergMarquardt(Replayed(self.level, self.log), self.poses, LevenbergMarquardtSettings(
             steps=settings.steps + 1, start_damping=POSE.fine_damping if last else POSE.coarse_damping,
             least_damping=0.1 * POSE.fine_damping, most_damping=POSE.most_damping, unseen_damping=1e-5,
-            trust_radius=POSE.longest_step, least_gain=POSE.least_gain,
+            trust_radius=POSE.longest_step, least_gain=POSE.least_gain * self.level.temperature,
             shortest_step=settings.step_tolerance * self.level.coarseness,
         ))  # fmt: skip
 
@@ -132,7 +132,7 @@ class HypothesisSearch:
             if self.further:
                 best = min(self.groups, key=lambda group: min(group.costs))
                 order = sorted(range(len(best.poses)), key=best.costs.__getitem__)
-                drawn = 1 if best.levels[min(k + 1, len(best.levels) - 1)].last else 2
+                drawn = 2 if k == 0 else 1
                 best.poses += [pose for row in order[:drawn] for pose in best.open_ends(row)]
         for group in self.groups:
             group.enter(deepest - 1, self.settings)
@@ -141,12 +141,18 @@ class HypothesisSearch:
             noises = [group.level.contour_noises for group in self.groups]
             for group in self.groups:
                 group.level = group.level.informed(group.poses).focused(group.poses[0])
-            if noises == [group.level.contour_noises for group in self.groups]:
+            if noises == [group.level.contour_noises for group in self.groups] and self._rests():
                 break
             for group in self.groups:
                 group.begin(self.settings)
             self._halve(((POSE.last_steps, POSE.modes),))
         return self._modes()
+
+    def _rests(self) -> bool:
+        """Whether the likeliest hypothesis has a short next step by as many pixels as count as one now."""
+        group = self.groups[0]
+        assert group.descents is not None
+        return group.descents.descents[0].predicted < POSE.least_gain * group.level.temperature
 
     def _halve(self, rounds: Sequence[Round]) -> None:
         """Take steps, and keep the likeliest hypotheses after each round."""
@@ -170,7 +176,8 @@ class HypothesisSearch:
         for cost, g, row in ranked:
             pose = self._descent(g, row).point
             alone = all(self.apart(pose, self._descent(*other).point) > POSE.distinct for other in kept)
-            unlikely = self.groups[g].level.last and cost - ranked[0][0] > POSE.unlikely_nats
+            level = self.groups[g].level
+            unlikely = bool(level.contour_noises) and cost - ranked[0][0] > POSE.unlikely_nats * level.temperature
             if math.isfinite(cost) and alone and not unlikely and len(kept) < most:
                 kept.append((g, row))
         kept = kept or [(ranked[0][1], ranked[0][2])]
@@ -212,7 +219,7 @@ class HypothesisSearch:
         for mode, gain in sorted(found, key=lambda pair: pair[0].cost):
             if all(self.apart(mode.pose, other.pose) > POSE.same_mode for other, _ in kept):
                 kept.append((mode, gain))
-        T = kept[0][0].level.temperature(kept[0][0].pose) if kept else 1.0
+        T = kept[0][0].level.temperature if kept else 1.0
         return [
             mode._replace(temperature=T, rests=mode.rests or gain < POSE.least_gain * T) for mode, gain in kept
         ]  # fmt: skip

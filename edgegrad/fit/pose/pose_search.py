@@ -52,9 +52,9 @@ class PoseSearch:
         return sum(min(steps, self.settings.steps) for steps in most)
 
     @property
-    def converged(self) -> bool:
-        """Whether the likeliest mode is at rest, and the pictures show its edges."""
-        return bool(self.modes) and self.modes[0].rests and self.edge_support >= self.enough
+    def rests(self) -> bool:
+        """Whether the likeliest mode is at rest."""
+        return bool(self.modes) and self.modes[0].rests
 
     @property
     def ambiguous(self) -> list[Pose]:

@@ -42,7 +42,7 @@ class Replayed(Problem[Pose]):
         self.problem, self.log = problem, log
 
     def model(self, points: Sequence[Pose]) -> Model:
-        return Model(*self.log.replay(lambda: list(self.problem.model(points)[:3])))
+        return Model(*self.log.replay(lambda: list(self.problem.model(points))))
 
     def moved(self, points: Sequence[Pose], steps: Tensor) -> list[Pose]:
         return self.problem.moved(points, steps)

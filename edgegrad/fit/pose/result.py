@@ -56,6 +56,9 @@ class PoseFit(FitResult):
     R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given one
     (of several the first), with the focal length found when that was asked for.
 
+    `converged` says that the descent came to rest, and `reason` what else speaks against the pose; `confidence` is the
+    probability that it is right.
+
     `loss` is −log of how much likelier the pictures are with the object than without, in nats of independent pixels. It belongs
     to the finest level, and compares only fits to the same pictures.
     """
@@ -97,12 +100,12 @@ class PoseFit(FitResult):
 
     @property
     def reason(self) -> str:
-        """Return "converged", or what kept the fit from that, in words.
+        """Return "converged", or what speaks against the pose, in words.
 
         These are "edges not explained: …", "hidden: …", "in one place: …", "ambiguous: …", "directions unknown: …", "steps
         ran out: …" and "interrupted".
         """
-        if not self.interrupted and not self.converged and self.visible < CAMERA.least_visible:
+        if not self.interrupted and self.visible < CAMERA.least_visible:
             return f"hidden: the other objects leave {self.visible:.0%} of it to be seen; its pose is about its start's"
         if self.conflict and not self.interrupted:
             return self.conflict

@@ -118,11 +118,12 @@ def contour_rows(seen: RenderedPoses, blur: float) -> Tensor:
     return smoothed(seen.tangents.flatten(0, 1), blur).reshape(seen.tangents.shape).flatten(2).movedim(0, 1)
 
 
-def contour_term(picture: PictureLevel, sides: Sides, rows: Tensor) -> Term:
-    """Return the term of N silhouettes, with derivatives `rows`, for the picture of their box."""
+def contour_term(picture: PictureLevel, sides: Sides, gained: tuple[Tensor, Tensor], rows: Tensor) -> Term:
+    """Return the term of N silhouettes, with derivatives `rows`, for the picture of their box; `gained` is what Sides.gain()
+    says of it."""
     deviation, band = sides.variance.sqrt(), sides.band
     residual, step = (sides.mixed - picture.outlined) / deviation, sides.step / deviation
-    gain, own = sides.gain(picture.outlined)
+    gain, own = gained
     # One row of J serves all channels, whose slopes by alpha are `step`.
     strength = step.square().sum(1)
     along = (residual * step).sum(1) / strength.clamp(min=1e-12)
@@ -140,10 +141,8 @@ def contour_noise(
         sides = Sides.from_picture(picture, seen, visible, light, every, ContourNoise(blur, 0.0))
         band = sides.band if band is None else band
         rows = contour_rows(seen, blur)
-        terms = [
-            contour_term(picture, sides.noisy(math.hypot(picture.noise, one))._replace(band=band), rows)
-            for one in POSE.contour_noises
-        ]
+        noisy = [sides.noisy(math.hypot(picture.noise, one))._replace(band=band) for one in POSE.contour_noises]
+        terms = [contour_term(picture, one, one.gain(picture.outlined), rows) for one in noisy]
         _, deviation = min(zip((float(term.cost) for term in terms), POSE.contour_noises, strict=True))
         after = min(float(term.cost - term.predicted_gain) for term in terms)
         found.append((after, ContourNoise(blur, deviation)))

@@ -43,7 +43,7 @@ class FittedLight(NamedTuple):
     predicted: Tensor  # (N, C, M), linear radiance, blurred
     residual: Tensor  # (N, C, M), scaled
     weight: Tensor  # (N, M), of pixels
-    robust: Tensor  # (N, M), weights of pixels, near zero for outliers
+    robust: Tensor  # (N, M), weights of pixels, the probability that they show the surface
     deviation: Tensor  # (N,), of scaled differences
     likely: Tensor  # (N, M), log likelihood ratio to the colours nearby
     visible: Tensor  # (N, h, w), probability that nothing covers the pixel
@@ -121,7 +121,8 @@ class FittedLight(NamedTuple):
         # Along the silhouette a blur mixes the contours of object and occluder, so a margin counts as occluded.
         hidden = F.max_pool2d(torch.where(inside, 1.0 - visible, 0.0)[:, None], 5, 1, 2)[:, 0]
         visible = 1.0 - torch.where(inside, 1.0 - visible, hidden) * known[:, None, None]
-        robust = robust * whole * known[:, None]
+        own_share = torch.sigmoid(likely + math.log(1.0 / POSE.occluded - 1.0))
+        robust = count * own_share * visible.flatten(1)[:, at] * whole * known[:, None]
         return FittedLight(
             inside, at, known, light, predicted, residual, count, robust, used, likely, visible, B, scale, slopes, ridge
         )
@@ -136,8 +137,9 @@ class FittedLight(NamedTuple):
         Y = harmonics_of(seen.normal, self.coefficients.shape[2])
         return (seen.color * torch.einsum("nck,nkhw->nchw", self.coefficients, Y)).clamp(min=0.0)
 
-    def term(self, flow: Tensor) -> Term:
-        """Return the term of the surfaces, whose points move by `flow` (D, N, 2, h, w), with the light's numbers eliminated."""
+    def term(self, flow: Tensor, tangents: Tensor | None = None) -> Term:
+        """Return the term of the surfaces, whose points move by `flow` (D, N, 2, h, w), and their silhouettes by `tangents`
+        (D, N, h, w), with the light's numbers eliminated."""
         e = POSE.occluded
         gain = ((1.0 - e) * self.likely.clamp(max=20.0).exp() + e).log()
         cost = -(self.weight * gain).sum(1) / POSE.correlated_light * self.known
@@ -159,12 +161,22 @@ class FittedLight(NamedTuple):
             gradient += b[:, :D] - (A[:, :D, D:] @ eliminated[..., D:])[..., 0]
             kept.append((moved - eliminated[..., :D].mT @ self.basis[:, c], self.robust * self.residual[:, c]))
         information = 1.0 / (POSE.correlated_light * self.deviation.double().square())
+        gradient = information[:, None] * gradient
+        if tangents is not None:
+            gradient -= self._growth(gain, tangents)
 
         def summands() -> Tensor:
             total = sum((rows * pull[:, None] for rows, pull in kept[1:]), kept[0][0] * kept[0][1][:, None])
             return self.image(information[:, None, None].float() * total)
 
-        return Term(cost.double(), information[:, None] * gradient, information[:, None, None] * curvature, summands)
+        return Term(cost.double(), gradient, information[:, None, None] * curvature, summands)
+
+    def _growth(self, gain: Tensor, tangents: Tensor) -> Tensor:
+        """Return by how much the gain (N, M) of pixels grows (N, D) as the silhouette, which moves by `tangents` (D, N, h, w),
+        takes in others that are like those along it."""
+        near = smoothed(self.image(self.weight * gain), POSE.contour_window)
+        mean = near / smoothed(self.inside.float(), POSE.contour_window).clamp(min=0.02)
+        return (mean * tangents).sum((2, 3)).T * (self.known / POSE.correlated_light)[:, None]
 
 
 def harmonics_of(normals: Tensor, count: int) -> Tensor:

@@ -68,6 +68,7 @@ class PoseLevel(Problem[Pose]):
     last: bool
     contour_noises: tuple[ContourNoise, ...] = ()  # of each picture
     light_deviations: tuple[float | None, ...] = ()
+    temperature: float = 1.0  # pixels that count as one, where that is known
 
     @property
     def size(self) -> tuple[int, int]:
@@ -78,23 +79,8 @@ class PoseLevel(Problem[Pose]):
         total = Term.zero(len(points), len(self.dofs))
         for one in self.comparisons(points):
             total = total.plus(one.term._replace(summands=None))
-        return Model(total.cost[:, None], total.gradient, total.curvature)
-
-    def scored(self, pose: Pose) -> tuple[Term, Tensor]:
-        """Return the sum of all terms at a pose, and the covariance (D, D) of its gradient by the residuals there."""
-        terms = [one.term for one in self.comparisons([pose])]
-        total, scores = Term.zero(1, len(self.dofs)), torch.zeros(len(self.dofs), len(self.dofs), dtype=torch.float64)
-        for term in terms:
-            total = total.plus(term._replace(summands=None))
-            scores += term.score_covariance(POSE.correlation_length)[0]
-        return total, POSE.common_errors * scores
-
-    def temperature(self, pose: Pose) -> float:
-        """Return how many pixels count as one: the covariance of the gradient relative to Fisher's information."""
-        total, scores = self.scored(pose)
-        H = total.curvature[0]
-        H = H + 1e-9 * H.diagonal().max() * torch.eye(len(H), dtype=torch.float64)
-        return max(1.0, float(torch.linalg.solve(H, scores).trace()) / len(H))
+        noise = torch.full_like(total.cost, POSE.cost_noise * self.temperature)
+        return Model(total.cost[:, None], total.gradient, total.curvature, noise)
 
     def moved(self, points: Sequence[Pose], steps: Tensor) -> list[Pose]:
         return moved_poses(self.task, points, self.dofs, steps)
@@ -128,7 +114,8 @@ class PoseLevel(Problem[Pose]):
                 light = FittedLight.from_picture(part, seen, self.harmonics, inside, deviation)
                 if light is not None:
                     visible = light.visible
-                    terms.append(light.term(flow))
+                    # Far from the right pose, flat surroundings would draw the silhouette outwards.
+                    terms.append(light.term(flow, seen.tangents if self.last else None))
             if measured:
                 scale = stacked(poses).scale
                 terms.append(depth_term(part, seen, moving, flow, scale, self.task.size))
@@ -136,8 +123,9 @@ class PoseLevel(Problem[Pose]):
         if self.last:
             every = seen.box.cut(colors.every)
             sides = Sides.from_picture(part, seen, visible, light, every, noise)
-            mixed = sides.band * sides.gain(part.outlined)[1]
-            terms.append(contour_term(part, sides, contour_rows(seen, noise.blur)))
+            gained = sides.gain(part.outlined)
+            mixed = sides.band * gained[1]
+            terms.append(contour_term(part, sides, gained, contour_rows(seen, noise.blur)))
         terms.append(region_term(picture, seen, colors, visible, mixed, self.alpha_blur))
         total = terms[0]
         for term in terms[1:]:
@@ -160,11 +148,31 @@ class PoseLevel(Problem[Pose]):
             for one in sharp
         ]
         # Samples are enough where their noise is far below the pictures'. Stratified ones leave an error of about spp^(-3/4).
+        here = replace(self, contour_noises=tuple(found)).comparisons([pose])
         excess = 0.0
-        for one, other, noise in zip(replace(self, dofs=(), last=False).comparisons([pose]), sharp, found, strict=True):
+        for one, other, noise in zip(here, sharp, found, strict=True):
             excess = max(excess, one.sides(noise).distance(other.sides(noise)) / POSE.render_noise)
         spp = min(max(self.spp, POSE.sharp_spp), math.ceil(self.spp * max(1.0, excess ** (4.0 / 3.0))))
-        return replace(self, contour_noises=tuple(found), spp=spp)
+        T = temperature([one.term for one in here])
+        return replace(self, contour_noises=tuple(found), spp=spp, temperature=T)
+
+
+def scored(terms: Sequence[Term]) -> tuple[Term, Tensor]:
+    """Return the sum of terms of one pose, and the covariance (D, D) of its gradient by the residuals there."""
+    total = Term.zero(1, terms[0].gradient.shape[1])
+    scores = torch.zeros_like(total.curvature[0])
+    for term in terms:
+        total = total.plus(term._replace(summands=None))
+        scores += term.score_covariance(POSE.correlation_length)[0]
+    return total, POSE.common_errors * scores
+
+
+def temperature(terms: Sequence[Term]) -> float:
+    """Return how many pixels count as one: the covariance of the gradient relative to Fisher's information."""
+    total, scores = scored(terms)
+    H = total.curvature[0]
+    H = H + (1e-9 * H.diagonal().max() + 1e-30) * torch.eye(len(H), dtype=torch.float64)
+    return max(1.0, float(torch.linalg.solve(H, scores).trace()) / len(H))
 
 
 class Crop(NamedTuple):
