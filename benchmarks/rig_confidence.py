@@ -123,7 +123,7 @@ def main() -> None:
             flush=True,
         )
     if told.train:
-        found = trained(features, right)
+        found = trained(features, right, ridge=1.0)
         print(found)
         sure = [found.probability(one) for one in features]
     wrong = sum(p >= SURE and not ok for p, ok in zip(sure, right, strict=True))

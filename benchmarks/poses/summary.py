@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgegrad.fit.pose.confidence import POSE_CONFIDENCE
+from edgegrad.fit.pose.confidence import POSE_CONFIDENCE, confidence_of
 
 from .cases import Case, Placed
 from .kinds import KINDS, cases
@@ -42,7 +42,7 @@ def known(record: Record) -> bool:
 def confidence(record: Record) -> float:
     """Return the confidence by a fit's features, so that fits need not run again after a training; NaN without any."""
     features = record.get("features") or {}
-    return POSE_CONFIDENCE.probability(features) if features else record.get("confidence", math.nan)
+    return confidence_of(features) if features else record.get("confidence", math.nan)
 
 
 def sure(record: Record) -> bool:
@@ -140,11 +140,13 @@ def calibration_error(found: Sequence[Bin]) -> float:
 
 def training(records: Sequence[Record]) -> str:
     """Return the coefficients of confidence by the features of fits, and how it does on cases that were left out."""
-    features, right = [one["features"] for one in records], [known(one) for one in records]
-    found, pairs = trained(features, right), list(zip(left_out(features, right), right, strict=True))
+    features = [{name: one["features"][name] for name in POSE_CONFIDENCE.names} for one in records]
+    right, meshes = [known(one) for one in records], [one["mesh"] for one in records]
+    said = [one["features"]["mass"] * p for one, p in zip(records, left_out(features, right, meshes), strict=True)]
+    found, pairs = trained(features, right), list(zip(said, right, strict=True))
     wrong = sum(p >= SURE and not good for p, good in pairs)
     return (
-        f"{found}\n{sum(right)} of {len(right)} right; trained on the others, {sum(p >= SURE for p, _ in pairs)} are sure, "
+        f"{found}\n{sum(right)} of {len(right)} right; trained on other meshes, {sum(p >= SURE for p, _ in pairs)} are sure, "
         f"{wrong} of them wrong; expected calibration error {calibration_error(bins(pairs)):.3f}"
     )
 

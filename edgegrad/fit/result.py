@@ -25,7 +25,8 @@ class FitResult:
     Attributes
     ----------
     converged, reason : bool, str
-        Whether further steps lead no further, and the pictures show what was found; and "converged", or in words what is missing.
+        Whether further steps lead no further and, but for poses, the pictures show what was found; and "converged", or in words
+        what is missing.
     loss, explained : float
         The loss at the end, and the share, 0 … 1, of the render's edges that the pictures show too.
     history : list

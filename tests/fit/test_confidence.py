@@ -11,7 +11,7 @@ from brackets import START, bracket, camera, picture
 from quiet_fits import quiet
 
 from edgegrad.fit import fit_pose
-from edgegrad.fit.pose.confidence import POSE_CONFIDENCE, features_of
+from edgegrad.fit.pose.confidence import FEATURES, confidence_of, features_of
 from edgegrad.fit.pose.likelihood.support import Evidence
 from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.uncertainty import Uncertainty
@@ -24,7 +24,7 @@ def known(deviation: float) -> Uncertainty:
 
 
 def confidence(evidence: Evidence, deviation: float = 0.003, best: float = 1.0) -> float:
-    return POSE_CONFIDENCE.probability(features_of(evidence, best, known(deviation)))
+    return confidence_of(features_of(evidence, best, known(deviation)))
 
 
 def test_doubt_lowers_confidence() -> None:
@@ -44,7 +44,7 @@ def test_a_fit_says_how_sure_it_is() -> None:
     options = quiet(max_size=32, callback=lambda fit: said.append(fit.confidence))
     fit = fit_pose(bracket(), image, view, init=START, search=False, options=options)
     assert said and all(map(math.isnan, said)) and fit.converged  # before the answer
-    assert set(fit.features) == set(POSE_CONFIDENCE.names)
+    assert set(fit.features) == set(FEATURES)
     assert PoseFit.from_json(fit.to_json()).confidence == fit.confidence
     data = json.loads(fit.to_json())
     for wrong in ([1.0], {"support": 1.0}):

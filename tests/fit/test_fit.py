@@ -1,6 +1,7 @@
 """fit_pose on a small coloured bracket finds poses, names wrong arguments, and keeps the best pose when interrupted."""
 
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
@@ -147,7 +148,12 @@ def test_json_round_trip():
     back = PoseFit.from_json(fit.to_json())
     torch.testing.assert_close(back.matrix, fit.matrix, rtol=0, atol=1e-12)
     assert torch.equal(back.camera.K, fit.camera.K) and back.camera.size == fit.camera.size
-    assert (back.loss, back.steps, back.converged, back.interrupted) == (fit.loss, fit.steps, fit.converged, False)
+    names = ("loss", "steps", "converged", "interrupted", "reason", "enough", "visible")
+    for name in names:
+        assert getattr(back, name) == getattr(fit, name), name
+    assert [mode.probability for mode in back.modes] == [mode.probability for mode in fit.modes] and back.modes
+    doubtful = replace(fit, conflict="ambiguous: another pose", visible=0.3)
+    assert PoseFit.from_json(doubtful.to_json()).reason == doubtful.reason
     torch.testing.assert_close(pose_from_json(fit.to_json()).matrix, fit.matrix, rtol=0, atol=1e-12)
     again = fit_pose(before_sky(), picture(view), view, init=back, search=False, options=quiet(steps=1))
     assert torch.allclose(again.history[0].pose.matrix, fit.matrix)

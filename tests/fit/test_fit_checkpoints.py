@@ -203,6 +203,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
         "depths": torch.ones(24, 24),
         "init": torch.eye(4),
         "scale": True,
+        "symmetries": eg.Symmetries(),
         "spp": 4,
         "steps": 2,
     }.items():

@@ -124,7 +124,8 @@ def search_pose(
     file = CheckpointFile(settings.checkpoint, {
         names.init: None if init is None else given.matrix, names.mesh: mesh, names.images: images, "masks": masks,
         "weights": weights, "cameras": [traits(one) for one in given_cameras], **lens._asdict(), "depths": depths,
-        "search": search, **{n: getattr(settings, n) for n in ("max_size", "steps", "spp", "step_tolerance", "seed")},
+        "search": search, "symmetries": symmetries,
+        **{name: getattr(settings, name) for name in ("max_size", "steps", "spp", "step_tolerance", "seed")},
     })  # fmt: skip
     saved = file.read()
     log = ReplayLog() if saved is None else ReplayLog(saved["values"])

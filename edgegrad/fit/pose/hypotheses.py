@@ -150,7 +150,7 @@ class HypothesisSearch:
 
     def _rests(self) -> bool:
         """Whether the likeliest hypothesis has a short next step by as many pixels as count as one now."""
-        group = self.groups[0]
+        group = min(self.groups, key=lambda group: min(group.costs))
         assert group.descents is not None
         return group.descents.descents[0].predicted < POSE.least_gain * group.level.temperature
 

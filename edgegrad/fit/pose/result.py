@@ -19,7 +19,7 @@ from ...optim.history import Ending
 from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
 from ..result import FitResult, made_folder, number_or_none, reason_of
-from .confidence import POSE_CONFIDENCE
+from .confidence import FEATURES, confidence_of
 from .pose import Pose, pose_from_matrix
 from .settings import CAMERA
 from .uncertainty import Uncertainty
@@ -77,10 +77,10 @@ class PoseFit(FitResult):
     task: PoseTask | None = field(default=None, repr=False)  # what was compared, for pictures; not kept in JSON
     cameras: list[Camera] = field(default_factory=list, repr=False)  # all given ones, as `camera`; not kept in JSON
     uncertainty: Uncertainty | None = field(default=None, repr=False)  # None before the answer
-    visible: float = 1.0  # share of this object that the others of fit_poses() do not hide; not kept in JSON
-    conflict: str = ""  # the other pose or object that may be the right one, in words; not kept in JSON
-    enough: float = MIN_EDGE_SUPPORT  # least `explained` of a right pose; not kept in JSON
-    # The poses at which the search came to rest, the likeliest first.
+    visible: float = 1.0  # share of this object that the others of fit_poses() do not hide
+    conflict: str = ""  # the other pose or object that may be the right one, in words
+    enough: float = MIN_EDGE_SUPPORT  # least `explained` of a right pose
+    # The poses at which the search came to rest, by their costs; the first one is the answer.
     modes: Sequence[PoseMode] = ()
     features: Mapping[str, float] = field(default_factory=dict, repr=False)  # of the fit, on which `confidence` depends
 
@@ -93,10 +93,10 @@ class PoseFit(FitResult):
     def confidence(self) -> float:
         """The probability, 0 … 1, that the pose is right within 2° and 2 % of the object's size, up to given symmetries.
 
-        It is a logistic regression on features of the fit that was trained on other pictures, see docs/pose.md; NaN before
-        the answer.
+        It is the mass of the mode times a logistic regression on features of the fit that was trained on other pictures, see
+        docs/pose.md; NaN before the answer.
         """
-        return POSE_CONFIDENCE.probability(self.features) if self.features else math.nan
+        return confidence_of(self.features) if self.features else math.nan
 
     @property
     def reason(self) -> str:
@@ -153,7 +153,8 @@ class PoseFit(FitResult):
             "loss": number_or_none(self.loss), "steps": self.steps, "seconds": round(self.seconds, 3),
             "converged": self.converged, "reason": self.reason, "interrupted": self.interrupted,
             "explained": number_or_none(self.explained), "confidence": number_or_none(self.confidence),
-            "features": dict(self.features),
+            "features": dict(self.features), "conflict": self.conflict, "visible": self.visible, "enough": self.enough,
+            "modes": [{"mesh_to_world": mode.matrix.tolist(), "probability": mode.probability} for mode in self.modes],
             "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
         }  # fmt: skip
         return json.dumps(content, indent=2)
@@ -166,12 +167,18 @@ class PoseFit(FitResult):
         pose = pose_from_matrix("mesh_to_world", data["mesh_to_world"])
         try:
             known, given = data.get("uncertainty"), dict(data.get("features") or {})
+            modes = [
+                PoseMode(pose_from_matrix("modes", one["mesh_to_world"]).matrix, float(one["probability"]))
+                for one in data.get("modes") or []
+            ]
             loss, explained = (math.nan if (x := data.get(name)) is None else x for name in ("loss", "explained"))
             return PoseFit(
                 pose.R, pose.t, float(pose.scale), camera_from_fields(data["camera"]), float(loss), int(data["steps"]),
                 float(data["seconds"]), bool(data["converged"]), bool(data["interrupted"]), float(explained),
                 uncertainty=None if known is None else Uncertainty.from_dict(known),
-                features={name: float(given[name]) for name in POSE_CONFIDENCE.names} if given else {},
+                features={name: float(given[name]) for name in FEATURES} if given else {},
+                conflict=str(data.get("conflict", "")), visible=float(data.get("visible", 1.0)),
+                enough=float(data.get("enough", MIN_EDGE_SUPPORT)), modes=modes,
             )  # fmt: skip
         except (FormatError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
