@@ -69,10 +69,8 @@ class PoseSettings:
     # Steps on the coarsest level, and hypotheses kept then.
     first_rounds: tuple[tuple[int, int], ...] = ((3, 8), (4, 4))
     later_rounds: tuple[tuple[int, int], ...] = ((2, 6), (3, 3))  # the same on each further level before the last
-    last_rounds: tuple[tuple[int, int], ...] = (
-        (1, 5),
-        (2, 3),
-    )  # on the last level, before its noise and blur are known
+    # The same on the last level, before its noise and blur are known.
+    last_rounds: tuple[tuple[int, int], ...] = ((1, 5), (2, 3))
     unlikely_nats: float = 8.0  # by which hypotheses on the last level may be less likely: a factor of 3000
     last_steps: int = 20  # most steps on the last level, once its noise and blur are known
     noise_rounds: int = 4  # most times that noise and blur are estimated anew, and that descents go on by these

@@ -47,11 +47,6 @@ class Comparison(NamedTuple):
             self.part, self.seen, self.visible, self.light, self.seen.box.cut(self.colors.every), noise
         )
 
-    @property
-    def visible_share(self) -> Tensor:
-        """The share (N,) of the object that nothing seems to cover."""
-        return (self.seen.alpha * self.visible).sum((1, 2)) / self.seen.alpha.sum((1, 2)).clamp(min=1e-6)
-
 
 @dataclass(frozen=True)
 class PoseLevel(Problem[Pose]):
