@@ -160,7 +160,7 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, uninterru
         sizes = [step.size[0] for step in whole.history]
         assert set(sizes) == {32, 64} and sizes.count(32) > 4 and len(sizes) > 14
     for stop in stops:
-        stop %= whole.steps  # −1: the last step but the final comparison
+        stop = stop % whole.steps or 1  # −1: the last step but the final comparison
 
         def after_step(fit, stop=stop):
             if fit.steps == stop:
