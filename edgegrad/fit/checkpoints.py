@@ -21,7 +21,7 @@ from ..warnings import warn
 from .placement import Placement
 from .views import Observation
 
-FORMAT = 12
+FORMAT = 13
 
 
 @dataclass(frozen=True)

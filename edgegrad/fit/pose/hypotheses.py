@@ -132,7 +132,7 @@ class HypothesisSearch:
             if self.further:
                 best = min(self.groups, key=lambda group: min(group.costs))
                 order = sorted(range(len(best.poses)), key=best.costs.__getitem__)
-                drawn = 2 if k == 0 else 1
+                drawn = 2 if k == 0 else 1  # The coarsest level tells hypotheses apart least.
                 best.poses += [pose for row in order[:drawn] for pose in best.open_ends(row)]
         for group in self.groups:
             group.enter(deepest - 1, self.settings)

@@ -121,6 +121,7 @@ class FittedLight(NamedTuple):
         # Along the silhouette a blur mixes the contours of object and occluder, so a margin counts as occluded.
         hidden = F.max_pool2d(torch.where(inside, 1.0 - visible, 0.0)[:, None], 5, 1, 2)[:, 0]
         visible = 1.0 - torch.where(inside, 1.0 - visible, hidden) * known[:, None, None]
+        # The cost's derivative by a difference is the difference times this, the mixture's posterior.
         own_share = torch.sigmoid(likely + math.log(1.0 / POSE.occluded - 1.0))
         robust = count * own_share * visible.flatten(1)[:, at] * whole * known[:, None]
         return FittedLight(
@@ -174,6 +175,7 @@ class FittedLight(NamedTuple):
     def _growth(self, gain: Tensor, tangents: Tensor) -> Tensor:
         """Return by how much the gain (N, M) of pixels grows (N, D) as the silhouette, which moves by `tangents` (D, N, h, w),
         takes in others that are like those along it."""
+        # Where a window has next to no inner pixels, the silhouette takes in nothing that is known.
         near = smoothed(self.image(self.weight * gain), POSE.contour_window)
         mean = near / smoothed(self.inside.float(), POSE.contour_window).clamp(min=0.02)
         return (mean * tangents).sum((2, 3)).T * (self.known / POSE.correlated_light)[:, None]

@@ -152,20 +152,12 @@ class PoseLevel(Problem[Pose]):
         return replace(self, contour_noises=tuple(found), spp=spp, temperature=T)
 
 
-def scored(terms: Sequence[Term]) -> tuple[Term, Tensor]:
-    """Return the sum of terms of one pose, and the covariance (D, D) of its gradient by the residuals there."""
-    total = Term.zero(1, terms[0].gradient.shape[1])
-    scores = torch.zeros_like(total.curvature[0])
-    for term in terms:
-        total = total.plus(term._replace(summands=None))
-        scores += term.score_covariance(POSE.correlation_length)[0]
-    return total, POSE.common_errors * scores
-
-
 def temperature(terms: Sequence[Term]) -> float:
-    """Return how many pixels count as one: the covariance of the gradient relative to Fisher's information."""
-    total, scores = scored(terms)
-    H = total.curvature[0]
+    """Return how many pixels count as one: the covariance of the gradient, by the residuals of the terms of one pose, relative to
+    Fisher's information."""
+    scores = POSE.common_errors * sum(term.score_covariance(POSE.correlation_length)[0] for term in terms)
+    H = sum(term.curvature[0] for term in terms)
+    assert isinstance(H, Tensor) and isinstance(scores, Tensor)
     H = H + (1e-9 * H.diagonal().max() + 1e-30) * torch.eye(len(H), dtype=torch.float64)
     return max(1.0, float(torch.linalg.solve(H, scores).trace()) / len(H))
 
