@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..files.image import linear_to_srgb, srgb_slope, srgb_to_linear
 from .edge_support import edge_support
-from .region import smoothed
+from .region import smoothed, smoothed_within
 
 COLOUR_WINDOW = 2.0  # standard deviation in pixels of the windows from which colours are taken
 PIXEL_NOISE = 0.03  # standard deviation of a pixel, sRGB values
@@ -81,7 +81,7 @@ def contour_support(parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
     h, w), and the weights (1, h, w) of the pixels near the object."""
     pairs, shown, length = [], 0.0, 0.0
     for image, alpha, near in parts:
-        contour = smoothed(alpha, CONTOUR_BLUR)
+        contour = smoothed_within(alpha, CONTOUR_BLUR)
         sides = ContourColors.from_image(image, contour, near)
         on = ((contour > PURE) & (contour < 1.0 - PURE)) * near
         length += float(on.sum())

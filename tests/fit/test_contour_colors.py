@@ -5,7 +5,7 @@ import torch
 
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit.contour_colors import CONTOUR_BLURS, ContourColors, blur_losses, mask_noise
-from edgegrad.fit.region import ColorFrequencies, palette, smoothed
+from edgegrad.fit.region import ColorFrequencies, palette, smoothed, smoothed_within
 from edgegrad.fit.views import area_mean
 
 
@@ -28,6 +28,15 @@ def test_the_posterior_separates_colours_near_the_contour_alone():
     near = (edge > 0.02) & (edge < 0.98)
     assert float(P[near & (alpha > 0.5)].min()) > 0.8 and float(P[near & (alpha < 0.5)].max()) < 0.2
     assert float(wide[near & (alpha > 0.5)].min()) < 0.6
+
+
+@pytest.mark.quick
+def test_what_the_border_cuts_has_no_edge_there():
+    """A half plane is the same beyond the border, so its blur in a part of the picture is that in the whole."""
+    whole = (torch.arange(40) < 17).float().expand(1, 60, 40)
+    part = whole[:, 20:35]
+    torch.testing.assert_close(smoothed_within(part, 2.0)[..., 8:-8], smoothed(whole, 2.0)[:, 20:35, 8:-8])
+    assert float(smoothed_within(torch.ones(1, 9, 9), 2.0).min()) == pytest.approx(1.0)
 
 
 def test_the_noise_of_a_mask_is_that_of_its_pixels():

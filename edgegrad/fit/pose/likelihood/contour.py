@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ....files.image import linear_to_srgb, srgb_slope, srgb_to_linear
 from ...contour_colors import PURE, SUPPORT, local_colors
-from ...region import smoothed
+from ...region import smoothed_within
 from ..settings import POSE
 from .light import FittedLight
 from .picture import PictureLevel, RenderedPoses
@@ -54,7 +54,7 @@ class Sides(NamedTuple):
     ) -> Sides:  # fmt: skip
         """Measure the colours in the picture of a box, in windows of so many pixels; `visible` (N, h, w) weights the pixels,
         whose colours have the frequencies `every` (1, h, w) nearby."""
-        alpha = smoothed(seen.alpha, noise.blur)
+        alpha = smoothed_within(seen.alpha, noise.blur)
         image, curved = picture.outlined, picture.mask is None  # A mask's values mix as they are.
         near = picture.weight * visible
         behind = torch.zeros_like(image) if picture.background is None else picture.background
@@ -65,7 +65,7 @@ class Sides(NamedTuple):
         known = (front_count > SUPPORT) & (back_count > SUPPORT) & (near > MIN_VISIBLE)
         a = alpha[:, None]
         if light is not None and curved:
-            lit = smoothed(light.lit(seen).flatten(0, 1), noise.blur).reshape(front.shape) / a.clamp(min=PURE)
+            lit = smoothed_within(light.lit(seen).flatten(0, 1), noise.blur).reshape(front.shape) / a.clamp(min=PURE)
             sure = front_variance / (front_variance + light.deviation.square()[:, None, None, None] + 1e-8)
             front = torch.lerp(front - behind, linear_to_srgb(lit.clamp(0.0, 1.0)) - behind, sure) + behind
             front_variance = front_variance * (1.0 - sure)
@@ -115,7 +115,7 @@ def log_normal(residual: Tensor, variance: Tensor) -> Tensor:
 
 def contour_rows(seen: RenderedPoses, blur: float) -> Tensor:
     """Return the derivatives (N, D, h · w) of silhouettes that are blurred by so many pixels."""
-    return smoothed(seen.tangents.flatten(0, 1), blur).reshape(seen.tangents.shape).flatten(2).movedim(0, 1)
+    return smoothed_within(seen.tangents.flatten(0, 1), blur).reshape(seen.tangents.shape).flatten(2).movedim(0, 1)
 
 
 def contour_term(picture: PictureLevel, sides: Sides, gained: tuple[Tensor, Tensor], rows: Tensor) -> Term:
