@@ -206,17 +206,21 @@ def refined(searches: Sequence[PoseFit], settings: Settings) -> CameraFit:
             task, own = search.task, replace(settings, seed=(settings.seed + 7919 * k) % 2**32)
             assert task is not None
             starts.append(next(step.pose for step in reversed(search.history) if step.best))
-            level = pose_levels(task, starts[k], [None] * len(task.shots), own)[-1]
-            levels.append(level.informed([starts[k]]).focused(starts[k]))
+            levels.append(pose_levels(task, starts[k], [None] * len(task.shots), own)[-1])
+        levels = [level.informed([pose]).focused(pose) for level, pose in zip(levels, starts, strict=True)]
         bundle = Bundle(levels)
         most = min(CAMERA.adjust_steps, settings.steps)
         found = minimise(bundle, [bundle.agreed(starts)], bundle.settings(most), after_step)
         if found.interrupted:
             raise KeyboardInterrupt
         assert end is not None
-        ends = list(zip(levels, end.poses, strict=True))
-        end = end._replace(costs=[float(level.costs([pose])[0]) for level, pose in ends])
-        supports = [evidence_of(level, pose).edges for level, pose in ends]
+        # Where the searches ended, a part of the residuals was of the poses: deviations by these would be nearly twice as wide.
+        levels = [level.informed([pose]).focused(pose) for level, pose in zip(levels, end.poses, strict=True)]
+        bundle = Bundle(levels)
+        bundle.model([end.poses])
+        assert bundle.last is not None
+        end = bundle.last._replace(costs=end.costs)
+        supports = [evidence_of(level, pose).edges for level, pose in zip(levels, end.poses, strict=True)]
         ending = Ending.FLAT if found.descents[0].rest is Rest.SHORT else Ending.STEPS
         best = result(end)
     each = progress.seconds / len(searches)
