@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 import trimesh
-from brackets import CENTER, START, bracket, camera, errors, task_of
+from brackets import BACKGROUND, CENTER, START, bracket, camera, errors, picture, task_of
 from photographs import clutter, coverage, depth_of, photograph
 from quiet_fits import arranged, quiet
 
@@ -19,7 +19,7 @@ from edgegrad.fit.options import Settings
 from edgegrad.fit.pose import pose_search
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.likelihood.objective import pose_levels
-from edgegrad.fit.pose.likelihood.support import evidence_of
+from edgegrad.fit.pose.likelihood.support import RESOLVED, evidence_of
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.fit.pose.target_images import is_clutter
@@ -123,6 +123,18 @@ def test_a_faint_contour_proves_little(step, least, most):
     pose = pose_from_matrix("init", torch.eye(4))
     level = pose_levels(task, pose, [None], Settings(max_size=96))[-1].informed([pose])
     assert least <= evidence_of(level, pose).edges <= most
+
+
+def test_few_pixels_prove_little_before_something_else_than_the_known_background():
+    """A coloured mesh is at its very place, before the background that is given, or before clutter."""
+    view = camera(32)
+    pose, found = pose_from_matrix("init", torch.eye(4)), []
+    for behind in (BACKGROUND, clutter(32, 1)):
+        task = task_of(picture(view, background=behind), view, background=BACKGROUND)
+        level = pose_levels(task, pose, [None], Settings())[-1].informed([pose])
+        found.append(evidence_of(level, pose))
+    known, other = found
+    assert known.edges > 0.85 and other.edges < 1.05 * other.across / RESOLVED < 0.8, found
 
 
 @pytest.mark.slow

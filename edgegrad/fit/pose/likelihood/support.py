@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ....files.image import linear_to_srgb
-from ...contour_colors import ALONE_INFORMATION, ALONE_SHOWN, COLOUR_WINDOW, CONTRAST, PURE
+from ...contour_colors import ALONE_INFORMATION, ALONE_SHOWN, COLOUR_WINDOW, CONTRAST, PIXEL_NOISE, PURE
 from ...edge_support import edge_support
-from ...region import information, smoothed
+from ...region import information, smoothed_within
 from ..pose import Pose
 from ..settings import POSE
 from ..task import PoseTask
@@ -44,11 +45,25 @@ def evidence_of(level: PoseLevel, pose: Pose) -> Evidence:
     visible = sum(float((one.seen.alpha * one.visible).sum()) for one in compared) / total
     nats = -sum(float(one.term.cost) for one in compared) / total
     extent = max(picture.extent for picture in level.pictures)
-    least = RESOLVED if level.task.clutter else 1.0
-    edges = _share(compared, extent / least, level.harmonics > 0, False)
+    known = _before_known(compared)
+    resolved = known + (1.0 - known) * min(1.0, extent / RESOLVED)
+    edges = _share(compared, resolved, level.harmonics > 0, False)
     if edges < 1.0 and visible >= FULLY_VISIBLE:
-        edges = max(edges, _share(compared, extent / least, level.harmonics > 0, True))
+        edges = max(edges, _share(compared, resolved, level.harmonics > 0, True))
     return Evidence(edges, visible, nats, extent)
+
+
+def _before_known(compared: list[Comparison]) -> float:
+    """Return the share of the pixels around the object that a mask is known of, or that show the background as it is known."""
+    shown = around = 0.0
+    for part, alpha in ((one.part, one.seen.alpha[0]) for one in compared):
+        count = part.weight * (alpha < PURE)
+        around += float(count.sum())
+        if part.mask is None:
+            off = math.inf if part.background is None else (part.display - part.background).abs().amax(0)
+            count = count * (off < CONTRAST * PIXEL_NOISE)
+        shown += float(count.sum())
+    return shown / max(around, 1e-30)
 
 
 def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered: bool) -> float:
@@ -56,43 +71,33 @@ def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered
     shown = length = bits = pixels = 0.0
     for one in compared:
         part, seen = one.part, one.seen
-        visible = one.visible if uncovered else torch.ones_like(one.visible)
-        sides, weight = (
-            Sides.from_picture(
-                part, seen, visible, None, seen.box.cut(one.colors.every), ContourNoise(), COLOUR_WINDOW
-            ),
-            (part.weight * visible)[0],
-        )
-        on = ((sides.alpha > PURE) & (sides.alpha < 1.0 - PURE)) * part.weight * visible
+        visible, every = one.visible if uncovered else torch.ones_like(one.visible), seen.box.cut(one.colors.every)
+        sides = Sides.from_picture(part, seen, visible, None, every, ContourNoise(), COLOUR_WINDOW)
+        weight = (part.weight * visible)[0]
+        on = ((sides.alpha > PURE) & (sides.alpha < 1.0 - PURE)) * weight
         length += float(on.sum())
         shown += float((on * (sides.contrast > CONTRAST) * (sides.band > 0.0)).sum())
         if not colored:
-            soft = smoothed(seen.alpha, COLOUR_WINDOW)
+            soft = smoothed_within(seen.alpha, COLOUR_WINDOW)
             ring = ((soft > PURE) & (soft < 1.0 - PURE)) * part.weight
             inside, outside = seen.box.cut(one.colors.inside), seen.box.cut(one.colors.outside)
             bits += float((ring * information(inside / (inside + outside), seen.alpha)).sum())
             pixels += float(ring.sum())
-        mixed, band = sides.mixed[0], sides.band[0]
+        mixed, band = sides.mixed[0].movedim(0, -1), sides.band[0]
         if one.light is None or part.mask is not None:
-            pairs.append(_pair(mixed, part.outlined, band))
+            pairs.append((mixed, mixed, part.outlined.movedim(0, -1), band[..., None]))
         if one.light is not None:
             inner = one.light.inside[0]
-            expected = linear_to_srgb(one.light.image(one.light.predicted)[0].clamp(0.0, 1.0))
+            expected = linear_to_srgb(one.light.image(one.light.predicted)[0].clamp(0.0, 1.0)).movedim(0, -1)
             covered = torch.where(inner, weight, 0.0)
             if part.mask is None:
-                expected, covered = torch.where(inner, expected, mixed), torch.where(inner, weight, band)
-            pairs.append(_pair(expected, part.display, covered))
+                expected, covered = torch.where(inner[..., None], expected, mixed), torch.where(inner, weight, band)
+            pairs.append((expected, expected, part.display.movedim(0, -1), covered[..., None]))
     if length == 0.0:
         return 0.0
-    share = edge_support(pairs, softer=True) * min(1.0, resolved)
+    share = edge_support(pairs, softer=True) * resolved
     if colored:
         return share * min(1.0, shown / length / MIN_SHOWN_CONTOUR)
     # Off the object, both sides of a contour have similar colours, however strong the edges that it follows.
     sure = max(0.0, min(1.0, bits / max(pixels, 1e-30) / ALONE_INFORMATION))
     return share * min(1.0, shown / length / ALONE_SHOWN) * sure
-
-
-def _pair(expected: Tensor, picture: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Return what edge_support() compares, of images (C, h, w) and weights (h, w)."""
-    first = expected.movedim(0, -1)
-    return first, first, picture.movedim(0, -1), weight[..., None]
