@@ -196,6 +196,23 @@ def test_radiance_and_weights_of_any_unit(taken):
     assert found[1] == pytest.approx(found[0], abs=0.05) and found[0] > 0.5
 
 
+def test_colours_are_as_sure_in_larger_pictures():
+    """A disc with spots of the background's colours, and the other way round: their share at the contour is the same at any
+    resolution, and blurred pixels are fewer in larger pictures."""
+    found, spots = [], (torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0)) < 0.15).float()
+    for n in (96, 384):
+        at = (torch.arange(n) + 0.5) / n - 0.5
+        alpha = (n * (0.25 - torch.hypot(at, at[:, None])) + 0.5).clamp(0.0, 1.0)
+        mixed = torch.lerp(alpha, 1.0 - alpha, torch.nn.functional.interpolate(spots, (n, n))[0, 0])
+        front, behind = torch.tensor([0.6, 0.3, 0.1]), torch.tensor([0.1, 0.2, 0.4])
+        image = torch.lerp(behind, front, smoothed(mixed[None], 0.7)[0, ..., None])
+        view = eg.Camera.look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), size=(n, n))
+        regions = RegionLoss(region_views(views_of(view, image)), 0)
+        regions.renew(0, alpha[..., None])
+        found.append(regions.edge_support([alpha[..., None]]))
+    assert found[1] == pytest.approx(found[0], abs=0.06) and 0.3 < found[0] < 0.9, found
+
+
 def test_edge_support_is_low_without_the_object():
     fit = fit_scene(
         vase(RADII), clutter(96, 3), VIEW, {"pose": PoseParameter()}, options=quiet(loss="region", spp=4, steps=30)
