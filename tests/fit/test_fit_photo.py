@@ -20,7 +20,7 @@ from edgegrad.fit.pose import pose_search
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.likelihood.objective import pose_levels
 from edgegrad.fit.pose.likelihood.support import RESOLVED, evidence_of
-from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.pose.pose import angle, pose_from_matrix
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.fit.pose.target_images import is_clutter
 from edgegrad.fit.region import smoothed
@@ -186,7 +186,10 @@ def test_an_ambiguous_pose_in_unknown_light_is_not_converged():
 
 @pytest.mark.slow
 def test_an_ambiguous_pose_is_not_converged(monkeypatch):
-    """A box before a camera without perspective has nearly one contour turned to the left and to the right."""
+    """A box before a camera without perspective has nearly one contour turned to the left and to the right.
+
+    Which of both is the answer is chance: before this clutter the mirrored one is likelier by 18 nats, of which some 50 count
+    as one, and before those of the seeds 5, 6 and 7 the right one by 8 … 121. Both must be found, with about the same mass."""
     made = trimesh.creation.box((1.6, 0.9, 0.7))
     verts = torch.tensor(made.vertices.copy())
     box = eg.Mesh(verts, torch.tensor(made.faces.copy()))
@@ -200,8 +203,10 @@ def test_an_ambiguous_pose_is_not_converged(monkeypatch):
         monkeypatch.setattr(pose_search, "POSE", replace(POSE, ambiguous_nats=least))
         found.append(fit_pose(box, image, view, init=start, options=quiet()))
     for fit in found:
-        assert math.degrees(math.acos(min(1.0, (float((fit.R.T @ R).trace()) - 1.0) / 2.0))) < 3.0
-        assert fit.explained >= POSE.plain_support
+        off = [math.degrees(angle(mode.matrix[:3, :3], R)) for mode in fit.modes[:2]]
+        assert min(off) < 3.0 and 15.0 < max(off) < 40.0 and fit.explained >= POSE.plain_support
+        assert 0.65 > fit.modes[0].probability >= fit.modes[1].probability > 0.35
+        torch.testing.assert_close(fit.matrix, fit.modes[0].matrix)
     assert found[0].reason == "converged" and found[1].reason != "converged"
     words = r"ambiguous: the pictures hardly separate it from a pose that is turned by (\d+)°"
     said = re.match(words, found[1].reason)

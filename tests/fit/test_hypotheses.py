@@ -13,6 +13,7 @@ from edgegrad.fit.pose import hypotheses
 from edgegrad.fit.pose.camera_motion import moved_poses
 from edgegrad.fit.pose.hypotheses import Group, HypothesisSearch, Mode, probabilities, turned
 from edgegrad.fit.pose.pose import angle, pose_from_matrix
+from edgegrad.fit.pose.pose_search import ambiguous
 from edgegrad.fit.pose.replay_log import ReplayLog
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.optim.levenberg_marquardt import Model, Problem
@@ -52,14 +53,18 @@ class KnownMinima(Problem):
 
     def model(self, points):
         """Return the models, whose derivatives are exact in the minima, and along rotations about one axis."""
-        costs, gradients = [], []
+        costs, gradients, curvatures = [], [], []
         for pose in points:
-            places = [(cost, self.place(pose, end)) for cost, end in self.minima]
-            cost, place = min(((c + 0.5 * float(x.square() @ STIFF), x) for c, x in places), key=lambda one: one[0])
+            places = [
+                (cost, self.place(pose, end), STIFF * (factor[0] if factor else 1.0))
+                for cost, end, *factor in self.minima
+            ]
+            found = ((c + 0.5 * float(x.square() @ stiff), x, stiff) for c, x, stiff in places)
+            cost, place, stiff = min(found, key=lambda one: one[0])
             costs.append([cost])
-            gradients.append(STIFF * place)
-        curvature = torch.diag(STIFF).expand(len(points), 6, 6)
-        return Model(torch.tensor(costs, dtype=F64), torch.stack(gradients), curvature)
+            gradients.append(stiff * place)
+            curvatures.append(stiff.diag())
+        return Model(torch.tensor(costs, dtype=F64), torch.stack(gradients), torch.stack(curvatures))
 
 
 def search_of(monkeypatch, minima, groups=None, symmetries=None):
@@ -148,6 +153,15 @@ def test_probabilities_of_modes_are_ratios_of_gaussian_integrals():
     found = probabilities(modes)
     assert found == pytest.approx([mass / sum(masses) for mass in masses], rel=1e-6)
     assert probabilities([]) == [] and probabilities(modes[:1]) == [1.0]
+
+
+@pytest.mark.quick
+def test_the_answer_is_the_mode_with_the_largest_mass(monkeypatch):
+    """Of two minima the wider one has more mass, though it is less likely by 10 nats, of which 64 count as one."""
+    modes = search_of(monkeypatch, [(-3000.0, RIGHT), (-2990.0, WRONG, 0.5)]).run()
+    assert [mode.cost for mode in modes] == pytest.approx([-2990.0, -3000.0], abs=0.1)
+    assert modes[0].log_mass - modes[1].log_mass == pytest.approx(3.0 * math.log(2.0) - 10.0 / T, abs=0.1)
+    assert ambiguous(modes) == [modes[1].pose] and ambiguous(modes[:1]) == []
 
 
 def test_the_same_seed_gives_the_same_modes():

@@ -120,7 +120,7 @@ class HypothesisSearch:
         self.report: Callable[[str], Any] = lambda _: None
 
     def run(self) -> list[Mode]:
-        """Return the modes, the likeliest first; none where nothing in the pictures depends on the poses."""
+        """Return the modes, the one with the largest mass first; none where nothing in the pictures depends on the poses."""
         for about, poses in self.given:
             self.groups.append(Group(pose_levels(self.task, about, self.depths, self.settings), poses, self.log))
         deepest = max(len(group.levels) for group in self.groups)
@@ -205,24 +205,21 @@ class HypothesisSearch:
         self.after_step()
 
     def _modes(self) -> list[Mode]:
-        """Return the ends of all descents that differ, the likeliest first. Steps that gain less than errors of the pictures do
-        are short, too: where nothing shows a direction, descents wander along it."""
-        found: list[tuple[Mode, float]] = []
-        for group in self.groups:
-            assert group.descents is not None
-            for one in group.descents.descents:
-                if one.accepted and one.rest is not Rest.FLAT:
-                    rests = one.rest in (Rest.SHORT, Rest.DAMPED)
-                    mode = Mode(one.point, one.mean_cost, one.curvature, rests, group.level)
-                    found.append((mode, one.predicted))
+        """Return the ends of all descents that differ, the one with the largest mass first. Steps that gain less than errors of
+        the pictures do are short, too: where nothing shows a direction, descents wander along it."""
+        short = Rest.SHORT, Rest.DAMPED
+        found = [
+            (Mode(one.point, one.mean_cost, one.curvature, one.rest in short, group.level), one.predicted)
+            for group in self.groups if group.descents is not None
+            for one in group.descents.descents if one.accepted and one.rest is not Rest.FLAT
+        ]  # fmt: skip
         kept: list[tuple[Mode, float]] = []
         for mode, gain in sorted(found, key=lambda pair: pair[0].cost):
             if all(self.apart(mode.pose, other.pose) > POSE.same_mode for other, _ in kept):
                 kept.append((mode, gain))
         T = kept[0][0].level.temperature if kept else 1.0
-        return [
-            mode._replace(temperature=T, rests=mode.rests or gain < POSE.least_gain * T) for mode, gain in kept
-        ]  # fmt: skip
+        modes = [mode._replace(temperature=T, rests=mode.rests or gain < POSE.least_gain * T) for mode, gain in kept]
+        return sorted(modes, key=lambda mode: -mode.log_mass)
 
     def apart(self, one: Pose, other: Pose) -> float:
         """Return how far apart two poses are, in radians or object sizes, whichever is more, up to symmetries."""

@@ -53,7 +53,7 @@ class PoseSearch:
 
     @property
     def rests(self) -> bool:
-        """Whether the likeliest mode is at rest."""
+        """Whether the first mode is at rest."""
         return bool(self.modes) and self.modes[0].rests
 
     @property
@@ -108,8 +108,8 @@ class PoseSearch:
 
 
 def ambiguous(modes: Sequence[Mode]) -> list[Pose]:
-    """Return the poses of modes that are hardly less likely than the first."""
-    return [mode.pose for mode in modes[1:] if mode.cost - modes[0].cost < POSE.ambiguous_nats * mode.temperature]
+    """Return the poses of modes with hardly less mass than the first."""
+    return [mode.pose for mode in modes[1:] if modes[0].log_mass - mode.log_mass < POSE.ambiguous_nats]
 
 
 def around(task: PoseTask, pose: Pose, count: int) -> list[Pose]:

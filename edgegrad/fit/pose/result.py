@@ -80,7 +80,7 @@ class PoseFit(FitResult):
     visible: float = 1.0  # share of this object that the others of fit_poses() do not hide
     conflict: str = ""  # the other pose or object that may be the right one, in words
     enough: float = MIN_EDGE_SUPPORT  # least `explained` of a right pose
-    # The poses at which the search came to rest, by their costs; the first one is the answer.
+    # The poses at which the search came to rest, by their probabilities; the first one is the answer.
     modes: Sequence[PoseMode] = ()
     features: Mapping[str, float] = field(default_factory=dict, repr=False)  # of the fit, on which `confidence` depends
 
