@@ -17,9 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..optional import require
-
-__all__ = ["huber", "iou", "l1", "l2", "multiscale", "robust", "ssim"]
+__all__ = ["huber", "iou", "l1", "l2", "multiscale", "robust"]
 
 Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
@@ -111,24 +109,6 @@ def iou(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
     return (1.0 - both / either.clamp(min=1e-30)).mean()
 
 
-def ssim(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return 1 − the structural similarity (Wang et al. 2004), by torchmetrics (`pip install 'edgegrad[fit]'`).
-
-    Parameters
-    ----------
-    image, target, weight : as of l1(), with values in 0 … 1
-    """
-    metrics = require("torchmetrics.functional.image", "edgegrad[fit]", "ssim")
-
-    def batch(x: Tensor) -> Tensor:
-        return x.reshape(-1, *x.shape[-3:]).movedim(-1, 1)
-
-    _, full = metrics.structural_similarity_index_measure(
-        batch(image), batch(target).to(image), data_range=1.0, return_full_image=True
-    )
-    return _mean(1.0 - full.movedim(1, -1).reshape(image.shape), weight)
-
-
 def multiscale(loss: Loss = l2, levels: int = 4) -> Loss:
     """Return a loss that is the mean of `loss` over an image pyramid of halved levels; it sees farther than a pixel.
 
@@ -160,7 +140,7 @@ def _halved(x: Tensor) -> Tensor:
 
 
 REGION = "region"  # compares pictures with silhouettes: see descent/region_loss.py
-LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "huber": huber, "robust": robust, "iou": iou, "ssim": ssim}
+LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "huber": huber, "robust": robust, "iou": iou}
 
 
 def loss_of(name: str, loss: str | Loss) -> Loss:

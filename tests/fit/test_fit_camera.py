@@ -61,7 +61,7 @@ def test_a_camera_is_saved(tmp_path):
     view = camera(24)
     fit = fit_camera(before_sky(), picture(view), view, focal=False, search=False, options=quiet(steps=2))
     names = fit.save(tmp_path)
-    assert names == ["camera.json", "calibration.json", "history.json", "pose.json", "fit.png", "loss.png", "fit.webp"]
+    assert names == ["camera.json", "calibration.json", "history.json", "pose.json", "fit.png", "loss.png"]
     assert {path.name for path in tmp_path.iterdir()} == set(names) and torch.equal(fit.camera.K, view.K)
     history = json.loads((tmp_path / "history.json").read_text())
     assert [record["loss"] for record in history] == [record.loss for record in fit.history]

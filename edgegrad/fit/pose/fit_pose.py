@@ -26,8 +26,7 @@ from ..checkpoints import CheckpointFile, traits
 from ..measured import depth_images
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
-from ..row_order import warn_of_flipped_rows
-from ..views import PICTURES, Images, cameras_of
+from ..views import Images, cameras_of
 from .confidence import features_of
 from .hypotheses import probabilities
 from .initial_pose import initial_pose
@@ -159,9 +158,6 @@ def search_pose(
         state.run()
         if search == "global":
             warn_of_units(task.scene.transformed(state.best.R, state.best.t, state.best.scale), seen, measured, "found")
-        doubtful = fit_of(state, progress, given_cameras).reason != "converged"
-        if search and doubtful and proposals is None:
-            _warn_of_flipped_pictures(task, state, init is None)
     keep()
     return fit_of(state, progress, given_cameras)
 
@@ -235,15 +231,3 @@ def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -
     if isinstance(given, str):
         raise ValueError(f'{name}: expected Symmetries, "find" or None, got {given!r}')
     raise TypeError(f'{name}: expected Symmetries, "find" or None, got {type(given).__name__}')
-
-
-def _warn_of_flipped_pictures(task: PoseTask, search: PoseSearch, place: bool) -> None:
-    """Warn where a fit to the pictures turned over finds in them what it did not find as they are."""
-    turned, settings = task.turned_over(), search.settings
-    start = initial_pose(turned) if place else search.start
-    again = PoseSearch(turned, start, [None] * len(task.shots), settings)
-    found = again.first_end()
-    if found >= max(again.enough, search.edge_support + PICTURES.iou_gain):
-        warn_of_flipped_rows(
-            search.task.names.images, f"it shows {found:.0%} of the render's edges, as given {search.edge_support:.0%}"
-        )

@@ -100,12 +100,6 @@ class PoseSearch:
         ])  # fmt: skip
         return [(Pose.from_numbers(about), [Pose.from_numbers(pose) for pose in poses]) for about, poses in found]
 
-    def first_end(self) -> float:
-        """Return the share of the render's edges that the pictures show where the start alone leads."""
-        search = HypothesisSearch(self.task, [(self.start, [self.start])], self.depths, self.settings, further=False)
-        modes = search.run()
-        return evidence_of(modes[0].level, modes[0].pose).edges if modes else 0.0
-
 
 def ambiguous(modes: Sequence[Mode]) -> list[Pose]:
     """Return the poses of modes that are hardly less likely than the first."""

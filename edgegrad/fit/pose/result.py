@@ -129,7 +129,7 @@ class PoseFit(FitResult):
         return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(self, most=most)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """Write pose.json, fit.png, loss.png (plot_history()) and fit.webp to a folder, and return their names.
+        """Write pose.json, fit.png and loss.png (plot_history()) to a folder, and return their names.
 
         The folder is made where it is missing, and each file is written whole or not at all. A fit that took no step writes
         pose.json alone. Raises OSError, or ImportError once pose.json is written when matplotlib or pillow is missing.
@@ -138,9 +138,7 @@ class PoseFit(FitResult):
         write_text(out / "pose.json", self.to_json() + "\n")
         if not self.history or not figures:
             return ["pose.json"]
-        names = write_figures(out, {"fit.png": self.plot, "loss.png": self.plot_history})
-        require("edgegrad.fit.pose.pictures", *DRAWING).draw_animation(out / "fit.webp", self)
-        return ["pose.json", *names, "fit.webp"]
+        return ["pose.json", *write_figures(out, {"fit.png": self.plot, "loss.png": self.plot_history})]
 
     @property
     def _can_draw(self) -> bool:

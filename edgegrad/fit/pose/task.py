@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -155,18 +155,6 @@ class PoseTask:
             )
         bare = scene.replace(meshes=double, background=None)
         return PoseTask(bare, aovs, shots, clutter, colorless, (low + high) / 2, size, dofs, names, white)
-
-    def turned_over(self) -> PoseTask:
-        """Return the task with the pictures upside down."""
-
-        def flipped(image: Tensor | None) -> Tensor | None:
-            return image if image is None or image.dim() < 3 else image.flip(0)
-
-        shots = [
-            TargetView(shot.camera, shot.target.flip(0), flipped(shot.background), flipped(shot.weight))
-            for shot in self.shots
-        ]
-        return replace(self, shots=shots)
 
     def between(self, one: Pose, other: Pose) -> float:
         """Return the distance of the object's centres at two poses, relative to its size."""
