@@ -108,15 +108,16 @@ def reason_of(
     return "converged"
 
 
-def history_rows(history: Sequence[Record]) -> list[dict[str, Any]]:
-    """Return the records for history.json."""
+def history_rows(history: Sequence[Any]) -> list[dict[str, Any]]:
+    """Return for history.json records with values, or steps with a pose."""
     return [
         {
-            "step": record.step, "loss": number_or_none(record.loss),
-            "gradient": {name: number_or_none(norm) for name, norm in record.gradient.items()},
-            "values": {name: value.tolist() for name, value in record.values.items()}, "rate": record.rate,
+            "step": k, "loss": number_or_none(one.loss),
+            "gradient": {name: number_or_none(norm) for name, norm in one.gradient.items()},
+            "values": {name: value.tolist() for name, value in values.items()},
         }
-        for record in history
+        for k, one in enumerate(history)
+        for values in [one.values if isinstance(one, Record) else one.pose._asdict()]
     ]  # fmt: skip
 
 

@@ -30,7 +30,7 @@ from ..views import Images, cameras_of
 from .confidence import features_of
 from .hypotheses import probabilities
 from .initial_pose import initial_pose
-from .inputs import ArgumentNames, check_in_front, warn_of_scale, warn_of_units
+from .inputs import ArgumentNames, check_in_front, warn_of_units
 from .pose import Pose, angle, pose_from_matrix
 from .pose_search import Groups, PoseSearch, Report, anywhere, around, everywhere
 from .replay_log import ReplayLog
@@ -116,8 +116,6 @@ def search_pose(
     _check_search(search, init, given_cameras, names.init)
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.from_arguments(mesh, images, given_cameras, masks, weights, lens, float(given.scale), names)
-    if names == ArgumentNames():  # A camera may stand inside of a scene.
-        warn_of_scale(names.mesh, task.scene.transformed(given.R, given.t, given.scale), task.shots[0].camera)
     start = initial_pose(task) if init is None else given
     check_in_front(names.init, task.shots[0].camera, start, task.center)
     file = CheckpointFile(settings.checkpoint, {
