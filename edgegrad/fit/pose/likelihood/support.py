@@ -11,8 +11,8 @@ from torch import Tensor
 from ....files.image import linear_to_srgb
 from ...contour_colors import ALONE_INFORMATION, ALONE_SHOWN, COLOUR_WINDOW, CONTRAST, PURE
 from ...edge_support import edge_support
+from ...placement import Pose
 from ...region import information, smoothed
-from ..pose import Pose
 from ..settings import POSE
 from ..task import PoseTask
 from .contour import ContourNoise, Sides
@@ -53,7 +53,7 @@ def evidence_of(level: PoseLevel, pose: Pose) -> Evidence:
 
 def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered: bool) -> float:
     pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]] = []
-    shown = length = bits = pixels = 0.0
+    contour, bits, pixels = torch.zeros(2), 0.0, 0.0
     for one in compared:
         part, seen = one.part, one.seen
         visible = one.visible if uncovered else torch.ones_like(one.visible)
@@ -63,9 +63,7 @@ def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered
             ),
             (part.weight * visible)[0],
         )
-        on = ((sides.alpha > PURE) & (sides.alpha < 1.0 - PURE)) * part.weight * visible
-        length += float(on.sum())
-        shown += float((on * (sides.contrast > CONTRAST) * (sides.band > 0.0)).sum())
+        contour = contour + contour_length(sides, part.weight * visible)
         if not colored:
             soft = smoothed(seen.alpha, COLOUR_WINDOW)
             ring = ((soft > PURE) & (soft < 1.0 - PURE)) * part.weight
@@ -74,14 +72,15 @@ def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered
             pixels += float(ring.sum())
         mixed, band = sides.mixed[0], sides.band[0]
         if one.light is None or part.mask is not None:
-            pairs.append(_pair(mixed, part.outlined, band))
+            pairs.append(compared_images(mixed, part.outlined, band))
         if one.light is not None:
             inner = one.light.inside[0]
             expected = linear_to_srgb(one.light.image(one.light.predicted)[0].clamp(0.0, 1.0))
             covered = torch.where(inner, weight, 0.0)
             if part.mask is None:
                 expected, covered = torch.where(inner, expected, mixed), torch.where(inner, weight, band)
-            pairs.append(_pair(expected, part.display, covered))
+            pairs.append(compared_images(expected, part.display, covered))
+    length, shown = contour.tolist()
     if length == 0.0:
         return 0.0
     share = edge_support(pairs, softer=True) * min(1.0, resolved)
@@ -92,7 +91,13 @@ def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered
     return share * min(1.0, shown / length / ALONE_SHOWN) * sure
 
 
-def _pair(expected: Tensor, picture: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+def contour_length(sides: Sides, near: Tensor) -> Tensor:
+    """Return the pixels (2,) along contours, weighted by `near` (N, h, w), and those of them whose two sides differ visibly."""
+    on = ((sides.alpha > PURE) & (sides.alpha < 1.0 - PURE)) * near
+    return torch.stack([on.sum(), (on * (sides.contrast > CONTRAST) * (sides.band > 0.0)).sum()])
+
+
+def compared_images(expected: Tensor, picture: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """Return what edge_support() compares, of images (C, h, w) and weights (h, w)."""
     first = expected.movedim(0, -1)
     return first, first, picture.movedim(0, -1), weight[..., None]
