@@ -1,4 +1,4 @@
-"""What the loops of all optimisers share: a bar on standard error, a clock, Ctrl-C, and times to keep the state."""
+"""The context of all loops of steps: a bar on standard error, a clock, Ctrl-C, and times to keep the state."""
 
 from __future__ import annotations
 

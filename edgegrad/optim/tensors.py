@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from enum import Enum
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .convergence import Settling
-from .history import Ending, Record
 from .loop import Progress, nothing
 from .parameter import Parameter
 
 COMPARISON_STEP = 2**20  # The first that gives losses which are compared their samples: no descent reaches it.
 MAX_RECORDED = 64  # numbers of a parameter whose values the history holds
 Tensors = Mapping[str, Tensor]
+
+
+class Record(NamedTuple):
+    """One step of a descent in named tensors."""
+
+    step: int
+    loss: float  # of this step's samples
+    gradient: dict[str, float]  # norm of the gradient by each parameter
+    values: dict[str, Tensor]  # of parameters of up to 64 numbers, before the step
+    rate: float = 1.0  # factor of the learning rates
+
+
+class Ending(Enum):
+    """Why a fit took no more steps."""
+
+    FLAT = "the steps led no further"
+    STEPS = "steps ran out"
+    FALLING = "loss still falling"
+    INTERRUPTED = "interrupted"
 
 
 class Objective:

@@ -20,7 +20,7 @@ from edgegrad.fit.pose.fit_pose import search_pose
 from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, PRINCIPAL
 from edgegrad.fit.pose.uncertainty import Uncertainty, reach
-from edgegrad.optim.history import Ending
+from edgegrad.optim.tensors import Ending
 
 LENS = torch.tensor([-0.15, 0.05, 0.0, 0.0], dtype=torch.float64)
 SIMPLE = torch.tensor([-0.15, 0.0, 0.0, 0.0], dtype=torch.float64)

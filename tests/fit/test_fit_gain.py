@@ -14,7 +14,7 @@ import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import PoseParameter, fit_pose, fit_scene
 from edgegrad.fit.edge_support import edge_support
-from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.placement import pose_from_matrix
 from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.views import has_levels, white_level
 

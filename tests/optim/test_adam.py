@@ -12,8 +12,7 @@ from torch import Tensor
 
 from edgegrad.fit import Parameter
 from edgegrad.optim.adam import Adam, AdamDescent, AdamSettings
-from edgegrad.optim.history import Ending
-from edgegrad.optim.tensors import DescentResult, Objective, Tensors, descend
+from edgegrad.optim.tensors import DescentResult, Ending, Objective, Tensors, descend
 
 
 def test_steps_equal_those_of_torch_adam() -> None:

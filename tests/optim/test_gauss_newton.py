@@ -11,9 +11,8 @@ from torch import Tensor
 
 from edgegrad.fit import Parameter, losses
 from edgegrad.optim.gauss_newton import GaussNewtonDescent
-from edgegrad.optim.history import Ending
 from edgegrad.optim.levenberg_marquardt import LevenbergMarquardtSettings
-from edgegrad.optim.tensors import Objective, descend
+from edgegrad.optim.tensors import Ending, Objective, descend
 
 F64 = torch.float64
 SETTINGS = LevenbergMarquardtSettings(trust_radius=10.0, settled_steps=5, tolerance=0.01, steps=1000)

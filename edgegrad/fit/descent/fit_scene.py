@@ -9,8 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...optim.history import Record
 from ...optim.parameter import Parameter
+from ...optim.tensors import Record
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors

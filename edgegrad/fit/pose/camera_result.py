@@ -11,7 +11,7 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...files.cameras import save_camera
 from ...files.paths import PathLike, write_figures, write_json
-from ...optim.history import Ending
+from ...optim.tensors import Ending
 from ...optional import DRAWING, require
 from ..result import FitResult, chosen, history_rows, made_folder, number_or_none
 from .result import PoseFit, Step
@@ -149,10 +149,6 @@ class CameraFit(FitResult):
             "explained": [search.explained for search in self.searches], "steps": self.steps,
             "seconds": round(self.seconds, 3),
         }  # fmt: skip
-
-    @property
-    def _can_draw(self) -> bool:
-        return all(search.history for search in self.searches)
 
 
 def fitted(searches: Sequence[PoseFit], ending: Ending = Ending.STEPS, joint: Sequence[Step] = ()) -> CameraFit:

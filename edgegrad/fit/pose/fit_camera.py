@@ -15,8 +15,8 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.lens import COEFFICIENT_COUNTS
 from ...check import check_flag, check_int
-from ...optim.history import Ending
 from ...optim.levenberg_marquardt import LevenbergMarquardt, Rest, minimise
+from ...optim.tensors import Ending
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
@@ -24,6 +24,7 @@ from ..by_camera import one_for_each
 from ..checkpoints import checkpoint_of
 from ..modes import in_full_precision
 from ..options import MIN_PICTURE_SIDE, POSE_OPTIONS, FitOptions, Settings, options_of
+from ..placement import Pose
 from ..views import Images, cameras_of, check_image
 from .bundle_adjustment import Adjustment, Bundle, Poses
 from .camera_result import CameraFit, fitted
@@ -32,7 +33,6 @@ from .hypotheses import norms_of
 from .inputs import ArgumentNames
 from .likelihood.objective import PoseLevel, pose_levels
 from .likelihood.support import evidence_of
-from .pose import Pose
 from .result import PoseFit, Step
 from .settings import CAMERA
 from .task import Unknowns

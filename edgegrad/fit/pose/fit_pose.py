@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...check import as_int, check_flag
+from ...check import check_choice, check_flag, check_int
 from ...optim.loop import Progress
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -26,12 +26,12 @@ from ..checkpoints import CheckpointFile, traits
 from ..measured import depth_images
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
+from ..placement import Pose, angle, pose_from_matrix
 from ..views import Images, cameras_of
 from .confidence import features_of
 from .hypotheses import probabilities
 from .initial_pose import initial_pose
 from .inputs import ArgumentNames, check_in_front, warn_of_units
-from .pose import Pose, angle, pose_from_matrix
 from .pose_search import Groups, PoseSearch, Report, anywhere, around, everywhere
 from .replay_log import ReplayLog
 from .result import PoseFit, PoseMode
@@ -40,7 +40,6 @@ from .task import PoseTask, Unknowns
 from .uncertainty import Uncertainty
 
 MOST_STARTS = 1000
-SEARCHES = f'True, False, a number of starts from 2 to {MOST_STARTS}, or "global"'
 Search = bool | int | Literal["global"]
 
 
@@ -210,14 +209,9 @@ def _check_search(search: object, init: object, cameras: Sequence[Camera], name:
                 f'search: expected a perspective or orthographic camera for "global", got a {projection}; give {name}'
             )
     elif isinstance(search, str):
-        raise ValueError(f"search: expected {SEARCHES}, got {search!r}")
+        check_choice("search", search, ["global"])
     elif not isinstance(search, bool):
-        try:
-            number = as_int("search", search)
-        except TypeError:
-            raise TypeError(f"search: expected {SEARCHES}, got {type(search).__name__} ({search!r})") from None
-        if not 2 <= number <= MOST_STARTS:
-            raise ValueError(f"search: expected {SEARCHES}, got {number}")
+        check_int("search", search, 2, MOST_STARTS)
 
 
 def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -> Symmetries | None:

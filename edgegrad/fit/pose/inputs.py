@@ -14,8 +14,8 @@ from ...camera.camera import Camera
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...warnings import warn
+from ..placement import Pose
 from ..region import VISIBLE
-from .pose import Pose
 from .settings import CAMERA, POSE
 
 

@@ -15,12 +15,12 @@ from ...camera.poses import rigid
 from ...files.cameras import camera_fields, camera_from_fields
 from ...files.formats.part import FormatError
 from ...files.paths import PathLike, write_figures, write_text
-from ...optim.history import Ending
+from ...optim.tensors import Ending
 from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
+from ..placement import Pose, pose_from_matrix
 from ..result import FitResult, made_folder, number_or_none, reason_of
 from .confidence import FEATURES, confidence_of
-from .pose import Pose, pose_from_matrix
 from .settings import CAMERA
 from .uncertainty import Uncertainty
 
@@ -139,10 +139,6 @@ class PoseFit(FitResult):
         if not self.history or not figures:
             return ["pose.json"]
         return ["pose.json", *write_figures(out, {"fit.png": self.plot, "loss.png": self.plot_history})]
-
-    @property
-    def _can_draw(self) -> bool:
-        return self.task is not None and bool(self.history)
 
     def to_json(self) -> str:
         """Return JSON text with the pose, `mesh_to_world` 4 × 4 by rows for column vectors, the camera, and figures."""
