@@ -53,7 +53,7 @@ EXCEPTIONS = {
         edgegrad/scene/environment.py edgegrad/scene/texel_edges.py edgegrad/scene/textures.py
         """,
     "looks": """
-        edgegrad/camera/convention_warnings.py edgegrad/fit/row_order.py
+        edgegrad/camera/convention_warnings.py
         """,
     "beside": """
         edgegrad/files/formats/context.py edgegrad/files/formats/gltf_material.py edgegrad/files/formats/gltf_write.py

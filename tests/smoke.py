@@ -13,7 +13,6 @@ import edgegrad as eg
 from edgegrad.cli import main
 from edgegrad.cli.doctor import gradient_error
 from edgegrad.fit import FitOptions, fit_pose, fit_shape
-from edgegrad.fit.losses import ssim
 
 
 def painted() -> eg.Mesh:
@@ -69,7 +68,6 @@ def extras() -> None:
     fit = fit_pose(eg.Scene([mesh], torch.zeros(3)), image, camera, options=FitOptions(seed=0, progress=False, steps=1))
     needs = {
         "matplotlib": ("figures", fit.plot),
-        "torchmetrics": ("fit", lambda: ssim(image, image)),
         "gpytoolbox": (
             "fit",
             lambda: fit_shape(mesh, [image], [camera], options=FitOptions(seed=0, steps=1, progress=False)),

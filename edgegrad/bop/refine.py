@@ -12,8 +12,8 @@ from torch import Tensor
 from ..camera.camera import Camera
 from ..check import check_flag, check_positive
 from ..fit.options import FitOptions
+from ..fit.placement import angle
 from ..fit.pose.fit_pose import fit_pose
-from ..fit.pose.pose import angle
 from ..fit.pose.result import PoseFit
 from .dataset import Dataset
 from .files import Estimate

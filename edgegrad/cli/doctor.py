@@ -14,7 +14,7 @@ from .. import __version__
 LIBRARIES = ("torch", "numpy", "embreex", "trimesh", "OpenImageIO")
 # The extra that brings a library, and its purpose.
 OPTIONAL = {
-    "pillow": "files, figures: textures of meshes, labels of masks, animations",
+    "pillow": "files, figures: textures of meshes, labels of masks",
     "lxml": "files: 3MF",
     "DracoPy": "files: compressed glTF",
     "pyyaml": "cameras: calibrations of OpenCV, ROS and Kalibr",
@@ -25,7 +25,6 @@ OPTIONAL = {
     "cholespy": "fit: smooth steps of shapes",
     "gpytoolbox": "fit: remeshing, visual hulls",
     "xatlas": "fit: unwrapping",
-    "torchmetrics": "fit: SSIM",
 }
 TOLERANCE = 0.02  # of the gradient's size; the sampling error is 0.1 %
 

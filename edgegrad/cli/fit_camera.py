@@ -25,9 +25,7 @@ def add(commands: Any) -> None:
     add_steps(parser, 60)
     parser.add_argument("--seed", type=number, default=0)
     add_resume(parser)
-    add_out(
-        parser, f"camera.json, calibration.json, history.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}"
-    )
+    add_out(parser, f"camera.json, calibration.json, history.json, pose.json, fit.png, loss.png, {CHECKPOINT}")
     add_live(parser)
     parser.set_defaults(run=run)
 

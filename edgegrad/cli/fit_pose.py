@@ -68,7 +68,7 @@ def add(commands: Any) -> None:
     add_size(parser)
     add_steps(parser)
     parser.add_argument("--seed", type=number, default=0)
-    add_out(parser, f"pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}")
+    add_out(parser, f"pose.json, fit.png, loss.png, {CHECKPOINT}")
     add_live(parser)
     parser.set_defaults(run=run)
 

@@ -176,7 +176,7 @@ def read_pose(path: Path) -> Pose:
     import numpy as np
 
     from ..files.paths import check_readable
-    from ..fit.pose.pose import pose_from_matrix
+    from ..fit.placement import pose_from_matrix
     from ..fit.pose.result import pose_from_json
 
     try:

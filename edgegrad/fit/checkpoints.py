@@ -21,7 +21,7 @@ from ..warnings import warn
 from .placement import Placement
 from .views import Observation
 
-FORMAT = 13
+FORMAT = 14
 
 
 @dataclass(frozen=True)
@@ -164,36 +164,28 @@ def traits(camera: Camera) -> tuple[Any, ...]:
 
 def _digest(value: Any) -> str:
     """Hash the tensors and plain values in it."""
-    digest = hashlib.sha256()
-    for part in _parts(value):
-        digest.update(f"{len(part)}:".encode())  # so that 1, 23 and 12, 3 differ
-        digest.update(part)
-    return digest.hexdigest()
+    return hashlib.sha256(repr(_plain(value)).encode()).hexdigest()
 
 
-def _parts(value: Any) -> Any:
+def _plain(value: Any) -> Any:
+    """Return what it consists of in plain values, arrays as their hashes; functions as None."""
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().contiguous().numpy()
+    if isinstance(value, np.ndarray):
+        return str(value.dtype), value.shape, hashlib.sha256(value.tobytes()).hexdigest()
     if isinstance(value, float) and value.is_integer():
-        value = int(value)  # 0 and 0.0 are the same
-    if isinstance(value, (str, int, float, type(None))):
-        yield repr(value).encode()
-    elif isinstance(value, Mapping):
-        for name in sorted(value):
-            yield name.encode()
-            yield from _parts(value[name])
-    elif isinstance(value, Placement):
-        yield from _parts((value.coordinates, value.start, value.center, value.size))
-    elif isinstance(value, (tuple, list)):
-        for part in value:
-            yield from _parts(part)
-    elif isinstance(value, np.ndarray):
-        yield f"{value.dtype} {value.shape}".encode()
-        yield value.tobytes()
-    elif isinstance(value, torch.Tensor):
-        yield f"{value.dtype} {tuple(value.shape)}".encode()
-        yield value.detach().cpu().contiguous().numpy().tobytes()
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        yield type(value).__name__.encode()
-        for field in dataclasses.fields(value):
-            if field.name != "name":  # a mesh's name changes nothing
-                yield field.name.encode()
-                yield from _parts(getattr(value, field.name))
+        return int(value)  # 0 and 0.0 are the same
+    if isinstance(value, str | int | float):
+        return value
+    if isinstance(value, Mapping):
+        return {name: _plain(value[name]) for name in sorted(value)}
+    if isinstance(value, Placement):
+        return _plain((value.coordinates, value.start, value.center, value.size))
+    if isinstance(value, tuple | list):
+        return [_plain(part) for part in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = [
+            field.name for field in dataclasses.fields(value) if field.name != "name"
+        ]  # a mesh's name changes nothing
+        return type(value).__name__, {name: _plain(getattr(value, name)) for name in names}
+    return None

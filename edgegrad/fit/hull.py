@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..check import as_double, check_int, check_positive_int
+from ..check import check_int, check_positive_int
 from ..scene.mesh import Mesh
 from .remeshing import gpytoolbox, remeshed
 from .views import Images, Observation, views_of
@@ -24,7 +24,6 @@ def visual_hull(
     cameras: Camera | Sequence[Camera],
     resolution: int = 96,
     faces: int | None = None,
-    bounds: Tensor | None = None,
 ) -> Mesh:
     """Return the largest body that has these silhouettes (Laurentini 1994), as a closed mesh.
 
@@ -41,8 +40,6 @@ def visual_hull(
         Cells on the longest side of the box around the object; smaller details are lost.
     faces : int, optional
         About so many even triangles; few are best for the first level of fit_shape(). By default those of the cells.
-    bounds : Tensor, optional
-        (2, 3) opposite corners of a box that holds the object. By default it is found from the cameras.
 
     Raises
     ------
@@ -64,10 +61,7 @@ def visual_hull(
     if missing:
         raise ValueError(f"masks[{missing[0]}]: expected a mask, got None; leave that camera out")
     gpytoolbox("a visual hull")  # before the work
-    box = _where_cameras_look(views) if bounds is None else _checked(bounds)
-    for _ in range(2 if bounds is None else 1):
-        box = _occupied(views, box)
-    low, high = box
+    low, high = _occupied(views, _occupied(views, _where_cameras_look(views)))
     cell = float((high - low).max()) / resolution
     count = ((high - low) / cell).ceil().long() + 3
     # One more cell on each side closes the surface.
@@ -75,14 +69,6 @@ def visual_hull(
     inside = F.pad(_inside(views, axes)[1:-1, 1:-1, 1:-1], (1,) * 6)  # The surface is closed at the grid's border.
     found = _surface(inside, axes)
     return found if faces is None else remeshed(found, faces)
-
-
-def _checked(bounds: object) -> tuple[Tensor, Tensor]:
-    box = as_double("bounds", bounds, (2, 3)).cpu()
-    low, high = box.amin(0), box.amax(0)
-    if not bool((high > low).all()):
-        raise ValueError("bounds: expected opposite corners of a box, got one without volume")
-    return low, high
 
 
 def _where_cameras_look(views: Sequence[Observation]) -> tuple[Tensor, Tensor]:
@@ -94,7 +80,7 @@ def _where_cameras_look(views: Sequence[Observation]) -> tuple[Tensor, Tensor]:
     across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
     total = across.sum(0)
     if float(torch.linalg.eigvalsh(total)[0]) < 1e-4 * len(views):
-        raise ValueError("cameras: expected some that look in different directions, got parallel ones; give bounds")
+        raise ValueError("cameras: expected some that look in different directions, got parallel ones")
     middle = torch.linalg.solve(total, (across @ eye[:, :, None]).sum(0)[:, 0])
     depths = (axis * (middle - eye)).sum(1).abs().tolist()
     half = max(_half_width(camera, depth) for camera, depth in zip(cameras, depths, strict=True))
@@ -119,7 +105,7 @@ def _occupied(views: Sequence[Observation], box: tuple[Tensor, Tensor]) -> tuple
     if not len(places):
         raise ValueError(
             "masks: expected silhouettes of one object, got some that have no body in common; look for cameras in other "
-            "conventions, or turned images, or give bounds"
+            "conventions, or turned images"
         )
     first, last = places.amin(0), places.amax(0) + 1
     return low + step * (first - 0.5).clamp(min=0), low + step * (last + 0.5).clamp(max=HULL_CELLS)
@@ -169,7 +155,7 @@ def _surface(inside: Tensor, axes: Sequence[Tensor]) -> Mesh:
     field = inside.permute(1, 2, 0).reshape(-1).double()
     found, faces = gpytoolbox("a visual hull").marching_cubes(field.numpy(), order.numpy(), nx, ny, nz, 0.5)
     if not len(faces):
-        raise ValueError("masks: expected an object larger than a cell, got none; give a higher resolution, or bounds")
+        raise ValueError("masks: expected an object larger than a cell, got none; give a higher resolution")
     verts, triangles = torch.from_numpy(np.ascontiguousarray(found)), torch.from_numpy(faces.astype(np.int64))
     a, b, c = verts[triangles].unbind(1)
     if float((a * torch.linalg.cross(b, c)).sum()) < 0.0:  # six times the volume

@@ -65,7 +65,7 @@ class FitOptions:
     views_per_step : int
         Number of views in each step, drawn anew. By default all are compared.
     loss, mask_loss : str or function, default "l2"
-        Between render and picture, and between alpha and mask: "l1", "l2", "huber", "robust", "ssim", for masks "iou", or a
+        Between render and picture, and between alpha and mask: "l1", "l2", "huber", "robust", for masks "iou", or a
         function of image, target and weight, as in edgegrad.fit.losses. "region" finds the object in photographs by its
         colours.
     method : "adam" or "gauss-newton"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -10,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ..camera.poses import check_rotation, rigid, rotation
-from ..check import as_tensor, check_finite, check_positive, check_shape
-from ..optim.history import Record
+from ..check import as_double, check_finite, check_positive, check_shape
 from ..optim.parameter import Parameter as Parameter
+from ..optim.tensors import Record
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..scene.symmetries import Symmetries
@@ -36,21 +37,10 @@ class Pose(NamedTuple):
         """Return the (4, 4) matrix for column vectors."""
         return rigid(self.scale * self.R, self.t)
 
-    @property
-    def numbers(self) -> list[float]:
-        """All fields as one list."""
-        return [number for field in self for number in field.flatten().tolist()]
-
     def closest(self, symmetries: Symmetries, reference: Pose) -> Pose:
         """Return, among the poses that `symmetries` make equal, the one whose rotation is nearest to the reference's."""
         matrix = symmetries.closest(self.matrix, reference.matrix)
         return self._replace(R=matrix[:3, :3] / self.scale, t=matrix[:3, 3])
-
-    @staticmethod
-    def from_numbers(numbers: list[float]) -> Pose:
-        """Return the pose of a list as `numbers` gives it."""
-        R, t, scale, focal, principal, distortion = torch.tensor(numbers, dtype=torch.float64).split([9, 3, 1, 1, 2, 8])
-        return Pose(R.reshape(3, 3), t, scale[0], focal[0], principal, distortion)
 
 
 def pose_from_matrix(name: str, matrix: object) -> Pose:
@@ -78,6 +68,21 @@ def pose_from_matrix(name: str, matrix: object) -> Pose:
     U, _, Vh = torch.linalg.svd(R)
     one = torch.ones((), dtype=torch.float64)
     return Pose(U @ Vh, M[:3, 3].clone(), scale * one, one)
+
+
+def rotation_vector(R: Tensor) -> Tensor:
+    """Return the axis of a rotation (3, 3) times its angle, which is below π. The cosine alone has no digits near 0, so the sine
+    is used, too."""
+    axis = 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = float(axis.norm())
+    return axis * (math.atan2(sine, 0.5 * (float(R.trace()) - 1.0)) / sine if sine > 0.0 else 1.0)
+
+
+def angle(A: Tensor, B: Tensor) -> float:
+    """Return the radians of the rotation from A (3, 3) to B."""
+    R = A.T @ B
+    sine = 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]).norm()
+    return math.atan2(float(sine), float(0.5 * (R.trace() - 1.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,13 +135,9 @@ def _checked(name: str, init: Any) -> Pose:
         return Pose(torch.eye(3, dtype=f64), torch.zeros(3, dtype=f64))
     if not isinstance(init, tuple) or not 2 <= len(init) <= 6:
         return pose_from_matrix(f"{name}: init", getattr(init, "matrix", init))
-    R, t, scale = (
-        as_tensor(f"{name}: {part}", x).detach().cpu().to(f64, copy=True)
-        for part, x in zip(("R", "t", "scale"), Pose(*init), strict=False)
-    )
-    for part, value, shape in (("R", R, (3, 3)), ("t", t, (3,)), ("scale", scale, ())):
-        check_shape(f"{name}: {part}", value, shape)
-        check_finite(f"{name}: {part}", value)
+    shapes = {"R": (3, 3), "t": (3,), "scale": ()}
+    parts = zip(shapes.items(), Pose(*init), strict=False)
+    R, t, scale = (as_double(f"{name}: {part}", x, shape).cpu().clone() for (part, shape), x in parts)
     check_rotation(f"{name}: R", R)
     if float(scale) <= 0.0:
         raise ValueError(f"{name}: scale: expected a number above 0, got {float(scale):g}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import os
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..files.paths import PathLike
-from ..optim.history import Ending, Record
+from ..optim.tensors import Ending, Record
 from ..optional import DRAWING, require
 from .edge_support import MIN_EDGE_SUPPORT
 
@@ -50,18 +49,6 @@ class FitResult:
         matplotlib is missing.
         """
         raise NotImplementedError
-
-    @property
-    def _can_draw(self) -> bool:
-        return True
-
-    def _repr_png_(self) -> bytes | None:
-        """Return plot() for a notebook, where there is something to draw."""
-        if not self._can_draw:
-            return None
-        file = io.BytesIO()
-        self.plot().savefig(file, format="png", dpi=100)
-        return file.getvalue()
 
 
 def delegated(part: str, names: str) -> list[Any]:
@@ -108,15 +95,16 @@ def reason_of(
     return "converged"
 
 
-def history_rows(history: Sequence[Record]) -> list[dict[str, Any]]:
-    """Return the records for history.json."""
+def history_rows(history: Sequence[Any]) -> list[dict[str, Any]]:
+    """Return for history.json records with values, or steps with a pose."""
     return [
         {
-            "step": record.step, "loss": number_or_none(record.loss),
-            "gradient": {name: number_or_none(norm) for name, norm in record.gradient.items()},
-            "values": {name: value.tolist() for name, value in record.values.items()}, "rate": record.rate,
+            "step": k, "loss": number_or_none(one.loss),
+            "gradient": {name: number_or_none(norm) for name, norm in one.gradient.items()},
+            "values": {name: value.tolist() for name, value in values.items()},
         }
-        for record in history
+        for k, one in enumerate(history)
+        for values in [one.values if isinstance(one, Record) else one.pose._asdict()]
     ]  # fmt: skip
 
 

@@ -35,10 +35,6 @@ class PictureSettings:
     highlights: float = 0.01  # share of the pixels that are brighter than white
     rounding: float = 0.02  # distance of a level from a whole number in float32, in steps of 8 bits
     faint_mask: float = 0.5  # A mask whose pixels are all below was read with another curve, or holds labels.
-    # Rows from the bottom up.
-    compared_views: int = 4
-    flipped_iou: float = 0.75  # least IoU of flipped masks and the start
-    iou_gain: float = 0.15  # over the pictures as given
 
 
 PICTURES = PictureSettings()

@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from .convergence import EMPTY, Settling
-from .loop import Loop, nothing, run
 
 Point = TypeVar("Point")
 Rows = Sequence[int]
@@ -169,11 +168,6 @@ class LevenbergMarquardt(Generic[Point]):
         return max((descent.steps for descent in self.descents), default=0)
 
     @property
-    def loss(self) -> float:
-        """The least cost."""
-        return min((descent.mean_cost for descent in self.descents), default=math.inf)
-
-    @property
     def points(self) -> list[Point]:
         """The results so far, one for each start: the last accepted point, or a mean of several where costs are noisy."""
         return [
@@ -312,12 +306,16 @@ class LevenbergMarquardt(Generic[Point]):
 
 def minimise(
     problem: Problem[Point], starts: Sequence[Point], settings: LevenbergMarquardtSettings | None = None,
-    after_step: Callable[[LevenbergMarquardt[Point]], Any] = nothing,
+    after_step: Callable[[LevenbergMarquardt[Point]], Any] = lambda _: None,
 ) -> LevenbergMarquardt[Point]:  # fmt: skip
     """Run the descents until all rest. `after_step` is called after each step. Ctrl-C ends them with what they have found."""
     descents = LevenbergMarquardt(problem, starts, settings)
-    loop = Loop(descents.settings.steps, after_step=lambda: after_step(descents))
-    _, descents.interrupted = run(descents, loop)
+    try:
+        while not descents.resting:
+            descents.advance()
+            after_step(descents)
+    except KeyboardInterrupt:
+        descents.interrupted = True
     return descents
 
 

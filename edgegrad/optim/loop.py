@@ -1,12 +1,12 @@
-"""The loop that all optimisers share, with a bar on standard error, a clock, Ctrl-C, and a state to go on from."""
+"""The context of all loops of steps: a bar on standard error, a clock, Ctrl-C, and times to keep the state."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from tqdm import tqdm
 
@@ -63,57 +63,3 @@ class Progress:
         self.after_step()
         if self.every is not None and self.steps % self.every == 0:
             self.keep()
-
-
-class Optimizer(Protocol):
-    """An optimiser takes steps until they lead no further. Its state is all that they depend on, in tensors and plain
-    values."""
-
-    @property
-    def steps(self) -> int: ...
-    @property
-    def resting(self) -> bool: ...
-    @property
-    def loss(self) -> float: ...
-    def advance(self) -> Any: ...
-    def state(self) -> dict[str, Any]: ...
-    def load(self, state: Mapping[str, Any]) -> None: ...
-
-
-@dataclass(frozen=True)
-class Loop:
-    """How run() runs.
-
-    steps       largest number of steps
-    after_step  called after each step
-    save        called with a state every `every` steps and at the end; the state has the seconds so far
-    saved       such a state to go on from; None: begin anew
-    title       of the bar on standard error; None: there is none
-    """
-
-    steps: int
-    after_step: Callable[[], Any] = nothing
-    save: Callable[[dict[str, Any]], Any] = nothing
-    every: int | None = None
-    saved: Mapping[str, Any] | None = None
-    title: str | None = None
-
-
-def run(optimizer: Optimizer, loop: Loop) -> tuple[float, bool]:
-    """Take steps until the optimizer rests or the steps run out. Ctrl-C ends the loop with what the optimizer has. Return the
-    seconds, those before a saved state included, and whether Ctrl-C ended it."""
-    progress = Progress(loop.title, loop.after_step, every=loop.every, total=loop.steps)
-    if loop.saved is not None:
-        optimizer.load(loop.saved)
-        progress.earlier, progress.steps = loop.saved["seconds"], optimizer.steps
-
-    def keep() -> None:
-        loop.save({**optimizer.state(), "seconds": progress.seconds})
-
-    progress.keep = keep
-    with progress:
-        while optimizer.steps < loop.steps and not optimizer.resting:
-            optimizer.advance()
-            progress.step(f"loss {optimizer.loss:.3e}")
-    keep()
-    return progress.seconds, progress.interrupted

@@ -53,11 +53,7 @@ class Parameter:
         return found
 
     def within(self, value: Tensor) -> Tensor:
-        low, high = (
-            b if b is None or isinstance(b, Tensor) else torch.as_tensor(b, dtype=value.dtype)
-            for b in (self.low, self.high)
-        )
-        return value if low is None and high is None else value.clamp(low, high)
+        return value if self.low is None and self.high is None else value.clamp(self.low, self.high)  # type: ignore[arg-type]
 
 
 def _bound(name: str, given: object, value: Tensor) -> Tensor | None:
@@ -68,11 +64,8 @@ def _bound(name: str, given: object, value: Tensor) -> Tensor | None:
     if bool(bound.isnan().any()):
         raise ValueError(f"{name}: expected a number, got NaN; leave it out where there is no bound")
     try:
-        fits = torch.broadcast_shapes(bound.shape, value.shape) == value.shape
+        return bound.expand(value.shape)
     except RuntimeError:
-        fits = False
-    if not fits:
         raise ValueError(
             f"{name}: expected a number or a shape that broadcasts to {tuple(value.shape)}, got shape {tuple(bound.shape)}"
-        )
-    return bound
+        ) from None

@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from enum import Enum
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .convergence import Settling
-from .history import Ending, Record
-from .loop import Loop, run
+from .loop import Progress, nothing
 from .parameter import Parameter
 
 COMPARISON_STEP = 2**20  # The first that gives losses which are compared their samples: no descent reaches it.
 MAX_RECORDED = 64  # numbers of a parameter whose values the history holds
 Tensors = Mapping[str, Tensor]
+
+
+class Record(NamedTuple):
+    """One step of a descent in named tensors."""
+
+    step: int
+    loss: float  # of this step's samples
+    gradient: dict[str, float]  # norm of the gradient by each parameter
+    values: dict[str, Tensor]  # of parameters of up to 64 numbers, before the step
+    rate: float = 1.0  # factor of the learning rates
+
+
+class Ending(Enum):
+    """Why a fit took no more steps."""
+
+    FLAT = "the steps led no further"
+    STEPS = "steps ran out"
+    FALLING = "loss still falling"
+    INTERRUPTED = "interrupted"
 
 
 class Objective:
@@ -119,10 +138,32 @@ class DescentResult(NamedTuple):
     ending: Ending
 
 
-def descend(descent: TensorDescent, loop: Loop) -> DescentResult:
-    """Run a descent."""
-    seconds, interrupted = run(descent, loop)
-    return DescentResult(descent.best, descent.history, seconds, descent.ending(interrupted))
+def descend(
+    descent: TensorDescent, steps: int, after_step: Callable[[], Any] = nothing, *,
+    save: Callable[[dict[str, Any]], Any] = nothing, every: int | None = None, saved: Mapping[str, Any] | None = None,
+    title: str | None = None,
+) -> DescentResult:  # fmt: skip
+    """Take at most so many steps, until they lead no further. Ctrl-C ends them with the best so far.
+
+    save   called with a state every `every` steps and at the end; the state has the seconds so far
+    saved  such a state to go on from; None: begin anew
+    title  of the bar on standard error; None: there is none
+    """
+    progress = Progress(title, after_step, every=every, total=steps)
+    if saved is not None:
+        descent.load(saved)
+        progress.earlier, progress.steps = saved["seconds"], descent.steps
+
+    def keep() -> None:
+        save({**descent.state(), "seconds": progress.seconds})
+
+    progress.keep = keep
+    with progress:
+        while descent.steps < steps and not descent.resting:
+            descent.advance()
+            progress.step(f"loss {descent.loss:.3e}")
+    keep()
+    return DescentResult(descent.best, descent.history, progress.seconds, descent.ending(progress.interrupted))
 
 
 def gradients_of(loss: Tensor, values: Tensors) -> dict[str, Tensor | None]:

@@ -76,7 +76,6 @@ def test_fit_texture(sphere, capsys):
 
 def test_fit_camera(files, capsys, monkeypatch):
     monkeypatch.setattr("edgegrad.fit.fit_camera", partial(fit_camera, search=False))
-    monkeypatch.setattr("edgegrad.fit.pose.pictures.draw_animation", lambda path, fit: path.touch())  # takes long
     out = files / "out"
     said = ["fit-camera", files / "mesh.ply", files / "target.png", "--camera", files / "camera.json", "--steps", 4]
     assert run(*said, "--no-focal", "--out", out) == 0

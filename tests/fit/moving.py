@@ -14,7 +14,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.camera.poses import rotation
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
-from edgegrad.fit.pose.pose import angle
+from edgegrad.fit.placement import angle
 
 SKIN = 0.82, 0.58, 0.46  # sRGB
 NOISE = 0.01  # of a picture, sRGB values

@@ -11,10 +11,10 @@ from brackets import BACKGROUND, CENTER, bracket, camera, rotation
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad.fit.placement import Pose
 from edgegrad.fit.pose.camera_motion import moved_poses, moving_cameras
 from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.likelihood.picture import Box, RenderedPoses
-from edgegrad.fit.pose.pose import Pose
 from edgegrad.fit.pose.task import DISTORTION, FOCAL_LENGTH, STEP_SIZE, PoseTask, Unknowns, focal_of
 
 F64 = torch.float64

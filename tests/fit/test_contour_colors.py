@@ -3,10 +3,12 @@
 import pytest
 import torch
 
+import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
-from edgegrad.fit.contour_colors import CONTOUR_BLURS, ContourColors, blur_losses, mask_noise
+from edgegrad.fit.contour_colors import CONTOUR_BLURS, mask_noise
+from edgegrad.fit.descent.region_loss import RegionLoss
 from edgegrad.fit.region import ColorFrequencies, palette, smoothed, smoothed_within
-from edgegrad.fit.views import area_mean
+from edgegrad.fit.views import area_mean, region_views, views_of
 
 
 def test_the_posterior_separates_colours_near_the_contour_alone():
@@ -62,7 +64,7 @@ def test_how_sharp_a_contour_is(blur):
     mixed = smoothed(alpha[None], blur)[0][..., None]
     noise = 0.02 * torch.randn(n, n, 3, generator=torch.Generator().manual_seed(0))
     display = linear_to_srgb(srgb_to_linear(linear_to_srgb(mixed * front + (1 - mixed) * behind) + noise).clamp(0, 1))
-    whole, image = torch.ones(1, n, n), display.movedim(-1, 0)[None]
-    sides = ContourColors.from_image(image, smoothed(alpha[None], max(CONTOUR_BLURS)), whole)
-    losses = blur_losses(sides, image, whole, alpha[None])
-    assert CONTOUR_BLURS[int(losses.argmin())] == blur, losses
+    view = eg.Camera(torch.eye(4), torch.eye(3), (n, n))
+    regions = RegionLoss(region_views(views_of(view, srgb_to_linear(display))), 0)
+    regions.renew(0, alpha[..., None])
+    assert regions.blur == blur

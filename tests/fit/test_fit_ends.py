@@ -7,7 +7,7 @@ import small_fits
 from small_fits import RIGHT, WRONG
 
 from edgegrad.fit.result import reason_of
-from edgegrad.optim.history import Ending
+from edgegrad.optim.tensors import Ending
 
 MOST = {"adam": 260, "gauss-newton": 40}  # steps
 QUICK = {

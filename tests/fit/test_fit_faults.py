@@ -31,7 +31,6 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    monkeypatch.setattr("edgegrad.fit.pose.pictures.draw_animation", lambda path, fit: path.touch())  # takes long
     return write_bracket(tmp_path, 24)
 
 

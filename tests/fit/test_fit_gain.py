@@ -14,7 +14,7 @@ import edgegrad as eg
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import PoseParameter, fit_pose, fit_scene
 from edgegrad.fit.edge_support import edge_support
-from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.placement import pose_from_matrix
 from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.views import has_levels, white_level
 
@@ -113,14 +113,3 @@ def test_the_white_level_of_a_picture() -> None:
     assert has_levels(dark) and not has_levels(0.5 * dark) and not has_levels(2.0 * picture(camera(32)))
     assert white_level((7.0 * dark).flatten(0, 1)) == pytest.approx(7.0 * white_level(dark.flatten(0, 1)), rel=1e-5)
     assert white_level(torch.zeros(5, 3)) == 1.0
-
-
-@pytest.mark.parametrize(
-    ("scale", "said"),
-    [(1000.0, "mesh: the camera stands inside the mesh"), (1e-3, r"mesh: the mesh covers 0\.0\d+ px")],
-)
-def test_units_that_differ_are_named(scale: float, said: str) -> None:
-    view = camera(32)
-    mesh = bracket().transformed(scale=scale)
-    with pytest.warns(UserWarning, match=said):
-        fit_pose(eg.Scene([mesh], BACKGROUND), picture(view), view, search=False, options=quiet(steps=1, spp=1))

@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from brackets import START, about_center, before_sky, bracket, camera, picture, rotation, silhouette
+from brackets import START, about_center, bracket, camera, picture, rotation, silhouette
 from photographs import coverage, depth_of, photograph
 from quiet_fits import arranged, quiet
 
@@ -163,30 +163,6 @@ def test_what_is_not_explained_is_not_blamed_on_steps(taken):
     assert fit.reason.startswith("edges not explained"), fit.reason
 
 
-@pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_picture_from_the_bottom_up_is_named(masked):
-    view = camera(64)
-    target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
-    options = {"masks": mask} if masked else {}
-    with pytest.warns(UserWarning, match=r"^images: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(before_sky(), target, view, init=START, **arranged(steps=1, **options))
-    assert fit.reason != "converged"
-
-
-def test_masks_from_the_bottom_up_are_named():
-    views = [camera(32), camera(32, distance=5.0)]
-    masks = [silhouette(view).flip(0) for view in views]
-    parameters = {"verts": 1e-4}
-    options = {"masks": masks, "steps": 2, "spp": 2, "progress": False}
-    with pytest.warns(UserWarning, match=r"^masks: expected the upper row first.*IoU of \d+%, as given at \d+%"):
-        fit_scene(bracket(), None, views, parameters, **arranged(**options))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        fit_scene(
-            bracket(), None, views, parameters, **arranged(**options | {"masks": [mask.flip(0) for mask in masks]})
-        )
-
-
 BLANK = torch.zeros(64, 64, 3)
 
 
@@ -312,6 +288,6 @@ def test_options_that_a_fit_does_not_use_are_refused(used):
 @pytest.mark.parametrize("search", [None, 0, 1, 10**6])
 def test_a_search_that_is_none_is_named(taken, search):
     view, image = taken
-    message = r"search: expected True, False, a number of starts from 2 to 1000, or .global., got "
+    message = r"search: expected an int"
     with pytest.raises((TypeError, ValueError), match=message):
         fit_pose(bracket(), image, view, search=search)

@@ -16,13 +16,13 @@ from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import fit_camera, fit_pose
 from edgegrad.fit.options import Settings
+from edgegrad.fit.placement import pose_from_matrix
 from edgegrad.fit.pose import pose_search
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.likelihood.objective import pose_levels
 from edgegrad.fit.pose.likelihood.support import RESOLVED, evidence_of
-from edgegrad.fit.pose.pose import angle, pose_from_matrix
 from edgegrad.fit.pose.settings import POSE
-from edgegrad.fit.pose.target_images import is_clutter
+from edgegrad.fit.pose.task import is_clutter
 from edgegrad.fit.region import smoothed
 
 

@@ -17,8 +17,8 @@ import edgegrad as eg
 from edgegrad.cli import main
 from edgegrad.fit import fit_pose, fit_poses
 from edgegrad.fit.options import Settings
+from edgegrad.fit.placement import pose_from_matrix
 from edgegrad.fit.pose.likelihood.objective import pose_levels
-from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.result import PoseFit
 
 ASIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which covers a part of the bracket

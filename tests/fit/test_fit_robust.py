@@ -11,7 +11,7 @@ from quiet_fits import quiet
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb
 from edgegrad.fit import fit_pose
-from edgegrad.fit.pose.target_images import is_clutter
+from edgegrad.fit.pose.task import is_clutter
 from edgegrad.fit.region import smoothed
 
 

@@ -16,9 +16,9 @@ from benchmarks.poses.cases import Placed, Recipe, drawn
 from benchmarks.poses.objects import Sources
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import FitOptions, fit_pose
+from edgegrad.fit.placement import Pose, angle
 from edgegrad.fit.pose.photo.match import Matches, Mips, _in_mask, closer
 from edgegrad.fit.pose.photo.template_views import TemplateViews, all_sides, ball, pose_at, spread
-from edgegrad.fit.pose.pose import Pose, angle
 from edgegrad.fit.pose.settings import TEMPLATES
 from edgegrad.fit.pose.task import PoseTask
 
@@ -176,7 +176,7 @@ def test_eight_of_ten_are_found_without_a_start(masked: bool) -> None:
 
 def test_errors_name_the_argument() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    for search, says in ((0, "search"), ("all", 'or "global"'), (10**6, "search")):
+    for search, says in ((0, "search"), ("all", "expected one of global"), (10**6, "search")):
         with pytest.raises(ValueError, match=says):
             fit_pose(mesh, picture, camera(), mask, search=search, options=quiet())  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="search"):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import fit_pose
-from edgegrad.fit.pose.pose import Pose
+from edgegrad.fit.placement import Pose
 from edgegrad.fit.pose.result import PoseFit
 from edgegrad.fit.pose.task import FOCAL_LENGTH, PoseTask
 from edgegrad.fit.pose.uncertainty import Uncertainty

@@ -15,6 +15,7 @@ from small_scenes import views
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit.options import Settings
+from edgegrad.fit.placement import Pose
 from edgegrad.fit.pose.camera_motion import moved_poses, moving_cameras
 from edgegrad.fit.pose.inputs import ArgumentNames
 from edgegrad.fit.pose.likelihood import light, objective
@@ -25,7 +26,6 @@ from edgegrad.fit.pose.likelihood.objective import pose_levels
 from edgegrad.fit.pose.likelihood.picture import Box, PictureLevel, RenderedPoses
 from edgegrad.fit.pose.likelihood.region import Frequencies, region_term
 from edgegrad.fit.pose.likelihood.term import Term
-from edgegrad.fit.pose.pose import Pose
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.fit.pose.task import PoseTask, TargetView, Unknowns
 from edgegrad.fit.region import palette, smoothed

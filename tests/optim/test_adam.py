@@ -12,9 +12,7 @@ from torch import Tensor
 
 from edgegrad.fit import Parameter
 from edgegrad.optim.adam import Adam, AdamDescent, AdamSettings
-from edgegrad.optim.history import Ending
-from edgegrad.optim.loop import Loop
-from edgegrad.optim.tensors import DescentResult, Objective, Tensors, descend
+from edgegrad.optim.tensors import DescentResult, Ending, Objective, Tensors, descend
 
 
 def test_steps_equal_those_of_torch_adam() -> None:
@@ -50,9 +48,9 @@ class Bowl(Objective):
         return found * math.nan if step == self.broken else found
 
 
-def bowl(loop: Loop, objective: Bowl | None = None, **settings: Any) -> DescentResult:
+def bowl(steps: int, objective: Bowl | None = None, tolerance: float = 0.01, **loop: Any) -> DescentResult:
     x = Parameter(0.05, torch.zeros(3, dtype=torch.float64))
-    return descend(AdamDescent(objective or Bowl(), {"x": x}, AdamSettings(**settings)), loop)
+    return descend(AdamDescent(objective or Bowl(), {"x": x}, AdamSettings(tolerance)), steps, **loop)
 
 
 def off(found: DescentResult) -> float:
@@ -60,27 +58,27 @@ def off(found: DescentResult) -> float:
 
 
 def test_a_noisy_descent_ends_flat_and_its_mean_is_near_the_minimum() -> None:
-    found = bowl(Loop(2000))
+    found = bowl(2000)
     assert found.ending is Ending.FLAT and len(found.history) < 300 and off(found) < 0.2
     assert min(record.rate for record in found.history) == pytest.approx(0.3**3)
 
 
 def test_too_few_steps_leave_the_loss_falling() -> None:
-    assert bowl(Loop(20)).ending is Ending.FALLING
-    assert bowl(Loop(5)).ending is Ending.STEPS  # which are too few to say so
+    assert bowl(20).ending is Ending.FALLING
+    assert bowl(5).ending is Ending.STEPS  # which are too few to say so
 
 
 def test_a_loss_that_is_nan_cuts_the_rates_and_goes_back() -> None:
-    found = bowl(Loop(40), Bowl(broken=30), tolerance=0.0)
+    found = bowl(40, Bowl(broken=30), tolerance=0.0)
     assert math.isnan(found.history[30].loss) and found.history[31].rate == 0.3
     assert all(torch.isfinite(record.values["x"]).all() for record in found.history)
 
 
 def test_a_resumed_descent_equals_an_uninterrupted_one(tmp_path) -> None:
-    whole = bowl(Loop(60))
-    first = bowl(Loop(25, save=lambda state: torch.save(state, tmp_path / "state.pt"), every=10))
+    whole = bowl(60)
+    first = bowl(25, save=lambda state: torch.save(state, tmp_path / "state.pt"), every=10)
     assert len(first.history) == 25
-    rest = bowl(Loop(60, saved=torch.load(tmp_path / "state.pt", weights_only=True)))
+    rest = bowl(60, saved=torch.load(tmp_path / "state.pt", weights_only=True))
     assert torch.equal(rest.values["x"], whole.values["x"]) and rest.seconds > first.seconds
     assert [record.loss for record in rest.history] == [record.loss for record in whole.history]
 
@@ -94,6 +92,6 @@ def test_ctrl_c_keeps_the_best_values_and_the_last_state() -> None:
 
     x = Parameter(0.05, torch.zeros(3, dtype=torch.float64))
     descent = AdamDescent(Bowl(), {"x": x}, AdamSettings())
-    found = descend(descent, Loop(200, stop, states.append))
+    found = descend(descent, 200, stop, save=states.append)
     assert found.ending is Ending.INTERRUPTED and len(found.history) == 30
     assert states[-1]["steps"] == 30 and 0.0 < off(found) < 2.3

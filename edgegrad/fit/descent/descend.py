@@ -11,11 +11,10 @@ from torch import Tensor
 
 from ...optim.adam import AdamDescent, AdamSettings
 from ...optim.gauss_newton import GaussNewtonDescent
-from ...optim.history import Ending, Record
 from ...optim.levenberg_marquardt import LevenbergMarquardtSettings
-from ...optim.loop import Loop, nothing
+from ...optim.loop import nothing
 from ...optim.parameter import Parameter
-from ...optim.tensors import DescentResult, TensorDescent, descend
+from ...optim.tensors import DescentResult, Ending, Record, TensorDescent, descend
 from ..checkpoints import CheckpointFile
 from ..losses import REGION
 from .curvature import MAX_NUMBERS, check_pointwise, curvature
@@ -50,7 +49,7 @@ def descend_views(
             callback(report(descent.history[-1], descent.values))
 
     title = title if options.progress else None
-    return descend(descent, Loop(options.steps, after_step, save=save, every=every, saved=saved, title=title))
+    return descend(descent, options.steps, after_step, save=save, every=every, saved=saved, title=title)
 
 
 def descend_levels(

@@ -9,8 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...optim.history import Record
 from ...optim.parameter import Parameter
+from ...optim.tensors import Record
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
@@ -19,7 +19,6 @@ from ..losses import REGION
 from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..placement import Coordinates, Placement, PoseParameter
-from ..row_order import check_mask_rows
 from ..views import Images, Observation, views_of
 from .descend import descend_views
 from .objective import Objective
@@ -145,8 +144,7 @@ def fit_views(
         return build(coordinates.values(tensors))
 
     first = {name: p.value for name, p in coordinates.parameters.items() if p.value is not None}
-    start, cameras = build_detached(whole, first)
-    check_mask_rows(views, start, cameras)
+    start, _ = build_detached(whole, first)
     objective = Objective(whole, views, options, regularizer)
     objective.check(first)
     report = reporter(whole, views, coordinates)

@@ -23,7 +23,6 @@ from ..modes import in_full_precision
 from ..options import DESCENT_OPTIONS, FitOptions, Settings
 from ..placement import Coordinates
 from ..remeshing import count_nonmanifold_edges, remeshed
-from ..row_order import check_mask_rows
 from ..views import Images, views_of
 from .descend import Save, descend_levels, descend_views
 from .fit_scene import reporter
@@ -143,8 +142,6 @@ def fit_shape(
     ) -> DescentResult:  # fmt: skip
         """Run one level from a mesh's `verts` and `faces`, and return the best as its values."""
         mesh = Mesh(values["verts"], values["faces"])
-        if level == 0 and saved is None:
-            check_mask_rows(views, scene(mesh), [view.camera for view in views])
         smooth = LaplacianSolver(mesh.faces, len(mesh.verts), how.smoothness)
         smallest = min(min(view.camera.size) for view in views)
         factor = min(1.0, max(0.5 ** (how.levels - 1 - level), DESCENT.coarsest_pixels / smallest))

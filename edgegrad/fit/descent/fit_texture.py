@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...check import check_positive, check_positive_int
+from ...camera.poses import image_size
+from ...check import check_positive
 from ...optim.parameter import Parameter
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -81,11 +82,7 @@ def fit_texture(
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; load one with load_mesh(path)")
     if mesh.uvs is None:
         raise ValueError("mesh: expected texture coordinates, got a mesh without; use unwrap(mesh)")
-    if not isinstance(size, int) and (not isinstance(size, (tuple, list)) or len(size) != 2):
-        raise TypeError(f"size: expected an int or (h, w), got {size!r}")
-    h, w = (size, size) if isinstance(size, int) else size
-    for n in (h, w):
-        check_positive_int("size", n)
+    h, w = image_size((size, size) if isinstance(size, int) else size)
     check_positive("lr", lr, least=0.0, most=1e30)
     views = views_of(cameras, images, masks, weights)
     pictures = [view.image for view in views if view.image is not None]

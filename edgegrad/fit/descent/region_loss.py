@@ -2,9 +2,9 @@
 
 The region term is −log(αP + (1 − α)(1 − P)), with the posterior P of the colours as a silhouette divides them (region.py). Its
 minimum is where P has its border, and that is where the silhouette was, so errors of P preserve themselves. The contour term is
-half the robust squared difference of the picture from a mixture of the colours on both sides (contour_colors.py). It says where
-between these colours a border lies. P and the colours are held fixed between renewals, so that the loss is a function of each
-pixel's alpha, which a descent can compare from step to step.
+half the robust squared difference of the picture from a mixture of the colours on both sides (pose/likelihood/contour.py). It
+says where between these colours a border lies. P and the colours are held fixed between renewals, so that the loss is a function
+of each pixel's alpha, which a descent can compare from step to step.
 
 Alpha is blurred, widely at first, so that a step reaches far. The contour term joins when alpha is as sharp as the pictures.
 """
@@ -12,15 +12,19 @@ Alpha is blurred, widely at first, so that a step reaches far. The contour term 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ...files.image import linear_to_srgb
-from ..contour_colors import CONTOUR_BLUR, CONTOUR_BLURS, PURE, TOLERANCE, ContourColors, blur_losses, contour_support
-from ..edge_support import MIN_EDGE_SUPPORT
+from ..contour_colors import ALONE_SHOWN, COLOUR_WINDOW, CONTOUR_BLURS, PURE, TOLERANCE
+from ..edge_support import MIN_EDGE_SUPPORT, edge_support
+from ..pose.likelihood.contour import ContourNoise, Sides, mixture
+from ..pose.likelihood.picture import Box, PictureLevel, RenderedPoses
+from ..pose.likelihood.support import compared_images, contour_length
+from ..pose.task import TargetView
 from ..region import COLORS, ColorFrequencies, likelihood, palette, slope, smoothed, smoothed_within, surroundings
 from ..views import Observation, has_levels, white_level
 
@@ -57,7 +61,7 @@ class ViewColors(NamedTuple):
 
     near: Tensor  # weights of the pixels near the object
     posterior: Tensor
-    contour: ContourColors | None = None
+    sides: Sides | None = None  # of the contour
 
 
 class RegionLoss:
@@ -65,35 +69,34 @@ class RegionLoss:
 
     def __init__(self, views: Sequence[Observation], seed: int, settings: RegionSettings | None = None) -> None:
         self.settings = settings or RegionSettings()
-        pictures = [view.image for view in views if view.image is not None]
-        whites = [1.0 if has_levels(picture) else white_level(picture.flatten(0, 1)) for picture in pictures]
-        shown = [linear_to_srgb((image / white).clamp(0.0, 1.0)) for image, white in zip(pictures, whites, strict=True)]
-        self.displays = [display.movedim(-1, 0)[None] for display in shown]  # (1, C, H, W) each
-        self.palettes = [palette(display, seed) for display in shown]
-        self.labels = [own.labels(display) for display, own in zip(shown, self.palettes, strict=True)]
         most = max((float(view.weight.max()) for view in views if view.weight is not None), default=1.0)
-        self.weights = [None if view.weight is None else view.weight[..., 0] / most for view in views]
+        self.pictures = [_picture(view, most, seed) for view in views]
         blank = [torch.zeros(1, *view.camera.size, dtype=torch.float32) for view in views]
         self.colors = [ViewColors(zero, zero + 0.5) for zero in blank]
         self.blur = self.settings.least_blur
         self.narrows = False  # whether alpha is blurred more than at later steps
         # Of each view's contour, for each of CONTOUR_BLURS.
-        self._losses = [torch.zeros(len(CONTOUR_BLURS), dtype=torch.float32) for _ in views]
+        self._costs = [torch.zeros(len(CONTOUR_BLURS), dtype=torch.float32) for _ in views]
 
     def renew(self, index: int, alpha: Tensor, step: int = FINAL_STEP) -> None:
         """Take posterior and colours from a view's silhouette alpha (H, W, 1) at a step; keep the last ones if it is empty."""
         settings = self.settings
         wide = settings.start_blur * settings.narrowing ** (step // settings.renewal_steps)
         self.narrows = wide > settings.least_blur
-        share, display = alpha[None, ..., 0].detach().float(), self.displays[index]
+        share = alpha[None, ..., 0].detach().float()
         near, extent = self.around(index, alpha)
         if extent > 0.0 and bool((near > 0.0).any()):
-            labels, colors, radius = self.labels[index], self.palettes[index].colors, COLORS.radius * extent
+            picture = replace(self.pictures[index], weight=near[0])
+            labels, colors, radius = picture.labels, picture.palette.colors, COLORS.radius * extent
             found = ColorFrequencies.from_labels(labels, colors, share, near[0], radius, COLORS.prior_pixels)
-            contour = ContourColors.from_image(display, smoothed(share, CONTOUR_BLUR), near)
-            self.colors[index] = ViewColors(near, found.posterior, contour)
-            self._losses[index] = blur_losses(contour, display, near, share)
-        known = torch.stack(self._losses).sum(0)
+            box = Box(*(slice(0, n) for n in picture.size))
+            seen = RenderedPoses(box, share, share[None, :0], None, None, None)
+            visible, noise = torch.ones_like(share), ContourNoise()
+            sides = Sides.from_picture(picture, seen, visible, None, found.every, noise, COLOUR_WINDOW)
+            self.colors[index] = ViewColors(near, found.posterior, sides)
+            costs = [_contour(sides, picture.outlined, smoothed(share, blur))[0] for blur in CONTOUR_BLURS]
+            self._costs[index] = (near * torch.cat(costs)).sum((1, 2))
+        known = torch.stack(self._costs).sum(0)
         self.blur = (
             wide if self.narrows else CONTOUR_BLURS[int(known.argmin())] if bool(known.any()) else settings.least_blur
         )
@@ -101,8 +104,7 @@ class RegionLoss:
     def around(self, index: int, alpha: Tensor) -> tuple[Tensor, float]:
         """Return weights (1, H, W) of the pixels near the object, and its extent in pixels, 0 if it is not seen."""
         near, extent = surroundings(alpha[..., 0].detach().float())
-        weight = self.weights[index]
-        return (near if weight is None else near * weight)[None], extent
+        return (near * self.pictures[index].weight)[None], extent
 
     def loss(self, group: Sequence[int], alpha: Tensor) -> Tensor:
         """Return the sum of these views' losses at their alpha (B, H, W, 1)."""
@@ -118,14 +120,11 @@ class RegionLoss:
         blurred widely, and all of the views have shown the object."""
         P, soft = torch.cat([self.colors[i].posterior for i in group]), self.blurred(alpha)
         cost, curvature = -likelihood(P, soft).double().log(), slope(P, soft).square()
-        found = [contour for i in group if (contour := self.colors[i].contour) is not None]
+        found = [sides for i in group if (sides := self.colors[i].sides) is not None]
         if not self.narrows and len(found) == len(group):
-            contour = ContourColors(*(torch.cat(parts) for parts in zip(*found, strict=True)))
-            squares = contour.squares(soft, torch.cat([self.displays[i] for i in group]))
-            robust = 1.0 + squares / TOLERANCE
-            cost = cost + 0.5 * contour.band * (squares / robust).double()
-            square = (contour.slope(soft).square() / contour.variance).sum(1)
-            curvature = curvature + contour.band * robust.pow(-2) * square
+            sides = Sides(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+            own, bend = _contour(sides, torch.stack([self.pictures[i].outlined for i in group]), soft)
+            cost, curvature = cost + own, curvature + bend
         shares = self.shares(group)
         return shares * cost, shares * curvature
 
@@ -142,18 +141,21 @@ class RegionLoss:
         """Return how much of the contour the pictures show, 0 … 1, from the alphas (H, W, 1) of the last renewal. It is the
         smaller of two shares: that of the contour's edges, and how surely colours separate its two sides. The latter is the
         mean of 2P − 1 inside and 1 − 2P outside, scaled so that `min_sureness` is just enough. `within` (H, W) masks pixels."""
-        parts, sureness, length = [], 0.0, 0.0
-        for k, alpha in enumerate(alphas):
-            share, (near, extent) = alpha[None, ..., 0].float(), self.around(k, alpha)
-            near = near if within is None else near * within[k]
-            parts.append((self.displays[k], share, near))
+        pairs, contour, sureness, length = [], torch.zeros(2), 0.0, 0.0
+        for k, (alpha, picture, colors) in enumerate(zip(alphas, self.pictures, self.colors, strict=True)):
+            share, near = alpha[None, ..., 0].float(), colors.near * (1.0 if within is None else within[k])
+            if (sides := colors.sides) is not None:
+                contour = contour + contour_length(sides, near)
+                pairs.append(compared_images(sides.mixed[0], picture.outlined, (sides.band * (near > 0.0))[0]))
+            _, extent = self.around(k, alpha)
             soft = smoothed_within(share, self.settings.sureness_blur * COLORS.radius * extent)
             band = ((soft > PURE) & (soft < 1.0 - PURE)) * near
-            sure = 2.0 * self.colors[k].posterior - 1.0
+            sure = 2.0 * colors.posterior - 1.0
             sureness += float((band * torch.where(share > 0.5, sure, -sure)).sum())
             length += float(band.sum())
         sure_share = MIN_EDGE_SUPPORT / self.settings.min_sureness * sureness / max(length, 1e-30)
-        return max(0.0, min(sure_share, contour_support(parts)))
+        shown = min(1.0, float(contour[1] / contour[0].clamp(min=1e-30)) / ALONE_SHOWN)
+        return max(0.0, min(sure_share, edge_support(pairs, softer=True) * shown)) if float(contour[0]) > 0.0 else 0.0
 
     def check(self, alphas: Sequence[Tensor]) -> None:
         """Check that the silhouettes of the start leave pixels of the pictures around them, of more than one colour. Raises
@@ -162,7 +164,7 @@ class RegionLoss:
         for k, alpha in enumerate(alphas):
             near, extent = self.around(k, alpha)
             seen += extent > 0.0
-            colors, least = self.displays[k][0][:, near[0] > 0.0], self.settings.min_color_range
+            colors, least = self.pictures[k].display[:, near[0] > 0.0], self.settings.min_color_range
             colored += colors.numel() > 0 and float((colors.amax(1) - colors.amin(1)).max()) > least
             behind = float((near * (1.0 - alpha[..., 0])).sum())
             if extent > 0.0 and behind <= self.settings.min_background * float(near.sum()):
@@ -180,3 +182,21 @@ class RegionLoss:
                 'images: expected the object before something of another colour, as loss="region" needs, got one colour alone '
                 "where it is at the start and around it; start nearer, or look for what made the pictures black or white"
             )
+
+
+def _picture(view: Observation, most: float, seed: int) -> PictureLevel:
+    """Return the picture of a view, whose weights are relative to the largest of all."""
+    assert view.image is not None
+    image = view.image / (1.0 if has_levels(view.image) else white_level(view.image.flatten(0, 1)))
+    colors = palette(linear_to_srgb(image.clamp(0.0, 1.0)), seed)
+    shot = TargetView(view.camera, image, None, None if view.weight is None else view.weight / most)
+    return PictureLevel.from_shot(shot, None, False, view.camera.size, 0.0, colors)
+
+
+def _contour(sides: Sides, images: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Return half the robust squared differences (N, h, w) of images (…, C, h, w) from both sides mixed by alpha, and their
+    curvature by it."""
+    mixed, step = mixture(sides.front, sides.back, alpha)
+    squares = ((mixed - images).square() / sides.variance).sum(1)
+    robust, band = 1.0 + squares / TOLERANCE, sides.band > 0.0
+    return 0.5 * band * (squares / robust).double(), band * robust.pow(-2) * (step.square() / sides.variance).sum(1)

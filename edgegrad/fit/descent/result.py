@@ -15,8 +15,7 @@ from ...files.cameras import save_camera
 from ...files.image import write_image
 from ...files.paths import PathLike, replacing, write_figures, write_json
 from ...files.save import save_mesh
-from ...optim.history import Ending, Record
-from ...optim.tensors import DescentResult
+from ...optim.tensors import DescentResult, Ending, Record
 from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from ...optim.levenberg_marquardt import LevenbergMarquardtSettings, Model, Problem
+from ..placement import Pose
 from .likelihood.objective import PoseLevel
-from .pose import Pose
 from .settings import CAMERA
 from .task import FOCAL_LENGTH
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from .pose import Pose
+from ..placement import Pose
 from .task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, ROTATION, SCALE, STEP_SIZE, TRANSLATION, PoseTask, focal_of
 
 F64 = torch.float64

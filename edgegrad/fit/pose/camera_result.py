@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -12,21 +11,14 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...files.cameras import save_camera
 from ...files.paths import PathLike, write_figures, write_json
-from ...optim.history import Ending, Record
+from ...optim.tensors import Ending
 from ...optional import DRAWING, require
 from ..result import FitResult, chosen, history_rows, made_folder, number_or_none
-from .pose import Pose
-from .result import PoseFit
-from .task import STEP_PARTS, PoseTask
+from .result import PoseFit, Step
 from .uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# Each part of a step moves one tensor of a camera.
-TENSOR_OF = {
-    "rotation": "world_to_camera", "shift": "world_to_camera", "focal": "K", "principal": "K", "distortion": "distortion",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,16 +29,15 @@ class CameraFit(FitResult):
     ----------
     cameras : the camera of each picture
     searches : a PoseFit of each place, in which the scene moved before cameras at rest
-        fit_camera() has one place, and calibrate() one for each picture. `searches[0].history` has the size of the level of each
-        step, and marks the best steps so far.
+        fit_camera() has one place, and calibrate() one for each picture.
     ending : why the fit took no more steps
-    joint : a Record of each step of all numbers at once
+    joint : the steps of all numbers at once, with the pose and lens of the first place
     """
 
     cameras: list[Camera]
     searches: list[PoseFit] = field(repr=False)
     ending: Ending
-    joint: list[Record] = field(repr=False)
+    joint: list[Step] = field(repr=False)
 
     @property
     def camera(self) -> Camera:
@@ -65,20 +56,9 @@ class CameraFit(FitResult):
         return [None if one is None or one.at_lens is None else one for one in known]
 
     @property
-    def history(self) -> list[Record]:
-        """Return a Record of each step of one place, or of all numbers at once of several.
-
-        It has the loss, comparable within one level of the image pyramid, and the cameras, float64, by the names that
-        fit_scene() has for them: "cameras.0.world_to_camera", and "cameras.0.K" and "cameras.0.distortion" where they are
-        sought. Norms of the gradient are by "world_to_camera" (in radians and sizes of the scene), "K" (logarithm of the focal
-        length, widths of the image) and "distortion", which all cameras share. There are none where the loss rose and the step
-        was taken back. The last record of one place is the final comparison.
-        """
-        (search, *others) = self.searches
-        if others or search.task is None:
-            return self.joint
-        steps = enumerate(search.history)
-        return [record_of(k, step.loss, step.gradient, [(search.task, step.pose)]) for k, step in steps]
+    def history(self) -> list[Step]:
+        """Return the steps of one place, or those of all numbers at once of several."""
+        return self.joint if len(self.searches) > 1 else self.searches[0].history
 
     @property
     def loss(self) -> float:
@@ -93,7 +73,7 @@ class CameraFit(FitResult):
     @property
     def steps(self) -> int:
         """Return the number of records of the history."""
-        return len(self.searches[0].history) if len(self.searches) == 1 else len(self.joint)
+        return len(self.history)
 
     @property
     def seconds(self) -> float:
@@ -129,16 +109,13 @@ class CameraFit(FitResult):
         shown = [self.searches[k] for k in chosen(len(self.searches), most)]
         return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(*shown, most=most)
 
-    def plot_history(self) -> Figure:
-        return self.searches[0].plot_history() if len(self.searches) == 1 else super().plot_history()
-
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Write the result to a folder, which is made where it is missing, and return the files' names.
 
         - camera.json, of several camera-0.json and so on: the cameras, as load_camera reads them
         - calibration.json: focal length, principal point and distortion with their standard deviations, those of the poses,
           loss and reason
-        - history.json: loss, gradient norms and cameras of each step
+        - history.json: loss, gradient norms and pose of each step, where several the first one's
         - of one place what PoseFit.save writes; else fit.png and loss.png, plot() and plot_history(), not with figures=False
 
         Each file is written whole or not at all. Raises OSError, or at last ImportError when matplotlib or pillow is missing.
@@ -173,29 +150,11 @@ class CameraFit(FitResult):
             "seconds": round(self.seconds, 3),
         }  # fmt: skip
 
-    @property
-    def _can_draw(self) -> bool:
-        return all(search.history for search in self.searches)
 
-
-def fitted(searches: Sequence[PoseFit], ending: Ending = Ending.STEPS, joint: Sequence[Record] = ()) -> CameraFit:
+def fitted(searches: Sequence[PoseFit], ending: Ending = Ending.STEPS, joint: Sequence[Step] = ()) -> CameraFit:
     """Return searches that moved the scene before cameras as a fit of the cameras."""
     cameras = [_moved(seen, search.matrix) for search in searches for seen in search.cameras]
     return CameraFit(cameras, list(searches), ending, list(joint))
-
-
-def record_of(
-    number: int, loss: float, gradient: Mapping[str, float], places: Sequence[tuple[PoseTask, Pose]]
-) -> Record:
-    """Return the record of a step from norms of its gradient by the parts of a step, and from the pose of each place."""
-    values, norms = dict[str, Tensor](), dict[str, float]()
-    cameras = [_moved(task.lens(shot.camera, pose), pose.matrix) for task, pose in places for shot in task.shots]
-    for part, entries in STEP_PARTS.items():
-        if not set(entries).isdisjoint(places[0][0].dofs):
-            values |= {f"cameras.{k}.{TENSOR_OF[part]}": getattr(one, TENSOR_OF[part]) for k, one in enumerate(cameras)}
-    for part, norm in gradient.items():
-        norms[TENSOR_OF[part]] = math.hypot(norms.get(TENSOR_OF[part], 0.0), norm)
-    return Record(number, loss, norms, {name: value.clone() for name, value in values.items()})
 
 
 def _moved(camera: Camera, matrix: Tensor) -> Camera:

@@ -15,8 +15,8 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.lens import COEFFICIENT_COUNTS
 from ...check import check_flag, check_int
-from ...optim.history import Ending, Record
 from ...optim.levenberg_marquardt import LevenbergMarquardt, Rest, minimise
+from ...optim.tensors import Ending
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.tree import map_tensors
@@ -24,15 +24,15 @@ from ..by_camera import one_for_each
 from ..checkpoints import checkpoint_of
 from ..modes import in_full_precision
 from ..options import MIN_PICTURE_SIDE, POSE_OPTIONS, FitOptions, Settings, options_of
+from ..placement import Pose
 from ..views import Images, cameras_of, check_image
 from .bundle_adjustment import Adjustment, Bundle, Poses
-from .camera_result import CameraFit, fitted, record_of
+from .camera_result import CameraFit, fitted
 from .fit_pose import search_pose
 from .hypotheses import norms_of
 from .inputs import ArgumentNames
 from .likelihood.objective import PoseLevel, pose_levels
 from .likelihood.support import evidence_of
-from .pose import Pose
 from .result import PoseFit, Step
 from .settings import CAMERA
 from .task import Unknowns
@@ -181,7 +181,7 @@ def calibrate(
 def refined(searches: Sequence[PoseFit], settings: Settings) -> CameraFit:
     """Refine the poses of all places and their one lens together, and add how exactly they are known. Ctrl-C ends this with the
     best so far."""
-    joint, best, end = list[Record](), fitted(searches), None
+    joint, best, end = list[Step](), fitted(searches), None
     supports, ending = [search.explained for search in searches], Ending.STEPS
     progress = settings.progress_of("lens", lambda: best)
 
@@ -195,8 +195,8 @@ def refined(searches: Sequence[PoseFit], settings: Settings) -> CameraFit:
         if bundle.last is not None and descents.descents[0].point is bundle.last.poses:
             end = bundle.last
         assert end is not None
-        places, dofs = [(level.task, pose) for level, pose in zip(levels, end.poses, strict=True)], levels[0].task.dofs
-        joint.append(record_of(len(joint), end.loss, norms_of(dofs, end.gradient(dofs)), places))
+        dofs = levels[0].task.dofs
+        joint.append(Step(levels[0].size, end.loss, end.poses[0], True, norms_of(dofs, end.gradient(dofs))))
         best = result(end)
         progress.step(f"loss {end.loss:.3e}")
 

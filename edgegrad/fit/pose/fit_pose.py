@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...check import as_int, check_flag
+from ...check import check_choice, check_flag, check_int
 from ...optim.loop import Progress
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -26,13 +26,12 @@ from ..checkpoints import CheckpointFile, traits
 from ..measured import depth_images
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
-from ..row_order import warn_of_flipped_rows
-from ..views import PICTURES, Images, cameras_of
+from ..placement import Pose, angle, pose_from_matrix
+from ..views import Images, cameras_of
 from .confidence import features_of
 from .hypotheses import probabilities
 from .initial_pose import initial_pose
-from .inputs import ArgumentNames, check_in_front, warn_of_scale, warn_of_units
-from .pose import Pose, angle, pose_from_matrix
+from .inputs import ArgumentNames, check_in_front, warn_of_units
 from .pose_search import Groups, PoseSearch, Report, anywhere, around, everywhere
 from .replay_log import ReplayLog
 from .result import PoseFit, PoseMode
@@ -41,7 +40,6 @@ from .task import PoseTask, Unknowns
 from .uncertainty import Uncertainty
 
 MOST_STARTS = 1000
-SEARCHES = f'True, False, a number of starts from 2 to {MOST_STARTS}, or "global"'
 Search = bool | int | Literal["global"]
 
 
@@ -117,8 +115,6 @@ def search_pose(
     _check_search(search, init, given_cameras, names.init)
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.from_arguments(mesh, images, given_cameras, masks, weights, lens, float(given.scale), names)
-    if names == ArgumentNames():  # A camera may stand inside of a scene.
-        warn_of_scale(names.mesh, task.scene.transformed(given.R, given.t, given.scale), task.shots[0].camera)
     start = initial_pose(task) if init is None else given
     check_in_front(names.init, task.shots[0].camera, start, task.center)
     file = CheckpointFile(settings.checkpoint, {
@@ -159,9 +155,6 @@ def search_pose(
         state.run()
         if search == "global":
             warn_of_units(task.scene.transformed(state.best.R, state.best.t, state.best.scale), seen, measured, "found")
-        doubtful = fit_of(state, progress, given_cameras).reason != "converged"
-        if search and doubtful and proposals is None:
-            _warn_of_flipped_pictures(task, state, init is None)
     keep()
     return fit_of(state, progress, given_cameras)
 
@@ -216,14 +209,9 @@ def _check_search(search: object, init: object, cameras: Sequence[Camera], name:
                 f'search: expected a perspective or orthographic camera for "global", got a {projection}; give {name}'
             )
     elif isinstance(search, str):
-        raise ValueError(f"search: expected {SEARCHES}, got {search!r}")
+        check_choice("search", search, ["global"])
     elif not isinstance(search, bool):
-        try:
-            number = as_int("search", search)
-        except TypeError:
-            raise TypeError(f"search: expected {SEARCHES}, got {type(search).__name__} ({search!r})") from None
-        if not 2 <= number <= MOST_STARTS:
-            raise ValueError(f"search: expected {SEARCHES}, got {number}")
+        check_int("search", search, 2, MOST_STARTS)
 
 
 def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -> Symmetries | None:
@@ -235,15 +223,3 @@ def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -
     if isinstance(given, str):
         raise ValueError(f'{name}: expected Symmetries, "find" or None, got {given!r}')
     raise TypeError(f'{name}: expected Symmetries, "find" or None, got {type(given).__name__}')
-
-
-def _warn_of_flipped_pictures(task: PoseTask, search: PoseSearch, place: bool) -> None:
-    """Warn where a fit to the pictures turned over finds in them what it did not find as they are."""
-    turned, settings = task.turned_over(), search.settings
-    start = initial_pose(turned) if place else search.start
-    again = PoseSearch(turned, start, [None] * len(task.shots), settings)
-    found = again.first_end()
-    if found >= max(again.enough, search.edge_support + PICTURES.iou_gain):
-        warn_of_flipped_rows(
-            search.task.names.images, f"it shows {found:.0%} of the render's edges, as given {search.edge_support:.0%}"
-        )

@@ -26,13 +26,13 @@ from ..by_camera import numbered, one_for_each
 from ..measured import depth_images
 from ..modes import in_full_precision
 from ..options import POSE_OPTIONS, FitOptions, Settings
+from ..placement import Pose, angle, pose_from_matrix
 from ..views import Images, cameras_of
 from .fit_pose import fit_of, symmetries_of
 from .hypotheses import HypothesisSearch, turned
 from .inputs import ArgumentNames, check_in_front, check_seen, warn_of_units
 from .likelihood.objective import pose_levels
 from .likelihood.support import evidence_of
-from .pose import Pose, angle, pose_from_matrix
 from .pose_search import PoseSearch
 from .result import PoseFit, Step
 from .settings import CAMERA, POSE

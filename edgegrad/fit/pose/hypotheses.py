@@ -19,9 +19,9 @@ from torch import Tensor
 from ...optim.levenberg_marquardt import LevenbergMarquardt, LevenbergMarquardtSettings, Rest
 from ...scene.symmetries import Symmetries
 from ..options import Settings
+from ..placement import Pose, angle
 from .camera_motion import moved_poses
 from .likelihood.objective import PoseLevel, pose_levels
-from .pose import Pose, angle
 from .replay_log import Replayed, ReplayLog
 from .result import Step
 from .settings import POSE

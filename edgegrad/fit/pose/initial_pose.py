@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..placement import Pose
 from .inputs import depth_of
-from .pose import Pose
 from .settings import CAMERA
 from .task import PoseTask, focal_of
 

@@ -14,8 +14,8 @@ from ...camera.camera import Camera
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...warnings import warn
+from ..placement import Pose
 from ..region import VISIBLE
-from .pose import Pose
 from .settings import CAMERA, POSE
 
 
@@ -53,24 +53,6 @@ def check_seen(name: str, scene: Scene, cameras: Sequence[Camera], pose: Pose) -
         raise ValueError(
             f"{name}: expected a pose at which the camera sees the mesh, got one out of the picture; start where it is"
         )
-
-
-def warn_of_scale(name: str, scene: Scene, camera: Camera) -> None:
-    """Warn where a placed mesh has units other than its camera's, so that it is hardly visible."""
-    verts = torch.cat([mesh.verts.double() for mesh in scene.meshes])
-    low, high = verts.aminmax(dim=0)
-    eye = camera.eye.double()
-    size, away = float((high - low).norm()), float((0.5 * (low + high) - eye).norm())
-    where = f"it is {size:.3g} across, and its middle is {away:.3g} from the camera"
-    fix = "do both have the same units? Mesh.transformed(scale=…) changes those of the mesh"
-    if camera.projection == "perspective" and bool(((low < eye) & (eye < high)).all()):
-        warn(f"inside {name}", f"{name}: the camera stands inside the mesh: {where}; {fix}")
-    seen = camera.project(verts)
-    if not bool(seen.isfinite().all()):
-        return
-    across = float((seen.amax(0) - seen.amin(0)).max())
-    if across < 1.0:
-        warn(f"far {name}", f"{name}: the mesh covers {across:.2g} px: {where}; {fix}")
 
 
 def depth_of(camera: Camera, pose: Pose, point: Tensor) -> Tensor:

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from ...scene.symmetries import Symmetries
 from ..options import Settings
+from ..placement import Pose
 from .hypotheses import HypothesisSearch, Mode, turned
 from .likelihood.support import Evidence, enough_support, evidence_of
 from .photo.match import matches
 from .photo.template_views import ball, spread
-from .pose import Pose
 from .replay_log import ReplayLog
 from .result import Step
 from .settings import POSE
@@ -96,15 +96,9 @@ class PoseSearch:
     def _proposed(self, proposals: Callable[[Report], Groups]) -> Groups:
         """Return the groups that proposals make, as logged."""
         found = self.log.replay(lambda: [
-            (about.numbers, [pose.numbers for pose in poses]) for about, poses in proposals(self.report)
+            (tuple(about), [tuple(pose) for pose in poses]) for about, poses in proposals(self.report)
         ])  # fmt: skip
-        return [(Pose.from_numbers(about), [Pose.from_numbers(pose) for pose in poses]) for about, poses in found]
-
-    def first_end(self) -> float:
-        """Return the share of the render's edges that the pictures show where the start alone leads."""
-        search = HypothesisSearch(self.task, [(self.start, [self.start])], self.depths, self.settings, further=False)
-        modes = search.run()
-        return evidence_of(modes[0].level, modes[0].pose).edges if modes else 0.0
+        return [(Pose(*about), [Pose(*pose) for pose in poses]) for about, poses in found]
 
 
 def ambiguous(modes: Sequence[Mode]) -> list[Pose]:

@@ -12,7 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from ...optim.levenberg_marquardt import Model, Problem
-from .pose import Pose
+from ..placement import Pose
 
 
 class ReplayLog:

@@ -15,12 +15,12 @@ from ...camera.poses import rigid
 from ...files.cameras import camera_fields, camera_from_fields
 from ...files.formats.part import FormatError
 from ...files.paths import PathLike, write_figures, write_text
-from ...optim.history import Ending
+from ...optim.tensors import Ending
 from ...optional import DRAWING, require
 from ..edge_support import MIN_EDGE_SUPPORT
+from ..placement import Pose, pose_from_matrix
 from ..result import FitResult, made_folder, number_or_none, reason_of
 from .confidence import FEATURES, confidence_of
-from .pose import Pose, pose_from_matrix
 from .settings import CAMERA
 from .uncertainty import Uncertainty
 
@@ -129,7 +129,7 @@ class PoseFit(FitResult):
         return require("edgegrad.fit.pose.pictures", *DRAWING).sheet(self, most=most)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """Write pose.json, fit.png, loss.png (plot_history()) and fit.webp to a folder, and return their names.
+        """Write pose.json, fit.png and loss.png (plot_history()) to a folder, and return their names.
 
         The folder is made where it is missing, and each file is written whole or not at all. A fit that took no step writes
         pose.json alone. Raises OSError, or ImportError once pose.json is written when matplotlib or pillow is missing.
@@ -138,13 +138,7 @@ class PoseFit(FitResult):
         write_text(out / "pose.json", self.to_json() + "\n")
         if not self.history or not figures:
             return ["pose.json"]
-        names = write_figures(out, {"fit.png": self.plot, "loss.png": self.plot_history})
-        require("edgegrad.fit.pose.pictures", *DRAWING).draw_animation(out / "fit.webp", self)
-        return ["pose.json", *names, "fit.webp"]
-
-    @property
-    def _can_draw(self) -> bool:
-        return self.task is not None and bool(self.history)
+        return ["pose.json", *write_figures(out, {"fit.png": self.plot, "loss.png": self.plot_history})]
 
     def to_json(self) -> str:
         """Return JSON text with the pose, `mesh_to_world` 4 × 4 by rows for column vectors, the camera, and figures."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -10,17 +10,19 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
+from ...check import check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..by_camera import numbered
 from ..options import MIN_PICTURE_SIDE
+from ..placement import Pose
 from ..region import VISIBLE
 from ..views import check_without_alpha, has_levels, views_of, white_level
 from .inputs import ArgumentNames, without_colors
-from .pose import Pose
-from .target_images import background_of, is_clutter
 
 BACKGROUND_BRIGHTNESS = 0.25  # brightness of the picture behind a render, where the background is unknown
+# A border is clutter when more than 0.3 of it is further from its median than 0.1 of the range.
+UNIFORM_BORDER = (0.1, 0.3)
 
 # A step has these entries, and a constant for the first of each: a rotation vector about the centre and a shift, both along
 # the first camera's axes, logarithms of scale and focal length, the principal point in widths of the image, and distortion.
@@ -156,18 +158,6 @@ class PoseTask:
         bare = scene.replace(meshes=double, background=None)
         return PoseTask(bare, aovs, shots, clutter, colorless, (low + high) / 2, size, dofs, names, white)
 
-    def turned_over(self) -> PoseTask:
-        """Return the task with the pictures upside down."""
-
-        def flipped(image: Tensor | None) -> Tensor | None:
-            return image if image is None or image.dim() < 3 else image.flip(0)
-
-        shots = [
-            TargetView(shot.camera, shot.target.flip(0), flipped(shot.background), flipped(shot.weight))
-            for shot in self.shots
-        ]
-        return replace(self, shots=shots)
-
     def between(self, one: Pose, other: Pose) -> float:
         """Return the distance of the object's centres at two poses, relative to its size."""
         return float((self.center_at(one) - self.center_at(other)).norm()) / self.size
@@ -192,6 +182,32 @@ class PoseTask:
                 change = torch.cat([change, change.new_zeros(len(given) - len(change))])
             fields["distortion"] = change if given is None else change + F.pad(given, (0, len(change) - len(given)))
         return camera.replace(**fields)
+
+
+def is_clutter(picture: Tensor) -> bool:
+    """Return whether the border of a picture (H, W, C) has many colours, so that none of them is the background."""
+    border = _border(picture)
+    extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
+    off = ((border - border.median(dim=0).values).abs() / extent).amax(1)
+    return float((off > UNIFORM_BORDER[0]).float().mean()) > UNIFORM_BORDER[1]
+
+
+def _border(picture: Tensor) -> Tensor:
+    return torch.cat([picture[0], picture[-1], picture[1:-1, 0], picture[1:-1, -1]])
+
+
+def background_of(behind: Tensor | None, picture: Tensor) -> Tensor:
+    """Return a scene's background (C,) or (H, W, C), or else the median colour of the picture's border. Raises ValueError."""
+    if behind is None:
+        return _border(picture).median(dim=0).values
+    shapes = picture.shape[-1:], picture.shape
+    check_shape("background", behind, *shapes, fix="it needs the picture's size and channels")
+    return behind.detach().float()
+
+
+def scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    """Return the size of a picture whose sides are multiplied by a factor, at least one pixel."""
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
 def focal_of(camera: Camera) -> float:

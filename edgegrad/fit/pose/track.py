@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ...camera.camera import Camera
 from ...camera.poses import rigid, rotation
-from ...files.image import linear_to_srgb, read_image, srgb_to_linear
+from ...files.image import read_image
 from ...files.paths import PathLike
 from ...optim.levenberg_marquardt import Descent, LevenbergMarquardtSettings, Model, Problem, minimise
 from ...scene.mesh import Mesh
@@ -28,17 +28,16 @@ from ...scene.scene import Scene
 from ..measured import measured_image
 from ..modes import in_full_precision
 from ..options import FitOptions, Settings
+from ..placement import Pose, pose_from_matrix, rotation_vector
 from ..region import Palette
 from ..views import check_image
 from .hypotheses import HypothesisSearch
 from .inputs import ArgumentNames, check_in_front, check_seen, depth_of, warn_of_units
 from .likelihood.contour import ContourNoise
-from .likelihood.light import harmonics_of
 from .likelihood.objective import PoseLevel, pose_levels
 from .likelihood.support import enough_support, evidence_of
 from .photo.match import places
 from .photo.template_views import TemplateViews, across, ball
-from .pose import Pose, pose_from_matrix, rotation_vector
 from .result import PoseFit
 from .settings import POSE, TEMPLATES
 from .task import PoseTask, Unknowns
@@ -198,7 +197,6 @@ class FrameCandidate(NamedTuple):
     pose: Pose
     share: float = 0.0  # edges of the render that the picture shows
     visible: float = 0.0  # share of the object
-    level: PoseLevel | None = None  # on which it was found
 
 
 @dataclass(frozen=True)
@@ -253,7 +251,6 @@ class Tracker:
         self.task: PoseTask | None = None
         self.contours: tuple[ContourNoise, ...] | None = None  # of the film
         self.palettes: list[Palette] | None = None  # of the pictures that were last searched
-        self.shown: PoseLevel | None = None  # picture that shows the object there
         self.variance = TRACK.deviation**2  # of the prediction
 
     @in_full_precision
@@ -283,7 +280,7 @@ class Tracker:
         pose = self.good if lost else found.pose if seen else predicted
         self._move(task, pose, unknown=lost or jumped)
         if found.share >= enough:
-            self.good, self.shown = pose, found.level
+            self.good = pose
         return TrackedPose(index, pose.R, pose.t, float(pose.scale), found.share, lost, 1.0 - found.visible)
 
     def _followed(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> FrameCandidate:
@@ -299,7 +296,7 @@ class Tracker:
             square = float(problem.offset(found.point).square().mean())
             variance = self.variance + TRACK.learning_rate * (square - self.variance)
             self.variance = max(variance, TRACK.least_deviation**2)
-        return FrameCandidate(found.point, share, visible, fine)
+        return FrameCandidate(found.point, share, visible)
 
     def _searched(
         self, task: PoseTask, depth: Tensor | None, groups: Sequence[tuple[Pose, Sequence[Pose]]]
@@ -311,7 +308,7 @@ class Tracker:
         pose = modes[0].pose
         level = pose_levels(task, pose, [depth], self.settings)[-1]
         self.palettes = [picture.palette for picture in level.pictures]
-        return FrameCandidate(pose, *evidence_of(level, pose)[:2], level)
+        return FrameCandidate(pose, *evidence_of(level, pose)[:2])
 
     def _matches(self, task: PoseTask) -> list[Pose]:
         """Return where in the whole picture the object might be, about as large as it was, and rotated by up to some 60°."""
@@ -325,25 +322,13 @@ class Tracker:
         far = float(depth_of(camera, self.good, task.center))
         size = across(unit, camera, far) / min(camera.size)
         views = TemplateViews.from_rotations(unit, rotations, TEMPLATES.view_pixels, self.settings.seed)
-        views, lit = self._lit(views, camera)
-        found = places(unit, views, (size / TRACK.size_factor, size * TRACK.size_factor), lit)
+        found = places(unit, views, (size / TRACK.size_factor, size * TRACK.size_factor))
         poses = [pose._replace(scale=scale) for pose in found[: TRACK.matches]]
         if camera.projection == "orthographic":  # The match does not show depth.
             axis = camera.world_to_camera[2, :3]
             off = [far - float(depth_of(camera, pose, task.center)) for pose in poses]
             poses = [pose._replace(t=pose.t + shift * axis) for pose, shift in zip(poses, off, strict=True)]
         return poses
-
-    def _lit(self, views: TemplateViews, camera: Camera) -> tuple[TemplateViews, bool]:
-        """Return the views in the light in which the object was seen last, and whether that is known."""
-        light = None if self.shown is None else self.shown.comparisons([self.good])[0].light
-        if light is None:
-            return views, False
-        world = camera.world_to_camera[:3, :3].double().T @ views.rotations  # The light turned with the mesh.
-        normals = torch.einsum("nij,nhwj->nihw", (self.good.R.T @ world).float(), views.normals)
-        irradiance = harmonics_of(normals, light.coefficients.shape[2]).movedim(1, -1) @ light.coefficients[0].T
-        radiance = srgb_to_linear(views.colors) * irradiance
-        return replace(views, colors=linear_to_srgb(radiance.clamp(0.0, 1.0))), True
 
     def _predicted(self, task: PoseTask) -> Pose:
         """Predict the pose by constant velocity."""

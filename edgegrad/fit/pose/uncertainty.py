@@ -18,8 +18,8 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...camera.lens import MOST_COEFFICIENTS, distort
 from ...scene.symmetries import Symmetries
+from ..placement import Pose
 from .camera_motion import moving_cameras
-from .pose import Pose
 from .settings import CAMERA
 from .task import DISTORTION, FOCAL_LENGTH, PRINCIPAL, SCALE, PoseTask, focal_of
 

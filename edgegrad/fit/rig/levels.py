@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from ...aovs import render_aovs
-from ...optim.history import Ending
 from ...optim.parameter import Parameter
-from ...optim.tensors import DescentResult
+from ...optim.tensors import DescentResult, Ending
 from ...rig.function import FunctionDeformer
 from ...rig.rotations import roma
 from ...scene.mesh import Mesh

@@ -70,11 +70,7 @@ class Sides(NamedTuple):
             front = torch.lerp(front - behind, linear_to_srgb(lit.clamp(0.0, 1.0)) - behind, sure) + behind
             front_variance = front_variance * (1.0 - sure)
         back = back + behind
-        mixed, step = back + a * (front - back), front - back
-        if curved:
-            inside, outside = (srgb_to_linear(side.clamp(0.0, 1.0)) for side in (front, back))
-            mixed = linear_to_srgb((outside + a * (inside - outside)).clamp(0.0, 1.0))
-            step = srgb_slope(mixed) * (inside - outside)
+        mixed, step = mixture(front, back, alpha) if curved else (back + a * (front - back), front - back)
         band = ((alpha > PURE) & (alpha < 1.0 - PURE) & known) * near
         kernel = POSE.color_kernel * math.sqrt(2.0 * math.pi)
         density = every.log() - (len(image) * math.log(kernel) if curved else 0.0)
@@ -106,6 +102,13 @@ class Sides(NamedTuple):
         """Return the root mean square difference of the mixtures of two renders, in standard deviations of the other's."""
         square = ((self.mixed - other.mixed).square() / other.variance).mean(1)
         return math.sqrt(float((self.band * square).sum() / self.band.sum().clamp(min=1e-12)))
+
+
+def mixture(front: Tensor, back: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the display values (N, C, h, w) of two sides' radiances mixed by alpha (N, h, w), and their derivative by it."""
+    inside, outside = (srgb_to_linear(side.clamp(0.0, 1.0)) for side in (front, back))
+    mixed = linear_to_srgb((outside + alpha[:, None] * (inside - outside)).clamp(0.0, 1.0))
+    return mixed, srgb_slope(mixed) * (inside - outside)
 
 
 def log_normal(residual: Tensor, variance: Tensor) -> Tensor:

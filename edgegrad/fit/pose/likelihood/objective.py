@@ -13,12 +13,11 @@ from torch import Tensor
 from ....camera.camera import Camera
 from ....optim.levenberg_marquardt import Model, Problem
 from ...options import Settings
+from ...placement import Pose
 from ...region import Palette, palette
 from ..camera_motion import moved_poses, moving_cameras, stacked
-from ..pose import Pose
 from ..settings import POSE
-from ..target_images import scaled
-from ..task import FOCAL_LENGTH, PoseTask, TargetView
+from ..task import FOCAL_LENGTH, PoseTask, TargetView, scaled
 from .contour import ContourNoise, Sides, contour_noise, contour_rows, contour_term
 from .depth import depth_term
 from .light import HARMONICS, FittedLight

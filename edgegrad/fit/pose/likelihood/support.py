@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ....files.image import linear_to_srgb
-from ...contour_colors import ALONE_INFORMATION, ALONE_SHOWN, COLOUR_WINDOW, CONTRAST, PIXEL_NOISE, PURE
+from ...contour_colors import ALONE_INFORMATION, ALONE_SHOWN, COLOUR_WINDOW, CONTRAST, PURE
 from ...edge_support import edge_support
+from ...placement import Pose
 from ...region import information, smoothed_within
-from ..pose import Pose
 from ..settings import POSE
 from ..task import PoseTask
 from .contour import ContourNoise, Sides
@@ -61,38 +61,37 @@ def _before_known(compared: list[Comparison]) -> float:
         around += float(count.sum())
         if part.mask is None:
             off = math.inf if part.background is None else (part.display - part.background).abs().amax(0)
-            count = count * (off < CONTRAST * PIXEL_NOISE)
+            count = count * (off < CONTRAST * POSE.first_contour[1])
         shown += float(count.sum())
     return shown / max(around, 1e-30)
 
 
 def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered: bool) -> float:
     pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]] = []
-    shown = length = bits = pixels = 0.0
+    contour, bits, pixels = torch.zeros(2), 0.0, 0.0
     for one in compared:
         part, seen = one.part, one.seen
         visible, every = one.visible if uncovered else torch.ones_like(one.visible), seen.box.cut(one.colors.every)
         sides = Sides.from_picture(part, seen, visible, None, every, ContourNoise(), COLOUR_WINDOW)
         weight = (part.weight * visible)[0]
-        on = ((sides.alpha > PURE) & (sides.alpha < 1.0 - PURE)) * weight
-        length += float(on.sum())
-        shown += float((on * (sides.contrast > CONTRAST) * (sides.band > 0.0)).sum())
+        contour = contour + contour_length(sides, part.weight * visible)
         if not colored:
             soft = smoothed_within(seen.alpha, COLOUR_WINDOW)
             ring = ((soft > PURE) & (soft < 1.0 - PURE)) * part.weight
             inside, outside = seen.box.cut(one.colors.inside), seen.box.cut(one.colors.outside)
             bits += float((ring * information(inside / (inside + outside), seen.alpha)).sum())
             pixels += float(ring.sum())
-        mixed, band = sides.mixed[0].movedim(0, -1), sides.band[0]
+        mixed, band = sides.mixed[0], sides.band[0]
         if one.light is None or part.mask is not None:
-            pairs.append((mixed, mixed, part.outlined.movedim(0, -1), band[..., None]))
+            pairs.append(compared_images(mixed, part.outlined, band))
         if one.light is not None:
             inner = one.light.inside[0]
-            expected = linear_to_srgb(one.light.image(one.light.predicted)[0].clamp(0.0, 1.0)).movedim(0, -1)
+            expected = linear_to_srgb(one.light.image(one.light.predicted)[0].clamp(0.0, 1.0))
             covered = torch.where(inner, weight, 0.0)
             if part.mask is None:
-                expected, covered = torch.where(inner[..., None], expected, mixed), torch.where(inner, weight, band)
-            pairs.append((expected, expected, part.display.movedim(0, -1), covered[..., None]))
+                expected, covered = torch.where(inner, expected, mixed), torch.where(inner, weight, band)
+            pairs.append(compared_images(expected, part.display, covered))
+    length, shown = contour.tolist()
     if length == 0.0:
         return 0.0
     share = edge_support(pairs, softer=True) * resolved
@@ -101,3 +100,15 @@ def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered
     # Off the object, both sides of a contour have similar colours, however strong the edges that it follows.
     sure = max(0.0, min(1.0, bits / max(pixels, 1e-30) / ALONE_INFORMATION))
     return share * min(1.0, shown / length / ALONE_SHOWN) * sure
+
+
+def contour_length(sides: Sides, near: Tensor) -> Tensor:
+    """Return the pixels (2,) along contours, weighted by `near` (N, h, w), and those of them whose two sides differ visibly."""
+    on = ((sides.alpha > PURE) & (sides.alpha < 1.0 - PURE)) * near
+    return torch.stack([on.sum(), (on * (sides.contrast > CONTRAST) * (sides.band > 0.0)).sum()])
+
+
+def compared_images(expected: Tensor, picture: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Return what edge_support() compares, of images (C, h, w) and weights (h, w)."""
+    first = expected.movedim(0, -1)
+    return first, first, picture.movedim(0, -1), weight[..., None]

@@ -15,11 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ....files.image import linear_to_srgb
+from ...placement import Pose
 from ...views import area_mean
-from ..pose import Pose
 from ..settings import TEMPLATES, Round
-from ..target_images import scaled
-from ..task import PoseTask
+from ..task import PoseTask, scaled
 from .template_views import TemplateViews, across, all_sides, pose_at, rotations
 from .templates import Templates, surprise
 
@@ -128,7 +127,7 @@ def matches(task: PoseTask, seed: int, report: Callable[[str], object]) -> list[
     report("views from all sides")
     views = TemplateViews.from_rotations(task, all_sides(), TEMPLATES.view_pixels, seed)
     fewer = TEMPLATES.fewer_with_mask if mips.masked else 1
-    found = _in_mask(views, mips) if mips.masked else _everywhere(views, mips, _ratios(views))
+    found = _in_mask(views, mips) if mips.masked else _everywhere(views, mips)
     found = found.distinct(TEMPLATES.coarse // fewer, *TEMPLATES.distinct)
     for k, one in enumerate(TEMPLATES.beam_rounds):
         if len(found.scores):
@@ -137,46 +136,17 @@ def matches(task: PoseTask, seed: int, report: Callable[[str], object]) -> list[
     return found.poses(task)
 
 
-def places(task: PoseTask, views: TemplateViews, sizes: tuple[float, float], lit: bool) -> list[Pose]:
+def places(task: PoseTask, views: TemplateViews, sizes: tuple[float, float]) -> list[Pose]:
     """Return the best places of some views in the first picture, distinct, the best first. The object's diagonal is between
-    two `sizes`, relative to the picture's shorter side. `lit`: the views are in the light of the picture."""
-    score = _errors(views) if lit else _ratios(views)
-    return (
-        _everywhere(views, Mips(task, views.across), score, sizes)
-        .distinct(TEMPLATES.places, *TEMPLATES.distinct)
-        .poses(task)
-    )
-
-
-# A score takes a picture (C + 1, h, w), and how many pixels of the whole picture are across the object.
-Score = Callable[[Tensor, float], Tensor]
-
-
-def _ratios(views: TemplateViews) -> Score:
-    """Return a score by log likelihood ratios: larger objects have more pixels, and these correlate."""
-    templates = Templates(views)
-    return lambda picture, pixels: templates.scores(picture[None], TEMPLATES.stride) * pixels
-
-
-def _errors(views: TemplateViews) -> Score:
-    """Return a score by the negative mean squared difference of views and picture inside, pixel by pixel."""
-    inside = torch.where(views.alpha > 0.5, views.alpha, torch.zeros_like(views.alpha))
-    area = inside.sum((1, 2)).clamp(min=1.0)[:, None, None]
-    weighted = (inside[..., None] * views.colors).movedim(-1, 1)
-    own = (weighted * views.colors.movedim(-1, 1)).sum((1, 2, 3))[:, None, None]
-
-    def score(picture: Tensor, pixels: float) -> Tensor:
-        colors = picture[:-1]
-        squares = F.conv2d(colors.square().sum(0)[None, None], inside[:, None], stride=TEMPLATES.stride)[0]
-        return -(squares - 2.0 * F.conv2d(colors[None], weighted, stride=TEMPLATES.stride)[0] + own) / area
-
-    return score
+    two `sizes`, relative to the picture's shorter side."""
+    found = _everywhere(views, Mips(task, views.across), sizes)
+    return found.distinct(TEMPLATES.places, *TEMPLATES.distinct).poses(task)
 
 
 def _everywhere(
-    views: TemplateViews, mips: Mips, score: Score, sizes: tuple[float, float] = (TEMPLATES.smallest, TEMPLATES.largest)
+    views: TemplateViews, mips: Mips, sizes: tuple[float, float] = (TEMPLATES.smallest, TEMPLATES.largest)
 ) -> Matches:
-    (H, W), T = mips.size, views.alpha.shape[-1]
+    (H, W), T, templates = mips.size, views.alpha.shape[-1], Templates(views)
     margin = T // 3
     found = [
         Matches(torch.empty(0, 3, 3).double(), torch.empty(0, 2).double(), torch.empty(0).double(), torch.empty(0))
@@ -187,7 +157,9 @@ def _everywhere(
         h, w = picture.shape[1:]
         if min(h, w) + 2 * margin < T:
             continue
-        scores = score(F.pad(picture[None], (margin,) * 4, mode="replicate")[0], pixels)
+        padded = F.pad(picture[None], (margin,) * 4, mode="replicate")
+        # These are log likelihood ratios: larger objects have more pixels, and these correlate.
+        scores = templates.scores(padded, TEMPLATES.stride) * pixels
         columns = scores.shape[-1]
         best, at = scores.flatten(1).topk(min(TEMPLATES.places_per_view, scores[0].numel()))
         middle = torch.stack([at % columns, at // columns], -1).double() * TEMPLATES.stride + 0.5 * T - margin

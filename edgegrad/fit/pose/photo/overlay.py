@@ -7,11 +7,10 @@ from torch import Tensor
 
 from ....files.image import srgb_to_linear
 from ...contour_colors import draw_contour
+from ...placement import Pose
 from ..likelihood.objective import Comparison, whole_level
 from ..likelihood.picture import Box
-from ..pose import Pose
-from ..target_images import scaled
-from ..task import BACKGROUND_BRIGHTNESS, PoseTask
+from ..task import BACKGROUND_BRIGHTNESS, PoseTask, scaled
 
 
 def overlay(task: PoseTask, longest: int, spp: int, pose: Pose) -> list[tuple[Tensor, Tensor]]:

@@ -15,8 +15,8 @@ from ....camera.poses import rotation
 from ....files.image import linear_to_srgb
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
+from ...placement import Pose
 from ..camera_motion import cross_matrices
-from ..pose import Pose
 from ..settings import TEMPLATES
 from ..task import PoseTask, focal_of
 
