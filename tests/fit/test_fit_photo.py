@@ -16,7 +16,7 @@ from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import srgb_to_linear
 from edgegrad.fit import fit_camera, fit_pose
 from edgegrad.fit.options import Settings
-from edgegrad.fit.placement import pose_from_matrix
+from edgegrad.fit.placement import angle, pose_from_matrix
 from edgegrad.fit.pose import pose_search
 from edgegrad.fit.pose.fit_pose import ambiguity
 from edgegrad.fit.pose.likelihood.objective import pose_levels
