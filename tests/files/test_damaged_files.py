@@ -7,21 +7,7 @@ import pytest
 import torch
 from lit_gltf import CORNERS, TURN, file, places
 from mesh_3mf import triangle_3mf
-from mesh_files import (
-    GOOD,
-    OFF,
-    SQUARE,
-    STL,
-    TEXELS,
-    TEXTURED,
-    TRIANGLES,
-    changed,
-    load,
-    ply,
-    saved,
-    square_glb,
-    write,
-)
+from mesh_files import GOOD, OFF, SQUARE, STL, TEXELS, TEXTURED, TRIANGLES, changed, load, ply, saved, square_glb, write
 
 import edgegrad as eg
 

@@ -139,7 +139,7 @@ def test_interruption_keeps_the_best_pose():
     assert fit.interrupted and not fit.converged and fit.steps == len(fit.history) >= 10
     assert torch.equal(fit.matrix, seen[-1].matrix)
     assert fit.loss == min(f.loss for f in seen) and fit.loss < seen[0].loss
-    assert sum(errors(fit)) < 7.0  # 12 + 8 at the start
+    assert sum(errors(fit)) < 10.0  # 12 + 8 at the start
 
 
 def test_json_round_trip():

@@ -14,18 +14,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from malformed_calls import (
-    BAD_OPTIONS,
-    F64,
-    FLOATS,
-    INF,
-    NAN,
-    Case,
-    call,
-    check_refused,
-    good_case,
-    malformed_cases,
-)
+from malformed_calls import BAD_OPTIONS, F64, FLOATS, INF, NAN, Case, call, check_refused, good_case, malformed_cases
 from quiet_fits import arranged
 from torch import Tensor
 

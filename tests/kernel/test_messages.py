@@ -11,22 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from messages import (
-    CAMERA,
-    FACES,
-    INF,
-    NAN,
-    POSE,
-    VERTS,
-    K,
-    T,
-    V,
-    bad_calls,
-    camera,
-    check_message,
-    mesh,
-    textured,
-)
+from messages import CAMERA, FACES, INF, NAN, POSE, VERTS, K, T, V, bad_calls, camera, check_message, mesh, textured
 
 import edgegrad as eg
 from edgegrad import library

@@ -10,17 +10,7 @@ from typing import Any
 import pytest
 import torch
 from finite_differences import rotation
-from lit_scenes import (
-    F64,
-    QUAD,
-    ball,
-    from_above,
-    hits_of,
-    picture,
-    plane,
-    uniform,
-    vector,
-)
+from lit_scenes import F64, QUAD, ball, from_above, hits_of, picture, plane, uniform, vector
 from oracles import reference
 from torch import Tensor
 

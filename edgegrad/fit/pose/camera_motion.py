@@ -74,7 +74,9 @@ class MovingCameras(NamedTuple):
         """Return how points (N, 3, h, w) of the mesh move in the image (D, N, 2, h, w), pixels."""
         camera, dW = self.cameras, self.tangents["world_to_camera"]
         N, D, size = len(points), len(dW), points.shape[2:]
-        p, W = points.double().flatten(2), camera.world_to_camera
+        bent = camera.projection != "orthographic" and camera.lens != "pinhole"
+        real = F64 if bent else torch.float32  # Differences for the lens need digits.
+        p, W, dW = points.to(real).flatten(2), camera.world_to_camera.to(real), dW.to(real)
         q = W[:, :3, :3] @ p + W[:, :3, 3:]  # (N, 3, M)
         dq = dW[..., :3, :3] @ p + dW[..., :3, 3:]  # (D, N, 3, M)
         if camera.projection == "orthographic":
@@ -84,9 +86,10 @@ class MovingCameras(NamedTuple):
             dn = (dq[:, :, :2] - n * dq[:, :, 2:]) / q[:, 2:]
         else:
             n, dn = self._through_lens(q, dq)
-        K = camera.K
+        K = camera.K.to(real)
         moved = K[:, :2, :2] @ dn
         if (dK := self.tangents.get("K")) is not None:
+            dK = dK.to(real)
             moved = moved + dK[..., :2, :2] @ n + dK[..., :2, 2:]
         return moved.nan_to_num(0.0, 0.0, 0.0).float().reshape(D, N, 2, *size)
 

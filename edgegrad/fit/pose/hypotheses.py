@@ -140,7 +140,7 @@ class HypothesisSearch:
         for _ in range(POSE.noise_rounds):
             noises = [group.level.contour_noises for group in self.groups]
             for group in self.groups:
-                group.level = group.level.informed(group.poses).focused(group.poses[0])
+                group.level = group.level.informed(group.poses[:1]).focused(group.poses[0])
             if noises == [group.level.contour_noises for group in self.groups] and self._rests():
                 break
             for group in self.groups:

@@ -130,8 +130,8 @@ def contour_term(picture: PictureLevel, sides: Sides, gained: tuple[Tensor, Tens
     # One row of J serves all channels, whose slopes by alpha are `step`.
     strength = step.square().sum(1)
     along = (residual * step).sum(1) / strength.clamp(min=1e-12)
-    cost = -(band * gain).sum((1, 2))
-    return Term.from_rows(cost, rows, (own * band * strength).flatten(1), along.flatten(1), along.shape[1:])
+    weight = (own * band * strength).flatten(1)
+    return Term.from_rows(band * gain, rows, weight, along.flatten(1))
 
 
 def contour_noise(

@@ -34,14 +34,14 @@ def depth_term(
     weight = (picture.weight * inside).flatten(1)
     known = (inside.sum((1, 2)) >= POSE.min_depth_pixels).float()
     low, high = (size * share for share in POSE.depth_noise)
-    deviation = (1.4826 * weighted_median(residual.abs().flatten(1), weight, weight)).clamp(low, high)[:, None]
+    deviation = (1.4826 * weighted_median(residual.abs().flatten(1), weight)).clamp(low, high)[:, None]
     r = residual.flatten(1)
     e = POSE.occluded
     likely = -0.5 * (r / deviation).square() - (deviation * math.sqrt(2.0 * math.pi) / size).log()
     share = (1.0 - e) * likely.exp() / ((1.0 - e) * likely.exp() + e)  # probability that it is the surface's
-    cost = -(weight * ((1.0 - e) * likely.exp() + e).log()).sum(1) / POSE.correlated_depth * known
+    gains = weight * ((1.0 - e) * likely.exp() + e).log() * known[:, None]
     dW = moving.tangents["world_to_camera"][:, :, 2]  # (D, N, 4)
     along = s * (torch.einsum("dnk,nkhw->dnhw", dW[..., :3], points) + dW[..., 3, None, None])
     rows = along.float() - (flow * slope(z).movedim(0, 1)).sum(2)
-    information = share * weight / (POSE.correlated_depth * deviation.square()) * known[:, None]
-    return Term.from_rows(cost, rows.flatten(2).movedim(0, 1), information, r, residual.shape[1:])
+    information = share * weight / deviation.square() * known[:, None]
+    return Term.from_rows(gains.reshape(residual.shape), rows.flatten(2).movedim(0, 1), information, r)

@@ -101,18 +101,17 @@ class PoseLevel(Problem[Pose]):
         colors = Frequencies.from_picture(picture, seen.box.pasted(seen.alpha, whole))
         part, light, visible = picture.part(seen.box), None, torch.ones_like(seen.alpha)
         terms: list[Term] = []
+        flow: Tensor | None = None
         if seen.position is not None:
             flow = moving.flow(seen.position / seen.alpha[:, None].clamp(min=1e-6))
             if colored:
-                inside = seen.box.cut(colors.inside)
-                light = FittedLight.from_picture(part, seen, self.harmonics, inside, deviation)
-                if light is not None:
-                    visible = light.visible
-                    # Far from the right pose, flat surroundings would draw the silhouette outwards.
-                    terms.append(light.term(flow, seen.tangents if self.last else None))
+                near = Frequencies(*(seen.box.cut(one) for one in colors))
+                blur = noise.blur if self.contour_noises and part.mask is None else 0.0  # A mask's is its own.
+                light = FittedLight.from_picture(part, seen, self.harmonics, near, deviation, blur)
+                visible = visible if light is None else light.visible
             if measured:
-                scale = stacked(poses).scale
-                terms.append(depth_term(part, seen, moving, flow, scale, self.task.size))
+                depth = depth_term(part, seen, moving, flow, stacked(poses).scale, self.task.size)
+                terms.append(depth.counted(POSE.correlated_depth))
         mixed: Tensor | None = None  # pixels that the contour term explains
         if self.last:
             every = seen.box.cut(colors.every)
@@ -121,6 +120,11 @@ class PoseLevel(Problem[Pose]):
             mixed = sides.band * gained[1]
             terms.append(contour_term(part, sides, gained, contour_rows(seen, noise.blur)))
         terms.append(region_term(picture, seen, colors, visible, mixed, self.alpha_blur))
+        if light is not None and flow is not None:
+            # Contour and region gain where nothing covers the object.
+            shown = [term.gains for term in terms[-2 if self.last else -1 :] if term.gains is not None]
+            others = POSE.correlated_light * sum(shown, torch.zeros_like(visible)) / visible.clamp(min=1e-3)
+            terms.append(light.term(flow, seen.tangents, others).counted(POSE.correlated_light))
         total = terms[0]
         for term in terms[1:]:
             total = total.plus(term)

@@ -47,12 +47,11 @@ def region_term(
         weight = (weight - mixed).clamp(min=0.0)
     soft = smoothed(seen.alpha, sigma)
     likelihood = soft * inside + (1.0 - soft) * outside + POSE.region_outliers * (inside + outside)
-    cost = -far - (weight * (likelihood / every).log()).sum((1, 2))
+    gains = weight * (likelihood / every).log()
     if mixed is not None:  # It shows either side.
-        cost = cost - (mixed * (0.5 * (inside + outside) / every).log()).sum((1, 2))
+        gains = gains + mixed * (0.5 * (inside + outside) / every).log()
     slope = ((outside - inside) / likelihood * weight).flatten(1)
     blurred = smoothed(seen.tangents.flatten(0, 1), sigma).reshape(seen.tangents.shape).flatten(2).movedim(0, 1)
     rows = (blurred * slope[:, None]).double()  # Sums of many large numbers of both signs need more digits.
-    return Term(
-        cost.double(), rows.sum(-1), rows @ rows.mT, lambda: rows.float().reshape(blurred.shape[:2] + soft.shape[1:])
-    )
+    cost, size = -(far + gains.sum((1, 2))).double(), blurred.shape[:2] + soft.shape[1:]
+    return Term(cost, rows.sum(-1), rows @ rows.mT, lambda: rows.float().reshape(size), gains)

@@ -86,7 +86,7 @@ def _share(compared: list[Comparison], resolved: float, colored: bool, uncovered
             pairs.append(compared_images(mixed, part.outlined, band))
         if one.light is not None:
             inner = one.light.inside[0]
-            expected = linear_to_srgb(one.light.image(one.light.predicted)[0].clamp(0.0, 1.0))
+            expected = linear_to_srgb(one.light.predicted[0].clamp(0.0, 1.0))
             covered = torch.where(inner, weight, 0.0)
             if part.mask is None:
                 expected, covered = torch.where(inner, expected, mixed), torch.where(inner, weight, band)

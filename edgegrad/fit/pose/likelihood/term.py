@@ -19,6 +19,7 @@ class Term(NamedTuple):
     gradient: Tensor  # (N, D)
     curvature: Tensor  # (N, D, D), Fisher's information
     summands: Summands | None = None  # of the gradient, (N, D, h, w), by pixels
+    gains: Tensor | None = None  # (N, h, w), what pixels near the object take off the cost
 
     @staticmethod
     def zero(count: int, dofs: int) -> Term:
@@ -37,17 +38,25 @@ class Term(NamedTuple):
         cost, gradient, curvature = (a + b for a, b in zip(self[:3], other[:3], strict=True))
         return Term(cost, gradient, curvature, summands if parts else None)
 
+    def counted(self, pixels: float) -> Term:
+        """Return the term if so many pixels count as one, because their errors have common causes."""
+        summands, gains = self.summands, self.gains
+        return self._replace(
+            cost=self.cost / pixels, gradient=self.gradient / pixels, curvature=self.curvature / pixels,
+            summands=None if summands is None else lambda: summands() / pixels, gains=None if gains is None else gains / pixels,
+        )  # fmt: skip
+
     @staticmethod
-    def from_rows(cost: Tensor, rows: Tensor, weight: Tensor, residual: Tensor, size: tuple[int, ...]) -> Term:
-        """Return the term of weighted least squares: derivatives `rows` (N, D, M) of residuals (N, M), each of which counts
-        `weight` (N, M), of the pixels of images of this size."""
+    def from_rows(gains: Tensor, rows: Tensor, weight: Tensor, residual: Tensor) -> Term:
+        """Return the term of weighted least squares: derivatives `rows` (N, D, h · w) of residuals (N, h · w), each of which
+        counts `weight` (N, h · w), in images in which pixels take `gains` (N, h, w) off the cost."""
         weighted = rows * weight[:, None]
         gradient = (weighted @ residual[..., None])[..., 0]
 
         def summands() -> Tensor:
-            return (weighted * residual[:, None]).reshape(*rows.shape[:2], *size)
+            return (weighted * residual[:, None]).reshape(*rows.shape[:2], *gains.shape[1:])
 
-        return Term(cost.double(), gradient.double(), (weighted @ rows.mT).double(), summands)
+        return Term(-gains.sum((1, 2)).double(), gradient.double(), (weighted @ rows.mT).double(), summands, gains)
 
     @property
     def predicted_gain(self) -> Tensor:
