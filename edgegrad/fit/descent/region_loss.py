@@ -48,7 +48,7 @@ class RegionSettings:
     # doubts two right ones. In pixels it would judge large pictures by their blurred pixels alone, and doubt right ones there.
     sureness_blur: float = 0.2
     # How surely colours must separate the two sides of a right contour. Of small pictures, wrong ones on edges of clutter reach
-    # 0.69, right ones 0.70 … 0.81; of ten objects 157 … 236 pixels across, seven within 1° have 0.79 … 0.93, one 15° off 0.57, and
+    # 0.69, right ones 0.70 … 0.81. Of ten objects 157 … 236 pixels across, seven within 1° have 0.79 … 0.93, one 15° off 0.57;
     # a stone 5° off is above the limit.
     min_sureness: float = 0.695
     # These refuse starts alone: pixels that differ by no more are of one colour in eight bits, sRGB values; and the share of
