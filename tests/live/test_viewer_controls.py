@@ -175,7 +175,6 @@ def test_the_command_line_opens_it_and_saves_before_it_waits(tmp_path, monkeypat
 
     monkeypatch.setattr(view.Viewer, "wait", wait)
     monkeypatch.setattr("edgegrad.fit.fit_pose", partial(fit_pose, search=False))
-    monkeypatch.setattr("edgegrad.fit.pose.pictures.draw_animation", lambda path, fit: path.touch())  # takes long
     arguments = ["fit-pose", "mesh.ply", "target.png", "--camera", "camera.json", "--steps", "3", "--size", "32"]
     monkeypatch.chdir(tmp_path)
     assert cli.main([*arguments, "--out", "out", "--view", "--port", "0"]) == 0

@@ -124,7 +124,9 @@ class PoseLevel(Problem[Pose]):
             # Contour and region gain where nothing covers the object.
             shown = [term.gains for term in terms[-2 if self.last else -1 :] if term.gains is not None]
             others = POSE.correlated_light * sum(shown, torch.zeros_like(visible)) / visible.clamp(min=1e-3)
-            terms.append(light.term(flow, seen.tangents, others).counted(POSE.correlated_light))
+            # Far from the right pose, and in few pixels, surroundings like the margin would draw the silhouette outwards.
+            grown = seen.tangents if self.last else torch.zeros_like(seen.tangents)
+            terms.append(light.term(flow, grown, others).counted(POSE.correlated_light))
         total = terms[0]
         for term in terms[1:]:
             total = total.plus(term)
