@@ -271,7 +271,7 @@ def test_refine_keeps_poses_whose_fit_fails(made: Path) -> None:
     found = bop.refine(data, off_image, options=quiet())
     assert found.kept and found.fit is None and "does not show" in found.why and found.estimate is off_image
     start = replace(estimates()[0], pose=pose_off(TRUTHS[0][0][1]))
-    early = bop.refine(data, start, options=quiet(max_size=32, steps=1))
+    early = bop.refine(data, start, options=quiet(max_size=16, steps=1))
     assert early.kept and early.estimate is start and early.why.split(":")[0] in REASONS
     with pytest.raises(ValueError, match="expected object 7 in it, got 1, 5"):
         bop.refine(data, bop.files.Estimate(3, 0, 7, 1.0, TRUTHS[0][0][1]))
