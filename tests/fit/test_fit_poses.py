@@ -18,6 +18,7 @@ from edgegrad.cli import main
 from edgegrad.fit import fit_pose, fit_poses
 from edgegrad.fit.options import Settings
 from edgegrad.fit.placement import pose_from_matrix
+from edgegrad.fit.pose.fit_poses import _conflict
 from edgegrad.fit.pose.likelihood.objective import pose_levels
 from edgegrad.fit.pose.result import PoseFit
 
@@ -320,6 +321,15 @@ def test_white_may_be_any_brighter_colour():
     light = level.comparisons([pose])[0].light
     torch.testing.assert_close(light.coefficients[0, 1:, 0], torch.tensor([1.6, 1.6]), atol=0.02, rtol=0.0)
     assert float(light.found.residual.abs().max()) < 0.03  # 0.44 too bright in red, of which 1 is all that is shown
+
+
+@pytest.mark.parametrize(("aside", "words"), [(0.02, "in one place: meshes[0] ends where meshes[1] does"), (3.0, "")])
+def test_objects_that_end_in_one_place_are_said_to(aside, words):
+    task = task_of(torch.rand(24, 24, 3), view_of(24), MESHES[0])
+    here, there = torch.eye(4).double(), torch.eye(4).double()
+    there[0, 3] = aside
+    found = _conflict([task, task], [pose_from_matrix("pose", M) for M in (here, there)], 0)
+    assert found.startswith(words) and bool(found) == bool(words)
 
 
 @pytest.mark.slow
