@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -53,7 +53,7 @@ def fit_poses(
     weights: Images | None = None,
     depths: Images | None = None,
     search: bool = True,
-    symmetries: Sequence[Symmetries | None] | None = None,
+    symmetries: Sequence[Symmetries | Literal["find"] | None] | None = None,
     options: FitOptions | None = None,
 ) -> list[PoseFit]:
     """Find rotation and translation of several known meshes in a picture, or in several, in one fit.
@@ -73,7 +73,7 @@ def fit_poses(
         files put them.
     search : bool, default True
         Whether an object whose edges the pictures do not show at its end starts again from other poses.
-    symmetries : sequence of Symmetries or None, optional
+    symmetries : sequence of Symmetries, "find" or None, optional
         Of each mesh, as of fit_pose().
     options : FitOptions, optional
         Of its defaults, `steps` is 40, `step_tolerance` 3e-4, `spp` 16 and `max_size` 256.
