@@ -94,11 +94,16 @@ class CheckpointFile:
         return CheckpointFile(checkpoint, {**given, **of_views})
 
     def read(self) -> dict[str, Any] | None:
-        """Return the state to go on from, or None to begin. Raises ValueError for a file that is no checkpoint, or another
-        fit's."""
-        if self.checkpoint is None or not self.checkpoint.resume:
+        """Return the state to go on from, or None to begin. Raises ValueError for a folder, for a file that is no checkpoint, and
+        where a fit is to go on from another's."""
+        if self.checkpoint is None:
             return None
         path = self.checkpoint.path
+        if Path(path).is_dir():
+            raise ValueError(f"checkpoint: expected a file name, got the folder {path}; add a name to it")
+        if not self.checkpoint.resume:
+            _check_replaceable(path)
+            return None
         if (content := _content(path)) is None:
             warn(
                 f"no checkpoint {path}",
@@ -133,6 +138,21 @@ def saved_seed(checkpoint: Checkpoint | None) -> int | None:
     """Return the seed of the fit that goes on, or None. Raises ValueError for a file that is no checkpoint."""
     content = None if checkpoint is None or not checkpoint.resume else _content(checkpoint.path)
     return None if content is None else content["seed"]
+
+
+def _check_replaceable(path: PathLike) -> None:
+    """Raise ValueError where a file is neither empty nor a checkpoint of any fit, which a new one would overwrite."""
+    if not Path(path).exists() or Path(path).stat().st_size == 0:
+        return
+    try:
+        content = torch.load(path, weights_only=True, map_location="cpu", mmap=True)
+    except Exception:  # torch raises errors of many kinds for other files
+        content = None
+    if not isinstance(content, dict) or not {"format", "given", "state"} <= content.keys():
+        raise ValueError(
+            f"checkpoint: expected {path} to be a checkpoint or no file yet, got another file, which the fit would overwrite; "
+            "give another name, or remove it"
+        )
 
 
 def _content(path: PathLike) -> dict[str, Any] | None:

@@ -55,7 +55,7 @@ class FitOptions:
         length.
     loss_tolerance, patience : float and int, default 0.01 and 40
         Descents end where `patience` more steps would lower the loss by less than this share of it, or by less than its noise.
-        0: all steps are taken.
+        With a tolerance of 0 all steps are taken.
     spp : int
         Samples a pixel.
     seed : int

@@ -23,11 +23,12 @@ ALL = Unknowns(True, True, True, 4)
 LENSES = {
     "pinhole": ("perspective", None), "brown-conrady": ("perspective", [0.1, -0.05, 2e-3, -1e-3]),
     "orthographic": ("orthographic", None), "fisheye": ("fisheye", [0.05, -0.02, 0.01, -0.004]),
+    "panorama": ("panorama", None),
 }  # fmt: skip
 CASES = [
     ("pinhole", Unknowns()), ("pinhole", Unknowns(focal=True)), ("pinhole", ALL), ("brown-conrady", ALL),
     ("brown-conrady", Unknowns(focal=True, principal=True)), ("orthographic", Unknowns(scale=True, principal=True)),
-    ("orthographic", Unknowns(focal=True)), ("fisheye", ALL), ("fisheye", Unknowns(scale=True)),
+    ("orthographic", Unknowns(focal=True)), ("fisheye", ALL), ("fisheye", Unknowns(scale=True)), ("panorama", Unknowns()),
 ]  # fmt: skip
 
 

@@ -247,3 +247,29 @@ def test_a_checkpoint_that_cannot_be_written_ends_no_fit(tmp_path, monkeypatch):
     with pytest.warns(UserWarning, match=r"checkpoint: .*fit\.ckpt: expected to write it, got: No space left"):
         fit = small_fit(steps=1, search=False, checkpoint=tmp_path / "fit.ckpt", every=1)
     assert fit.steps > 3 and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["folder", "weights", "text"])
+def test_a_checkpoint_overwrites_nothing_else(tmp_path, kind):
+    """Before the fit begins, so that no work is lost."""
+    path = tmp_path / "kept.pt"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "weights":
+        torch.save({"my": "weights"}, path)
+    else:
+        path.write_text("notes")
+    before = None if kind == "folder" else path.read_bytes()
+    steps = []
+    with pytest.raises(ValueError, match=f"checkpoint: expected .*{'folder' if kind == 'folder' else 'another file'}"):
+        small_fit(checkpoint=path, callback=steps.append)
+    assert not steps and (before is None or path.read_bytes() == before)
+
+
+def test_an_empty_file_and_another_fits_checkpoint_are_replaced(tmp_path):
+    path = tmp_path / "fit.pt"
+    path.touch()
+    small_fit(checkpoint=path, steps=1)
+    written = path.read_bytes()
+    small_fit(checkpoint=path, steps=2)
+    assert written and path.read_bytes() != written

@@ -176,7 +176,7 @@ def test_eight_of_ten_are_found_without_a_start(masked: bool) -> None:
 
 def test_errors_name_the_argument() -> None:
     mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    for search, says in ((0, "search"), ("all", "expected one of global"), (10**6, "search")):
+    for search, says in ((0, "search"), ("all", "expected True, False, a number"), (10**6, "search")):
         with pytest.raises(ValueError, match=says):
             fit_pose(mesh, picture, camera(), mask, search=search, options=quiet())  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="search"):

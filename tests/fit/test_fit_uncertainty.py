@@ -103,6 +103,14 @@ def test_an_unknown_focal_length_is_named() -> None:
     information[6, 6] = 1.0 / 0.08**2
     known = Uncertainty.from_information(given, standing(), information)
     assert known.focal == pytest.approx(0.08, rel=0.01) and known.unknown == "focal length known to ±8% only"
+    # The object's distance goes with the focal length: 8 % of it. At the length found, which `unknown` judges by, it is known.
+    away = float((camera().world_to_camera[:3, :3] @ standing().t.float() + camera().world_to_camera[:3, 3])[2])
+    axis = camera().world_to_camera[2, :3].double()
+    assert known.shift == pytest.approx(0.08 * away, rel=0.01) and abs(float(known.direction @ axis)) > 0.999
+    restored = Uncertainty.from_dict(known.to_dict())
+    assert restored.shift == known.shift and restored.at_lens is not None
+    at_lens = replace(restored, covariance=restored.at_lens)
+    assert at_lens.shift == pytest.approx(1e-3 * given.size, rel=0.01)
     information[5, 6] = information[6, 5] = 0.9 * (information[5, 5] * information[6, 6]).sqrt()
     known = Uncertainty.from_information(given, standing(), information)
     assert known.focal == pytest.approx(0.08 / 0.19**0.5, rel=0.03)

@@ -99,7 +99,8 @@ class MovingCameras(NamedTuple):
         unit, bend = torch.eye(3, dtype=F64), self.tangents.get("distortion")
         places, motions = [], []
         for k, points in enumerate(q.mT):
-            camera = self.cameras[k].replace(world_to_camera=torch.eye(4, dtype=F64), K=unit)
+            # A panorama may not reach around many times, so the image is small where its pixels are large.
+            camera = self.cameras[k].replace(world_to_camera=torch.eye(4, dtype=F64), K=unit, size=(1, 1))
             h = DIFFERENCE * float(points.norm(dim=1).mean())
             sides = [(camera.project(points + h * e), camera.project(points - h * e)) for e in unit]
             slopes = torch.stack([(ahead - behind) / (2.0 * h) for ahead, behind in sides], -1)  # (M, 2, 3)

@@ -53,7 +53,7 @@ class CameraFit(FitResult):
     def uncertainties(self) -> list[Uncertainty | None]:
         """Return the uncertainty of each place."""
         known = [search.uncertainty for search in self.searches]
-        return [None if one is None or one.at_lens is None else one for one in known]
+        return [None if one is None or not one.of_camera else one for one in known]
 
     @property
     def history(self) -> list[Step]:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...check import check_choice, check_flag, check_int
+from ...check import check_flag, check_int
 from ...optim.loop import Progress
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -208,8 +208,8 @@ def _check_search(search: object, init: object, cameras: Sequence[Camera], name:
             raise ValueError(
                 f'search: expected a perspective or orthographic camera for "global", got a {projection}; give {name}'
             )
-    elif isinstance(search, str):
-        check_choice("search", search, ["global"])
+    elif isinstance(search, str) or search is None:
+        raise ValueError(f'search: expected True, False, a number of starts or "global", got {search!r}')
     elif not isinstance(search, bool):
         check_int("search", search, 2, MOST_STARTS)
 

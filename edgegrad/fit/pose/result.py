@@ -113,7 +113,7 @@ class PoseFit(FitResult):
         words = reason_of(ending, self.explained, "mesh, camera or picture", self.enough)
         if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < self.enough:
             return words
-        if self.uncertainty.at_lens is not None:
+        if self.uncertainty.of_camera:
             fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
             return f"not known: {self.uncertainty.unknown}; {fix}"
         fix = "give the mesh's colours, symmetries of the mesh, depth, or another picture"

@@ -87,8 +87,11 @@ class PoseTask:
         levels, pixels = True, list[Tensor]()
         for k, view in enumerate(views):
             name = numbered(names.masks if images is None else names.images, k, len(views))
-            if (view.image is None) != (images is None) or (view.mask is None) == masked:
-                raise ValueError(f"{name}: expected pictures, and masks, for all cameras or for none, got None for one")
+            for missing, given, each in ((view.image, images, names.images), (view.mask, masks, names.masks)):
+                if (missing is None) != (given is None):
+                    raise ValueError(
+                        f"{numbered(each, k, len(views))}: expected one for all cameras or for none, got None for this one"
+                    )
             if min(view.camera.size) < MIN_PICTURE_SIDE:
                 raise ValueError(
                     f"{name}: expected a picture of {MIN_PICTURE_SIDE} × {MIN_PICTURE_SIDE} pixels or more, got "

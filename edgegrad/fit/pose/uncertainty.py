@@ -35,8 +35,8 @@ class Uncertainty:
     Attributes
     ----------
     covariance : (6, 6) float64, of a rotation vector in radians and a shift of the centre, world units and axes
-        Entries that were not sought, such as the distance with scale=True, are zero. Of a pose, places are those at the focal
-        length found, since distance goes with it. Of a camera it is the scene that moves before it, with the lens unknown, too.
+        With the lens unknown, too, where it was sought: distance goes with the focal length. Entries that were not sought, such
+        as the distance with scale=True, are zero. Of a camera it is the scene that moves before it.
     size : the diagonal of the object's bounding box, world units
     free : directions (n, 3) in the world
         About these a continuous symmetry makes all rotations the same; none of them is unknown.
@@ -55,7 +55,8 @@ class Uncertainty:
     distortion: Tensor = NOT_SOUGHT[:0]
     names: Sequence[str] = ()  # of these coefficients
     vague: Sequence[str] = ()  # unknown numbers of the lens, in words
-    at_lens: Tensor | None = None  # (6, 6), of a camera the covariance at the lens found
+    at_lens: Tensor | None = None  # (6, 6), the covariance at the lens found
+    of_camera: bool = False  # whether the pose is a camera's
 
     @property
     def degrees(self) -> float:
@@ -93,7 +94,7 @@ class Uncertainty:
         return {
             "degrees": self.degrees, "axis": self.axis.tolist(), "shift": self.shift, "direction": self.direction.tolist(),
             "covariance": self.covariance.tolist(), "size": self.size, "free": self.free.tolist(), "focal": self.focal,
-            "most": self.most,
+            "most": self.most, "at_lens": None if self.at_lens is None else self.at_lens.tolist(),
         }  # fmt: skip
 
     @staticmethod
@@ -101,15 +102,19 @@ class Uncertainty:
         """Return what to_dict() described."""
         covariance = torch.tensor(data["covariance"], dtype=torch.float64).reshape(6, 6)
         free = torch.tensor(data["free"], dtype=torch.float64).reshape(-1, 3)
-        return Uncertainty(covariance, float(data["size"]), free, float(data["focal"]), float(data["most"]))
+        at_lens = data.get("at_lens")
+        at_lens = None if at_lens is None else torch.tensor(at_lens, dtype=torch.float64).reshape(6, 6)
+        return Uncertainty(
+            covariance, float(data["size"]), free, float(data["focal"]), float(data["most"]), at_lens=at_lens
+        )
 
     @property
     def unknown(self) -> str:
         """Return what is known less exactly than to `most` degrees, 5 % of the object's size, or 3 % of the focal length.
 
-        It is in words, and empty where all are known. Of a camera, the pose counts at the lens found. Its other numbers are
-        unknown where they move a corner of the image by more than 3 % of its distance from the principal point, or where a guess
-        says as much as the pictures.
+        It is in words, and empty where all are known. The pose counts at the lens found. Other numbers of a camera are unknown
+        where they move a corner of the image by more than 3 % of its distance from the principal point, or where a guess says as
+        much as the pictures.
         """
         own, parts = self if self.at_lens is None else replace(self, covariance=self.at_lens), []
         if own.degrees > self.most:
@@ -137,7 +142,8 @@ class Uncertainty:
         world = torch.block_diag(pose.R, pose.scale * pose.R)
         spins = [pose.R @ axis.direction for axis in ([] if symmetries is None else symmetries.continuous)]
         free = torch.stack(spins) if spins else known.free
-        return replace(known, covariance=world @ known.at_lens @ world.T, free=free, at_lens=None)
+        whole, at_lens = (world @ one @ world.T for one in (known.covariance, known.at_lens))
+        return replace(known, covariance=whole, free=free, at_lens=at_lens, of_camera=False)
 
     @staticmethod
     def from_covariance(task: PoseTask, pose: Pose, covariance: Tensor) -> Uncertainty:
@@ -160,7 +166,7 @@ class Uncertainty:
             torch.tensor(pixels, dtype=torch.float64),
             torch.tensor([deviations[entry] for entry in bent], dtype=torch.float64),
             [coefficient(camera, entry) for entry in bent], vague(camera, deviations),
-            own @ covariance[of_pose][:, of_pose] @ own.T,
+            own @ covariance[of_pose][:, of_pose] @ own.T, True,
         )  # fmt: skip
 
 
