@@ -350,7 +350,8 @@ def photos(tmp_path: Path) -> Path:
         (tmp_path / "bottle" / name).mkdir(parents=True)
     for k in (200, 201):
         Image.new("RGB", (64, 48), (k, 90, 60)).save(tmp_path / "bottle" / "_sequence" / f"color_camera_image_{k}.png")
-    eg.save_mesh(tmp_path / "bottle" / "_body" / "schauma.obj", eg.shapes.box((0.0, 0.0, 0.0), (0.05, 0.03, 0.02)))
+    box = eg.shapes.box((0.0, 0.0, 0.0), (0.05, 0.03, 0.02))
+    eg.save_mesh(tmp_path / "bottle" / "_body" / "schauma.obj", eg.Mesh(box.verts, box.faces))
     pose = {"cam_R_body": np.eye(3).tolist(), "cam_t_body_m": [0.02, 0.0, 0.5], "geometry_offset_z_m": -0.01}
     K = [[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]]
     (tmp_path / "bottle" / "reference.json").write_text(json.dumps({"K": K, "schauma": pose}))
