@@ -65,7 +65,8 @@ class Figures:
         returned = [after for one in records for after in recoveries(one)]
         within = [after for after in returned if after is not None]
         errors, said = _where(records, "nees", followed), pairs(records)
-        first = [one for one in records if one["object"] == 0]  # The time of a film is that of all objects.
+        # The time of a film is that of all its objects.
+        first = [one for one in records if one["object"] == 0] or records[:1]
         seconds, work = (np.concatenate([one[name] for one in first]) for name in ("seconds", "work"))
         return Figures(
             len(first), len(off), _quantiles(degrees), _quantiles(shift), _mean(gone[there]), _mean(off), _mean(off[there]),

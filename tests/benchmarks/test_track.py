@@ -292,6 +292,7 @@ def test_generators_and_classes_are_shown_films(
     records = measures.measured(film, trackers.maker(trackers.GENERATOR))
     assert [one["object"] for one in records] == list(range(count))
     for record in records:
+        assert command.line(record).startswith("block              7 box")
         assert max(record["degrees"]) < 1e-5 and max(record["shift"]) < 1e-6
         if follow is Class:
             assert record["nees"] == [0.0] * 4 and record["features"] == {"edges": [2.0] * 4}
