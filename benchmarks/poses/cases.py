@@ -157,7 +157,7 @@ def drawn(kind: str, recipe: Recipe, seed: int, sources: Sources) -> list[Case]:
     behind, cover = (crop(photographs[k], camera.size, rng) for k in _two(len(photographs), recipe, rng))
     poses = _poses(recipe, meshes, camera, rng)
     placed = [mesh.transformed(pose.R, pose.t) for mesh, pose in zip(meshes, poses, strict=True)]
-    lights = _lights(recipe.fixed, rng)
+    lights = sun_and_sky(recipe.fixed, rng)
     shade = [_bar(lights[0].direction, rng, placed[0].channels or 3)] if recipe.shadow else []
     image = _lit([*placed, *shade], camera, behind, lights)
     if not recipe.fixed:
@@ -248,7 +248,7 @@ def _shares(meshes: Sequence[eg.Mesh], camera: eg.Camera) -> list[float]:
     return [float(one) / whole for one, whole in zip(seen, alone, strict=True)]
 
 
-def _lights(fixed: bool, rng: np.random.Generator) -> tuple[eg.lights.DirectionalLight, eg.lights.Environment]:
+def sun_and_sky(fixed: bool, rng: np.random.Generator) -> tuple[eg.lights.DirectionalLight, eg.lights.Environment]:
     """Return a sun from above, from the camera's side, and a sky."""
     if fixed:
         way, power, sky = torch.tensor([0.6, -0.7, 0.8]), 3.0, torch.tensor([0.35, 0.4, 0.5])
@@ -286,10 +286,16 @@ def _covered(image: Tensor, alpha: Tensor, cover: Tensor, rng: np.random.Generat
 
 
 def _worn(image: Tensor, blur: float, noise: float, quality: int, rng: np.random.Generator) -> Tensor:
-    """Return the image after a lens, which blurs radiance, a sensor and a file."""
+    """Return the image after a lens, a sensor and a file."""
+    file = io.BytesIO(photographed(image, blur, noise, quality, rng))
+    return srgb_to_linear(torch.from_numpy(np.asarray(Image.open(file), np.float32) / 255.0))
+
+
+def photographed(image: Tensor, blur: float, noise: float, quality: int, rng: np.random.Generator) -> bytes:
+    """Return the JPEG file of a linear image after a lens, which blurs radiance, and a sensor."""
     blurred = gaussian_filter(image.clamp(0.0, 1.0).numpy(), (blur, blur, 0.0), mode="nearest")
     seen = linear_to_srgb(torch.from_numpy(blurred)).numpy()
     seen = seen + noise * rng.normal(size=seen.shape)
     file = io.BytesIO()
     Image.fromarray((255.0 * seen.clip(0.0, 1.0)).round().astype(np.uint8)).save(file, "JPEG", quality=quality)
-    return srgb_to_linear(torch.from_numpy(np.asarray(Image.open(file), np.float32) / 255.0))
+    return file.getvalue()

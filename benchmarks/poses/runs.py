@@ -144,7 +144,7 @@ def draw(folder: Path, case: Case, record: Record) -> None:
         (record["matrix"], fitted_camera, (1.0, 0.9, 0.0)),
     ):  # fmt: skip
         if pose is not None:
-            on = _outline(case.alpha(Placed.from_matrix(pose), camera.resized((2 * H, 2 * W))))
+            on = outline(case.alpha(Placed.from_matrix(pose), camera.resized((2 * H, 2 * W))))
             image = torch.where(on, torch.tensor(color), image)
     folder.mkdir(parents=True, exist_ok=True)
     eg.write_image(folder / f"{record['kind']}-{record['seed']}-{record['object']}-{record['mesh']}.png", image)
@@ -156,6 +156,7 @@ def _zoomed(K: Tensor, factor: float) -> Tensor:
     return K
 
 
-def _outline(alpha: Tensor) -> Tensor:
+def outline(alpha: Tensor) -> Tensor:
+    """Return the pixels (H, W, 1) just outside a silhouette (H, W)."""
     highest = F.max_pool2d(alpha[None, None], 3, 1, 1)[0, 0]
     return (highest - alpha > OUTLINE)[..., None]

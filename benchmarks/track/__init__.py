@@ -1,0 +1,1 @@
+"""How well trackers follow objects in films with known poses: `python -m benchmarks.track`, and --help."""
