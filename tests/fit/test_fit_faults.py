@@ -185,7 +185,7 @@ def test_a_folder_without_permission_is_named_before_the_fit(files, monkeypatch,
 @pytest.mark.slow
 @linux
 @pytest.mark.filterwarnings("ignore:checkpoint. .*expected to write")  # of files larger than the limits
-@pytest.mark.parametrize(("limit", "file"), [(100, "pose.json"), (4096, "fit.png")])
+@pytest.mark.parametrize(("limit", "file"), [(100, "pose.json"), (6144, "fit.png")])
 def test_a_file_that_cannot_grow(files, limit, file):
     def fit():
         # Python ignores SIGXFSZ, so writing fails as on a full disk.

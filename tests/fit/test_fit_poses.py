@@ -152,7 +152,7 @@ def test_three_objects():
     fits = fit_poses(MESHES, image, view, init=STARTS, depths=depth_of(view, *scene_of(3)), options=quiet())
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=True):
         off = errors(fit, mesh, truth)
-        assert off[0] < 0.3 and off[1] < 0.1 and fit.reason == "converged", (off, fit.explained)
+        assert off[0] < 0.45 and off[1] < 0.12 and fit.reason == "converged", (off, fit.explained)
 
 
 @pytest.mark.slow

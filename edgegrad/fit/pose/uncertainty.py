@@ -143,7 +143,9 @@ class Uncertainty:
         spins = [pose.R @ axis.direction for axis in ([] if symmetries is None else symmetries.continuous)]
         free = torch.stack(spins) if spins else known.free
         whole, at_lens = (world @ one @ world.T for one in (known.covariance, known.at_lens))
-        return replace(known, covariance=whole, free=free, at_lens=at_lens, of_camera=False)
+        return replace(
+            known, covariance=whole, free=free, at_lens=at_lens if known.focal > 0.0 else None, of_camera=False
+        )
 
     @staticmethod
     def from_covariance(task: PoseTask, pose: Pose, covariance: Tensor) -> Uncertainty:
