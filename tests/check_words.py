@@ -50,7 +50,7 @@ EXCEPTIONS = {
         edgegrad/fit/pose/photo/match.py edgegrad/light/near_field.py
         edgegrad/points/blend.py edgegrad/points/discontinuous_pixels.py edgegrad/points/hits.py edgegrad/points/pyramid.py
         edgegrad/points/discontinuity_terms.py edgegrad/points/discontinuities.py edgegrad/raster/exact.py edgegrad/render.py
-        edgegrad/scene/environment.py edgegrad/scene/texel_edges.py edgegrad/scene/textures.py
+        edgegrad/scene/environment.py edgegrad/scene/texel_edges.py edgegrad/scene/textures.py edgegrad/track/surface.py
         """,
     "looks": """
         edgegrad/camera/convention_warnings.py

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -21,11 +20,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from .. import Camera
-    from ..fit.pose.track import TrackedPose
     from ..scene.scene import Scene
+    from ..track import TrackedPose
 
 FRAMES_BETWEEN_WRITES = 10  # frames between two writings of poses.json
-FOUND, LOST = (60, 230, 90), (230, 60, 60)  # colours of contours
+FOUND, LOST = (60.0, 230.0, 90.0), (230.0, 60.0, 60.0)  # colours of contours: sure, and not
 
 
 def add(commands: Any) -> None:
@@ -57,7 +56,8 @@ def _rate(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Follow a mesh through the frames of a video, from its pose in the first one. poses.json is written every few frames;
     Ctrl-C and broken frames keep the poses so far."""
-    from ..fit import FitOptions, track
+    from ..fit import FitOptions
+    from ..track import track
     from . import INTERRUPTED
 
     scene, init = read_scene(args), read_pose(args.init)
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
             if pose.index % FRAMES_BETWEEN_WRITES == 0:
                 with suppress(OSError):  # the last copy reports errors
                     _write_poses(args.out, poses)
-            state = "lost" if pose.lost else f"{pose.explained:.0%} of the edges"
+            state = "lost" if pose.lost else f"right with a probability of {pose.confidence:.1%}"
             print(f"frame {pose.index}: {state}", file=sys.stderr)
             path = overlays / f"{pose.index:05d}.png"
             _write_overlay(path, shown[0], scene, camera, pose)
@@ -111,9 +111,8 @@ def _write_poses(folder: Path, poses: list[TrackedPose]) -> None:
 
     rows = [
         {
-            "frame": pose.index, "mesh_to_world": pose.matrix.tolist(),
-            "explained": pose.explained if math.isfinite(pose.explained) else None, "lost": pose.lost,
-            "covered": pose.covered, "reason": pose.reason,
+            "frame": pose.index, "mesh_to_world": pose.matrix.tolist(), "confidence": pose.confidence, "lost": pose.lost,
+            "visible": pose.visible, "reason": pose.reason,
         }
         for pose in poses
     ]  # fmt: skip
@@ -134,5 +133,6 @@ def _write_overlay(path: Path, frame: Tensor, scene: Scene, camera: Camera, pose
     pool = torch.nn.functional.max_pool2d
     contour = (pool(inside, 3, 1, 1) + pool(-inside, 3, 1, 1))[0, 0] > 0.5
     picture = frame.clone()
-    picture[contour] = srgb_to_linear(torch.tensor(LOST if pose.lost else FOUND) / 255.0)
+    color = torch.lerp(torch.tensor(LOST), torch.tensor(FOUND), 0.0 if pose.lost else pose.confidence)
+    picture[contour] = srgb_to_linear(color / 255.0)
     write_image(path, picture)

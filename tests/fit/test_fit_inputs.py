@@ -13,12 +13,13 @@ from photographs import coverage, depth_of, photograph
 from quiet_fits import arranged, quiet
 
 import edgegrad as eg
-from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses, fit_scene, fit_texture, track
+from edgegrad.fit import FitOptions, fit_camera, fit_pose, fit_poses, fit_scene, fit_texture
 from edgegrad.fit.options import DESCENT_OPTIONS, POSE_OPTIONS, UNUSED, Settings
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.inputs import warn_of_units
 from edgegrad.fit.pose.settings import POSE
 from edgegrad.fit.views import views_of
+from edgegrad.track import track
 
 SIZE = 48
 QUICK = {"init": START, "search": False, "progress": False, "steps": 1, "spp": 2, "max_size": 24}
