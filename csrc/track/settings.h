@@ -17,6 +17,9 @@ struct TrackSettings {
     // compared on meanwhile. The last three use the sub-pixel edge.
     static constexpr int scales = 6, first_exact = 3;
     static constexpr int scale[scales] = {6, 4, 2, 1, 1, 1}, level[scales] = {2, 2, 1, 1, 0, 0};
+    // A segment is at most this part of the object, and on a level of the pyramid the object has at least so many
+    // pixels. With 14 and 25, a stone of 58 px that turns by 3 degrees a frame is lost.
+    static constexpr double segments_across = 20, pixels_across = 35;
     // Gauss-Newton steps for each. Two in the last as well change no error by more than a tenth.
     static constexpr int steps[scales] = {2, 2, 2, 2, 1, 1};
     // Depth, in sizes of the object, by which a visible point may lie behind the surface: floats and coarse meshes
@@ -59,8 +62,9 @@ struct TrackSettings {
     // value in the first frame, where `init` may be off by some 10 degrees.
     static constexpr double least_deviation = 0.008, greatest_deviation = 0.05, first_deviation = 0.1;
     static constexpr double deviation_rate = 0.2, velocity_rate = 0.5;
-    // Deviations of the prediction within which a line expects the contour.
-    static constexpr double gate = 3;
+    // Deviations of the prediction within which a line expects the contour. A hand's film is 8 % off with 5, 12 % with
+    // 3, and 48 % where exact edges have no gate.
+    static constexpr double gate = 5;
     static constexpr double seen = 0.35;  // share of lines with an edge below which a frame teaches nothing
     // Factor of the covariance, next to the mean square of the lines' residuals (at least that of `least_residual`):
     // neighbouring lines and points share errors of the model, which the terms take for independent. With it the

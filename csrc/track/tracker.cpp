@@ -110,7 +110,7 @@ void Tracker::follow(int index, const FrameView& frame, const DepthView* depth) 
     if (object.found.edges >= Settings::seen) object.lines.learn_models();
     if (object.found.edges >= Settings::seen) learn(object, object.frames ? Settings::learning_rate : 1.0, false);
     object.times.learn = watch.lap();
-    ++object.frames;
+    ++object.frames, ++object.since;
 }
 
 void Tracker::descend(int index, const RigidPose& start, const DepthView* depth) {
@@ -119,6 +119,8 @@ void Tracker::descend(int index, const RigidPose& start, const DepthView* depth)
     PosedMesh& posed = object.posed[index];
     const double size = object.mesh->size(), across = pixels_across(object, posed.pose);
     const double reach = object.deviation * across;  // px
+    // Level of the pyramid above which the object is too small.
+    const int coarsest = std::max(0, int(std::log2(std::max(across / Settings::pixels_across, 1.0))));
     const Visibility visibility(camera_, object.posed);
     Stopwatch watch;
     if (object.texture.exists()) object.texture.choose_visible(visibility, index), times.texture += watch.lap();
@@ -128,7 +130,7 @@ void Tracker::descend(int index, const RigidPose& start, const DepthView* depth)
     step_between(start, posed.pose, size, offset);
     for (int k = 0; k < Settings::scales; ++k) {
         const int segment = Settings::scale[k];
-        if (segment > std::max(2.0, reach)) continue;
+        if (segment > std::max(2.0, std::min(reach, across / Settings::segments_across))) continue;
         const double line = std::max<double>((Settings::reach + Settings::side) * segment + 1, Settings::learnt + 2);
         const bool exact = k >= Settings::first_exact;
         object.contour.find(visibility, index, phase_of(object.frames, k), line, exact);
@@ -139,13 +141,14 @@ void Tracker::descend(int index, const RigidPose& start, const DepthView* depth)
                              {segment, exact, Settings::gate * reach, object.velocity});
         if (exact) object.lines.measure_sharp(object.frame, object.contour.sharp_points());
         times.lines += watch.lap();
+        const int level = std::min(Settings::level[k], coarsest);
         const double cauchy = std::max(1.5 * segment, exact ? 0.0 : 2 * reach);
         for (int step = 0; step < Settings::steps[k]; ++step) {
             sum = {};
             object.lines.add(camera_, posed, cauchy, sum);
             times.solve += watch.lap();
             if (object.texture.exists()) {
-                object.texture.add(object.frame, Settings::level[k], camera_, posed, sum);
+                object.texture.add(object.frame, level, camera_, posed, sum);
                 times.texture += watch.lap();
             }
             if (depth) object.depth.add(*depth, camera_, posed, sum), times.depth += watch.lap();
@@ -159,7 +162,8 @@ void Tracker::descend(int index, const RigidPose& start, const DepthView* depth)
     }
     TrackedObject& found = object.found;
     found.pose = posed.pose;
-    if (!sum.invert(found.covariance)) std::fill(found.covariance, found.covariance + 36, 0.0);
+    if (!sum.invert(found.covariance))
+        for (int k = 0; k < 36; ++k) found.covariance[k] = k % 7 == 0;  // Nothing is known to a radian and a size.
     const auto distances = object.lines.distances();
     int close = 0;
     double gain = 0;
@@ -181,16 +185,16 @@ void Tracker::descend(int index, const RigidPose& start, const DepthView* depth)
 
 // The velocity takes half of the difference of two poses, which has the errors of both.
 void Tracker::move(Object& object, const RigidPose& before, double square) {
-    const bool known = object.frames > 1 && object.found.edges >= 1.5 * Settings::seen;
+    const bool known = object.since > 1 && object.found.edges >= 1.5 * Settings::seen;
     if (known) {
         const double rate = Settings::deviation_rate;
         object.deviation = std::sqrt((1 - rate) * object.deviation * object.deviation + rate * square);
     }
-    if (object.frames > 0)
+    if (object.since > 0)
         object.deviation = std::clamp(object.deviation, Settings::least_deviation, Settings::greatest_deviation);
     double step[6];
     step_between(before, object.pose, object.mesh->size(), step);
-    const double rate = object.frames > 1 ? Settings::velocity_rate : object.frames;
+    const double rate = object.since > 1 ? Settings::velocity_rate : object.since;
     for (int k = 0; k < 6; ++k) object.velocity[k] += rate * (step[k] - object.velocity[k]);
 }
 
@@ -198,8 +202,8 @@ void Tracker::place(int index, const RigidPose& pose) {
     Object& object = *objects_[index];
     object.pose = pose;
     std::fill(object.velocity, object.velocity + 6, 0.0);
-    object.deviation = Settings::greatest_deviation;
-    object.frames = std::min(object.frames, 1);
+    object.deviation = Settings::first_deviation;
+    object.since = 0;
 }
 
 bool Tracker::is_in_view(int index) {
@@ -214,7 +218,7 @@ void Tracker::save(int index, double* out) const {
     for (const Vec3& r : o.pose.R.row) *out++ = r.x, *out++ = r.y, *out++ = r.z;
     *out++ = o.pose.c.x, *out++ = o.pose.c.y, *out++ = o.pose.c.z;
     out = std::copy(o.velocity, o.velocity + 6, out);
-    *out++ = o.deviation, *out++ = o.frames;
+    *out++ = o.deviation, *out++ = o.frames, *out++ = o.since;
     const TextureTerm::Light& light = o.texture.light;
     for (const auto& channel : light.harmonics) out = std::copy(channel, channel + 9, out);
     *out++ = light.deviation, *out++ = light.known;
@@ -227,7 +231,7 @@ void Tracker::load(int index, const double* in) {
     for (Vec3& r : o.pose.R.row) r.x = *in++, r.y = *in++, r.z = *in++;
     o.pose.c = {in[0], in[1], in[2]}, in += 3;
     std::copy(in, in + 6, o.velocity), in += 6;
-    o.deviation = *in++, o.frames = int(*in++);
+    o.deviation = *in++, o.frames = int(*in++), o.since = int(*in++);
     TextureTerm::Light& light = o.texture.light;
     for (auto& channel : light.harmonics) std::copy(in, in + 9, channel), in += 9;
     light.deviation = *in++, light.known = *in++ != 0;

@@ -60,7 +60,7 @@ class Tracker {
     bool is_in_view(int object);
 
     // These are all numbers that the next update depends on.
-    static constexpr int numbers = 9 + 3 + 6 + 2 + 27 + 2 + SideModels::count + 1;
+    static constexpr int numbers = 9 + 3 + 6 + 3 + 27 + 2 + SideModels::count + 1;
     void save(int object, double* out) const;
     void load(int object, const double* in);
     std::span<float> colors(int object) { return objects_[object]->histograms.state(); }
@@ -74,7 +74,8 @@ class Tracker {
         RigidPose pose;
         double velocity[6] = {};  // step of a frame: rotation vector, and shift in sizes
         double deviation;         // of each entry of a step from the predicted pose
-        int frames = 0;
+        int frames = 0;           // updates in all, and since the object was placed
+        int since = 0;
         Frame frame;
         Contour contour;
         ColorHistograms histograms;

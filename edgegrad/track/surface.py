@@ -1,4 +1,4 @@
-"""The parts of a mesh that the tracker compares: its shape about a centre, points of its texture, and points spread over its surface."""
+"""The parts of a mesh that the tracker compares: its shape, points of its texture, and points spread over its surface."""
 
 from __future__ import annotations
 

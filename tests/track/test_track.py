@@ -122,7 +122,7 @@ def test_depth_for_each_frame(film, frames):
         depths.append(torch.where(alpha > 0.99, channels["depth"][..., 0] / alpha, torch.nan))
     for pose in track(plain, frames[:3], film.camera, film.poses[0], depths=depths, options=FitOptions(seed=0)):
         degrees, percent = errors(film, pose.index, pose.R, pose.t)
-        assert degrees < 0.3 and percent < 0.1
+        assert degrees < 0.3 and percent < 0.2
 
 
 def test_command_line_on_a_folder(film, frames, arguments, tmp_path, capsys):

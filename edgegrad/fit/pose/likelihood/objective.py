@@ -198,11 +198,9 @@ class Crop(NamedTuple):
 
 
 def pose_levels(
-    task: PoseTask, start: Pose, depths: Sequence[Tensor | None], settings: Settings,
-    palettes: Sequence[Palette] | None = None,
+    task: PoseTask, start: Pose, depths: Sequence[Tensor | None], settings: Settings
 ) -> list[PoseLevel]:  # fmt: skip
-    """Return the levels from coarse to fine, of what surrounds the object at the start. `palettes` of the pictures may be
-    given."""
+    """Return the levels from coarse to fine, of what surrounds the object at the start."""
     shots, cut, extents = [], [], []
     for shot, depth in zip(task.shots, depths, strict=True):
         crop = Crop.around(task, shot, start)
@@ -225,11 +223,11 @@ def pose_levels(
     halved = [*range(halvings, -1, -1)]
     halved += [0] * (1 + len(blurs) - len(halved))
     masked, harmonics = _kind(task)
-    levels = []
+    levels, palettes = [], list[Palette]()
     for k, n in enumerate(halved):
         sizes = [scaled(shot.camera.size, factor / 2**n) for shot, factor in zip(shots, finest, strict=True)]
         own = [extent * factor / 2**n for extent, factor in zip(extents, finest, strict=True)]
-        if palettes is None:
+        if not palettes:
             palettes = [_palette(shot, masked, size, settings.seed) for shot, size in zip(shots, sizes, strict=True)]
         columns = zip(shots, cut, sizes, own, palettes, strict=True)
         pictures = tuple(PictureLevel.from_shot(a, b, masked, c, d, e) for a, b, c, d, e in columns)
