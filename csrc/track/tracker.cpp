@@ -204,6 +204,7 @@ void Tracker::place(int index, const RigidPose& pose) {
     std::fill(object.velocity, object.velocity + 6, 0.0);
     object.deviation = Settings::first_deviation;
     object.since = 0;
+    object.texture.light = {};  // It may be that of something else by now.
 }
 
 bool Tracker::is_in_view(int index) {

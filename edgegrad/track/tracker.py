@@ -162,10 +162,7 @@ class Tracker:
         """
         name = f"frames[{self._index}]"
         frame = self._frame(name, image)
-        measured = None
-        if depth is not None:
-            measured = measured_image(f"depths[{self._index}]", depth, self._camera.size)[..., 0]
-            self._warn_of_units(measured)
+        measured = None if depth is None else self._depth(depth)
         self._channels = frame.shape[-1]
         for k in range(len(self._objects)):
             self._return_to_last(k)
@@ -177,15 +174,21 @@ class Tracker:
         self._index += 1
         return poses[0] if self._single else poses
 
-    def _warn_of_units(self, depth: Tensor) -> None:
-        """Warn where the first depth image has other units than the scene."""
-        if self._had_depth:
-            return
+    def _depth(self, given: object) -> Tensor:
+        """Return a depth image (H, W) float32. The first one is checked, and warned of where it has other units than the scene.
+        Raises TypeError or ValueError."""
+        name = f"depths[{self._index}]"
+        depth = as_tensor(name, given).detach().cpu()
+        if self._had_depth and depth.dtype == torch.float32 and tuple(depth.shape) == self._camera.size:
+            return depth  # The kernel leaves out what was not measured.
+        depth = measured_image(name, depth, self._camera.size)[..., 0]
+        if not self._had_depth:
+            start = [one.to_world(*one.good) for one in self._objects]
+            moved = [one.scene.transformed(p.R, p.t, p.scale) for one, p in zip(self._objects, start, strict=True)]
+            meshes = [part for scene in moved for part in without_colors(scene).meshes]
+            warn_of_units(Scene(meshes), [self._camera], [depth], "at the start")
         self._had_depth = True
-        start = [one.to_world(*one.good) for one in self._objects]
-        moved = [one.scene.transformed(p.R, p.t, p.scale) for one, p in zip(self._objects, start, strict=True)]
-        meshes = [part for scene in moved for part in without_colors(scene).meshes]
-        warn_of_units(Scene(meshes), [self._camera], [depth], "at the start")
+        return depth
 
     def _return_to_last(self, k: int) -> None:
         """Move a lost object to where a search found it, or to where it was seen last."""
@@ -238,7 +241,8 @@ class Tracker:
             return None
         linear = torch.from_numpy(frame.copy())
         linear = srgb_to_linear(linear.float() / 255.0) if frame.dtype == np.uint8 else linear
-        return search.begin(Sighting(self._index, linear, depth, one.to_world(*one.good)))
+        measured = None if depth is None else torch.where(depth > 0.0, depth, torch.nan)
+        return search.begin(Sighting(self._index, linear, measured, one.to_world(*one.good)))
 
     def _frame(self, name: str, image: object) -> np.ndarray:
         """Return a frame (H, W, C) as uint8 or float32. Raises TypeError, ValueError or OSError."""

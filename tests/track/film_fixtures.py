@@ -16,7 +16,7 @@ import edgegrad as eg
 
 @pytest.fixture(scope="session")
 def film() -> Film:
-    return Film.turning(80, 7, spp=8)
+    return Film.turning(160, 7, spp=8)
 
 
 @pytest.fixture(scope="session")
