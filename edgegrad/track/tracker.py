@@ -40,8 +40,9 @@ class TrackerSettings:
 
     # A pose is lost below this confidence: more says so of right poses, less is late to say so of wrong ones.
     least_confidence: float = 0.5
-    # Successive frames for which a lost object is followed by its motion; then each frame starts where it was seen last.
-    patience: int = 3
+    # Successive frames for which a lost object is followed alone; then every other frame starts where it was seen last, and goes
+    # on elsewhere if that fails.
+    patience: int = 2
     # Frames after which it is sought in a whole frame, and from the end of one search to the next.
     search_after: int = 4
 
@@ -61,6 +62,7 @@ class _Followed:
         self.view = camera.world_to_camera.double().numpy()
         self.good = self.to_camera(self.start)  # the last pose that was likely
         self.poor = 0  # successive frames in which it was not
+        self.aside: tuple[np.ndarray, np.ndarray] | None = None  # the kernel's state while a frame starts at `good`
 
     def to_camera(self, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
         """Return the rotation from the mesh to the camera, and the centre in the camera's frame."""
@@ -199,7 +201,11 @@ class Tracker:
             found = self._searches[k].result()
         except (MemoryError, RuntimeError, ValueError):  # A frame in which nothing can be compared finds nothing.
             found = None
-        self._kernel.place(k, *(one.good if found is None else one.to_camera(found)))
+        if found is not None:
+            self._kernel.place(k, *one.to_camera(found))
+        elif one.poor % 2 == 0:
+            one.aside = self._kernel.save(k)
+            self._kernel.place(k, *one.good)
 
     def _judged(self, k: int, found: Found) -> TrackedPose:
         """Return the result for an object, and note whether it is lost."""
@@ -208,6 +214,9 @@ class Tracker:
         confidence = confidence_of(features)
         lost = not confidence >= TRACKER.least_confidence
         one.poor = one.poor + 1 if lost else 0
+        if lost and one.aside is not None:
+            self._kernel.load(k, *one.aside)
+        one.aside = None
         if not lost:
             one.good = found.R, found.c
         pose = one.to_world(*one.good)
