@@ -169,6 +169,11 @@ class Tracker:
         for k in range(len(self._objects)):
             self._return_to_last(k)
         rows = self._kernel.update(frame, None if measured is None else measured.numpy())
+        if len(rows) == 1 and (one := self._objects[0]).aside is not None and not self._is_likely(0, rows[0]):
+            # One object alone goes on in this frame; several do in the next one.
+            self._kernel.load(0, *one.aside)
+            one.aside = None
+            rows = self._kernel.update(frame, None if measured is None else measured.numpy())
         self.times = tuple(found.times for found in rows)
         poses = tuple(self._judged(k, found) for k, found in enumerate(rows))
         for k in range(len(self._objects)):
@@ -206,6 +211,10 @@ class Tracker:
         elif one.poor % 2 == 0:
             one.aside = self._kernel.save(k)
             self._kernel.place(k, *one.good)
+
+    def _is_likely(self, k: int, found: Found) -> bool:
+        features = features_of(found, len(self._objects[k].shape.textured.X) > 0)
+        return confidence_of(features) >= TRACKER.least_confidence
 
     def _judged(self, k: int, found: Found) -> TrackedPose:
         """Return the result for an object, and note whether it is lost."""
