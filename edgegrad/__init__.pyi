@@ -1,4 +1,4 @@
-from . import fit, image, lights, points, rig, shapes, textures
+from . import fit, image, lights, points, rig, shapes, textures, track
 from .aovs import render_aovs
 from .camera.camera import Camera
 from .files.cameras import load_camera, load_cameras, save_camera
@@ -53,6 +53,7 @@ __all__ = [
     "screen_gradient",
     "shapes",
     "textures",
+    "track",
     "viewer",
     "write_image",
 ]

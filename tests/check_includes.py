@@ -15,7 +15,7 @@ LAYERS = (
     ("scene", "texture"),
     ("camera",),
     ("rays",),
-    ("film",),
+    ("film", "track"),
     ("accumulate",),
     ("shading",),
     ("estimator",),

@@ -35,7 +35,8 @@ using namespace nanobind::literals;
 
 namespace edgegrad {
 
-void bind_paths_for_tests(nb::module_& m);  // paths_for_tests.cpp defines it.
+void bind_paths_for_tests(nb::module_& m);  // paths_for_tests.cpp
+void bind_track_for_tests(nb::module_& m);  // track_for_tests.cpp
 
 namespace {
 
@@ -151,6 +152,7 @@ NB_MODULE(_core_tests, p) {
     bind_scene_functions<float>(p);
     bind_scene_functions<double>(p);
     bind_paths_for_tests(p);
+    bind_track_for_tests(p);
 
     p.def("project", [](const Camera& c, A3 q) { return array(distort(c, project(c, vec(q))).x); });
     p.def("project_straight", [](const Camera& c, A3 q) { return array(project(c, vec(q))); });

@@ -30,6 +30,7 @@ void bind_lit(nb::module_& m);              // lit.cpp
 void bind_secondary_edges(nb::module_& m);  // secondary_edges.cpp
 void bind_moving_hits(nb::module_& m);      // moving_hits.cpp
 void bind_raster(nb::module_& m);           // raster.cpp
+void bind_track(nb::module_& m);            // track.cpp
 template <class T>
 void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene);
 template <class T>
@@ -271,6 +272,7 @@ NB_MODULE(_core, m) {
     bind_secondary_edges(m);
     bind_moving_hits(m);
     bind_raster(m);
+    bind_track(m);
     bind_scene<float>(m, "SceneFloat", "HitsFloat");
     bind_scene<double>(m, "SceneDouble", "HitsDouble");
     bind_memory(m);

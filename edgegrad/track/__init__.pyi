@@ -1,0 +1,5 @@
+from .film import track
+from .result import TrackedPose
+from .tracker import Tracker
+
+__all__ = ["TrackedPose", "Tracker", "track"]
