@@ -158,7 +158,7 @@ def test_a_calibration_that_ran_out_of_steps_names_what_is_not_known() -> None:
     (view,), zeros, eye = taken(1, 16), torch.zeros(2), torch.eye(3).double()
     known = Uncertainty(
         torch.eye(6).double(), 1.0, torch.empty(0, 3).double(), 0.0, 5.0, principal=zeros, distortion=zeros, names=("k1", "k2"),
-        vague=(words,), at_lens=1e-9 * torch.eye(6).double(),
+        vague=(words,), at_lens=1e-9 * torch.eye(6).double(), of_camera=True,
     )  # fmt: skip
     search = PoseFit(eye, eye[0], 1.0, view, 0.0, 1, 0.0, False, explained=1.0, cameras=[view], uncertainty=known)
     ended = fitted([search, search], Ending.STEPS)
