@@ -21,9 +21,3 @@ def harmonics(n: Tensor, factors: Sequence[float] = ORTHONORMAL) -> list[Tensor]
         one * torch.ones_like(x), c1 * y, c1 * z, c1 * x, c2 * x * y, c2 * y * z, c3 * (3 * z * z - 1), c2 * x * z,
         c4 * (x * x - y * y),
     ]  # fmt: skip
-
-
-def harmonics_jvp(n: Tensor, tangents: Tensor) -> list[Tensor]:
-    """Return the derivatives (D, …) of harmonics(n, UNSCALED) along tangents (D, …, 3)."""
-    (x, y, z), (a, b, c) = n.unbind(-1), tangents.unbind(-1)
-    return [a * 0.0, b, c, a, a * y + x * b, b * z + y * c, 6.0 * z * c, a * z + x * c, 2.0 * (x * a - y * b)]
