@@ -1,6 +1,6 @@
 """How films are shown to trackers: one picture after the other, and what is kept of their answers.
 
-A tracker is given by its name, `module:name`. What it names is a generator as edgegrad.track, which takes
+A tracker is given by its name, `module:name`. What it names is a generator as edgegrad.fit.track, which takes
 (mesh, frames, camera, init, depths=…), or a class that takes (mesh, camera, init) and whose update(image, depth) returns a pose;
 for several objects it takes sequences and returns as many poses. Poses have `matrix` or R and t, and `lost`; the others that are
 read where they are there: `covariance` (6, 6) of a rotation vector in radians and a shift of the object's centre in world units,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator
-from os import PathLike as OsPath
 
 from torch import Tensor
 
 from ..camera.camera import Camera
 from ..fit.options import FitOptions
 from ..fit.pose.result import PoseFit
+from ..fit.pose.track import check_one_by_one
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from .result import TrackedPose
@@ -64,21 +64,10 @@ def track(
     """
     if not isinstance(mesh, Mesh | Scene):
         raise TypeError(f"mesh: expected a Mesh or a Scene, got {type(mesh).__name__}; load one with load_mesh(path)")
-    _check_one_by_one("frames", frames, 4, "pictures or paths one after the other")
+    check_one_by_one("frames", frames, 4, "pictures or paths one after the other")
     if depths is not None:
-        _check_one_by_one("depths", depths, 3, "one for each frame or None")
+        check_one_by_one("depths", depths, 3, "one for each frame or None")
     return _poses(Tracker(mesh, camera, init, options=options, wait=True), frames, depths)
-
-
-def _check_one_by_one(name: str, given: object, dims: int, expected: str) -> None:
-    """Raise TypeError or ValueError for what has no pictures one after the other; a tensor has so many dimensions, or one more
-    for a single channel."""
-    if isinstance(given, (str, OsPath)) or not isinstance(given, (Iterable, Tensor)):
-        got = type(given).__name__
-        raise TypeError(f"{name}: expected {expected}, got {got}; of a folder, give sorted(folder.glob('*.png'))")
-    if isinstance(given, Tensor) and given.dim() not in (dims, 4):
-        shape = "(T, H, W, C)" if dims == 4 else "(T, H, W)"
-        raise ValueError(f"{name}: expected {shape}, got {tuple(given.shape)}; give a list of pictures")
 
 
 def _poses(

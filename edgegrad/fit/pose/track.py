@@ -156,9 +156,9 @@ def track(
         raise TypeError(f"camera: expected the one Camera of all frames, got {got}")
     if not isinstance(mesh, Mesh | Scene):
         raise TypeError(f"mesh: expected a Mesh or a Scene, got {type(mesh).__name__}; load one with load_mesh(path)")
-    _check_one_by_one("frames", frames, 4, "pictures or paths one after the other")
+    check_one_by_one("frames", frames, 4, "pictures or paths one after the other")
     if depths is not None:
-        _check_one_by_one("depths", depths, 3, "one for each frame or None")
+        check_one_by_one("depths", depths, 3, "one for each frame or None")
     settings = Settings.from_options(options, "track", ("max_size", "spp"), spp=8)
     start = pose_from_matrix("init", getattr(init, "matrix", init))
     scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu").detach()
@@ -168,7 +168,7 @@ def track(
     return _poses(Tracker(mesh, camera, start, settings), frames, depths)
 
 
-def _check_one_by_one(name: str, given: object, dims: int, expected: str) -> None:
+def check_one_by_one(name: str, given: object, dims: int, expected: str) -> None:
     """Raise TypeError or ValueError for what has no pictures one after the other; a tensor has so many dimensions, or one more
     for a single channel."""
     if isinstance(given, (str, OsPath)) or not isinstance(given, (Iterable, Tensor)):
