@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
@@ -15,30 +14,13 @@ from ..fit.modes import in_full_precision
 from ..fit.options import Settings
 from ..fit.placement import Pose
 from ..fit.pose.hypotheses import HypothesisSearch
-from ..fit.pose.inputs import ArgumentNames, depth_of
+from ..fit.pose.inputs import ArgumentNames
 from ..fit.pose.likelihood.objective import pose_levels
 from ..fit.pose.likelihood.support import enough_support, evidence_of
-from ..fit.pose.photo.match import places
-from ..fit.pose.photo.template_views import TemplateViews, across, ball
-from ..fit.pose.settings import TEMPLATES
 from ..fit.pose.task import PoseTask, Unknowns
+from ..fit.pose.track import matches
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
-
-
-@dataclass(frozen=True)
-class RecoverySettings:
-    """Numbers of the search for a lost object."""
-
-    # It renders so many views, up to so many radians from where the object was seen last, and this much larger or smaller. Half
-    # as many miss objects that have turned; twice as many take as much longer.
-    views: int = 160
-    view_radius: float = 1.1
-    size_factor: float = 1.2
-    matches: int = 12  # best places of views that are refined
-
-
-RECOVERY = RecoverySettings()
 
 
 class Sighting(NamedTuple):
@@ -66,33 +48,13 @@ class Recovery:
         )
         # The background counts as unknown, since a film shows more than one.
         task = replace(task, clutter=True, shots=[task.shots[0]._replace(background=None)])
-        groups = [(last, [last]), *((pose, [pose]) for pose in self._matches(task, last))]
+        groups = [(last, [last]), *((pose, [pose]) for pose in matches(task, last, self._settings.seed))]
         modes = HypothesisSearch(task, groups, depths, self._settings, further=False).run()
         if not modes:
             return None
         level = pose_levels(task, modes[0].pose, depths, self._settings)[-1]
         share = evidence_of(level, modes[0].pose).edges
         return modes[0].pose if share >= enough_support(task) else None
-
-    def _matches(self, task: PoseTask, last: Pose) -> list[Pose]:
-        """Return where in the whole frame the object might be, about as large as it was, and rotated by up to some 60°."""
-        camera, scale = task.shots[0].camera, last.scale
-        if camera.projection not in ("perspective", "orthographic"):
-            return []
-        unit = replace(
-            task, scene=task.scene.transformed(torch.eye(3), torch.zeros(3), scale), center=scale * task.center
-        )
-        rotations = ball(RECOVERY.views, RECOVERY.view_radius) @ (camera.world_to_camera[:3, :3] @ last.R)
-        far = float(depth_of(camera, last, task.center))
-        size = across(unit, camera, far) / min(camera.size)
-        views = TemplateViews.from_rotations(unit, rotations, TEMPLATES.view_pixels, self._settings.seed)
-        found = places(unit, views, (size / RECOVERY.size_factor, size * RECOVERY.size_factor))
-        poses = [pose._replace(scale=scale) for pose in found[: RECOVERY.matches]]
-        if camera.projection == "orthographic":  # The match does not show depth.
-            axis = camera.world_to_camera[2, :3]
-            off = [far - float(depth_of(camera, pose, task.center)) for pose in poses]
-            poses = [pose._replace(t=pose.t + shift * axis) for pose, shift in zip(poses, off, strict=True)]
-        return poses
 
 
 class SearchThread:

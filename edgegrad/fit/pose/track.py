@@ -240,6 +240,25 @@ def _rested(problem: PredictedLevel, start: Pose) -> Descent[Pose]:
     return minimise(problem, [start], settings).descents[0]
 
 
+def matches(task: PoseTask, last: Pose, seed: int) -> list[Pose]:
+    """Return where in the whole picture the object might be, about as large as it was, and rotated by up to some 60°."""
+    camera, scale = task.shots[0].camera, last.scale
+    if camera.projection not in ("perspective", "orthographic"):
+        return []
+    unit = replace(task, scene=task.scene.transformed(torch.eye(3), torch.zeros(3), scale), center=scale * task.center)
+    rotations = ball(TRACK.views, TRACK.view_radius) @ (camera.world_to_camera[:3, :3] @ last.R)
+    far = float(depth_of(camera, last, task.center))
+    size = across(unit, camera, far) / min(camera.size)
+    views = TemplateViews.from_rotations(unit, rotations, TEMPLATES.view_pixels, seed)
+    found = places(unit, views, (size / TRACK.size_factor, size * TRACK.size_factor))
+    poses = [pose._replace(scale=scale) for pose in found[: TRACK.matches]]
+    if camera.projection == "orthographic":  # The match does not show depth.
+        axis = camera.world_to_camera[2, :3]
+        off = [far - float(depth_of(camera, pose, task.center)) for pose in poses]
+        poses = [pose._replace(t=pose.t + shift * axis) for pose, shift in zip(poses, off, strict=True)]
+    return poses
+
+
 class Tracker:
     """The state of tracking through a film."""
 
@@ -271,7 +290,7 @@ class Tracker:
         if found.share < enough:
             groups = [(predicted, [predicted, self.good][: 1 if predicted is self.good else 2])]
             if lost and (self.poor - TRACK.patience) % TRACK.search_interval == 0:
-                groups += [(pose, [pose]) for pose in self._matches(task)]
+                groups += [(pose, [pose]) for pose in matches(task, self.good, self.settings.seed)]
             again = self._searched(task, depth, groups)
             if first or again.share >= enough:
                 found, seen, jumped = again, True, True
@@ -309,26 +328,6 @@ class Tracker:
         level = pose_levels(task, pose, [depth], self.settings)[-1]
         self.palettes = [picture.palette for picture in level.pictures]
         return FrameCandidate(pose, *evidence_of(level, pose)[:2])
-
-    def _matches(self, task: PoseTask) -> list[Pose]:
-        """Return where in the whole picture the object might be, about as large as it was, and rotated by up to some 60°."""
-        camera, scale = task.shots[0].camera, self.good.scale
-        if camera.projection not in ("perspective", "orthographic"):
-            return []
-        unit = replace(
-            task, scene=task.scene.transformed(torch.eye(3), torch.zeros(3), scale), center=scale * task.center
-        )
-        rotations = ball(TRACK.views, TRACK.view_radius) @ (camera.world_to_camera[:3, :3] @ self.good.R)
-        far = float(depth_of(camera, self.good, task.center))
-        size = across(unit, camera, far) / min(camera.size)
-        views = TemplateViews.from_rotations(unit, rotations, TEMPLATES.view_pixels, self.settings.seed)
-        found = places(unit, views, (size / TRACK.size_factor, size * TRACK.size_factor))
-        poses = [pose._replace(scale=scale) for pose in found[: TRACK.matches]]
-        if camera.projection == "orthographic":  # The match does not show depth.
-            axis = camera.world_to_camera[2, :3]
-            off = [far - float(depth_of(camera, pose, task.center)) for pose in poses]
-            poses = [pose._replace(t=pose.t + shift * axis) for pose, shift in zip(poses, off, strict=True)]
-        return poses
 
     def _predicted(self, task: PoseTask) -> Pose:
         """Predict the pose by constant velocity."""
